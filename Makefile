@@ -1,0 +1,51 @@
+# Each target sets up what it needs in .venv. PYTHON=python3.12 make ... takes another Python (3.11 or newer).
+PYTHON ?= python3
+BIN := .venv/bin
+# An editable install knows where it lies: a folder that was moved gets a new one.
+HERE := $(shell pwd | cksum | cut -d' ' -f1)
+RUNTIME := .venv/.runtime-$(HERE)
+DEV := .venv/.dev-$(HERE)
+PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+
+.PHONY: help demo test check bench clean
+
+help:
+	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
+	@echo "make test    run all tests"
+	@echo "make check   ruff, mypy --strict, import rules"
+	@echo "make bench   print the benchmarks"
+	@echo "make clean   remove .venv and caches"
+
+demo: $(RUNTIME)
+	$(BIN)/python -m otolith demo
+
+test: $(DEV)
+	$(BIN)/python -m pytest
+
+check: $(DEV)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(DEV)
+	@for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "$(PYTHON) is missing or older than 3.11: set PYTHON=python3.12 or the like"; exit 2; }
+	@$(PYTHON) -m venv .venv || { rm -rf .venv; echo "on Debian: apt install python3-venv"; exit 2; }
+
+$(RUNTIME): pyproject.toml constraints.txt | .venv/bin/python
+	@echo "setting up .venv, which takes a minute or two"
+	@$(PIP) --editable .
+	@touch $@
+
+$(DEV): pyproject.toml constraints.txt | .venv/bin/python
+	@echo "setting up .venv with the test tools, which takes a minute or two"
+	@$(PIP) --editable '.[dev]'
+	@touch $@ $(RUNTIME)

@@ -1,0 +1,1 @@
+"""From samples to windows: ring buffers, alignment to the sampling grid, window quality."""

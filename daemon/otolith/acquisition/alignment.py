@@ -1,0 +1,129 @@
+"""From time-stamped samples to a uniform grid. Pure: times come in as arguments.
+
+A cyclic source samples on a grid of its own; what jitters is the arrival. So a signal that comes at about the sample
+period is not interpolated: each sample is given to the slot of the grid it was taken in, late arrivals to the slots
+before (a frame can come late, never early). Interpolation is for signals that come at another rate.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Mask, Quality, Verdict
+
+CYCLIC_TOLERANCE = 0.3  # a source whose median period is this close to the grid's is taken to be on it
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a window may lack and still be good."""
+
+    missing: float = 0.05
+    """Share of records of the worst signal."""
+    gap: float = 0.05
+    """s, of the worst signal."""
+    jitter: float = 0.005
+    """s, of the worst signal."""
+
+
+class Aligned(NamedTuple):
+    """One signal on the grid."""
+
+    values: Array
+    missing: Mask
+    lateness: Array
+    """s between each sample and its slot; empty if there was none."""
+
+
+def align(times: Array, values: Array, start: float, records: int, period: float) -> Aligned:
+    """Samples (s, value) on the grid ``start + k * period``, ``k < records``.
+
+    Samples that are not finite count as missing. Gaps are bridged by the straight line between their ends, at the
+    edges by the nearest value; without any sample the values are zero and all missing.
+    """
+    finite = np.isfinite(values)
+    times, values = times[finite], values[finite]
+    if len(times) > 1 and not _cyclic(times, period):
+        return _interpolated(times, values, start, records, period)
+    slots = _slots(times, start, period)
+    inside = (slots >= 0) & (slots < records)
+    slots, times, values = slots[inside], times[inside], values[inside]
+    grid = np.full(records, np.nan)
+    grid[slots] = values
+    missing = np.isnan(grid)
+    return Aligned(*_finite(_bridged(grid, missing), missing), times - (start + slots * period))
+
+
+def _cyclic(times: Array, period: float) -> bool:
+    return bool(abs(np.median(np.diff(times)) / period - 1.0) <= CYCLIC_TOLERANCE)
+
+
+def _slots(times: Array, start: float, period: float) -> "np.ndarray[tuple[int, ...], np.dtype[np.int64]]":
+    """The nearest slot of each sample, pushed back where several came in a burst after a stall."""
+    order = np.arange(len(times))
+    nearest = np.rint((times - start) / period).astype(np.int64)
+    return np.minimum.accumulate((nearest - order)[::-1])[::-1] + order if len(times) else nearest
+
+
+def _interpolated(times: Array, values: Array, start: float, records: int, period: float) -> Aligned:
+    """A signal slower or faster than the grid: straight lines between samples, missing where they are too far apart."""
+    grid = start + period * np.arange(records)
+    usual = max(float(np.median(np.diff(times))), period)
+    after = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
+    gap = times[after] - times[after - 1]
+    outside = (grid < times[0] - usual) | (grid > times[-1] + usual)
+    missing: Mask = (gap > 2.5 * usual) | outside
+    return Aligned(*_finite(np.interp(grid, times, values), missing), np.zeros(0))
+
+
+def _bridged(grid: Array, missing: Mask) -> Array:
+    if missing.all():
+        return np.zeros(len(grid))
+    if not missing.any():
+        return grid
+    known = np.flatnonzero(~missing)
+    return np.interp(np.arange(len(grid)), known, grid[known])
+
+
+def _finite(values: Array, missing: Mask) -> tuple[Array, Mask]:
+    """A line between two absurd values can overflow: such a record is missing."""
+    absurd = ~np.isfinite(values)
+    return np.where(absurd, 0.0, values), missing | absurd
+
+
+def judge(aligned: Mapping[str, Aligned], period: float, limits: Limits) -> Quality:
+    """The quality of a window from its signals."""
+    missing = {signal: float(found.missing.mean()) for signal, found in aligned.items()}
+    gaps = {signal: _longest_run(found.missing) * period for signal, found in aligned.items()}
+    jitters = {signal: float(found.lateness.std()) if len(found.lateness) else 0.0 for signal, found in aligned.items()}
+    offsets = [float(np.median(found.lateness)) for found in aligned.values() if len(found.lateness)]
+    reasons = _silent(missing) or [
+        *_over(missing, limits.missing, lambda signal, share: f"{share:.0%} of {signal} is missing"),
+        *_over(gaps, limits.gap, lambda signal, gap: f"{signal} has a gap of {gap * 1e3:.0f} ms"),
+        *_over(jitters, limits.jitter, lambda signal, jitter: f"{signal} arrives with {jitter * 1e3:.1f} ms of jitter"),
+    ]
+    return Quality(
+        verdict=Verdict.BAD if reasons else Verdict.GOOD,
+        missing=max(missing.values()),
+        longest_gap=max(gaps.values()),
+        jitter=max(jitters.values()),
+        skew=max(offsets) - min(offsets) if offsets else 0.0,
+        reasons=tuple(reasons),
+    )
+
+
+def _silent(missing: Mapping[str, float]) -> list[str]:
+    silent = [signal for signal, share in missing.items() if share == 1.0]
+    return [f"no samples of {', '.join(silent)}"] if silent else []
+
+
+def _over(found: Mapping[str, float], limit: float, sentence: Callable[[str, float], str]) -> list[str]:
+    worst = max(found, key=lambda signal: found[signal])
+    return [sentence(worst, found[worst])] if found[worst] > limit else []
+
+
+def _longest_run(mask: Mask) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
+    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0

@@ -1,0 +1,199 @@
+"""The command line: speech only. Each command imports what it needs, so that ``otolith --help`` is quick."""
+
+import logging
+import math
+import os
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from otolith import __version__
+
+INTERRUPTED = 128 + signal.SIGINT
+FILE = click.Path(path_type=Path, dir_okay=False)
+EXIT_CODES = """\b
+Exit codes:
+  0    done, or stopped by SIGTERM
+  1    the demo's estimate was wrong
+  2    a file, option, bus or port cannot be used; the message says which and what to do
+  130  interrupted by Ctrl-C"""
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog=EXIT_CODES)
+@click.version_option(__version__, prog_name="otolith")
+def cli() -> None:
+    """Otolith makes an industrial machine aware of itself.
+
+    It listens to the drive, fits a white-box twin to every window of a few seconds, and says in physical terms what has
+    changed.
+
+    \b
+    Start here:
+      otolith demo                          a simulated motor, a daemon and a live table, for 90 s
+      otolith check config/dc-motor.toml    read a machine file and say what would be done
+      otolith run config/dc-motor.toml      the daemon, in the foreground
+    """
+
+
+@cli.command()
+@click.argument("file", type=FILE)
+@click.option("--listen", multiple=True, metavar="ENDPOINT", help="Publish here instead of where the file says.")
+@click.option("--recording", type=FILE, help="Record into this file instead of a new one in the state directory.")
+@click.option("-v", "--verbose", is_flag=True, help="Say more.")
+def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bool) -> int:
+    """Run the daemon for the machine in FILE until SIGTERM or Ctrl-C.
+
+    \b
+    Examples:
+      otolith run config/dc-motor.toml
+      otolith run config/dc-motor.toml --listen tcp/127.0.0.1:7450
+    """
+    from otolith.plan import load_plan
+    from otolith.service import Service
+
+    _log(verbose)
+    ended_by = Service(load_plan(file), listen or None, recording).run()
+    return INTERRUPTED if ended_by == signal.SIGINT else 0
+
+
+@cli.command()
+@click.argument("file", type=FILE)
+@click.option("--no-device", is_flag=True, help="Do not try to open the machine's bus.")
+def check(file: Path, no_device: bool) -> None:
+    """Read the machine file FILE, open its bus, and say what the daemon would do.
+
+    \b
+    Examples:
+      otolith check config/dc-motor.toml
+      otolith check --no-device config/dc-motor.toml
+    """
+    from otolith.plan import describe, load_plan
+
+    plan = load_plan(file)
+    if not no_device:
+        plan.driver.open(lambda _: None)
+        plan.driver.close()
+    for line in describe(plan):
+        click.echo(line)
+
+
+@cli.command()
+@click.argument("scenario", type=FILE)
+@click.option("--truth", type=FILE, help="Write the parameters as they really are into this CSV file.")
+@click.option("--duration", type=click.FloatRange(0.1), default=math.inf, metavar="SECONDS", help="End by then.")
+def plant(scenario: Path, truth: Path | None, duration: float) -> int:
+    """Be the simulated machine of SCENARIO, a node on the CAN bus, in real time.
+
+    \b
+    Example:
+      otolith plant config/scenarios/demo.toml
+    """
+    from otolith_drivers.plant.can_node import run as run_node
+    from otolith_drivers.plant.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    stop = _StopSignal()
+    click.echo(f"{loaded.plant} on {loaded.bus.title()}, frames of {loaded.dbc.name}; Ctrl-C ends it", err=True)
+    sent = run_node(loaded, lambda: stop.number is not None, truth, duration)
+    click.echo(f"{sent.frames} frames in {sent.seconds:.1f} s of simulated time, {sent.stalls} stalls", err=True)
+    return INTERRUPTED if stop.number == signal.SIGINT else 0
+
+
+@cli.command()
+@click.option(
+    "--connect", default="tcp/127.0.0.1:7447", show_default=True, metavar="ENDPOINT", help="Where daemons are."
+)
+@click.option("--machine", default="*", metavar="NAME", help="Only this machine.")
+@click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
+def watch(connect: str, machine: str, as_json: bool) -> int:
+    """Show the live table of a running daemon, from any process that reaches it.
+
+    \b
+    Examples:
+      otolith watch
+      otolith watch --json | jq .parameters.R_a
+    """
+    from otolith.watch import watch_reports
+
+    stop = _StopSignal()
+    watch_reports(connect, machine, as_json=as_json, stopped=lambda: stop.number is not None)
+    return INTERRUPTED if stop.number == signal.SIGINT else 0
+
+
+@cli.command()
+@click.argument("file", type=FILE, required=False)
+@click.option("--list", "listing", is_flag=True, help="Only list the recordings there are.")
+def view(file: Path | None, listing: bool) -> int:
+    """Open the recording FILE in the Rerun viewer; without FILE, the newest one.
+
+    \b
+    Examples:
+      otolith view
+      otolith view --list
+    """
+    from otolith.viewer import open_viewer, recordings
+
+    if listing:
+        for path in recordings():
+            click.echo(path)
+        return 0
+    return open_viewer(file)
+
+
+@cli.command()
+@click.option("--duration", type=click.FloatRange(8, 3600), default=90.0, show_default=True, help="Seconds.")
+@click.option("--machine", type=FILE, help="Machine file; the one of the DC motor if not given.")
+@click.option("--scenario", type=FILE, help="What happens to the machine; a falling armature resistance if not given.")
+@click.option("--json", "as_json", is_flag=True, help="Print the verdict as JSON, and no table.")
+def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: bool) -> int:
+    """Run plant and daemon as processes on a bus, watch, and compare what was found with what was injected.
+
+    \b
+    Examples:
+      otolith demo
+      otolith demo --duration 30 --json
+    """
+    from otolith.demo import Demo
+    from otolith.paths import examples_directory
+
+    examples = examples_directory()
+    stop = _StopSignal()
+    machine = machine or examples / "dc-motor.toml"
+    scenario = scenario or examples / "scenarios" / "demo.toml"
+    code = Demo(machine, scenario, duration, as_json=as_json).run(lambda: stop.number is not None)
+    return code if stop.number is None else 128 + stop.number
+
+
+class _StopSignal:
+    """Remembers the signal that asks this command to end."""
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._take)
+
+    def _take(self, number: int, _: FrameType | None) -> None:
+        self.number = number
+
+
+def _log(verbose: bool) -> None:
+    """To standard error; under systemd with the priority that journald understands."""
+    handler = logging.StreamHandler(sys.stderr)
+    if "JOURNAL_STREAM" in os.environ:
+        handler.setFormatter(_Journal("%(name)s: %(message)s"))
+    else:
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    logging.getLogger("otolith").setLevel(logging.DEBUG if verbose else logging.INFO)
+    logging.getLogger("otolith_drivers").setLevel(logging.DEBUG if verbose else logging.INFO)
+
+
+class _Journal(logging.Formatter):
+    PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
+
+    def format(self, record: logging.LogRecord) -> str:
+        priority = next(number for level, number in self.PRIORITIES if record.levelno >= level)
+        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())

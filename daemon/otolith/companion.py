@@ -1,0 +1,148 @@
+"""A process of our own beside the daemon that may die at any moment without taking anything with it.
+
+The only place where the daemon starts processes. A companion is spawned (forked children would inherit Zenoh's and
+Rerun's threads half), talks over one pipe, is never waited for, and ends by itself when the daemon is gone.
+"""
+
+import contextlib
+import multiprocessing
+import multiprocessing.connection
+import queue
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import resource_tracker
+from typing import Any
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0  # s before the second start after deaths in a row, and before any later one
+SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+
+
+@contextlib.contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """A child inherits the mask: Ctrl-C reaches the whole terminal, but only the daemon may act on it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _enter(connection: Any, main: Callable[..., None], arguments: Sequence[Any]) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the daemon is gone
+        main(connection, *arguments)
+
+
+class Companion:
+    """Runs ``main(connection, *arguments)`` in a process; at most ``room`` messages wait for it."""
+
+    def __init__(self, name: str, main: Callable[..., None], room: int) -> None:
+        self.name = name
+        self.starts = 0
+        self._main, self._room = main, room
+        self._deaths = 0
+        self._start_again_at: float | None = None
+        self._process: Any = None
+        self._connection: Any = None
+        self._outbox: queue.Queue[Any] = queue.Queue(room)
+
+    def start(self, *arguments: Any) -> None:
+        """Spawn the process; what waited for an earlier one is gone."""
+        self._release()
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._outbox = queue.Queue(self._room)
+        self._process = context.Process(
+            target=_enter, args=(theirs, self._main, arguments), name=self.name, daemon=True
+        )
+        resource_tracker.ensure_running()  # it unblocks the signals when it starts, so not among those below
+        with _signals_blocked():
+            self._process.start()
+            sender = threading.Thread(
+                target=_send, args=(self._outbox, self._connection), name=f"to-{self.name}", daemon=True
+            )
+            sender.start()
+        theirs.close()
+        self.starts += 1
+        self._start_again_at = None
+
+    @property
+    def pid(self) -> int | None:
+        """Of the running process."""
+        return None if self._process is None else self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process is not None and self._process.is_alive()
+
+    @property
+    def waitables(self) -> list[Any]:
+        """For :func:`multiprocessing.connection.wait`: ready when there is a reply, or when the process has died."""
+        return [self._connection, self._process.sentinel] if self.alive else []
+
+    def may_start_again(self, now: float) -> bool:
+        """Whether it is dead and its pause is over: none at first, then doubled with every death in a row."""
+        if self.alive:
+            return False
+        if self._start_again_at is None:
+            pause = FIRST_PAUSE * 2 ** (self._deaths - 1) if self._deaths else 0.0
+            self._deaths = min(self._deaths + 1, 16)
+            self._start_again_at = now + min(pause, LONGEST_PAUSE)
+        return now >= self._start_again_at
+
+    def has_thrived(self) -> None:
+        """It did its work: the next death is the first in a row again."""
+        self._deaths = 0
+
+    def offer(self, message: Any) -> bool:
+        """Hand a message over without waiting; False if there is no room and it was dropped."""
+        try:
+            self._outbox.put_nowait(message)
+        except queue.Full:
+            return False
+        return True
+
+    def replies(self) -> list[Any]:
+        """What it has said since; never waits."""
+        said = []
+        with contextlib.suppress(EOFError, OSError):
+            while self._connection is not None and self._connection.poll():
+                said.append(self._connection.recv())
+        return said
+
+    def kill(self) -> None:
+        """End the process now; :meth:`start` makes a new one."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join(timeout=1.0)
+        self._release()
+
+    def stop(self, seconds: float) -> None:
+        """Let it finish what it has for up to ``seconds``, then end it."""
+        if self._process is not None:
+            with contextlib.suppress(queue.Full):
+                self._outbox.put_nowait(None)
+            self._process.join(timeout=seconds)
+        self.kill()
+
+    def _release(self) -> None:
+        if self._connection is not None:
+            with contextlib.suppress(queue.Full):
+                self._outbox.put_nowait(None)  # ends the sender's thread
+            self._connection.close()
+        if self._process is not None:
+            with contextlib.suppress(ValueError):
+                self._process.close()
+        self._process = self._connection = None
+
+
+def _send(outbox: queue.Queue[Any], connection: Any) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        while True:
+            message = outbox.get()
+            connection.send(message)
+            if message is None:
+                return

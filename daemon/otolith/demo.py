@@ -1,0 +1,215 @@
+"""``otolith demo``: plant and daemon as processes on a bus, watched from here, and the verdict at the end."""
+
+import csv
+import json
+import os
+import queue
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from otolith.acquisition.window import Verdict
+from otolith.console import Board
+from otolith.errors import OtolithError
+from otolith.health.report import ReportDocument, Status
+from otolith.health.status import QUANTILE
+from otolith.outlets.zenoh_session import Listener
+from otolith.paths import state_directory, writable
+from otolith.plan import load_plan
+from otolith.topics import REPORT
+
+TOLERANCE = 0.005  # of the injected value: what every window with current must be found within
+CURRENT_FLOWS = 0.1  # A, mean over the window
+STOP_SECONDS = 2.5  # for a process to end by itself
+PAUSE = 0.1  # s
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One parameter in one window: injected (mean over the window) against found."""
+
+    window: int
+    end: float
+    parameter: str
+    injected: float
+    found: float | None
+    half_width: float | None
+    """Of the 95 % interval."""
+
+    @property
+    def error(self) -> float:
+        """Relative; infinite where nothing was found."""
+        return float("inf") if self.found is None else abs(self.found / self.injected - 1.0)
+
+
+def compare(reports: Sequence[ReportDocument], truth: Mapping[str, Sequence[float]]) -> list[Comparison]:
+    """Every parameter of every good window with current flowing; ``truth`` is columns over Unix time ``t`` (s)."""
+    times = np.asarray(truth["t"])
+    compared = []
+    for report in reports:
+        inside = (times >= report.window.start) & (times <= report.window.end)
+        if report.window.quality.verdict is not Verdict.GOOD or not inside.any():
+            continue
+        if np.abs(np.asarray(truth["i"])[inside]).mean() < CURRENT_FLOWS:
+            continue
+        for name, parameter in report.parameters.items():
+            found = parameter.value if parameter.status is Status.ESTIMATED else None
+            half = None if found is None or parameter.sd is None else QUANTILE * parameter.sd
+            injected = float(np.asarray(truth[name])[inside].mean())
+            compared.append(Comparison(report.window.index, report.window.end, name, injected, found, half))
+    return compared
+
+
+class Demo:
+    """One run of the demonstration."""
+
+    def __init__(self, machine: Path, scenario: Path, duration: float, *, as_json: bool) -> None:
+        self._machine, self._scenario, self._duration, self._as_json = machine, scenario, duration, as_json
+        self._plan = load_plan(machine)
+        stamp = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
+        self._folder = writable(state_directory() / "demo" / f"{stamp}-{os.getpid()}")
+        self._console = Console(stderr=as_json)
+        self._reports: list[ReportDocument] = []
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    @property
+    def recording(self) -> Path:
+        """Where the curves go."""
+        return self._folder / "recording.rrd"
+
+    def run(self, stopped: Callable[[], bool]) -> int:
+        """0 if every estimate was right, 1 if not; a process that fails gives its own exit code."""
+        identity = self._plan.file.machine
+        connect = self._plan.file.zenoh.listen
+        key = REPORT.under(identity.site, identity.name)
+        say = self._console.print
+        say(f"machine {self._machine}, scenario {self._scenario}, {self._duration:.0f} s")
+        say(f"frames on {self._plan.driver.describe()[0]}; reports on {connect[0]}, key {key}")
+        try:
+            self._start("daemon", "run", str(self._machine), "--recording", str(self.recording))
+            self._start("plant", "plant", str(self._scenario), "--truth", str(self._folder / "truth.csv"))
+            self._watch(connect, key, stopped)
+        finally:
+            self._end()
+        return 130 if stopped() else self._verdict()
+
+    def _start(self, name: str, *arguments: str) -> None:
+        """In a session of its own: Ctrl-C is for this process, which ends the others in order."""
+        with (self._folder / f"{name}.log").open("wb") as log:
+            self._processes[name] = subprocess.Popen(  # noqa: S603 - our own program
+                [sys.executable, "-m", "otolith", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    def _watch(self, connect: Sequence[str], key: str, stopped: Callable[[], bool]) -> None:
+        heard: queue.SimpleQueue[str] = queue.SimpleQueue()
+        board = Board("the first window")
+        live = self._console.is_terminal and not self._as_json
+        end = time.monotonic() + self._duration
+        with Listener(connect, key, heard.put), Live(board, console=self._console, auto_refresh=live, transient=False):
+            while time.monotonic() < end and not stopped():
+                self._complain_of_the_dead()
+                self._take(heard, board, aloud=not live)
+        self._take(heard, board, aloud=not live)
+
+    def _take(self, heard: "queue.SimpleQueue[str]", board: Board, *, aloud: bool) -> None:
+        try:
+            text = heard.get(timeout=PAUSE)
+        except queue.Empty:
+            return
+        report = board.hear(text)
+        if report is not None:
+            self._reports.append(report)
+            if aloud and not self._as_json:
+                values = (f"{name} {entry.value:.4f} {entry.unit}" if entry.value else f"{name} unknown"
+                          for name, entry in report.parameters.items())  # fmt: skip
+                self._console.print(
+                    f"window {report.window.index} {report.window.quality.verdict}: {', '.join(values)}"
+                )
+
+    def _complain_of_the_dead(self) -> None:
+        for name, process in self._processes.items():
+            if process.poll() is not None:
+                log = (self._folder / f"{name}.log").read_text(encoding="utf-8", errors="replace").strip()
+                raise OtolithError(f"the {name} ended with exit code {process.returncode}: {log.splitlines()[-1]}")
+
+    def _end(self) -> None:
+        for process in self._processes.values():
+            process.terminate()
+        deadline = time.monotonic() + STOP_SECONDS
+        for process in self._processes.values():
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _verdict(self) -> int:
+        compared = compare(self._reports, _read_columns(self._folder / "truth.csv"))
+        wrong = [row for row in compared if row.error > TOLERANCE]
+        right = bool(compared) and not wrong
+        if self._as_json:
+            self._print_json(compared, right=right)
+        else:
+            self._print_table(compared, wrong)
+        return 0 if right else 1
+
+    def _print_json(self, compared: list[Comparison], *, right: bool) -> None:
+        rows = [
+            {"window": row.window, "parameter": row.parameter, "injected": row.injected, "found": row.found}
+            for row in compared
+        ]
+        verdict = {"right": right, "tolerance": TOLERANCE, "windows": rows, "recording": str(self.recording)}
+        sys.stdout.write(json.dumps(verdict) + "\n")
+
+    def _print_table(self, compared: list[Comparison], wrong: list[Comparison]) -> None:
+        units = {entry.name: entry.unit for entry in self._plan.problem.free}
+        table = Table(title="injected against found, good windows with current flowing")
+        for column in ("window", "parameter", "injected", "found ± 95 %", "unit", "error"):
+            table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
+        step = max(1, len(compared) // 15)
+        shown = [*compared[::step], *(row for row in compared[-1:] if (len(compared) - 1) % step)]
+        for row in shown:
+            found = "unknown" if row.found is None else f"{row.found:.4f} ± {row.half_width or 0.0:.4f}"
+            style = "red" if row.error > TOLERANCE else None
+            error = "" if row.found is None else f"{row.error:.3%}"
+            table.add_row(str(row.window), row.parameter, f"{row.injected:.4f}", found, units[row.parameter], error,
+                          style=style)  # fmt: skip
+        say = self._console.print
+        say(table)
+        if compared:
+            first, last = compared[0], compared[-1]
+            say(f"{last.parameter} went from {first.injected:.4f} to {last.injected:.4f} {units[last.parameter]} "
+                f"({last.injected / first.injected - 1:+.1%}); largest error {max(row.error for row in compared):.3%} "
+                f"in {len(compared)} windows")  # fmt: skip
+        if not compared:
+            say("[red]no good window with current flowing: nothing was shown[/red]")
+        elif wrong:
+            say(f"[red]{len(wrong)} windows are wrong by more than {TOLERANCE:.1%}[/red]")
+        else:
+            say(f"[green]every one is within {TOLERANCE:.1%} of what was injected[/green]")
+        say(f"recording: {self.recording}", soft_wrap=True)
+        say(f"open it with: otolith view {self.recording}", soft_wrap=True)
+
+
+def _read_columns(path: Path) -> dict[str, list[float]]:
+    columns: dict[str, list[float]] = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if None in row.values() or None in row:  # the last line of a process that was ended
+                continue
+            for name, value in row.items():
+                columns.setdefault(name, []).append(float(value))
+    return columns or {"t": [], "i": []}

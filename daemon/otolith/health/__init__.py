@@ -1,0 +1,1 @@
+"""What the estimates mean: the status of each parameter, and the report."""

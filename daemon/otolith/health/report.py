@@ -1,0 +1,169 @@
+"""The report: one document per window, the same on Zenoh, in recordings and as JSON Lines.
+
+Every number is finite or absent; what has no content yet is absent, not invented.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from otolith.acquisition.window import Array, Verdict, Window
+from otolith.adaptation.information import Identifiability
+from otolith_drivers.toml_files import Closed
+
+SCHEMA = "otolith.report/1"
+
+
+class Status(StrEnum):
+    """How far a published parameter may be trusted."""
+
+    UNESTIMATED = "unestimated"
+    """No window has determined it yet; there is no value."""
+    ESTIMATED = "estimated"
+    """From this window."""
+    HELD = "held"
+    """From an earlier window; this one did not determine it, and the reason says why."""
+    INVALID = "invalid"
+    """This window contradicts the twin or the bounds, and the reason says how."""
+
+
+class QualityDocument(Closed):
+    """How well the window was sampled."""
+
+    verdict: Verdict
+    missing: float
+    longest_gap_s: float
+    jitter_s: float
+    skew_s: float
+    reasons: tuple[str, ...] = ()
+
+
+class WindowDocument(Closed):
+    """Which stretch of time the report is about; start and end in Unix seconds."""
+
+    index: int
+    start: float
+    end: float
+    records: int
+    quality: QualityDocument
+
+
+class ParameterDocument(Closed):
+    """One parameter: value, unit, uncertainty, status, reason."""
+
+    value: float | None = None
+    unit: str
+    sd: float | None = None
+    low: float | None = None
+    """Lower end of the 95 % interval."""
+    high: float | None = None
+    nominal: float
+    raw: float | None = None
+    """What this window alone says."""
+    status: Status
+    identifiability: Identifiability | None = None
+    reason: str = ""
+
+
+class FitDocument(Closed):
+    """How well the twin explains the window; root mean square errors per output, in the output's unit."""
+
+    rmse_configured: dict[str, float]
+    rmse_estimated: dict[str, float]
+    explained: bool
+    """Whether the estimated twin leaves nothing but noise."""
+
+
+class CostDocument(Closed):
+    """What the report took."""
+
+    seconds: float = 0.0
+    """Of computing."""
+    latency_s: float = 0.0
+    """From the end of the window to the publication of this report."""
+    evaluations: int = 0
+    generations: int = 0
+
+
+class CountersDocument(Closed):
+    """What was received and what was lost since the daemon started: nothing is lost silently."""
+
+    received: int = 0
+    bad: int = 0
+    lost: int = 0
+    reconnects: int = 0
+    windows: int = 0
+    """Windows cut."""
+    windows_bad: int = 0
+    """Not estimated from, for their quality."""
+    windows_missed: int = 0
+    """Not adapted to, because the worker was dead or busy."""
+    worker_restarts: int = 0
+    recordings_dropped: int = 0
+    """Windows that the recorder did not take in time."""
+
+
+class ReportDocument(Closed):
+    """The document itself."""
+
+    schema_: str = SCHEMA
+    machine: str
+    site: str
+    twin: str
+    model: str = "DT"
+    """``DT`` the twin as configured, ``DT'`` with estimated parameters (the paper's names)."""
+    window: WindowDocument
+    parameters: dict[str, ParameterDocument]
+    fit: FitDocument | None = None
+    cost: CostDocument = CostDocument()
+    counters: CountersDocument | None = None
+
+    def to_json(self) -> str:
+        """As published: absent where there is no content, ``schema`` first."""
+        return self.model_dump_json(exclude_none=True).replace('"schema_"', '"schema"', 1)
+
+    @classmethod
+    def from_json(cls, text: str) -> "ReportDocument":
+        """The inverse of :meth:`to_json`.
+
+        Raises:
+            pydantic.ValidationError: not a report of this schema.
+        """
+        return cls.model_validate_json(text.replace('"schema"', '"schema_"', 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Traces:
+    """The curves behind a report, (records, outputs) in the units of the twin."""
+
+    outputs: tuple[str, ...]
+    measured: Array
+    predicted: Array | None
+    """None where nothing was estimated."""
+    noise: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What the heart says of a window."""
+
+    document: ReportDocument
+    traces: Traces
+
+
+def window_document(window: Window) -> WindowDocument:
+    """The part of the report that is known before any estimation."""
+    quality = window.quality
+    return WindowDocument(
+        index=window.index,
+        start=window.start,
+        end=window.end,
+        records=window.records,
+        quality=QualityDocument(
+            verdict=quality.verdict,
+            missing=quality.missing,
+            longest_gap_s=quality.longest_gap,
+            jitter_s=quality.jitter,
+            skew_s=quality.skew,
+            reasons=quality.reasons,
+        ),
+    )

@@ -1,0 +1,48 @@
+"""From what a window says about a parameter to what is published of it."""
+
+import math
+from dataclasses import dataclass
+
+from otolith.adaptation.estimate import ParameterEstimate
+from otolith.adaptation.information import Identifiability
+from otolith.health.report import ParameterDocument, Status
+from otolith.twin.model import Parameter
+
+QUANTILE = 1.959964  # of the standard normal distribution, two-sided 95 %
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """The last value of a parameter that a window determined."""
+
+    value: float
+    sd: float
+
+
+def publish(
+    parameter: Parameter, estimate: ParameterEstimate | None, known: Known | None, reason: str = ""
+) -> tuple[Known | None, ParameterDocument]:
+    """What is known from now on, and what is said; ``estimate`` is None for a window that was not estimated from."""
+    identifiability = None if estimate is None else estimate.identifiability
+    if estimate is not None:
+        reason = estimate.reason
+        if identifiability is Identifiability.DETERMINED and math.isfinite(abs(estimate.value) + 2 * estimate.sd):
+            known, status = Known(estimate.value, estimate.sd), Status.ESTIMATED
+        elif identifiability is Identifiability.AT_BOUND:
+            status = Status.INVALID
+        else:
+            status = Status.UNESTIMATED if known is None else Status.HELD
+    else:
+        status = Status.UNESTIMATED if known is None else Status.HELD
+    return known, ParameterDocument(
+        value=None if known is None else known.value,
+        unit=parameter.unit,
+        sd=None if known is None else known.sd,
+        low=None if known is None else known.value - QUANTILE * known.sd,
+        high=None if known is None else known.value + QUANTILE * known.sd,
+        nominal=parameter.nominal,
+        raw=estimate.value if estimate is not None and math.isfinite(estimate.value) else None,
+        status=status,
+        identifiability=identifiability,
+        reason=reason,
+    )

@@ -1,0 +1,110 @@
+"""Zenoh: the session's configuration, the daemon's publisher, and a subscriber for people and tests."""
+
+import json
+import threading
+from collections.abc import Callable, Iterable
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from otolith.errors import ServiceError
+from otolith.health.report import ReportDocument
+from otolith.topics import ALIVE, PARAMETER, REPORT
+
+LEASE = 2000  # ms after which a silent peer counts as gone
+
+
+def session(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> zenoh.Session:
+    """An open session in peer mode that reaches only the endpoints it is told: no scouting, no shared memory.
+
+    Raises:
+        ServiceError: an endpoint to listen on is in use or malformed.
+    """
+    settings = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
+        "open/return_conditions/connect_scouted": False,
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": LEASE,
+    }
+    try:
+        config = zenoh.Config()
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        endpoints = ", ".join([*listen, *connect])
+        cause = str(error).split(" at ")[0].strip()
+        raise ServiceError(
+            f"Zenoh cannot open {endpoints}: {cause}; is another daemon using it? Set zenoh.listen in the machine file"
+        ) from error
+
+
+class Publisher:
+    """Publishes reports of one machine and answers queries for the latest."""
+
+    def __init__(self, site: str, machine: str, listen: Iterable[str], connect: Iterable[str]) -> None:
+        self._session = session(listen, connect)
+        self._site, self._machine = site, machine
+        self._lock = threading.Lock()
+        self._latest: str | None = None
+        key = REPORT.under(site, machine)
+        self._reports = self._session.declare_publisher(
+            key, encoding=zenoh.Encoding.APPLICATION_JSON, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._queryable = self._session.declare_queryable(key, self._answer, complete=True)
+        self._token = self._session.liveliness().declare_token(ALIVE.under(site, machine))
+
+    def publish(self, document: ReportDocument) -> None:
+        """Send the report and one key per parameter; never blocks for a slow subscriber."""
+        text = document.to_json()
+        with self._lock:
+            self._latest = text
+        self._reports.put(text)
+        for name, parameter in document.parameters.items():
+            key = PARAMETER.under(self._site, self._machine, name)
+            self._session.put(
+                key,
+                parameter.model_dump_json(exclude_none=True),
+                encoding=zenoh.Encoding.APPLICATION_JSON,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+
+    def close(self) -> None:
+        """End the session; subscribers see the liveliness token go."""
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query, self._lock:
+            if self._latest is not None:
+                query.reply(REPORT.under(self._site, self._machine), self._latest, encoding="application/json")
+
+
+class Listener:
+    """Hears the reports of any machine under ``key``, the latest one first if there is one already."""
+
+    def __init__(self, connect: Iterable[str], key: str, hear: Callable[[str], None]) -> None:
+        self._session = session(connect=connect)
+        self._hear = hear
+        self._subscriber = self._session.declare_subscriber(key, self._take)
+        for reply in self._session.get(key, timeout=1.0):
+            if reply.ok is not None:
+                hear(reply.ok.payload.to_string())
+
+    def __enter__(self) -> Self:
+        """The listener itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the session."""
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self._hear(sample.payload.to_string())

@@ -1,0 +1,187 @@
+"""What a machine file means: its twin, its estimation problem, its driver. Faults are told with file, line and key."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from otolith.acquisition.alignment import Limits
+from otolith.adaptation.problem import Problem, SwarmOptions
+from otolith.errors import ConfigurationError, nearest
+from otolith.settings import MachineFile, ParameterTable
+from otolith.topics import prefix
+from otolith.twin.library import find_twin
+from otolith.twin.model import Parameter, Twin
+from otolith_drivers.base import Driver, Signal
+from otolith_drivers.quantities import Quantity
+from otolith_drivers.registry import find
+from otolith_drivers.toml_files import Page, parse, read, validate
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A machine file understood: everything the service needs to begin."""
+
+    path: Path
+    file: MachineFile
+    twin: Twin
+    problem: Problem
+    records: int
+    limits: Limits
+    driver: Driver
+
+    @property
+    def recording_folder(self) -> Path | None:
+        """Where the file says that recordings go."""
+        folder = self.file.recording.folder
+        return None if folder is None else self.path.parent / folder
+
+
+def load_plan(path: Path) -> Plan:
+    """The machine file at ``path``, its twin, its estimation problem and its driver (not yet opened).
+
+    Raises:
+        ConfigurationError: anything in it that cannot be meant, one line per fault.
+    """
+    page = read(path)
+    file = validate(parse(page), MachineFile, page)
+    context = _Context(page)
+    with context.at("twin", "name"):
+        twin = find_twin(file.twin.name)
+    problem = _problem(file, twin, context)
+    table = file.window
+    records = round(table.length / table.sample_period)
+    if abs(records * table.sample_period - table.length) > 1e-6 * table.length or not 10 <= records <= 1_000_000:
+        context.fail(("window", "length"), f"{table.length:g} s must be 10 to 1000000 times {table.sample_period:g} s")
+    return Plan(
+        path=path,
+        file=file,
+        twin=twin,
+        problem=problem,
+        records=records,
+        limits=Limits(table.missing_limit, table.gap_limit, table.jitter_limit),
+        driver=_driver(file, twin, context),
+    )
+
+
+class _Context:
+    """Says where in the file a fault is, when it is found after the file's own types were right."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self._location: tuple[int | str, ...] = ()
+
+    def fail(self, location: tuple[int | str, ...], message: str) -> None:
+        raise ConfigurationError(f"{self.page.place(location)}: {message}")
+
+    def at(self, *location: int | str) -> "_Context":
+        self._location = location
+        return self
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, ValueError | ConfigurationError):
+            raise ConfigurationError(f"{self.page.place(self._location)}: {error}") from error
+
+
+def _problem(file: MachineFile, twin: Twin, context: _Context) -> Problem:
+    known_names = [entry.name for entry in twin.parameters]
+    for name in file.parameters:
+        if name not in known_names:
+            context.fail(
+                ("parameters", name), f"twin {twin.name!r} has no such parameter: {nearest(name, known_names)}"
+            )
+    known: list[tuple[str, float]] = []
+    free: list[Parameter] = []
+    for entry in twin.parameters:
+        table = file.parameters.get(entry.name, ParameterTable())
+        parameter = _parameter(entry, table, context)
+        if table.estimate:
+            free.append(parameter)
+        else:
+            known.append((entry.name, parameter.nominal))
+    if not free:
+        context.fail(("parameters",), "nothing is to be estimated: write R_a = { estimate = true } or the like")
+    return Problem(
+        twin=twin.name,
+        known=tuple(known),
+        free=tuple(free),
+        noise=_noise(file.noise, twin, context),
+        swarm=SwarmOptions(
+            file.swarm.size, file.swarm.generations, file.swarm.inertia, file.swarm.cognitive, file.swarm.social
+        ),
+        seed=file.swarm.seed,
+    )
+
+
+def _parameter(entry: Parameter, table: ParameterTable, context: _Context) -> Parameter:
+    given: dict[str, float] = {"value": entry.nominal, "low": entry.low, "high": entry.high}
+    for key, written in (("low", table.low), ("high", table.high), ("value", table.value)):
+        if written is not None:
+            with context.at("parameters", entry.name, key):
+                given[key] = Quantity(entry.unit)(written)
+    where = ("parameters", entry.name)
+    if given["low"] >= given["high"]:
+        context.fail(where, f"low {given['low']:g} {entry.unit} is not under high {given['high']:g} {entry.unit}")
+    if not given["low"] <= given["value"] <= given["high"]:
+        bounds = f"between {given['low']:g} and {given['high']:g} {entry.unit}"
+        context.fail(
+            where, f"{given['value']:g} {entry.unit} is out of bounds: it must lie {bounds}, or move the bounds"
+        )
+    return Parameter(entry.name, entry.unit, given["value"], given["low"], given["high"], entry.meaning)
+
+
+def _noise(table: Mapping[str, str], twin: Twin, context: _Context) -> tuple[float, ...]:
+    outputs = [entry.name for entry in twin.outputs]
+    for name in table:
+        if name not in outputs:
+            context.fail(("noise", name), f"twin {twin.name!r} has no such output: {nearest(name, outputs)}")
+    levels = []
+    for entry in twin.outputs:
+        with context.at("noise", entry.name):
+            levels.append(Quantity(entry.unit, low=1e-12)(table[entry.name]) if entry.name in table else entry.noise)
+    return tuple(levels)
+
+
+def _driver(file: MachineFile, twin: Twin, context: _Context) -> Driver:
+    wanted = list(twin.signals)
+    for name in file.signals:
+        if name not in wanted:
+            context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, wanted)}")
+    for name in wanted:
+        if name not in file.signals:
+            context.fail(("signals",), f"{name} ({twin.unit_of(name)}) is missing: the twin needs {', '.join(wanted)}")
+    with context.at("driver", "type"):
+        kind = file.driver.get("type")
+        if not isinstance(kind, str):
+            raise ValueError('missing: write type = "can" or another driver')  # noqa: TRY004 - a user's slip, not a bug
+        module = find(kind)
+    rest = {key: value for key, value in file.driver.items() if key != "type"}
+    options = validate(rest, module.Options, context.page, under=("driver",))
+    signals = [Signal(name, twin.unit_of(name), file.signals[name]) for name in wanted]
+    return module.build(options, signals, context.page.path.parent)
+
+
+def describe(plan: Plan) -> list[str]:
+    """What the daemon would do, a line per fact."""
+    file, problem = plan.file, plan.problem
+    lines = [
+        f"machine {file.machine.name} at {file.machine.site}, twin {plan.twin.name}: {plan.twin.title}",
+        *(f"  {equation}" for equation in plan.twin.equations),
+        *plan.driver.describe(),
+        f"windows of {file.window.length:g} s, {plan.records} records",
+    ]
+    for name, value in problem.known:
+        entry = plan.twin.parameter(name)
+        lines.append(f"known: {name} = {value:g} {entry.unit} ({entry.meaning})")
+    for entry in problem.free:
+        span = f"from {entry.low:g} to {entry.high:g}, starting at {entry.nominal:g} {entry.unit}"
+        lines.append(f"estimated: {entry.name} {span} ({entry.meaning})")
+    for output, noise in zip(plan.twin.outputs, problem.noise, strict=True):
+        lines.append(f"noise of {output.name}: {noise:g} {output.unit}")
+    endpoints = ", ".join(file.zenoh.listen) or "no endpoint"
+    lines.append(f"reports on {endpoints}, keys {prefix(file.machine.site, file.machine.name)}/...")
+    folder = plan.recording_folder or "the state directory"
+    lines.append(f"recordings into {folder}" if file.recording.enabled else "no recordings")
+    return lines

@@ -1,0 +1,179 @@
+"""The service: the only file that knows all parts. Builds, starts, watches and stops them.
+
+    driver thread -> rings -> [this thread] window -> worker process -> [this thread] report -> Zenoh, recorder process
+
+This thread never waits for a machine, a worker, a disk or a subscriber.
+"""
+
+import logging
+import os
+import signal
+import time
+from datetime import UTC, datetime
+from multiprocessing.connection import wait
+from pathlib import Path
+from types import FrameType
+
+from otolith.acquisition.ring import Rings
+from otolith.acquisition.window import Verdict
+from otolith.acquisition.windower import Windower
+from otolith.companion import SIGNALS, Companion
+from otolith.health.report import CountersDocument, Report, ReportDocument, Status
+from otolith.heart import begin
+from otolith.notify import Notifier
+from otolith.outlets import recorder
+from otolith.outlets.zenoh_session import Publisher
+from otolith.paths import cache_directory, state_directory, writable
+from otolith.plan import Plan
+from otolith.supervisor import Supervisor
+
+log = logging.getLogger(__name__)
+
+RING_WINDOWS = 8  # windows that the rings hold: how long this thread may be held up without losing a sample
+TICK = 0.1  # s; the longest wait, so how late a stop, a death or an outage can be noticed
+RECORDER_ROOM = 32  # windows
+RECORDER_FLUSH = 1.5  # s at the end
+STALL = 30.0  # s without a window finished or honestly missed, after which the watchdog is no longer fed
+
+
+class Service:
+    """One machine, from :meth:`run` to the signal that stops it."""
+
+    def __init__(self, plan: Plan, listen: tuple[str, ...] | None = None, recording: Path | None = None) -> None:
+        machine = plan.file.machine
+        self._plan = plan
+        self._listen = plan.file.zenoh.listen if listen is None else listen
+        self._rings = Rings(plan.twin.signals, RING_WINDOWS * plan.records)
+        self._windower = Windower(plan.twin.signals, plan.records, plan.file.window.sample_period, plan.limits)
+        self._supervisor = Supervisor(begin(machine.name, machine.site, plan.problem), self._windower.length)
+        self._recorder = Companion("otolith-recorder", recorder.main, RECORDER_ROOM)
+        self._recording = recording if plan.file.recording.enabled else None
+        self._publisher: Publisher | None = None
+        self._notifier = Notifier()
+        self._stop_signal: int | None = None
+        self._windows = self._windows_bad = self._recordings_dropped = self._settled = 0
+        self._started = self._progress = self._fed = 0.0
+
+    def run(self) -> int:
+        """Serve until SIGTERM, SIGHUP or SIGINT; the signal's number.
+
+        Raises:
+            DeviceError: the machine's bus cannot be opened.
+            ServiceError: a port or folder of this computer cannot be had.
+        """
+        for number in SIGNALS:
+            signal.signal(number, self._on_signal)
+        # numba runs what it finds in its cache, so the cache is a private folder.
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_directory() / "kernels"))
+        try:
+            self._start()
+            while self._stop_signal is None:
+                self._turn()
+        finally:
+            self._stop()
+        return self._stop_signal or 0
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        self._stop_signal = number
+
+    def _start(self) -> None:
+        machine, driver = self._plan.file.machine, self._plan.driver
+        self._publisher = Publisher(machine.site, machine.name, self._listen, self._plan.file.zenoh.connect)
+        driver.open(self._rings.deliver)
+        self._supervisor.start()
+        self._start_recorder()
+        self._started = self._progress = time.monotonic()
+        self._notifier.ready(f"listening: {driver.describe()[0]}")
+        log.info("machine %s, %s: reports on %s", machine.name, self._plan.twin.title, ", ".join(self._listen))
+
+    def _stop(self) -> None:
+        self._notifier.stopping()
+        self._plan.driver.close()
+        self._supervisor.stop()
+        self._recorder.stop(RECORDER_FLUSH)
+        if self._publisher is not None:
+            self._publisher.close()
+        self._notifier.close()
+
+    def _start_recorder(self) -> None:
+        plan = self._plan
+        if not plan.file.recording.enabled:
+            return
+        if self._recording is None or self._recorder.starts:  # a second file never overwrites the first
+            folder = plan.recording_folder or state_directory() / "recordings"
+            stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
+            self._recording = folder / f"{plan.file.machine.name}-{stamp}-{os.getpid()}.rrd"
+        writable(self._recording.parent)
+        title = f"{plan.file.machine.name} at {plan.file.machine.site}"
+        self._recorder.start(self._recording, title, plan.twin.outputs, plan.problem.free)
+        log.info("recording to %s", self._recording)
+
+    def _turn(self) -> None:
+        """One pass: cut what is due, hand it on, publish what came back, watch over everybody."""
+        now = time.monotonic()
+        begun = self._windower.begin(self._rings, now, now - self._started)
+        while begun and self._windower.due(self._rings, now):
+            self._cut(now)
+        pause = min(TICK, max(0.005, self._windower.next_end - now))
+        wait(self._supervisor.waitables, timeout=pause)
+        for report, seconds in self._supervisor.poll(time.monotonic()):
+            self._publish(report, seconds)
+        self._watch(time.monotonic())
+
+    def _cut(self, now: float) -> None:
+        window = self._windower.cut(self._rings, time.time() - time.monotonic())
+        self._windows += 1
+        self._windows_bad += window.quality.verdict is Verdict.BAD
+        self._supervisor.submit(window, now)
+
+    def _publish(self, report: Report, seconds: float) -> None:
+        document = report.document
+        latency = max(0.0, time.time() - document.window.end)
+        cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
+        document = document.model_copy(update={"cost": cost, "counters": self._counters()})
+        if self._publisher is not None:
+            self._publisher.publish(document)
+        if self._recorder.alive and not self._recorder.offer(Report(document, report.traces)):
+            self._recordings_dropped += 1
+        line = summary(document)
+        self._notifier.status(line)
+        log.info("%s", line)
+
+    def _counters(self) -> CountersDocument:
+        driver, rings, supervisor = self._plan.driver.counters(), self._rings.counters(), self._supervisor
+        return CountersDocument(
+            received=rings.received,
+            bad=driver.bad,
+            lost=driver.lost + rings.overwritten,
+            reconnects=driver.reconnects,
+            windows=self._windows,
+            windows_bad=self._windows_bad,
+            windows_missed=supervisor.missed,
+            worker_restarts=supervisor.restarts,
+            recordings_dropped=self._recordings_dropped,
+        )
+
+    def _watch(self, now: float) -> None:
+        """Feed the watchdog by progress, not by mere life; bring a dead recorder back with a file of its own."""
+        settled = self._supervisor.finished + self._supervisor.missed
+        if settled != self._settled:
+            self._settled, self._progress = settled, now
+        stalled = now - self._progress > STALL + 3 * self._windower.length
+        if self._notifier.watchdog and not stalled and now - self._fed > self._notifier.watchdog / 4:
+            self._fed = now
+            self._notifier.progress()
+        if self._plan.file.recording.enabled and self._recorder.may_start_again(now):
+            log.warning("the recorder died; it is started again")
+            self._start_recorder()
+
+
+def summary(document: ReportDocument) -> str:
+    """A report in one line."""
+    parts = [f"window {document.window.index} {document.window.quality.verdict}"]
+    for name, parameter in document.parameters.items():
+        if parameter.value is None or parameter.sd is None:
+            parts.append(f"{name} unknown ({parameter.reason})")
+        else:
+            held = "" if parameter.status is Status.ESTIMATED else f" ({parameter.status}: {parameter.reason})"
+            parts.append(f"{name} {parameter.value:.5g} {parameter.unit} ± {1.96 * parameter.sd:.2g}{held}")
+    return ", ".join(parts)

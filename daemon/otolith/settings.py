@@ -1,0 +1,113 @@
+"""The machine file: typed, bounded, closed, every value with its unit."""
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from otolith_drivers.quantities import Quantity
+from otolith_drivers.toml_files import Closed
+
+PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
+
+
+def _name(written: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}", written):
+        raise ValueError(
+            f"{written!r} is no name: letters, digits, '-' and '_', at most 64, as it becomes part of keys"
+        )
+    return written
+
+
+def _endpoint(written: str) -> str:
+    if not re.fullmatch(rf"({'|'.join(PROTOCOLS)})/\S+", written):
+        raise ValueError(f'{written!r} is no endpoint: write it like "tcp/127.0.0.1:7447" ({", ".join(PROTOCOLS)})')
+    return written
+
+
+def _value_alone(written: object) -> object:
+    """``"6.5 ohm"`` is short for ``{ value = "6.5 ohm" }``."""
+    return written if isinstance(written, dict) else {"value": written}
+
+
+Name = Annotated[str, AfterValidator(_name)]
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+Written = str | float | None
+"""A quantity that is understood once its unit is known; a number without a unit is refused then."""
+
+
+class MachineTable(Closed):
+    """Who the machine is; both names become part of the Zenoh keys and of file names."""
+
+    name: Name
+    site: Name = "site"
+
+
+class TwinTable(Closed):
+    """Which twin."""
+
+    name: str
+
+
+class ParameterTable(Closed):
+    """A parameter that is not simply known."""
+
+    value: Written = None
+    """Known, or for an estimated one where the search starts; without it the twin's nominal value."""
+    estimate: bool = False
+    low: Written = None
+    high: Written = None
+
+
+class WindowTable(Closed):
+    """How samples become windows, and what a window may lack and still be estimated from."""
+
+    length: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] = 2.0
+    sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-4, 10.0))] = 0.01
+    missing_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.05
+    gap_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 60.0))] = 0.05
+    jitter_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 10.0))] = 0.005
+
+
+class SwarmTable(Closed):
+    """The particle swarm; the default values are Table 2 of the paper."""
+
+    size: Annotated[int, Field(ge=3, le=1000)] = 15
+    generations: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    inertia: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.9
+    cognitive: Annotated[float, Field(ge=0.0, le=4.0)] = 2.0
+    social: Annotated[float, Field(ge=0.0, le=4.0)] = 2.0
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
+
+
+class ZenohTable(Closed):
+    """Where reports go; loopback only unless told otherwise."""
+
+    listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[Endpoint, ...] = ()
+
+
+class RecordingTable(Closed):
+    """Rerun recordings."""
+
+    enabled: bool = True
+    folder: Path | None = None
+    """Relative to the machine file; without it the state directory of the daemon."""
+
+
+class MachineFile(Closed):
+    """The whole file."""
+
+    machine: MachineTable
+    driver: dict[str, Any]
+    signals: dict[str, dict[str, Any]]
+    twin: TwinTable
+    parameters: Annotated[
+        dict[str, Annotated[ParameterTable, BeforeValidator(_value_alone)]], Field(default_factory=dict)
+    ]
+    noise: Annotated[dict[str, str], Field(default_factory=dict)]
+    window: WindowTable = WindowTable()
+    swarm: SwarmTable = SwarmTable()
+    zenoh: ZenohTable = ZenohTable()
+    recording: RecordingTable = RecordingTable()

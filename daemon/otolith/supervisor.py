@@ -1,0 +1,107 @@
+"""Hands windows to the worker process one at a time, and keeps its promise that the worker may die at any moment.
+
+A window whose worker died is tried once more; a second death, or a window that waits too long, is counted as missed.
+The adaptation state stays on this side of the pipe, so that a death loses no more than the window at hand.
+"""
+
+import logging
+from collections import deque
+from typing import Any
+
+from otolith import worker
+from otolith.acquisition.window import Window
+from otolith.companion import Companion
+from otolith.health.report import Report
+from otolith.heart import State
+
+log = logging.getLogger(__name__)
+
+ROOM = 2  # windows that wait for a busy worker; older ones are missed
+PATIENCE = 20.0  # s for a window beyond twice its length: the first one of a new machine also compiles
+
+
+class Supervisor:
+    """Times are seconds on the monotonic clock, given by the caller."""
+
+    def __init__(self, state: State, window_length: float) -> None:
+        self.missed = 0
+        self.finished = 0
+        self._state = state
+        self._patience = PATIENCE + 2 * window_length
+        self._companion = Companion("otolith-worker", worker.main, room=1)
+        self._waiting: deque[Window] = deque()
+        self._at_hand: Window | None = None
+        self._retried: int | None = None
+        self._deadline = 0.0
+
+    @property
+    def restarts(self) -> int:
+        """How often the worker had to be started again."""
+        return max(0, self._companion.starts - 1)
+
+    @property
+    def waitables(self) -> list[Any]:
+        """See :attr:`otolith.companion.Companion.waitables`."""
+        return self._companion.waitables
+
+    def start(self) -> None:
+        """Start the worker."""
+        self._companion.start(self._state)
+
+    def stop(self) -> None:
+        """End the worker at once; nobody will read what it has at hand."""
+        self._companion.kill()
+
+    def submit(self, window: Window, now: float) -> None:
+        """Queue a window, and hand it on if the worker is free."""
+        self._waiting.append(window)
+        while len(self._waiting) > ROOM:
+            self._miss(self._waiting.popleft(), "the worker is behind")
+        self._hand_on(now)
+
+    def poll(self, now: float) -> list[tuple[Report, float]]:
+        """Reports that are finished, each with the seconds of computing; restarts what has died."""
+        reports = [report for result in self._companion.replies() if (report := self._take(result)) is not None]
+        if not self._companion.alive:
+            self._take_back("died")
+            if self._companion.may_start_again(now):
+                self.start()
+        elif self._at_hand is not None and now > self._deadline:
+            self._take_back(f"has not finished window {self._at_hand.index} in {self._patience:.0f} s")
+            self._companion.kill()
+        self._hand_on(now)
+        return reports
+
+    def _take(self, result: worker.Result) -> tuple[Report, float] | None:
+        window, self._at_hand = self._at_hand, None
+        self._companion.has_thrived()
+        if result.report is None:
+            if window is not None:
+                self._miss(window, result.failure)
+            return None
+        self._state = result.state
+        self.finished += 1
+        return result.report, result.seconds
+
+    def _take_back(self, why: str) -> None:
+        """The window at hand waits for the next worker, unless it has already cost one."""
+        window, self._at_hand = self._at_hand, None
+        if window is None:
+            return
+        log.warning("the worker %s; it is started again", why)
+        if window.index == self._retried:
+            self._miss(window, "its worker died twice")
+        else:
+            self._retried = window.index
+            self._waiting.appendleft(window)
+
+    def _hand_on(self, now: float) -> None:
+        if self._at_hand is not None or not self._waiting or not self._companion.alive:
+            return
+        self._at_hand = self._waiting.popleft()
+        self._companion.offer(worker.Task(self._state, self._at_hand))
+        self._deadline = now + self._patience
+
+    def _miss(self, window: Window, why: str) -> None:
+        self.missed += 1
+        log.warning("window %d missed: %s", window.index, why)

@@ -1,0 +1,124 @@
+"""Physical quantities as people write them: ``"6.5 ohm"``, ``"11.7 g*cm^2"``, ``"2 s"``.
+
+Every number in a file carries its unit, is converted once on the way in, and is a plain float in its declared unit
+from there on. Parsing is pint's, behind a pattern that admits one number and one unit, so that nothing is evaluated.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pint
+
+QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*?)\s*")
+UNIT = re.compile(r"[\w°%·µμΩ*/^.() \-]{0,60}")
+
+# Units as drives and DBC files write them, where pint reads something else or nothing:
+# "Nm" alone would be read as "number meter".
+ALIASES = {
+    "Nm": "N*m",
+    "mNm": "mN*m",
+    "Nms": "N*m*s",
+    "U/min": "rpm",
+    "1/min": "rpm",
+    "r/min": "rpm",
+    "°C": "degC",
+    "°": "degree",
+    "": "dimensionless",
+    "1": "dimensionless",
+    "-": "dimensionless",
+}
+
+
+@cache
+def _registry() -> "pint.UnitRegistry[float]":
+    import pint  # noqa: PLC0415 - 0.3 s, and not every command reads a quantity
+
+    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+
+
+@cache
+def unit(text: str) -> "pint.Unit":
+    """The unit that ``text`` names.
+
+    Raises:
+        ValueError: unknown or malformed unit.
+    """
+    written = ALIASES.get(text.strip(), text)
+    if not UNIT.fullmatch(written) or re.search(r"\^\s*-?\d{2}|\*\*\s*-?\d{2}", written):
+        raise ValueError(f"{text!r} is not a unit")
+    try:
+        return _registry().Unit(written)
+    except Exception as error:
+        raise ValueError(f"{text!r} is not a unit (examples: ohm, N*m*s/rad, rad/s, ms)") from error
+
+
+def factor(source: str, target: str) -> tuple[float, float]:
+    """``(scale, offset)`` with ``value_in_target = scale * value_in_source + offset``.
+
+    Raises:
+        ValueError: the units measure different things; both are named.
+    """
+    _same_dimension(source, target)
+    zero = _registry().Quantity(0.0, unit(source)).to(unit(target)).magnitude
+    one = _registry().Quantity(1.0, unit(source)).to(unit(target)).magnitude
+    return one - zero, zero
+
+
+def _same_dimension(source: str, target: str) -> None:
+    if unit(source).dimensionality != unit(target).dimensionality:
+        raise ValueError(f"unit {source!r} does not measure what {target!r} does: expected a unit like {target!r}")
+    # pint takes an angle for a plain number, so that 1 Hz would become 1 rad/s: wrong by 2π.
+    written = f"{unit(source)} {unit(target)}"
+    if written.count("hertz") == 1 and "radian" in written:
+        raise ValueError(f"unit {source!r} leaves open whether turns or radians are meant: write {target!r} or 'rpm'")
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A validator: text with a unit in, float in ``unit`` out, ``low <= value <= high``."""
+
+    unit: str
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __call__(self, written: Any) -> float:
+        """The value in ``self.unit``.
+
+        Raises:
+            ValueError: no number, no unit, another dimension, or out of bounds (which are named).
+        """
+        value = self.convert(written)
+        if not self.low <= value <= self.high:
+            raise ValueError(f"{written!r} is out of bounds: it must lie {self._bounds()}")
+        return value
+
+    def convert(self, written: Any) -> float:
+        """The value in ``self.unit``, its bounds not looked at."""
+        example = f'write it with its unit, like "{1.0 if math.isinf(self.low) else max(self.low, 1.0):g} {self.unit}"'
+        if isinstance(written, bool) or not isinstance(written, str | int | float):
+            raise ValueError(f"{written!r} is not a quantity: {example}")  # noqa: TRY004 - a fault of a file, not a bug
+        match = QUANTITY.fullmatch(str(written))
+        if match is None:
+            raise ValueError(f"{written!r} is not a number with a unit: {example}")
+        if not match[2] and not self._is_plain_number:
+            raise ValueError(f"{written!r} has no unit: {example}")
+        scale, offset = factor(match[2], self.unit)
+        value = scale * float(match[1]) + offset
+        if not math.isfinite(value):
+            raise ValueError(f"{written!r} is not finite")
+        return value
+
+    @property
+    def _is_plain_number(self) -> bool:
+        return unit(self.unit).dimensionless and unit(self.unit) not in (unit("rad"), unit("degree"))
+
+    def _bounds(self) -> str:
+        if math.isinf(self.high):
+            return f"at or above {self.low:g} {self.unit}"
+        if math.isinf(self.low):
+            return f"at or below {self.high:g} {self.unit}"
+        return f"between {self.low:g} and {self.high:g} {self.unit}"

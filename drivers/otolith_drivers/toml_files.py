@@ -1,0 +1,158 @@
+"""TOML files as typed, bounded, closed models: one line per fault, with file, line, key, value and the way out."""
+
+import re
+import tomllib
+import types
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from otolith_drivers.errors import ConfigurationError, nearest
+
+FILE_SIZE_LIMIT = 1 << 20  # bytes; a machine file has a few thousand
+Location = Sequence[int | str]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Closed(BaseModel):
+    """A table of a file: unknown keys are errors, values are finite and do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A file and its text, so that a fault can say where it stands."""
+
+    path: Path
+    text: str = ""
+
+    def place(self, location: Location) -> str:
+        """``file:line: key.of.the.value``, the line left out where it cannot be told."""
+        line = line_of(self.text, location)
+        return f"{self.path}:{line}: {dotted(location)}" if line else f"{self.path}: {dotted(location)}"
+
+
+def load(path: Path, model: type[Model]) -> Model:
+    """The file as ``model``.
+
+    Raises:
+        ConfigurationError: missing or unreadable file, not TOML, or not what ``model`` asks for.
+    """
+    page = read(path)
+    return validate(parse(page), model, page)
+
+
+def read(path: Path) -> Page:
+    """The text of a file that the user named."""
+    try:
+        if path.stat().st_size > FILE_SIZE_LIMIT:
+            raise ConfigurationError(f"{path}: larger than {FILE_SIZE_LIMIT} bytes, so this is no file of ours")
+        return Page(path, path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path}: not UTF-8 text (byte {error.start}): is this the right file?") from error
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def parse(page: Page) -> dict[str, Any]:
+    """The TOML of ``page``."""
+    try:
+        return tomllib.loads(page.text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigurationError(f"{page.path}: not valid TOML: {error}") from error
+
+
+def validate(data: Any, model: type[Model], page: Page, under: Location = ()) -> Model:
+    """``data`` as ``model``; ``under`` is where in the file it stands."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        faults = [(_written(data, fault["loc"]), fault) for fault in error.errors()]
+        # A table that fails because of what is in it adds nothing to the fault inside.
+        deepest = [(at, fault) for at, fault in faults if not any(_inside(other, at) for other, _ in faults)]
+        lines = [f"{page.place([*under, *at])}: {_sentence(dict(fault), at, model)}" for at, fault in deepest]
+        raise ConfigurationError("\n".join(dict.fromkeys(lines))) from error
+
+
+def dotted(location: Location) -> str:
+    """``("setpoints", 2, "speed")`` as ``setpoints[2].speed``."""
+    return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".") or "the file"
+
+
+def line_of(text: str, location: Location) -> int | None:
+    """The line (from 1) where the value at ``location`` is written, as far as it can be told without a full parser."""
+    header: list[int | str] = []
+    counts: dict[tuple[str, ...], int] = {}
+    best: int | None = None
+    depth = 0
+    for number, line in enumerate(text.splitlines(), start=1):
+        if section := re.match(r"\s*(\[\[?)\s*([^\]]+?)\s*\]\]?\s*(?:#.*)?$", line):
+            keys = tuple(part.strip().strip("\"'") for part in section[2].split("."))
+            header = list(keys)
+            if section[1] == "[[":
+                counts[keys] = counts.get(keys, -1) + 1
+                header.append(counts[keys])
+        elif entry := re.match(r"\s*([\w\-.\"' ()]+?)\s*=", line):
+            keys = tuple(part.strip().strip("\"'") for part in re.findall(r"\"[^\"]*\"|'[^']*'|[^.]+", entry[1]))
+            here = [*header, *keys]
+            if len(here) > depth and list(location[: len(here)]) == here:
+                best, depth = number, len(here)
+            continue
+        else:
+            continue
+        if header and len(header) > depth and list(location[: len(header)]) == header:
+            best, depth = number, len(header)
+    return best
+
+
+def _written(data: Any, location: Location) -> tuple[int | str, ...]:
+    """``location`` without the keys that pydantic adds for the members of a union: they stand in no file."""
+    kept: list[int | str] = []
+    for position, key in enumerate(location):
+        inside = data[key] if isinstance(key, int) and isinstance(data, list | tuple) and key < len(data) else None
+        if isinstance(data, dict):
+            if key not in data and position < len(location) - 1:
+                continue
+            inside = data.get(key)
+        kept.append(key)
+        data = inside
+    return tuple(kept)
+
+
+def _inside(inner: tuple[int | str, ...], outer: tuple[int | str, ...]) -> bool:
+    return len(inner) > len(outer) and inner[: len(outer)] == outer
+
+
+def _sentence(fault: dict[str, Any], location: Location, model: type[BaseModel]) -> str:
+    if fault["type"] == "extra_forbidden":
+        known = _keys_at(model, fault["loc"][:-1])
+        return f"unknown key {location[-1]!r}: {nearest(str(location[-1]), known)}"
+    if fault["type"] == "missing":
+        return "missing: this key must be set"
+    if fault["type"] == "value_error":
+        return str(fault["ctx"]["error"])
+    message = re.sub(r"^Input", "the value", fault["msg"])
+    return f"{fault['input']!r}: {message}"
+
+
+def _keys_at(model: Any, location: Location) -> list[str]:
+    """The keys that the table at ``location`` of ``model`` knows."""
+    origin, arguments = typing.get_origin(model), typing.get_args(model)
+    if origin is typing.Annotated:
+        return _keys_at(arguments[0], location)
+    if origin in (typing.Union, types.UnionType):
+        return sorted({key for part in arguments for key in _keys_at(part, location)})
+    if origin in (dict, tuple, list) and location:
+        return _keys_at([part for part in arguments if part is not Ellipsis][-1], location[1:])
+    fields = model.model_fields if isinstance(model, type) and issubclass(model, BaseModel) else {}
+    if not location:
+        return sorted(fields)
+    if location[0] in fields:
+        return _keys_at(fields[str(location[0])].annotation, location[1:])
+    # The tag of a union's member stands in the location, not in the file.
+    return _keys_at(model, location[1:]) if fields else []

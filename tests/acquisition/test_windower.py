@@ -1,0 +1,99 @@
+"""Windows follow one another without a gap or an overlap, and rings count what falls out."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from otolith.acquisition.alignment import Limits
+from otolith.acquisition.ring import Rings
+from otolith.acquisition.window import Verdict, Window
+from otolith.acquisition.windower import GRACE, Windower
+from otolith_drivers.base import Sample
+
+PERIOD, RECORDS = 0.01, 50
+
+
+def feed(rings: Rings, samples: list[tuple[float, float]]) -> None:
+    for time, value in samples:
+        rings.deliver([Sample("a", time, value), Sample("b", time + 0.0005, -value)])
+
+
+def cut_all(rings: Rings, samples: list[tuple[float, float]], *, until: float) -> list[Window]:
+    """Feed samples at their times and cut whatever is due, as the service does."""
+    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    windows, now, queue = [], 0.0, list(samples)
+    while now < until:
+        arrived = [sample for sample in queue if sample[0] <= now]
+        queue = queue[len(arrived) :]
+        feed(rings, arrived)
+        if windower.begin(rings, now, now):
+            while windower.due(rings, now):
+                windows.append(windower.cut(rings, unix_offset=1000.0))
+        now += 0.004
+    return windows
+
+
+def test_every_sample_is_in_exactly_one_window() -> None:
+    random = np.random.default_rng(3)
+    samples = [(0.1 + index * PERIOD + random.uniform(0, 0.002), float(index)) for index in range(1000)]
+    windows = cut_all(Rings(("a", "b"), 400), samples, until=10.3)
+    assert len(windows) == 20
+    assert np.array_equal(np.concatenate([window.column("a") for window in windows]), np.arange(1000.0))
+    assert all(window.quality.verdict is Verdict.GOOD for window in windows)
+    for before, after in pairwise(windows):
+        assert after.start == pytest.approx(before.end, abs=PERIOD / 4)
+
+
+@pytest.mark.parametrize("drift", [-2e-4, 2e-4])
+def test_the_grid_follows_a_source_whose_clock_is_off(drift: float) -> None:
+    samples = [(0.1 + index * PERIOD * (1 + drift), float(index)) for index in range(6000)]
+    windows = cut_all(Rings(("a", "b"), 400), samples, until=60.0)
+    values = np.concatenate([window.column("a") for window in windows])
+    assert np.array_equal(values, np.arange(float(len(values))))
+
+
+def test_an_outage_gives_bad_windows_that_say_so_and_the_next_ones_are_good() -> None:
+    samples = [(index * PERIOD, 1.0) for index in range(600) if not 200 <= index < 350]
+    windows = cut_all(Rings(("a", "b"), 400), samples, until=6.2)
+    verdicts = [window.quality.verdict for window in windows]
+    assert verdicts[:4] == [Verdict.GOOD] * 4
+    assert verdicts[4:7] == [Verdict.BAD] * 3
+    assert verdicts[7:11] == [Verdict.GOOD] * 4
+    assert windows[5].quality.reasons == ("no samples of a, b",)
+
+
+def test_a_machine_that_never_speaks_gives_bad_windows() -> None:
+    windows = cut_all(Rings(("a", "b"), 400), [], until=2.0)
+    assert len(windows) >= 2
+    assert {window.quality.verdict for window in windows} == {Verdict.BAD}
+
+
+def test_a_signal_that_never_comes_is_named() -> None:
+    rings = Rings(("a", "b", "c"), 400)
+    windower = Windower(("a", "b", "c"), RECORDS, PERIOD, Limits())
+    feed(rings, [(index * PERIOD, 1.0) for index in range(100)])
+    assert not windower.begin(rings, 0.4, 0.4)
+    assert windower.begin(rings, 1.0, 1.0)
+    assert windower.cut(rings, 0.0).quality.reasons == ("no samples of c",)
+
+
+def test_a_window_is_not_waited_for_longer_than_the_grace() -> None:
+    rings = Rings(("a", "b"), 400)
+    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    feed(rings, [(index * PERIOD, 1.0) for index in range(RECORDS - 3)])
+    assert windower.begin(rings, 0.48, 0.48)
+    assert not windower.due(rings, windower.next_end + 0.9 * GRACE)
+    assert windower.due(rings, windower.next_end + GRACE)
+
+
+def test_rings_are_bounded_and_count_what_falls_out() -> None:
+    rings = Rings(("a",), 100)
+    rings.deliver([Sample("a", float(index), 0.0) for index in range(130)])
+    rings.deliver([Sample("x", 0.0, 0.0)])
+    counters = rings.counters()
+    assert (counters.received, counters.overwritten, counters.unknown) == (130, 30, 1)
+    times, _ = rings.between(0.0, 1000.0)["a"]
+    assert len(times) == 100
+    rings.deliver([Sample("a", 200.0, 0.0)])
+    assert rings.counters().overwritten == 30  # what was read before is not lost

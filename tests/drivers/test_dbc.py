@@ -1,0 +1,52 @@
+"""Finding signals in a CAN database, and refusing with the name of what is near."""
+
+from pathlib import Path
+
+import pytest
+
+from otolith_drivers.base import Signal
+from otolith_drivers.dbc import find_signals, load_dbc
+from otolith_drivers.errors import ConfigurationError
+from tests.conftest import EXAMPLES
+
+DBC = EXAMPLES / "dc-motor.dbc"
+
+
+def test_units_are_converted() -> None:
+    wanted = find_signals(load_dbc(DBC), [Signal("n", "rpm", {"signal": "RotorSpeed"})], DBC)[0]
+    assert wanted.read({"RotorSpeed": 10.471975512}) == pytest.approx(100.0)
+
+
+def test_a_frame_without_the_signal_gives_no_number() -> None:
+    wanted = find_signals(load_dbc(DBC), [Signal("n", "rad/s", {"signal": "RotorSpeed"})], DBC)[0]
+    assert wanted.read({}) != wanted.read({})
+
+
+@pytest.mark.parametrize(
+    ("unit", "source", "sentence"),
+    [
+        ("rad/s", {"signal": "RotorSped"}, "no signal 'RotorSped' (signals.n): did you mean 'RotorSpeed'?"),
+        ("rad/s", {"signal": "RotorSpeed", "message": "Motor"}, "no message 'Motor' (signals.n)"),
+        ("A", {"signal": "RotorSpeed"}, "unit 'rad/s' does not measure what 'A' does"),
+        ("A", {"signal": "RotorSpeed", "scale": 2}, "unknown key 'scale'"),
+        ("A", {}, "signals.n.signal: missing"),
+        ("1", {"signal": "ElectricalAliveCounter"}, "has no unit: set 'unit' in signals.n"),
+    ],
+)
+def test_refusals(unit: str, source: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        find_signals(load_dbc(DBC), [Signal("n", unit, source)], DBC)
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "BO_ what", "\x00\x01", 'VERSION 1\nBO_ 1 A: 8 X\n SG_ S : 99|64@1+ (1,0) [0|0] "" X\n']
+)
+def test_a_broken_database_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "broken.dbc"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(ConfigurationError) as caught:
+        find_signals(load_dbc(path), [Signal("n", "V", {"signal": "S"})], path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,190 @@
+"""The contract every driver keeps, parametrised over the registry: a new driver is tested by being there."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import can
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from otolith_drivers import registry
+from otolith_drivers.base import Driver, Sample, Signal
+from otolith_drivers.can_bus import BusOptions, open_bus
+from otolith_drivers.can_receiver import CanReceiver, Options, build, monotonic_of
+from otolith_drivers.errors import ConfigurationError, DeviceError
+from tests.conftest import EXAMPLES, OwnMachine
+
+SIGNALS = [
+    Signal("i", "A", {"signal": "ArmatureCurrent"}),
+    Signal("omega", "rpm", {"signal": "RotorSpeed"}),
+]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A driver and a real source that can be made to say something."""
+
+    driver: Driver
+    say: Callable[[], None]
+
+
+@contextmanager
+def can_rig(machine: OwnMachine) -> Iterator[Rig]:
+    options = Options(
+        interface="udp_multicast", multicast_group=machine.group, multicast_port=machine.port, dbc=Path("dc-motor.dbc")
+    )
+    bus = open_bus(BusOptions(**options.model_dump(exclude={"dbc"})))
+
+    def say() -> None:
+        bus.send(
+            can.Message(
+                arbitration_id=385, data=bytes(2) + (2000).to_bytes(2, "little") + bytes(4), is_extended_id=False
+            )
+        )
+        bus.send(can.Message(arbitration_id=641, data=(1000).to_bytes(2, "little") + bytes(6), is_extended_id=False))
+
+    yield Rig(build(options, SIGNALS, EXAMPLES), say)
+    bus.shutdown()
+
+
+RIGS = {"can": can_rig}
+
+
+@pytest.fixture(params=sorted(registry.DRIVERS))
+def rig(request: pytest.FixtureRequest, own_machine: OwnMachine) -> Iterator[Rig]:
+    with RIGS[request.param](own_machine) as made:
+        yield made
+        made.driver.close()
+
+
+def collect(rig: Rig, enough: int) -> list[Sample]:
+    """Open the driver and let its source speak until there are enough samples."""
+    got: list[Sample] = []
+    rig.driver.open(got.extend)
+    deadline = time.monotonic() + 5.0
+    while len(got) < enough and time.monotonic() < deadline:
+        rig.say()
+        time.sleep(0.01)
+    return got
+
+
+def test_it_delivers_in_the_wanted_units_and_stamps_at_the_source(rig: Rig) -> None:
+    """Samples bear the daemon's names and units, and a time on the monotonic clock that has just been."""
+    begun = time.monotonic()
+    samples = collect(rig, 10)
+    assert {sample.signal for sample in samples} == {"i", "omega"}
+    values = {sample.signal: sample.value for sample in samples}
+    assert values["i"] == pytest.approx(2.0)
+    assert values["omega"] == pytest.approx(10.0 * 60 / (2 * 3.141592653589793))
+    assert all(begun - 0.1 <= sample.time <= time.monotonic() for sample in samples)
+
+
+def test_it_counts_what_it_receives(rig: Rig) -> None:
+    """Every delivered frame, reply or row is in the counters."""
+    samples = collect(rig, 10)
+    assert rig.driver.counters().received >= len(samples) / len(SIGNALS)
+    assert rig.driver.counters().bad == 0
+    assert rig.driver.link().up
+
+
+def test_it_stops_within_a_second_and_may_be_closed_twice(rig: Rig) -> None:
+    """After close no thread of it is left and nothing more is delivered."""
+    before = set(threading.enumerate())
+    got = collect(rig, 2)
+    begun = time.monotonic()
+    rig.driver.close()
+    rig.driver.close()
+    assert time.monotonic() - begun < 1.0
+    assert set(threading.enumerate()) <= before
+    delivered = len(got)
+    rig.say()
+    time.sleep(0.05)
+    assert len(got) == delivered
+
+
+def test_it_says_what_it_will_read(rig: Rig) -> None:
+    """Every signal is in the description."""
+    text = "\n".join(rig.driver.describe())
+    assert all(signal.name in text for signal in SIGNALS)
+
+
+def test_it_cannot_write(rig: Rig) -> None:
+    """The protocol has five verbs, and none of them speaks to the machine."""
+    public = {name for name in dir(rig.driver) if not name.startswith("_")}
+    assert public == {"open", "close", "counters", "link", "describe"}
+
+
+def test_an_unknown_driver_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="did you mean 'can'"):
+        registry.find("cam")
+
+
+def receiver(machine: OwnMachine) -> CanReceiver:
+    options = Options(
+        interface="udp_multicast", multicast_group=machine.group, multicast_port=machine.port, dbc=Path("dc-motor.dbc")
+    )
+    return build(options, SIGNALS, EXAMPLES)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.sampled_from([385, 641, 7]), st.binary(max_size=8), st.booleans(), st.booleans())
+def test_any_frame_is_decoded_or_counted(
+    own_machine: OwnMachine, identifier: int, data: bytes, remote: bool, error: bool
+) -> None:
+    driver, got = receiver(own_machine), list[Sample]()
+    frame = can.Message(
+        arbitration_id=identifier,
+        data=None if remote else data,
+        is_extended_id=False,
+        is_remote_frame=remote,
+        is_error_frame=error,
+    )
+    driver._take(frame, got.extend)
+    counters = driver.counters()
+    wanted = identifier != 7 and not remote and not error
+    assert counters.received + counters.bad == int(wanted)
+    assert len(got) == counters.received
+
+
+def test_a_bus_that_breaks_is_opened_again(own_machine: OwnMachine, monkeypatch: pytest.MonkeyPatch) -> None:
+    with can_rig(own_machine) as rig:
+        collect(rig, 2)
+        broken = threading.Event()
+        original = can.BusABC.recv
+
+        def recv(self: can.BusABC, timeout: float | None = None) -> can.Message | None:
+            if not broken.is_set():
+                broken.set()
+                raise OSError("Network is down")
+            return original(self, timeout)
+
+        monkeypatch.setattr(can.BusABC, "recv", recv)
+        deadline = time.monotonic() + 5.0
+        while rig.driver.counters().reconnects == 0 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        received = rig.driver.counters().received
+        while rig.driver.counters().received == received and time.monotonic() < deadline:
+            rig.say()
+            time.sleep(0.01)
+        assert rig.driver.counters().reconnects == 1
+        assert rig.driver.counters().received > received
+        rig.driver.close()
+
+
+def test_a_bus_that_is_not_there_is_a_device_error() -> None:
+    with pytest.raises(DeviceError, match="can7"):
+        open_bus(BusOptions(interface="socketcan", channel="can7"))
+
+
+@pytest.mark.parametrize(
+    ("stamp", "expected"),
+    [(1000.0, 50.0), (999.99, 49.99), (1000.5, 50.0), (0.0, 50.0), (2000.0, 50.0)],
+    ids=["now", "a little ago", "wall clock set back", "stamp since start", "wall clock set forward"],
+)
+def test_stamps_land_on_the_monotonic_clock(stamp: float, expected: float) -> None:
+    assert monotonic_of(stamp, wall=1000.0, monotonic=50.0) == pytest.approx(expected)

@@ -1,0 +1,82 @@
+"""Real processes: plant and daemon as a user starts them, watched from outside."""
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from otolith.health.report import ReportDocument
+from otolith.outlets.zenoh_session import Listener
+from tests.conftest import OwnMachine
+
+OTOLITH = [sys.executable, "-m", "otolith"]
+
+
+class Running:
+    """Plant and daemon of one machine, and what the daemon publishes."""
+
+    def __init__(self, machine: OwnMachine, folder: Path) -> None:
+        self.machine, self.folder = machine, folder
+        self.recording, self.truth, self.log = folder / "run.rrd", folder / "truth.csv", folder / "daemon.log"
+        self.plant = self._start("plant", "plant", str(machine.scenario), "--truth", str(self.truth))
+        self.daemon = self._start("daemon", "run", str(machine.machine), "--recording", str(self.recording))
+        self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._listener = Listener([machine.endpoint], "otolith/**/report", self._heard.put)
+        self.reports: list[ReportDocument] = []
+
+    def _start(self, name: str, *arguments: str) -> "subprocess.Popen[bytes]":
+        with (self.folder / f"{name}.log").open("wb") as log:
+            return subprocess.Popen([*OTOLITH, *arguments], stdout=log, stderr=subprocess.STDOUT)
+
+    def wait_for(self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 60.0) -> list[ReportDocument]:
+        """The reports, once there are enough of them; fails with the daemon's log after ``seconds``."""
+        deadline = time.monotonic() + seconds
+        while not enough(self.reports):
+            left = deadline - time.monotonic()
+            assert self.daemon.poll() is None, self.log.read_text()
+            assert left > 0, f"{len(self.reports)} reports; {self.log.read_text()}"
+            try:
+                self.reports.append(ReportDocument.from_json(self._heard.get(timeout=min(left, 1.0))))
+            except queue.Empty:
+                continue
+        return self.reports
+
+    def child(self, name: str) -> psutil.Process:
+        """A process that the daemon has started, by what it is: ``worker`` or ``recorder``."""
+        found = {"worker": 0, "recorder": 1}[name]
+        spawned = [p for p in psutil.Process(self.daemon.pid).children() if "spawn_main" in " ".join(p.cmdline())]
+        return sorted(spawned, key=lambda process: process.create_time())[found]
+
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, float]:
+        """The daemon's exit code and the seconds it took to end."""
+        begun = time.monotonic()
+        self.daemon.send_signal(number)
+        return self.daemon.wait(timeout=10), time.monotonic() - begun
+
+    def close(self) -> None:
+        """End whatever still runs."""
+        self._listener.__exit__(None, None, None)
+        for process in (self.daemon, self.plant):
+            if process.poll() is None:
+                process.terminate()
+                process.wait(timeout=10)
+
+
+@pytest.fixture
+def running(own_machine: OwnMachine, tmp_path: Path) -> Iterator[Running]:
+    """A plant and a daemon, ended with the test."""
+    machine = Running(own_machine, tmp_path)
+    yield machine
+    machine.close()
+
+
+def descendants() -> set[int]:
+    """Every process below this one."""
+    return {process.pid for process in psutil.Process(os.getpid()).children(recursive=True)}

@@ -1,0 +1,188 @@
+"""The main job over real parts: bus, worker, Zenoh and recording, with foreign processes looking on."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pyarrow as pa
+import pytest
+from rerun.chunk import RrdReader
+
+from otolith.acquisition.window import Array, Verdict
+from otolith.demo import compare
+from otolith.health.report import Status
+from tests.conftest import OwnMachine
+from tests.system.conftest import Running
+
+FOREIGN_CAN = """
+import can, cantools, sys, json, time
+database = cantools.database.load_file(sys.argv[1])
+bus = can.Bus(interface="udp_multicast", channel=sys.argv[2], port=int(sys.argv[3]), hop_limit=0, fd=False)
+seen, end = {}, time.monotonic() + 2.0
+while time.monotonic() < end:
+    frame = bus.recv(0.2)
+    if frame is not None:
+        seen.setdefault(frame.arbitration_id, []).append(database.decode_message(frame.arbitration_id, frame.data))
+bus.shutdown()
+print(json.dumps({database.get_message_by_frame_id(key).name: frames for key, frames in seen.items()}))
+"""
+
+FOREIGN_ZENOH = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+heard, alive = [], []
+with zenoh.open(config) as session:
+    session.declare_subscriber("otolith/**", lambda s: heard.append((str(s.key_expr), s.payload.to_string())))
+    time.sleep(5)
+    latest = [reply.ok.payload.to_string() for reply in session.get("otolith/demo/dc-motor/report") if reply.ok]
+    alive = [str(reply.ok.key_expr) for reply in session.liveliness().get("otolith/*/*/alive") if reply.ok]
+print(json.dumps({"heard": heard, "latest": latest, "alive": alive}))
+"""
+
+
+def foreign(program: str, *arguments: object) -> Any:
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    return json.loads(done.stdout)
+
+
+def series(path: Path, entity: str) -> tuple[Array, Array]:
+    """Times (s) and values (rows, columns) of an entity read back from a recording."""
+    times, values = [], []
+    for chunk in RrdReader(path).stream():
+        if str(chunk.entity_path) == entity and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            times.append(batch.column("time").cast(pa.int64()).to_numpy() / 1e9)
+            values.append(np.stack(batch.column("Scalars:scalars").to_numpy(zero_copy_only=False)))
+    order = np.argsort(np.concatenate(times), kind="stable")
+    return np.concatenate(times)[order], np.concatenate(values)[order]
+
+
+def test_foreign_processes_see_frames_and_reports_and_the_recording_is_whole(running: Running) -> None:
+    running.wait_for(lambda reports: len(reports) >= 2)
+    machine = running.machine
+    frames = foreign(FOREIGN_CAN, machine.dbc, machine.group, machine.port)
+    assert {"MotorElectrical", "MotorMechanical"} == set(frames)
+    counters = [frame["ElectricalAliveCounter"] for frame in frames["MotorElectrical"]]
+    assert set(np.diff(counters) % 256) == {1}
+    assert len(counters) == pytest.approx(200, abs=10)
+
+    published = foreign(FOREIGN_ZENOH, machine.endpoint)
+    heard = [json.loads(text) for key, text in published["heard"] if key.endswith("/report")]
+    assert len(heard) >= 2
+    assert all(report["schema"] == "otolith.report/1" for report in heard)
+    assert {key for key, _ in published["heard"]} >= {"otolith/demo/dc-motor/parameter/R_a"}
+    assert json.loads(published["latest"][0])["machine"] == "dc-motor"
+    assert published["alive"] == ["otolith/demo/dc-motor/alive"]
+
+    reports = list(running.wait_for(lambda reports: len(reports) >= 7))
+    code, _ = running.stop()
+    assert code == 0
+    check_accuracy(running)
+    verify = Path(sys.executable).with_name("rerun")
+    done = subprocess.run([verify, "rrd", "verify", running.recording], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    times, values = series(running.recording, "/signals/i")
+    for report in reports:
+        half = 0.5 * (report.window.end - report.window.start) / report.window.records
+        inside = (times >= report.window.start - half) & (times < report.window.end - half)
+        assert inside.sum() == report.window.records
+        assert np.isfinite(values[inside]).all()
+    _, resistance = series(running.recording, "/parameters/R_a")
+    assert resistance[: len(reports), 0].tolist() == [report.parameters["R_a"].value for report in reports]
+
+
+def check_accuracy(running: Running) -> None:
+    with running.truth.open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if None not in row.values()]
+    truth = {name: [float(row[name]) for row in rows] for name in rows[0]}
+    compared = compare(running.reports, truth)
+    assert len(compared) >= 5
+    assert max(row.error for row in compared) <= 0.005
+    assert max(report.cost.latency_s for report in running.reports[1:]) < 1.0
+
+
+def test_the_worker_can_be_killed_at_any_time(running: Running) -> None:
+    running.wait_for(lambda reports: len(reports) >= 2)
+    running.child("worker").kill()
+    reports = running.wait_for(lambda reports: len(reports) >= 6)
+    last = reports[-1].counters
+    assert last is not None
+    assert last.worker_restarts == 1
+    assert last.windows_missed <= 2
+    assert last.windows_missed == last.windows - len(reports) or last.windows_missed == reports[
+        -1
+    ].window.index + 1 - len(reports)
+    assert (last.lost, last.bad) == (0, 0)
+    for before, after in pairwise(reports):
+        if after.window.index == before.window.index + 1:
+            assert after.window.start == pytest.approx(before.window.end, abs=0.003)
+        assert after.window.quality.verdict is Verdict.GOOD
+    assert reports[-1].parameters["R_a"].status is Status.ESTIMATED
+
+
+def test_a_killed_recorder_disturbs_nobody_and_overwrites_nothing(running: Running) -> None:
+    running.wait_for(lambda reports: len(reports) >= 2)
+    running.child("recorder").kill()
+    reports = running.wait_for(lambda reports: len(reports) >= 5)
+    last = reports[-1].counters
+    assert last is not None
+    assert (last.windows_missed, last.worker_restarts, last.lost) == (0, 0, 0)
+    running.stop()
+    second = list((running.folder / "state").rglob("*.rrd"))
+    assert len(second) == 1
+    assert running.recording.stat().st_size > 0
+
+
+@pytest.mark.parametrize("moment", [0.02, 0.2, 0.5, 1.0, 1.5, 3.5])
+def test_ctrl_c_at_any_moment_ends_everything_within_three_seconds(
+    own_machine: OwnMachine, tmp_path: Path, moment: float
+) -> None:
+    """The whole process group gets the signal, as from a terminal."""
+    command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine), "--recording", str(tmp_path / "a.rrd")]
+    shared = set(Path("/dev/shm").iterdir())  # noqa: S108 - looked at, not written to
+    daemon = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    time.sleep(moment)  # the moment is what is tested
+    children = psutil.Process(daemon.pid).children(recursive=True)
+    begun = time.monotonic()
+    for process in [psutil.Process(daemon.pid), *children]:
+        process.send_signal(signal.SIGINT)
+    _, errors = daemon.communicate(timeout=10)
+    assert time.monotonic() - begun < 3.0
+    assert daemon.returncode in (130, -signal.SIGINT)
+    assert "Traceback" not in errors
+    _, left = psutil.wait_procs(children, timeout=1.0)
+    # Where the first process of a container reaps nobody, an ended orphan stays listed as a zombie.
+    assert [process for process in left if process.status() != psutil.STATUS_ZOMBIE] == []
+    assert set(Path("/dev/shm").iterdir()) <= shared  # noqa: S108
+
+
+def test_demo_names_what_was_injected(tmp_path: Path, own_machine: OwnMachine) -> None:
+    command = [sys.executable, "-m", "otolith", "demo", "--duration", "10", "--json"]
+    command += ["--machine", str(own_machine.machine), "--scenario", str(own_machine.scenario)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    verdict = json.loads(done.stdout)
+    assert verdict["right"]
+    assert len(verdict["windows"]) >= 2
+    assert Path(verdict["recording"]).is_relative_to(tmp_path)
+
+
+def test_demo_says_when_the_estimate_is_wrong(own_machine: OwnMachine) -> None:
+    text = own_machine.machine.read_text(encoding="utf-8").replace('K_t = "0.038 N*m/A"', 'K_t = "0.045 N*m/A"')
+    own_machine.machine.write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "otolith", "demo", "--duration", "10", "--json"]
+    command += ["--machine", str(own_machine.machine), "--scenario", str(own_machine.scenario)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1, done.stderr
+    assert not json.loads(done.stdout)["right"]

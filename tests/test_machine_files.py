@@ -1,0 +1,69 @@
+"""Machine files: the golden folder of wrong ones, each with the sentence it gets, and what a right one means.
+
+A case is a folder with ``machine.toml`` and ``error.txt``; in the latter ``{file}`` stands for the file and ``*`` for
+what differs between computers. ``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the sentences anew: read the difference.
+"""
+
+import os
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import pytest
+
+from otolith.errors import ConfigurationError, OtolithError
+from otolith.plan import describe, load_plan
+from tests.conftest import EXAMPLES, OwnMachine
+
+GOLDEN = Path(__file__).parent / "golden" / "machine_files"
+CASES = sorted(path.parent for path in GOLDEN.glob("*/machine.toml"))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_wrong_file_gets_its_sentence(case: Path) -> None:
+    file = case / "machine.toml"
+    with pytest.raises(OtolithError) as caught:
+        load_plan(file).driver.open(lambda _: None)
+    assert caught.value.exit_code == 2
+    said = str(caught.value).replace(str(file), "{file}").replace(str(case), "{folder}")
+    expected = case / "error.txt"
+    if os.environ.get("OTOLITH_UPDATE_GOLDEN") and not (expected.exists() and "*" in expected.read_text()):
+        expected.write_text(said + "\n", encoding="utf-8")
+    assert fnmatchcase(said, expected.read_text(encoding="utf-8").rstrip("\n").replace("[", "[[]"))
+
+
+def test_the_example_means_what_it_says() -> None:
+    plan = load_plan(EXAMPLES / "dc-motor.toml")
+    assert [entry.name for entry in plan.problem.free] == ["R_a"]
+    assert dict(plan.problem.known)["J"] == pytest.approx(0.001171)
+    assert plan.problem.noise == (0.005, 0.02)
+    assert plan.records == 200
+    assert any("MotorMechanical.RotorSpeed" in line for line in describe(plan))
+
+
+def test_every_commented_default_of_the_example_is_the_default(tmp_path: Path) -> None:
+    """What a user gets by taking the '# ' off is what there was before."""
+    text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
+    plain = load_plan(EXAMPLES / "dc-motor.toml").file
+    uncommented = "\n".join(
+        line[2:] if line.startswith("# ") and "folder" not in line else line for line in text.splitlines()
+    )
+    assert uncommented.count("\n[") > text.count("\n[")
+    path = tmp_path / "dc-motor.toml"
+    path.write_text(uncommented, encoding="utf-8")
+    (tmp_path / "dc-motor.dbc").write_bytes((EXAMPLES / "dc-motor.dbc").read_bytes())
+    loaded = load_plan(path).file
+    assert loaded.model_copy(update={"driver": plain.driver}) == plain
+
+
+def test_units_of_the_file_are_free(own_machine: OwnMachine) -> None:
+    text = own_machine.machine.read_text(encoding="utf-8")
+    other = text.replace('"6.5 ohm"', '"6500 mohm"').replace('"0.02 rad/s"', '"0.190985932 rpm"')
+    own_machine.machine.write_text(other, encoding="utf-8")
+    problem = load_plan(own_machine.machine).problem
+    assert problem.free[0].nominal == pytest.approx(6.5)
+    assert problem.noise[1] == pytest.approx(0.02)
+
+
+def test_an_unreadable_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="No such file"):
+        load_plan(tmp_path / "none.toml")
