@@ -11,7 +11,8 @@ import numpy as np
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.problem import Objective, Problem
 from otolith.adaptation.swarm import search
-from otolith.heart import adapt, begin
+from otolith.heart import adapt
+from otolith.state import begin
 from otolith.twin.dc_motor import DC_MOTOR
 from otolith_drivers.plant.dc_motor import simulate
 from otolith_drivers.plant.scenario import load_scenario

@@ -10,7 +10,8 @@ import multiprocessing.connection
 import queue
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from importlib import import_module
 from multiprocessing import resource_tracker
 from typing import Any
 
@@ -28,17 +29,21 @@ def _signals_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _enter(connection: Any, main: Callable[..., None], arguments: Sequence[Any]) -> None:
+def _enter(connection: Any, main: str, arguments: Sequence[Any]) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the daemon is gone
-        main(connection, *arguments)
+        module, function = main.split(":")
+        getattr(import_module(module), function)(connection, *arguments)
 
 
 class Companion:
-    """Runs ``main(connection, *arguments)`` in a process; at most ``room`` messages wait for it."""
+    """Runs ``main``, written ``module:function``, as ``function(connection, *arguments)`` in a process.
 
-    def __init__(self, name: str, main: Callable[..., None], room: int) -> None:
+    Only the companion imports the module. At most ``room`` messages wait for it.
+    """
+
+    def __init__(self, name: str, main: str, room: int) -> None:
         self.name = name
         self.starts = 0
         self._main, self._room = main, room

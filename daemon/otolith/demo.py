@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -92,8 +93,8 @@ class Demo:
         connect = self._plan.file.zenoh.listen
         key = REPORT.under(identity.site, identity.name)
         say = self._console.print
-        say(f"machine {self._machine}, scenario {self._scenario}, {self._duration:.0f} s")
-        say(f"frames on {self._plan.driver.describe()[0]}; reports on {connect[0]}, key {key}")
+        say(f"machine {self._machine}, scenario {self._scenario}, {self._duration:.0f} s", soft_wrap=True)
+        say(f"frames on {self._plan.driver.describe()[0]}; reports on {connect[0]}, key {key}", soft_wrap=True)
         try:
             self._start("daemon", "run", str(self._machine), "--recording", str(self.recording))
             self._start("plant", "plant", str(self._scenario), "--truth", str(self._folder / "truth.csv"))
@@ -118,7 +119,8 @@ class Demo:
         board = Board("the first window")
         live = self._console.is_terminal and not self._as_json
         end = time.monotonic() + self._duration
-        with Listener(connect, key, heard.put), Live(board, console=self._console, auto_refresh=live, transient=False):
+        shown = Live(board, console=self._console, refresh_per_second=5) if live else nullcontext()
+        with Listener(connect, key, heard.put), shown:
             while time.monotonic() < end and not stopped():
                 self._complain_of_the_dead()
                 self._take(heard, board, aloud=not live)
@@ -201,7 +203,7 @@ class Demo:
         else:
             say(f"[green]every one is within {TOLERANCE:.1%} of what was injected[/green]")
         say(f"recording: {self.recording}", soft_wrap=True)
-        say(f"open it with: otolith view {self.recording}", soft_wrap=True)
+        say(f"open it with: {Path(sys.executable).with_name('otolith')} view {self.recording}", soft_wrap=True)
 
 
 def _read_columns(path: Path) -> dict[str, list[float]]:

@@ -4,13 +4,12 @@ Time comes in with the window and randomness with the seed, so that every run ca
 work can move between processes without loss.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.estimate import WindowEstimate, estimate
-from otolith.adaptation.problem import Problem
 from otolith.health.report import (
     CostDocument,
     FitDocument,
@@ -21,26 +20,11 @@ from otolith.health.report import (
     window_document,
 )
 from otolith.health.status import Known, publish
+from otolith.state import State
 from otolith.twin.library import find_twin
 from otolith.twin.model import Twin
 
 EXPLAINED = 1.5  # cost (RMSE over noise) up to which the residual counts as noise
-
-
-@dataclass(frozen=True, slots=True)
-class State:
-    """All that is carried from window to window. Plain and frozen: it pickles."""
-
-    machine: str
-    site: str
-    problem: Problem
-    known: tuple[Known | None, ...]
-    """Of each free parameter."""
-
-
-def begin(machine: str, site: str, problem: Problem) -> State:
-    """The state before the first window."""
-    return State(machine, site, problem, tuple(None for _ in problem.free))
 
 
 def adapt(state: State, window: Window) -> tuple[State, Report]:

@@ -19,12 +19,11 @@ from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.companion import SIGNALS, Companion
 from otolith.health.report import CountersDocument, Report, ReportDocument, Status
-from otolith.heart import begin
 from otolith.notify import Notifier
-from otolith.outlets import recorder
 from otolith.outlets.zenoh_session import Publisher
 from otolith.paths import cache_directory, state_directory, writable
 from otolith.plan import Plan
+from otolith.state import begin
 from otolith.supervisor import Supervisor
 
 log = logging.getLogger(__name__)
@@ -46,7 +45,7 @@ class Service:
         self._rings = Rings(plan.twin.signals, RING_WINDOWS * plan.records)
         self._windower = Windower(plan.twin.signals, plan.records, plan.file.window.sample_period, plan.limits)
         self._supervisor = Supervisor(begin(machine.name, machine.site, plan.problem), self._windower.length)
-        self._recorder = Companion("otolith-recorder", recorder.main, RECORDER_ROOM)
+        self._recorder = Companion("otolith-recorder", "otolith.outlets.recorder:main", RECORDER_ROOM)
         self._recording = recording if plan.file.recording.enabled else None
         self._publisher: Publisher | None = None
         self._notifier = Notifier()

@@ -12,7 +12,7 @@ from otolith import worker
 from otolith.acquisition.window import Window
 from otolith.companion import Companion
 from otolith.health.report import Report
-from otolith.heart import State
+from otolith.state import State
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ class Supervisor:
         self.finished = 0
         self._state = state
         self._patience = PATIENCE + 2 * window_length
-        self._companion = Companion("otolith-worker", worker.main, room=1)
+        self._companion = Companion("otolith-worker", "otolith.worker:main", room=1)
         self._waiting: deque[Window] = deque()
         self._at_hand: Window | None = None
         self._retried: int | None = None

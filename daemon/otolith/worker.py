@@ -1,4 +1,7 @@
-"""The worker process: adapts to the windows it is handed, one by one, and owns nothing that could be lost."""
+"""The worker process: adapts to the windows it is handed, one by one, and owns nothing that could be lost.
+
+The daemon imports this module for its messages; only the worker loads the heart, with its compiler and its optimiser.
+"""
 
 import logging
 import time
@@ -9,7 +12,7 @@ import numpy as np
 
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.health.report import Report
-from otolith.heart import State, adapt
+from otolith.state import State
 from otolith.twin.library import find_twin
 
 log = logging.getLogger(__name__)
@@ -43,6 +46,8 @@ def main(connection: Any, state: State) -> None:
 
 def perform(task: Task) -> Result:
     """Adapt, timed; an exception in the heart costs this window and nothing else."""
+    from otolith.heart import adapt  # noqa: PLC0415 - see the module's docstring
+
     begun = time.perf_counter()
     try:
         state, report = adapt(task.state, task.window)
@@ -60,4 +65,4 @@ def _warm_up(state: State) -> None:
     quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
     window = Window(0, 0.0, 0.01, signals, values, np.zeros(values.shape, dtype=np.bool_), quality)
     short = replace(state.problem, swarm=replace(state.problem.swarm, generations=2))
-    adapt(replace(state, problem=short), window)
+    perform(Task(replace(state, problem=short), window))

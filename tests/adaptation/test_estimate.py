@@ -11,7 +11,8 @@ from otolith.adaptation.estimate import estimate
 from otolith.adaptation.information import Identifiability
 from otolith.adaptation.problem import HOPELESS, Objective, Problem, SwarmOptions
 from otolith.health.report import Status
-from otolith.heart import State, adapt, begin
+from otolith.heart import adapt
+from otolith.state import State, begin
 from otolith.twin.dc_motor import DC_MOTOR
 from otolith_drivers.plant.scenario import Scenario
 

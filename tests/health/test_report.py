@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from otolith.acquisition.window import Verdict
-from otolith.adaptation.estimate import ParameterEstimate
-from otolith.adaptation.information import Identifiability
+from otolith.adaptation.information import Identifiability, ParameterEstimate
 from otolith.health.report import ParameterDocument, QualityDocument, ReportDocument, Status, WindowDocument
 from otolith.health.status import Known, publish
 from otolith.twin.model import Parameter

@@ -5,24 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.information import Identifiability, classify, information
+from otolith.adaptation.information import ParameterEstimate, classify, information
 from otolith.adaptation.problem import Objective, Problem
 from otolith.adaptation.swarm import search
 from otolith.twin.library import find_twin
 
 AT_BOUND = 1e-4  # of the width of the bounds
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterEstimate:
-    """What one window says about one parameter."""
-
-    name: str
-    value: float
-    sd: float
-    """Standard deviation; infinite where the window says nothing."""
-    identifiability: Identifiability
-    reason: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,18 @@ class Information:
     """(guess, guess)."""
 
 
+@dataclass(frozen=True, slots=True)
+class ParameterEstimate:
+    """What one window says about one parameter."""
+
+    name: str
+    value: float
+    sd: float
+    """Standard deviation; infinite where the window says nothing."""
+    identifiability: Identifiability
+    reason: str
+
+
 def information(objective: Objective, values: Array, cost: float) -> Information:
     """Standard deviations at ``values`` (guess,) from the inverse of the Fisher information.
 

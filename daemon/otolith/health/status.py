@@ -3,8 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from otolith.adaptation.estimate import ParameterEstimate
-from otolith.adaptation.information import Identifiability
+from otolith.adaptation.information import Identifiability, ParameterEstimate
 from otolith.health.report import ParameterDocument, Status
 from otolith.twin.model import Parameter
 

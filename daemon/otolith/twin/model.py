@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Literal
 
 from otolith.acquisition.window import Array
@@ -61,7 +62,14 @@ class Twin:
     states: tuple[str, ...]
     """Each state is an output of the same name, so that a window's records tell where it starts."""
     equations: tuple[str, ...]
-    simulate: Simulate
+    kernel: str
+    """The module with the compiled kernel, loaded on first use: who only reads a twin does not load a compiler."""
+
+    @property
+    def simulate(self) -> Simulate:
+        """The compiled kernel."""
+        found: Simulate = import_module(self.kernel).simulate
+        return found
 
     @property
     def signals(self) -> tuple[str, ...]:

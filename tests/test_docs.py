@@ -1,0 +1,80 @@
+"""The docs are true: every command is documented and has help with an example, every file they name is there."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from otolith.cli import cli
+from otolith.topics import TOPICS
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"]
+
+
+@pytest.mark.parametrize("name", sorted(cli.commands))
+def test_every_command_has_help_with_an_example_and_is_in_the_readme(name: str) -> None:
+    result = CliRunner().invoke(cli, [name, "--help"])
+    assert result.exit_code == 0
+    assert re.search(r"Examples?:\n\s+otolith " + name, result.output)
+    assert f"`otolith {name}" in README
+
+
+@pytest.mark.parametrize("name", sorted(cli.commands))
+def test_an_unknown_option_is_a_usage_error(name: str) -> None:
+    with pytest.raises(click.exceptions.NoSuchOption):
+        CliRunner().invoke(cli, [name, "--no-such"], standalone_mode=False, catch_exceptions=False)
+
+
+def test_every_topic_is_in_the_readme() -> None:
+    for topic in TOPICS:
+        assert f"`otolith/<site>/<machine>/{topic.key.replace('*', '<name>')}`" in README
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_file_a_page_names_is_there(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    named = set(re.findall(r"`([\w./@-]+\.(?:py|toml|md|txt|service|conf|dbc))`", text))
+    homes = [ROOT, ROOT / "daemon", ROOT / "drivers", ROOT / "daemon/otolith", ROOT / "drivers/otolith_drivers"]
+    lost = {name for name in named if not any(list(home.glob(f"**/{name}")) for home in homes)}
+    assert lost <= {"my-machine.toml", "machine.toml", "error.txt"}
+
+
+def test_every_make_target_of_the_docs_exists() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for page in PAGES:
+        for target in re.findall(r"`make (\w+)`", (ROOT / page).read_text(encoding="utf-8")):
+            assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+
+
+def test_ci_calls_the_readmes_test_command() -> None:
+    assert "    make test\n" in README
+    assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("otolith.cli", {"numpy", "numba", "rerun", "pymoo", "pint", "can", "zenoh", "pydantic"}),
+        ("otolith.service", {"numba", "rerun", "pymoo", "sympy", "scipy", "matplotlib"}),
+    ],
+)
+def test_nobody_loads_what_others_need(module: str, absent: set[str]) -> None:
+    """Help is quick, and the daemon's main process stays small: compiler, optimiser and recorder live beside it."""
+    program = f"import sys, {module}; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert not absent & set(loaded)
+
+
+def test_no_path_of_a_developers_machine_is_in_the_tree() -> None:
+    files = subprocess.run(
+        ["/usr/bin/env", "git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split("\0")[:-1]
+    for name in files:
+        text = (ROOT / name).read_text(encoding="utf-8", errors="replace")
+        assert not re.search(r"/(?:root|work|home/\w+)/", text), name
