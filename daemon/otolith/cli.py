@@ -186,7 +186,7 @@ def _log(verbose: bool) -> None:
         handler.setFormatter(_Journal("%(name)s: %(message)s"))
     else:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
     logging.getLogger("otolith").setLevel(logging.DEBUG if verbose else logging.INFO)
     logging.getLogger("otolith_drivers").setLevel(logging.DEBUG if verbose else logging.INFO)
 

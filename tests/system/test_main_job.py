@@ -99,7 +99,7 @@ def test_foreign_processes_see_frames_and_reports_and_the_recording_is_whole(run
         assert inside.sum() == report.window.records
         assert np.isfinite(values[inside]).all()
     _, resistance = series(running.recording, "/parameters/R_a")
-    assert resistance[: len(reports), 0].tolist() == [report.parameters["R_a"].value for report in reports]
+    assert resistance[: len(reports), 2].tolist() == [report.parameters["R_a"].value for report in reports]
 
 
 def check_accuracy(running: Running) -> None:

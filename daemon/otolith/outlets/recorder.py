@@ -49,8 +49,8 @@ class Recording:
             self._style(f"signals/{output.name}", names, [MEASURED, TWIN])
         self._style("residual", [f"{output.name} / noise" for output in outputs], None)
         for parameter in parameters:
-            names = [f"{parameter.name} [{parameter.unit}]", "95 % low", "95 % high"]
-            self._style(f"parameters/{parameter.name}", names, [TWIN, LIMIT, LIMIT])
+            names = ["95 % low", "95 % high", f"{parameter.name} [{parameter.unit}]"]  # the last is drawn on top
+            self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, TWIN])
 
     def add(self, report: Report) -> None:
         """Append a window."""
@@ -65,7 +65,7 @@ class Recording:
         self._stream.set_time(TIMELINE, timestamp=window.end)
         for name, parameter in document.parameters.items():
             if parameter.value is not None and parameter.low is not None and parameter.high is not None:
-                self._stream.log(f"parameters/{name}", rr.Scalars([parameter.value, parameter.low, parameter.high]))
+                self._stream.log(f"parameters/{name}", rr.Scalars([parameter.low, parameter.high, parameter.value]))
         for text, level in _sentences(document):
             self._stream.log("log", rr.TextLog(text, level=level))
         self._stream.log("report", rr.TextDocument(_table(document), media_type=rr.MediaType.MARKDOWN))
