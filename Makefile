@@ -5,6 +5,7 @@ BIN := .venv/bin
 HERE := $(shell pwd | cksum | cut -d' ' -f1)
 RUNTIME := .venv/.runtime-$(HERE)
 DEV := .venv/.dev-$(HERE)
+BENCH := .venv/.bench-$(HERE)
 PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
 .PHONY: help demo test check bench clean
@@ -28,8 +29,8 @@ check: $(DEV)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(DEV)
-	@for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done
+bench: $(BENCH)
+	@for file in benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
@@ -49,3 +50,8 @@ $(DEV): pyproject.toml constraints.txt | .venv/bin/python
 	@echo "setting up .venv with the test tools, which takes a minute or two"
 	@$(PIP) --editable '.[dev]'
 	@touch $@ $(RUNTIME)
+
+$(BENCH): pyproject.toml constraints.txt | .venv/bin/python
+	@echo "setting up .venv with what the benchmarks compare with, which takes a minute or two"
+	@$(PIP) --editable '.[dev,bench]'
+	@touch $@ $(RUNTIME) $(DEV)

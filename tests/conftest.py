@@ -10,8 +10,8 @@ import pytest
 
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.paths import examples_directory
-from otolith_drivers.plant.dc_motor import simulate
-from otolith_drivers.plant.scenario import Scenario, load_scenario
+from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.plant.plants import load_scenario, simulate
 
 EXAMPLES = examples_directory()
 GOOD = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
@@ -27,16 +27,18 @@ def private_directories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.fixture
-def scenario() -> Scenario:
+def scenario() -> MotorScenario:
     """The demo's."""
-    return load_scenario(EXAMPLES / "scenarios" / "demo.toml")
+    found = load_scenario(EXAMPLES / "scenarios" / "demo.toml")
+    assert isinstance(found, MotorScenario)
+    return found
 
 
 @pytest.fixture
 def windows() -> Callable[..., list[tuple[Window, float]]]:
     """Windows of a scenario as the daemon would cut them, each with the mean armature resistance in it."""
 
-    def cut(scenario: Scenario, count: int, records: int = 200) -> list[tuple[Window, float]]:
+    def cut(scenario: MotorScenario, count: int, records: int = 200) -> list[tuple[Window, float]]:
         ticks = list(islice(simulate(scenario), count * records))
         found = []
         for index in range(count):

@@ -17,7 +17,7 @@ BREACHES = {
     "the heart reads a clock": ("daemon/otolith/heart.py", "import time"),
     "adaptation opens a file": ("daemon/otolith/adaptation/swarm.py", "import pathlib"),
     "health publishes": ("daemon/otolith/health/status.py", "import zenoh"),
-    "the twin knows the estimation": ("daemon/otolith/twin/model.py", "import otolith.adaptation.problem"),
+    "the twin knows the estimation": ("daemon/otolith/twin/definition.py", "import otolith.adaptation.problem"),
     "acquisition knows the outlets": ("daemon/otolith/acquisition/ring.py", "import otolith.outlets.recorder"),
 }
 

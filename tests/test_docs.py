@@ -61,7 +61,7 @@ def test_ci_calls_the_readmes_test_command() -> None:
     ("module", "absent"),
     [
         ("otolith.cli", {"numpy", "numba", "rerun", "pymoo", "pint", "can", "zenoh", "pydantic"}),
-        ("otolith.service", {"numba", "rerun", "pymoo", "sympy", "scipy", "matplotlib"}),
+        ("otolith.service", {"numba", "rerun", "pymoo", "sympy", "matplotlib"}),
     ],
 )
 def test_nobody_loads_what_others_need(module: str, absent: set[str]) -> None:

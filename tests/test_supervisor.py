@@ -12,12 +12,12 @@ from otolith import supervisor, worker
 from otolith.acquisition.window import Window
 from otolith.health.report import Report
 from otolith.supervisor import Supervisor
-from otolith_drivers.plant.scenario import Scenario
+from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.adaptation.test_estimate import Cut, state_for
 
 
 @pytest.fixture
-def batch(scenario: Scenario, windows: Cut) -> list[Window]:
+def batch(scenario: MotorScenario, windows: Cut) -> list[Window]:
     return [window for window, _ in windows(scenario, 5)]
 
 

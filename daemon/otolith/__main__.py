@@ -1,17 +1,20 @@
 """Where execution starts: ``otolith`` and ``python -m otolith``."""
 
-import os
-import signal
-import sys
+# Before anything else, by the C module, which needs no import of its own: Ctrl-C in start-up has nothing to clean
+# up, so it ends the process at once, without a traceback. Commands take the signal over.
+import _signal  # type: ignore[import-not-found]  # no stub: signal is the public face of it
+
+_signal.signal(_signal.SIGINT, _signal.SIG_DFL)
+
+import os  # noqa: E402
+import sys  # noqa: E402
 
 INTERRUPTED = 130  # as a shell reports a command that Ctrl-C ended
 
 
 def main() -> None:
     """Run the command line; errors become one line each and an exit code, never a traceback."""
-    # Until a command takes the signal over, Ctrl-C has nothing to clean up: not even an import may print a traceback.
-    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
-    import click  # noqa: PLC0415 - only now is Ctrl-C safe
+    import click  # noqa: PLC0415 - after the lines above
 
     from otolith.cli import cli  # noqa: PLC0415
     from otolith.errors import OtolithError  # noqa: PLC0415

@@ -11,6 +11,7 @@ from types import FrameType
 import click
 
 from otolith import __version__
+from otolith.cli_twin import twin
 
 INTERRUPTED = 128 + signal.SIGINT
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -92,7 +93,7 @@ def plant(scenario: Path, truth: Path | None, duration: float) -> int:
       otolith plant config/scenarios/demo.toml
     """
     from otolith_drivers.plant.can_node import run as run_node
-    from otolith_drivers.plant.scenario import load_scenario
+    from otolith_drivers.plant.plants import load_scenario
 
     loaded = load_scenario(scenario)
     stop = _StopSignal()
@@ -165,6 +166,9 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     scenario = scenario or examples / "scenarios" / "demo.toml"
     code = Demo(machine, scenario, duration, as_json=as_json).run(lambda: stop.number is not None)
     return code if stop.number is None else 128 + stop.number
+
+
+cli.add_command(twin)
 
 
 class _StopSignal:

@@ -21,15 +21,14 @@ from otolith.health.report import (
 )
 from otolith.health.status import Known, publish
 from otolith.state import State
-from otolith.twin.library import find_twin
-from otolith.twin.model import Twin
+from otolith.twin.definition import Definition
 
 EXPLAINED = 1.5  # cost (RMSE over noise) up to which the residual counts as noise
 
 
 def adapt(state: State, window: Window) -> tuple[State, Report]:
     """Adapt the twin to ``window``; a bad window leaves the state where it was and is reported."""
-    twin = find_twin(state.problem.twin)
+    twin = state.problem.twin
     if window.quality.verdict is Verdict.BAD:
         reason = "window not estimated from: " + "; ".join(window.quality.reasons)
         return state, Report(_document(state, window, state.known, None, reason)[1], _measured(state, twin, window))
@@ -45,11 +44,11 @@ def _start(state: State) -> Array:
     return np.array([entry.nominal if known is None else known.value for known, entry in pairs])
 
 
-def _outputs(twin: Twin) -> tuple[str, ...]:
+def _outputs(twin: Definition) -> tuple[str, ...]:
     return tuple(entry.name for entry in twin.outputs)
 
 
-def _measured(state: State, twin: Twin, window: Window) -> Traces:
+def _measured(state: State, twin: Definition, window: Window) -> Traces:
     columns = [np.where(window.missing_in(name), np.nan, window.column(name)) for name in _outputs(twin)]
     return Traces(_outputs(twin), np.column_stack(columns), None, state.problem.noise)
 
@@ -66,13 +65,13 @@ def _document(
     document = ReportDocument(
         machine=state.machine,
         site=state.site,
-        twin=state.problem.twin,
+        twin=state.problem.twin.name,
         model="DT" if all(kept is None for kept in next_known) else "DT'",
         window=window_document(window),
         parameters=parameters,
     )
     if found is not None:
-        outputs = _outputs(find_twin(state.problem.twin))
+        outputs = _outputs(state.problem.twin)
         document = document.model_copy(
             update={
                 "fit": FitDocument(

@@ -1,7 +1,7 @@
 """What a machine file means: its twin, its estimation problem, its driver. Faults are told with file, line and key."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from otolith.acquisition.alignment import Limits
@@ -9,8 +9,8 @@ from otolith.adaptation.problem import Problem, SwarmOptions
 from otolith.errors import ConfigurationError, nearest
 from otolith.settings import MachineFile, ParameterTable
 from otolith.topics import prefix
-from otolith.twin.library import find_twin
-from otolith.twin.model import Parameter, Twin
+from otolith.twin.definition import Definition, Parameter, Role
+from otolith.twins import find_twin, load_twin
 from otolith_drivers.base import Driver, Signal
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.registry import find
@@ -23,7 +23,7 @@ class Plan:
 
     path: Path
     file: MachineFile
-    twin: Twin
+    twin: Definition
     problem: Problem
     records: int
     limits: Limits
@@ -45,8 +45,7 @@ def load_plan(path: Path) -> Plan:
     page = read(path)
     file = validate(parse(page), MachineFile, page)
     context = _Context(page)
-    with context.at("twin", "name"):
-        twin = find_twin(file.twin.name)
+    twin = _twin(file, context)
     problem = _problem(file, twin, context)
     table = file.window
     records = round(table.length / table.sample_period)
@@ -85,7 +84,16 @@ class _Context:
             raise ConfigurationError(f"{self.page.place(self._location)}: {error}") from error
 
 
-def _problem(file: MachineFile, twin: Twin, context: _Context) -> Problem:
+def _twin(file: MachineFile, context: _Context) -> Definition:
+    if (file.twin.name is None) == (file.twin.file is None):
+        context.fail(("twin",), 'write either name = "dc_motor" or the like, or file = "my-twin.toml"')
+    if file.twin.file is not None:
+        return load_twin(context.page.path.parent / file.twin.file)
+    with context.at("twin", "name"):
+        return find_twin(file.twin.name or "")
+
+
+def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
     known_names = [entry.name for entry in twin.parameters]
     for name in file.parameters:
         if name not in known_names:
@@ -97,14 +105,15 @@ def _problem(file: MachineFile, twin: Twin, context: _Context) -> Problem:
     for entry in twin.parameters:
         table = file.parameters.get(entry.name, ParameterTable())
         parameter = _parameter(entry, table, context)
-        if table.estimate:
+        estimated = table.value is None and entry.role is Role.ESTIMATED if table.estimate is None else table.estimate
+        if estimated:
             free.append(parameter)
         else:
             known.append((entry.name, parameter.nominal))
     if not free:
         context.fail(("parameters",), "nothing is to be estimated: write R_a = { estimate = true } or the like")
     return Problem(
-        twin=twin.name,
+        twin=twin,
         known=tuple(known),
         free=tuple(free),
         noise=_noise(file.noise, twin, context),
@@ -129,10 +138,10 @@ def _parameter(entry: Parameter, table: ParameterTable, context: _Context) -> Pa
         context.fail(
             where, f"{given['value']:g} {entry.unit} is out of bounds: it must lie {bounds}, or move the bounds"
         )
-    return Parameter(entry.name, entry.unit, given["value"], given["low"], given["high"], entry.meaning)
+    return replace(entry, nominal=given["value"], low=given["low"], high=given["high"])
 
 
-def _noise(table: Mapping[str, str], twin: Twin, context: _Context) -> tuple[float, ...]:
+def _noise(table: Mapping[str, str], twin: Definition, context: _Context) -> tuple[float, ...]:
     outputs = [entry.name for entry in twin.outputs]
     for name in table:
         if name not in outputs:
@@ -144,7 +153,7 @@ def _noise(table: Mapping[str, str], twin: Twin, context: _Context) -> tuple[flo
     return tuple(levels)
 
 
-def _driver(file: MachineFile, twin: Twin, context: _Context) -> Driver:
+def _driver(file: MachineFile, twin: Definition, context: _Context) -> Driver:
     wanted = list(twin.signals)
     for name in file.signals:
         if name not in wanted:
@@ -168,7 +177,8 @@ def describe(plan: Plan) -> list[str]:
     file, problem = plan.file, plan.problem
     lines = [
         f"machine {file.machine.name} at {file.machine.site}, twin {plan.twin.name}: {plan.twin.title}",
-        *(f"  {equation}" for equation in plan.twin.equations),
+        *(f"  {name} = {text}" for name, text, _ in plan.twin.definitions),
+        *(f"  {left} = {right}" for left, right in plan.twin.equations),
         *plan.driver.describe(),
         f"windows of {file.window.length:g} s, {plan.records} records",
     ]

@@ -45,9 +45,11 @@ class MachineTable(Closed):
 
 
 class TwinTable(Closed):
-    """Which twin."""
+    """Which twin: one of the library by its name, or a file of one's own."""
 
-    name: str
+    name: str | None = None
+    file: Path | None = None
+    """Relative to the machine file."""
 
 
 class ParameterTable(Closed):
@@ -55,7 +57,8 @@ class ParameterTable(Closed):
 
     value: Written = None
     """Known, or for an estimated one where the search starts; without it the twin's nominal value."""
-    estimate: bool = False
+    estimate: bool | None = None
+    """Without it: a parameter with a value is known, and one without is what the twin says of its role."""
     low: Written = None
     high: Written = None
 

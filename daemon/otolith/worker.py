@@ -13,7 +13,6 @@ import numpy as np
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.health.report import Report
 from otolith.state import State
-from otolith.twin.library import find_twin
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +59,7 @@ def perform(task: Task) -> Result:
 
 def _warm_up(state: State) -> None:
     """Load and compile what the first window would have to wait for."""
-    signals = find_twin(state.problem.twin).signals
+    signals = state.problem.twin.signals
     values = np.zeros((20, len(signals)))
     quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
     window = Window(0, 0.0, 0.01, signals, values, np.zeros(values.shape, dtype=np.bool_), quality)

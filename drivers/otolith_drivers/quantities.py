@@ -68,6 +68,13 @@ def factor(source: str, target: str) -> tuple[float, float]:
     return one - zero, zero
 
 
+def to_base(text: str) -> tuple[float, float]:
+    """``(scale, offset)`` from the unit ``text`` to SI base units (with radians)."""
+    registry = _registry()
+    zero = registry.Quantity(0.0, unit(text)).to_base_units().magnitude
+    return registry.Quantity(1.0, unit(text)).to_base_units().magnitude - zero, zero
+
+
 def _same_dimension(source: str, target: str) -> None:
     if unit(source).dimensionality != unit(target).dimensionality:
         raise ValueError(f"unit {source!r} does not measure what {target!r} does: expected a unit like {target!r}")

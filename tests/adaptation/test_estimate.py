@@ -13,23 +13,25 @@ from otolith.adaptation.problem import HOPELESS, Objective, Problem, SwarmOption
 from otolith.health.report import Status
 from otolith.heart import adapt
 from otolith.state import State, begin
-from otolith.twin.dc_motor import DC_MOTOR
-from otolith_drivers.plant.scenario import Scenario
+from otolith.twins import find_twin
+from otolith_drivers.plant.dc_motor import MotorScenario
 
 Cut = Callable[..., list[tuple[Window, float]]]
+
+DC_MOTOR = find_twin("dc_motor")
 
 
 def problem_for(*names: str) -> Problem:
     free = tuple(entry for entry in DC_MOTOR.parameters if entry.name in names)
     known = tuple((entry.name, entry.nominal) for entry in DC_MOTOR.parameters if entry.name not in names)
-    return Problem("dc_motor", known, free, (0.005, 0.02), swarm=SwarmOptions(generations=400))
+    return Problem(DC_MOTOR, known, free, (0.005, 0.02), swarm=SwarmOptions(generations=400))
 
 
 def state_for(*names: str) -> State:
     return begin("motor", "here", problem_for(*names))
 
 
-def test_resistance_comes_back_within_half_a_percent_in_every_window(scenario: Scenario, windows: Cut) -> None:
+def test_resistance_comes_back_within_half_a_percent_in_every_window(scenario: MotorScenario, windows: Cut) -> None:
     state = state_for("R_a")
     for window, injected in windows(scenario, 45):
         state, report = adapt(state, window)
@@ -39,7 +41,7 @@ def test_resistance_comes_back_within_half_a_percent_in_every_window(scenario: S
 
 
 @pytest.mark.parametrize("names", [("D",), ("R_a", "D"), ("R_a", "L_a", "J")])
-def test_any_subset_can_be_estimated(scenario: Scenario, windows: Cut, names: tuple[str, ...]) -> None:
+def test_any_subset_can_be_estimated(scenario: MotorScenario, windows: Cut, names: tuple[str, ...]) -> None:
     quiet = scenario.model_copy(update={"faults": ()})
     window, _ = windows(quiet, 11)[-1]  # the set-point has just doubled: everything moves
     found = estimate(problem_for(*names), window, np.array([DC_MOTOR.parameter(name).nominal for name in names]))
@@ -48,7 +50,7 @@ def test_any_subset_can_be_estimated(scenario: Scenario, windows: Cut, names: tu
         assert entry.value == pytest.approx(DC_MOTOR.parameter(entry.name).nominal, rel=0.02)
 
 
-def test_the_same_seed_gives_the_same_report(scenario: Scenario, windows: Cut) -> None:
+def test_the_same_seed_gives_the_same_report(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 2)[-1]
     first, second = (adapt(state_for("R_a"), window)[1].document for _ in range(2))
     assert first.to_json() == second.to_json()
@@ -66,7 +68,7 @@ def test_a_motor_at_rest_says_nothing_about_its_resistance() -> None:
     assert found.reason
 
 
-def test_parameters_that_only_act_together_are_named_as_traded(scenario: Scenario, windows: Cut) -> None:
+def test_parameters_that_only_act_together_are_named_as_traded(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 4)[-1]
     found = estimate(problem_for("J", "K_t", "D"), window, np.array([0.001171, 0.038, 0.00143]))
     traded = {entry.name: entry.reason for entry in found.parameters}
@@ -74,7 +76,7 @@ def test_parameters_that_only_act_together_are_named_as_traded(scenario: Scenari
     assert any("can be traded with" in reason for reason in traded.values())
 
 
-def test_a_bad_window_teaches_nothing(scenario: Scenario, windows: Cut) -> None:
+def test_a_bad_window_teaches_nothing(scenario: MotorScenario, windows: Cut) -> None:
     (good, _), (next_one, _) = windows(scenario, 2)
     state, _ = adapt(state_for("R_a"), good)
     bad = replace(next_one, quality=Quality(Verdict.BAD, 1.0, 2.0, 0.0, 0.0, ("no samples of i",)))
@@ -86,7 +88,7 @@ def test_a_bad_window_teaches_nothing(scenario: Scenario, windows: Cut) -> None:
     assert report.document.fit is None
 
 
-def test_the_truth_outside_the_bounds_is_reported_as_invalid(scenario: Scenario, windows: Cut) -> None:
+def test_the_truth_outside_the_bounds_is_reported_as_invalid(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 5)[-1]
     problem = problem_for("R_a")
     narrow = replace(problem, free=(replace(problem.free[0], nominal=8.0, low=7.0, high=9.0),))
@@ -96,14 +98,14 @@ def test_the_truth_outside_the_bounds_is_reported_as_invalid(scenario: Scenario,
     assert "bound" in found.reason
 
 
-def test_a_guess_that_diverges_never_wins(scenario: Scenario, windows: Cut) -> None:
+def test_a_guess_that_diverges_never_wins(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 1)[-1]
-    objective = Objective(problem_for("J"), DC_MOTOR, window)
+    objective = Objective(problem_for("J"), window)
     cost = objective.cost(np.vstack([objective.guess(np.array([1e-300])), objective.guess(np.array([np.nan]))]))
     assert cost.tolist() == [HOPELESS, HOPELESS]
 
 
-def test_missing_records_do_not_count(scenario: Scenario, windows: Cut) -> None:
+def test_missing_records_do_not_count(scenario: MotorScenario, windows: Cut) -> None:
     window, injected = windows(scenario, 5)[-1]
     missing = window.missing.copy()
     values = window.values.copy()
@@ -112,7 +114,7 @@ def test_missing_records_do_not_count(scenario: Scenario, windows: Cut) -> None:
     assert report.document.parameters["R_a"].value == pytest.approx(injected, rel=0.005)
 
 
-def test_spread_over_seeds_is_what_the_report_claims(scenario: Scenario, windows: Cut) -> None:
+def test_spread_over_seeds_is_what_the_report_claims(scenario: MotorScenario, windows: Cut) -> None:
     """Sensor noise alone, as the standard deviation assumes; the load torque is known exactly."""
     problem, pulls = problem_for("R_a"), []
     quiet = scenario.noise.model_copy(update={"load_torque": 0.0})

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from otolith_drivers.plant.dc_motor import Tick, simulate
+from otolith_drivers.plant.dc_motor import MotorScenario, SetPoint
 from otolith_drivers.plant.faults import Drift, Unbalance
-from otolith_drivers.plant.scenario import Scenario, SetPoint, load_scenario
+from otolith_drivers.plant.plants import load_scenario, simulate
+from otolith_drivers.plant.scenario import Scenario
+from otolith_drivers.plant.tick import Tick
 from tests.conftest import EXAMPLES
 
 
@@ -17,13 +19,13 @@ def run(scenario: Scenario, seconds: float) -> list[Tick]:
 
 
 @pytest.fixture
-def quiet(scenario: Scenario) -> Scenario:
+def quiet(scenario: MotorScenario) -> MotorScenario:
     """Without noise and faults, asked for 10 rad/s from the start."""
     changes = {"noise": type(scenario.noise)(), "faults": (), "set_points": (SetPoint(at="0 s", speed="10 rad/s"),)}
     return scenario.model_copy(update={**changes, "repeat_every": None})
 
 
-def test_settles_where_the_equations_say(quiet: Scenario) -> None:
+def test_settles_where_the_equations_say(quiet: MotorScenario) -> None:
     last = run(quiet, 200.0)[-1]
     speed, p = last.truth["omega"], quiet.parameters
     assert speed == pytest.approx(10.0, rel=1e-4)
@@ -36,20 +38,20 @@ def test_the_same_seed_gives_the_same_run(scenario: Scenario) -> None:
     assert run(scenario, 1.0) != run(scenario.model_copy(update={"seed": 7}), 1.0)
 
 
-def test_noise_is_as_large_as_the_scenario_says(scenario: Scenario) -> None:
+def test_noise_is_as_large_as_the_scenario_says(scenario: MotorScenario) -> None:
     ticks = run(scenario, 60.0)
     spread = math.sqrt(sum((tick.measured["ArmatureCurrent"] - tick.truth["i"]) ** 2 for tick in ticks) / len(ticks))
     assert spread == pytest.approx(scenario.noise.current, rel=0.05)
 
 
-def test_integrators_agree_on_the_machine(quiet: Scenario) -> None:
+def test_integrators_agree_on_the_machine(quiet: MotorScenario) -> None:
     accurate = run(quiet, 5.0)[-1].truth
     euler = run(quiet.model_copy(update={"integrator": "euler"}), 5.0)[-1].truth
     assert euler["omega"] == pytest.approx(accurate["omega"], rel=1e-3)
     assert euler["omega"] != accurate["omega"]
 
 
-def test_euler_is_equation_11_and_12_to_the_letter(quiet: Scenario) -> None:
+def test_euler_is_equation_11_and_12_to_the_letter(quiet: MotorScenario) -> None:
     ticks = run(quiet.model_copy(update={"integrator": "euler"}), 0.01)
     p, i, w = quiet.parameters, 0.0, 0.0
     for _ in range(100):

@@ -12,7 +12,7 @@ from otolith.acquisition.window import Verdict
 from otolith.adaptation.information import Identifiability, ParameterEstimate
 from otolith.health.report import ParameterDocument, QualityDocument, ReportDocument, Status, WindowDocument
 from otolith.health.status import Known, publish
-from otolith.twin.model import Parameter
+from otolith.twin.definition import Parameter
 
 RESISTANCE = Parameter("R_a", "ohm", 6.5, 3.0, 12.0, "armature resistance")
 

@@ -1,62 +1,158 @@
-"""Compiled kernels against an independent integrator, and their order."""
+"""Compiled kernels of every library twin: against an independent integrator, their order, their derivatives."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from otolith.acquisition.window import Array
-from otolith.twin.dc_motor import DC_MOTOR
+from otolith.twin.definition import Definition
+from otolith.twin.kernel import Excitation, kernel_of
+from otolith.twins import find_twin, names
+from tests.twin.reference import Reference
 
-PERIOD, RECORDS = 0.01, 200
-
-
-def inputs() -> Array:
-    """A voltage that jumps and a load torque that swings."""
-    time = np.arange(RECORDS) * PERIOD
-    return np.column_stack([np.where(time < 0.7, 12.0, 5.0), 0.05 + 0.02 * np.sin(9.0 * time)])
-
-
-def nominal() -> Array:
-    return np.array([entry.nominal for entry in DC_MOTOR.parameters])
+PERIODS = {"dc_motor": 0.01, "dc_motor_coulomb": 0.01, "hydraulic_actuator": 0.01, "pmsm": 5e-4, "pump": 0.02,
+           "servo_axis": 1e-3, "two_mass": 2e-3}  # fmt: skip
+RECORDS = 60
 
 
-def reference(parameters: Array, initial: Array, driven: Array) -> Array:
-    """Record by record with a tight tolerance: voltage held, load torque straight between records."""
-    R_a, L_a, J, K_e, K_t, D = parameters  # noqa: N806
-    states = [initial]
-    for record in range(RECORDS - 1):
-        voltage, torques = driven[record, 0], driven[record : record + 2, 1]
-
-        def rates(t: float, x: Array, voltage: float = voltage, torques: Array = torques) -> list[float]:
-            torque = torques[0] + (torques[1] - torques[0]) * t / PERIOD
-            return [(voltage - R_a * x[0] - K_e * x[1]) / L_a, (K_t * x[0] - torque - D * x[1]) / J]
-
-        states.append(solve_ivp(rates, (0.0, PERIOD), states[-1], rtol=1e-12, atol=1e-13).y[:, -1])
-    return np.array(states)
+def nominal(definition: Definition) -> Array:
+    return np.array([entry.nominal for entry in definition.parameters])
 
 
-def test_agrees_with_an_independent_integrator() -> None:
-    initial = np.array([0.3, 4.0])
-    found = DC_MOTOR.simulate(nominal()[None], initial[None], inputs(), PERIOD)[0]
-    expected = reference(nominal(), initial, inputs())
-    assert np.abs(found - expected).max(axis=0) == pytest.approx(0.0, abs=1e-6 * np.ptp(expected, axis=0).min())
+def initial(definition: Definition) -> Array:
+    return np.array([entry.initial for entry in definition.states])
 
 
-def test_order_four() -> None:
-    """Halving the step (half the period, every input twice) divides the error by sixteen."""
-    driven = np.column_stack([np.full(40, 12.0), np.zeros(40)])
+def excitation(definition: Definition, records: int = RECORDS, seed: int = 5) -> Excitation:
+    """Random levels within the inputs' ranges, each held for ten records or run through."""
+    random = np.random.default_rng(seed)
+    columns = [np.repeat(random.uniform(e.low, e.high, records // 10 + 1), 10)[:records] for e in definition.inputs]
+    return Excitation(np.column_stack(columns), PERIODS[definition.name])
+
+
+@pytest.fixture(params=names())
+def twin(request: pytest.FixtureRequest) -> Definition:
+    return find_twin(request.param)
+
+
+def resolved(twin: Definition, drive: Excitation) -> tuple[Excitation, Array, Array]:
+    """With substeps for a ten-millionth of each signal's range; the reference, and that range."""
+    expected = Reference(twin, nominal(twin)).simulate(initial(twin), drive.inputs, drive.sample_period)
+    extent = np.ptp(expected, axis=0)
+    assert (extent > 0.0).all(), "the excitation does not move every signal"
+    substeps = kernel_of(twin).substeps(nominal(twin), initial(twin), drive, 1e-7 * extent)
+    return replace(drive, substeps=substeps), expected, extent
+
+
+def test_it_agrees_with_an_independent_integrator(twin: Definition) -> None:
+    drive, expected, extent = resolved(twin, excitation(twin))
+    found = kernel_of(twin).simulate(nominal(twin)[None], initial(twin)[None], drive)[0]
+    assert (np.abs(found - expected).max(axis=0) / extent).max() < 1e-6
+
+
+def test_sensitivities_are_the_derivatives_of_the_reference(twin: Definition) -> None:
+    drive, expected, _ = resolved(twin, excitation(twin, records=30))
+    drive = replace(drive, substeps=8 * drive.substeps)  # a derivative is less smooth than what it is the derivative of
+    predicted, slopes = kernel_of(twin).sensitivities(nominal(twin), initial(twin), drive)
+    assert predicted == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.ptp(expected))
+    widths = [e.high - e.low for e in twin.parameters] + [e.high - e.low for e in twin.states]
+    point = np.concatenate([nominal(twin), initial(twin)])
+    split = len(twin.parameters)
+    for column, width in enumerate(widths):
+        step = np.zeros(len(point))
+        step[column] = 1e-5 * min(width, max(abs(point[column]), 1e-2 * width))
+        ahead, behind = (
+            Reference(twin, p[:split]).simulate(p[split:], drive.inputs, drive.sample_period)
+            for p in (point + step, point - step)
+        )
+        change = (ahead - behind) / (2.0 * step[column])
+        largest = np.abs(change).max(axis=0)
+        wrong = np.abs(slopes[:, :, column] - change).max(axis=0)
+        floor = 1e-9 * np.ptp(expected, axis=0) / width
+        assert (wrong <= 1e-5 * np.maximum(largest, floor)).all(), (column, wrong, largest)
+
+
+@pytest.mark.parametrize("name", ["dc_motor", "two_mass", "pmsm"])
+def test_order_four(name: str) -> None:
+    """Halving the step divides the error by sixteen."""
+    twin = find_twin(name)
+    drive = excitation(twin, records=20)
+    drive = replace(drive, sample_period=4 * drive.sample_period)
     coarse, fine, finest = (
-        DC_MOTOR.simulate(nominal()[None], np.zeros((1, 2)), np.repeat(driven, n, axis=0), 0.08 / n)[0, ::n][:40]
-        for n in (1, 2, 16)
+        kernel_of(twin).simulate(nominal(twin)[None], initial(twin)[None], replace(drive, substeps=n))
+        for n in (2, 4, 64)
     )
-    ratio = np.abs(coarse - finest).max() / np.abs(fine - finest).max()
-    assert np.log2(ratio) == pytest.approx(4.0, abs=0.3)
+    order = np.log2(np.abs(coarse - finest).max() / np.abs(fine - finest).max())
+    assert order == pytest.approx(4.0, abs=0.4)
 
 
-def test_a_swarm_is_its_particles_one_by_one() -> None:
+def test_euler_is_the_papers_equations_to_rounding() -> None:
+    twin = find_twin("dc_motor")
+    drive = excitation(twin)
+    held = replace(drive, inputs=np.repeat(drive.inputs[::10], 10, axis=0)[: len(drive.inputs)])
+    held.inputs[:, 1] = 0.05  # the paper holds the load torque too
+    found = kernel_of(twin).euler(nominal(twin)[None], initial(twin)[None], held, 1e-4)[0]
+    R_a, L_a, J, K_e, K_t, D = nominal(twin)  # noqa: N806 - as in the source equation
+    i = w = 0.0
+    for record in range(RECORDS):
+        assert found[record] == pytest.approx([i, w], rel=1e-11, abs=1e-13)
+        for _ in range(100):
+            i += 1e-4 * (held.inputs[record, 0] - R_a * i - K_e * w) / L_a
+            w += 1e-4 * (i * K_t - 0.05 - D * w) / J
+
+
+def test_a_swarm_is_its_particles_one_by_one(twin: Definition) -> None:
     random = np.random.default_rng(1)
-    swarm = nominal() * random.uniform(0.8, 1.2, (15, len(nominal())))
-    initial = random.normal(size=(15, 2))
-    together = DC_MOTOR.simulate(swarm, initial, inputs(), PERIOD)
-    alone = [DC_MOTOR.simulate(swarm[k : k + 1], initial[k : k + 1], inputs(), PERIOD)[0] for k in range(15)]
-    assert np.array_equal(together, np.array(alone))
+    swarm = nominal(twin) * random.uniform(0.95, 1.05, (5, len(twin.parameters)))
+    starts = np.tile(initial(twin), (5, 1))
+    kernel, drive = kernel_of(twin), excitation(twin)
+    together = kernel.simulate(swarm, starts, drive)
+    alone = [kernel.simulate(swarm[k : k + 1], starts[k : k + 1], drive)[0] for k in range(5)]
+    assert np.array_equal(together, np.array(alone), equal_nan=True)
+
+
+def test_the_innovation_form_is_a_kalman_filters_prediction() -> None:
+    """Record by record: predict, compare, correct, go on; a record without a measurement is only predicted."""
+    twin = find_twin("dc_motor")
+    kernel, drive = kernel_of(twin), excitation(twin)
+    random = np.random.default_rng(2)
+    measured = random.normal(size=(RECORDS, 2))
+    measured[7, 0] = np.nan
+    gain = np.array([[0.3, 0.01], [-0.2, 0.4]])
+    found = kernel.simulate(nominal(twin)[None], initial(twin)[None], replace(drive, measured=measured, gain=gain))[0]
+    state = initial(twin)
+    for record in range(RECORDS - 1):
+        assert found[record] == pytest.approx(state, rel=1e-12)
+        state = state + gain @ np.nan_to_num(measured[record] - state)
+        piece = replace(drive, inputs=drive.inputs[record : record + 2])
+        state = kernel.simulate(nominal(twin)[None], state[None], piece)[0, 1]
+
+
+def test_the_innovation_forms_sensitivities_are_its_derivatives() -> None:
+    twin = find_twin("dc_motor")
+    kernel, drive = kernel_of(twin), excitation(twin)
+    measured = np.random.default_rng(2).normal(size=(RECORDS, 2))
+    measured[7, 0] = np.nan
+    drive = replace(drive, measured=measured, gain=np.array([[0.3, 0.01], [-0.2, 0.4]]))
+    _, slopes = kernel.sensitivities(nominal(twin), initial(twin), drive)
+    point = np.concatenate([nominal(twin), initial(twin)])
+    for column in range(len(point)):
+        step = np.zeros(len(point))
+        step[column] = 1e-6 * max(abs(point[column]), 1e-2)
+        ahead, behind = (kernel.simulate(p[None, :6], p[None, 6:], drive)[0] for p in (point + step, point - step))
+        change = (ahead - behind) / (2.0 * step[column])
+        assert slopes[:, :, column] == pytest.approx(change, rel=1e-5, abs=1e-6 * np.abs(change).max())
+
+
+def test_fewer_substeps_would_be_too_few() -> None:
+    twin = find_twin("pmsm")
+    drive = excitation(twin)
+    tolerance = np.array([1e-6, 1e-6, 1e-6])
+    count = kernel_of(twin).substeps(nominal(twin), initial(twin), drive, tolerance)
+    assert count > 1
+    exact, enough, fewer = (
+        kernel_of(twin).simulate(nominal(twin)[None], initial(twin)[None], replace(drive, substeps=n))
+        for n in (16 * count, count, count // 2)
+    )
+    assert np.abs(enough - exact).max() <= 1e-6 < np.abs(fewer - exact).max()

@@ -8,7 +8,6 @@ from otolith.acquisition.window import Array, Window
 from otolith.adaptation.information import ParameterEstimate, classify, information
 from otolith.adaptation.problem import Objective, Problem
 from otolith.adaptation.swarm import search
-from otolith.twin.library import find_twin
 
 AT_BOUND = 1e-4  # of the width of the bounds
 
@@ -33,8 +32,7 @@ def estimate(problem: Problem, window: Window, start: Array) -> WindowEstimate:
 
     The same problem, window and start give the same estimate, bit for bit.
     """
-    twin = find_twin(problem.twin)
-    objective = Objective(problem, twin, window)
+    objective = Objective(problem, window)
     found = search(objective, problem.swarm, objective.guess(start), seed=problem.seed + window.index)
     told = information(objective, found.values, found.cost)
     margin = AT_BOUND * (objective.high - objective.low)

@@ -1,13 +1,15 @@
 """What is to be estimated from a window, and the objective that says how good a guess is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.twin.model import Parameter, Twin
+from otolith.twin.definition import Definition, Parameter
+from otolith.twin.kernel import Excitation, kernel_of
 
 INITIAL_STATE_REACH = 6.0  # standard deviations of the noise around the first record, in which the twin may start
+TRUNCATION = 1e-3  # of the noise: how large the integrator's error may be
 HOPELESS = 1e30  # the cost of a guess whose prediction is not finite: worse than any other, and finite
 
 
@@ -29,7 +31,7 @@ class SwarmOptions:
 class Problem:
     """A machine's estimation problem, the same for every window. Plain: it pickles."""
 
-    twin: str
+    twin: Definition
     known: tuple[tuple[str, float], ...]
     """Parameters that are given: name and value."""
     free: tuple[Parameter, ...]
@@ -51,26 +53,26 @@ class Objective:
     the noise.
     """
 
-    def __init__(self, problem: Problem, twin: Twin, window: Window) -> None:
-        self._twin = twin
-        self._period = window.sample_period
-        self._inputs = np.column_stack([window.column(entry.name) for entry in twin.inputs])
+    def __init__(self, problem: Problem, window: Window) -> None:
+        twin = problem.twin
+        self._kernel = kernel_of(twin)
+        inputs = np.column_stack([np.zeros((window.records, 0)), *(window.column(e.name) for e in twin.inputs)])
         self.measured = np.column_stack([window.column(entry.name) for entry in twin.outputs])
         noise = np.asarray(problem.noise)
         self._weights = 1.0 / noise
         absent = np.column_stack([window.missing_in(entry.name) for entry in twin.outputs])
         self._present = np.where(absent, 0.0, 1.0)
         self.count = max(float(self._present.sum()), 1.0)
-        outputs = [entry.name for entry in twin.outputs]
-        shown = [outputs.index(state) for state in twin.states]
-        first, reach = self.measured[0, shown], INITIAL_STATE_REACH * noise[shown]
+        lowest, self._first, highest = _initial_state(twin, self.measured[0], noise)
         self._template = np.array([dict(problem.known).get(entry.name, entry.nominal) for entry in twin.parameters])
         order = [entry.name for entry in twin.parameters]
         self._places = [order.index(entry.name) for entry in problem.free]
-        self.low = np.concatenate([[entry.low for entry in problem.free], first - reach])
-        self.high = np.concatenate([[entry.high for entry in problem.free], first + reach])
-        self.names = (*(entry.name for entry in problem.free), *(f"initial {state}" for state in twin.states))
-        self._first = first
+        self.low = np.concatenate([[entry.low for entry in problem.free], lowest])
+        self.high = np.concatenate([[entry.high for entry in problem.free], highest])
+        self.names = (*(entry.name for entry in problem.free), *(f"initial {state.name}" for state in twin.states))
+        coarse = Excitation(inputs, window.sample_period)
+        substeps = self._kernel.substeps(self._template, self._first, coarse, TRUNCATION * noise)
+        self._excitation = replace(coarse, substeps=substeps)
 
     def guess(self, parameters: Array) -> Array:
         """(free parameters,) -> a guess that starts at the first record."""
@@ -81,7 +83,7 @@ class Objective:
         parameters = np.repeat(self._template[None, :], len(guesses), axis=0)
         parameters[:, self._places] = guesses[:, : len(self._places)]
         initial = np.ascontiguousarray(guesses[:, len(self._places) :])
-        return self._twin.simulate(parameters, initial, self._inputs, self._period)
+        return self._kernel.simulate(parameters, initial, self._excitation)
 
     def residuals(self, predicted: Array) -> Array:
         """(particles, records, outputs): measured minus predicted in units of the noise, zero where not measured."""
@@ -99,3 +101,18 @@ class Objective:
         errors = (self.measured - predicted) * self._present
         counts = np.maximum(self._present.sum(axis=0), 1.0)
         return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
+
+
+def _initial_state(twin: Definition, first: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """(states,) lower bound, start and upper bound: around the first record where an output shows the state."""
+    outputs = [entry.name for entry in twin.outputs]
+    rows = []
+    for state in twin.states:
+        if state.name in outputs:
+            index = outputs.index(state.name)
+            reach = INITIAL_STATE_REACH * noise[index]
+            rows.append((first[index] - reach, first[index], first[index] + reach))
+        else:
+            rows.append((state.low, state.initial, state.high))
+    low, start, high = np.array(rows).T
+    return low, start, high

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from otolith.adaptation.information import Identifiability, ParameterEstimate
 from otolith.health.report import ParameterDocument, Status
-from otolith.twin.model import Parameter
+from otolith.twin.definition import Parameter
 
 QUANTILE = 1.959964  # of the standard normal distribution, two-sided 95 %
 

@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 from otolith.acquisition.window import Array
 from otolith.health.report import Report, ReportDocument, Status, Traces
 from otolith.health.status import QUANTILE
-from otolith.twin.model import Output, Parameter
+from otolith.twin.definition import Output, Parameter
 
 log = logging.getLogger(__name__)
 

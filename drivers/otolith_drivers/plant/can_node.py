@@ -14,8 +14,9 @@ from cantools.database import Message
 from otolith_drivers.can_bus import open_bus
 from otolith_drivers.dbc import load_dbc
 from otolith_drivers.errors import ConfigurationError, DeviceError, ServiceError
-from otolith_drivers.plant.dc_motor import Tick, simulate
+from otolith_drivers.plant.plants import simulate
 from otolith_drivers.plant.scenario import Scenario
+from otolith_drivers.plant.tick import Tick
 
 ALIVE_COUNTER = "AliveCounter"  # signals whose name ends so count the frames of their message
 LISTEN_FIRST = 0.15  # s; longer than ten periods of a node that is already there

@@ -5,31 +5,88 @@ acting. Eq. 5 of the paper has the signs of load and motor torque the other way 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.plant.faults import Drift, Step, Unbalance
-from otolith_drivers.plant.scenario import PARAMETERS, Scenario
+from otolith_drivers.plant.faults import Seconds, Unbalance
+from otolith_drivers.plant.scenario import POSITIVE, Ageing, Scenario
+from otolith_drivers.plant.tick import Tick
 from otolith_drivers.quantities import Quantity
+from otolith_drivers.toml_files import Closed
 
 EULER_STEP = 1e-4  # s, as in the paper
 RUNGE_KUTTA_STEP = 1e-3  # s; a hundredth of the shortest time constant, error below 1e-10 of the range
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """What the drive knows at one sampling instant, and what is true then."""
-
-    time: float
-    """s since the start of the scenario."""
-    measured: dict[str, float]
-    """Signals by their name on the bus, with noise: voltage applied from now on, current, speed, load torque."""
-    truth: dict[str, float]
-    """The parameters as they are, and the current (A) and speed (rad/s) without noise."""
+UNITS = {"R_a": "ohm", "L_a": "H", "J": "kg*m^2", "K_e": "V*s/rad", "K_t": "N*m/A", "D": "N*m*s/rad"}
 
 
-def simulate(scenario: Scenario) -> Iterator[Tick]:
+class Parameters(Closed):
+    """The motor's parameters at time zero; the default values are Table 3 of the paper."""
+
+    R_a: Annotated[float, BeforeValidator(Quantity(UNITS["R_a"], POSITIVE))] = 6.5
+    L_a: Annotated[float, BeforeValidator(Quantity(UNITS["L_a"], POSITIVE))] = 0.673
+    J: Annotated[float, BeforeValidator(Quantity(UNITS["J"], POSITIVE))] = 0.001171
+    K_e: Annotated[float, BeforeValidator(Quantity(UNITS["K_e"], POSITIVE))] = 0.038
+    K_t: Annotated[float, BeforeValidator(Quantity(UNITS["K_t"], POSITIVE))] = 0.038
+    D: Annotated[float, BeforeValidator(Quantity(UNITS["D"], 0.0))] = 0.00143
+
+
+class Controller(Closed):
+    """The drive's speed controller, a PI with the gains of the paper."""
+
+    K_p: Annotated[float, BeforeValidator(Quantity("V*s/rad", 0.0))] = 0.3
+    K_i: Annotated[float, BeforeValidator(Quantity("V/rad", 0.0))] = 0.1
+    voltage_limit: Annotated[float, BeforeValidator(Quantity("V", POSITIVE))] = 48.0
+
+
+class SetPoint(Closed):
+    """The speed asked for, from a moment on."""
+
+    at: Seconds
+    speed: Annotated[float, BeforeValidator(Quantity("rad/s", -1e4, 1e4))]
+
+
+class Noise(Closed):
+    """Standard deviation of each sensor; what the controller sees is as noisy as what the bus carries."""
+
+    current: Annotated[float, BeforeValidator(Quantity("A", 0.0))] = 0.0
+    speed: Annotated[float, BeforeValidator(Quantity("rad/s", 0.0))] = 0.0
+    load_torque: Annotated[float, BeforeValidator(Quantity("N*m", 0.0))] = 0.0
+
+
+class MotorScenario(Scenario):
+    """A scenario of this motor."""
+
+    UNITS: ClassVar[dict[str, str]] = UNITS
+    HAS_SHAFT: ClassVar[bool] = True
+
+    plant: Literal["dc_motor"]
+    parameters: Parameters = Parameters()
+    load: Annotated[float, BeforeValidator(Quantity("N*m*s/rad", 0.0))] = 0.006
+    """Load torque per speed."""
+    controller: Controller = Controller()
+    set_points: Annotated[tuple[SetPoint, ...], Field(min_length=1)]
+    repeat_every: Seconds | None = None
+    """The set-points start again after this time; without it the last one stays."""
+    noise: Noise = Noise()
+
+    @model_validator(mode="after")
+    def _set_points_fit(self) -> Self:
+        moments = [point.at for point in self.set_points]
+        if moments != sorted(set(moments)):
+            raise ValueError("set_points must be in the order of their times, each time once")
+        if self.repeat_every is not None and moments[-1] >= self.repeat_every:
+            raise ValueError(f"repeat_every ({self.repeat_every:g} s) must be later than the last set-point")
+        return self
+
+
+SCENARIO = MotorScenario
+
+
+def simulate(scenario: Any) -> Iterator[Tick]:
     """The machine from rest, one tick per sample period, without end; the same for the same seed."""
     machine = _Machine(scenario)
     random = np.random.default_rng(scenario.seed)
@@ -54,7 +111,7 @@ def simulate(scenario: Scenario) -> Iterator[Tick]:
         index += 1
 
 
-def _control(scenario: Scenario, time: float, speed: float, integral: float) -> tuple[float, float]:
+def _control(scenario: MotorScenario, time: float, speed: float, integral: float) -> tuple[float, float]:
     """Armature voltage for the next sample period, and the error's integral; it stops while the voltage is limited."""
     error = _set_point(scenario, time) - speed
     gains = scenario.controller
@@ -64,7 +121,7 @@ def _control(scenario: Scenario, time: float, speed: float, integral: float) -> 
     return voltage, integral + error * scenario.sample_period
 
 
-def _set_point(scenario: Scenario, time: float) -> float:
+def _set_point(scenario: MotorScenario, time: float) -> float:
     phase = time % scenario.repeat_every if scenario.repeat_every else time
     past = [point.speed for point in scenario.set_points if point.at <= phase + 1e-9]
     return past[-1] if past else 0.0
@@ -73,22 +130,11 @@ def _set_point(scenario: Scenario, time: float) -> float:
 class _Machine:
     """Current (A), speed (rad/s) and angle (rad), moved forward a sample period at a time."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: MotorScenario) -> None:
         self.current = self.speed = self.angle = 0.0
         self._scenario = scenario
-        self._initial = dict(scenario.parameters)
-        self._changes = [
-            (fault, Quantity(PARAMETERS[fault.parameter][0])(fault.amount))
-            for fault in scenario.faults
-            if isinstance(fault, Drift | Step)
-        ]
+        self.parameters = Ageing(scenario).at
         self._unbalances = [fault for fault in scenario.faults if isinstance(fault, Unbalance)]
-
-    def parameters(self, time: float) -> dict[str, float]:
-        values = dict(self._initial)
-        for fault, amount in self._changes:
-            values[fault.parameter] += fault.change(time, amount)
-        return values
 
     def advance(self, time: float, voltage: float) -> None:
         euler = self._scenario.integrator == "euler"

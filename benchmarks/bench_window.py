@@ -13,12 +13,13 @@ from otolith.adaptation.problem import Objective, Problem
 from otolith.adaptation.swarm import search
 from otolith.heart import adapt
 from otolith.state import begin
-from otolith.twin.dc_motor import DC_MOTOR
-from otolith_drivers.plant.dc_motor import simulate
-from otolith_drivers.plant.scenario import load_scenario
+from otolith.twins import find_twin
+from otolith_drivers.plant.plants import load_scenario, simulate
 
 SCENARIO = Path(__file__).parents[1] / "config" / "scenarios" / "demo.toml"
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
+
+DC_MOTOR = find_twin("dc_motor")
 
 
 def median_seconds(work: Callable[[], object], runs: int) -> float:
@@ -38,8 +39,8 @@ def main() -> int:
     window = Window(0, 0.0, 0.01, tuple(SIGNALS), values, np.zeros(values.shape, dtype=np.bool_), quality)
     free = tuple(entry for entry in DC_MOTOR.parameters if entry.name == "R_a")
     known = tuple((entry.name, entry.nominal) for entry in DC_MOTOR.parameters if entry.name != "R_a")
-    problem = Problem("dc_motor", known, free, (0.005, 0.02))
-    objective = Objective(problem, DC_MOTOR, window)
+    problem = Problem(DC_MOTOR, known, free, (0.005, 0.02))
+    objective = Objective(problem, window)
     start = objective.guess(np.array([6.5]))
     swarm = np.repeat(start[None, :], problem.swarm.size, axis=0)
     generations = search(objective, problem.swarm, start, seed=1).generations

@@ -1,0 +1,112 @@
+"""Dimensional analysis of expressions, by pint: what an expression measures, or which two of its parts disagree."""
+
+import ast
+from collections.abc import Mapping
+from typing import Any
+
+from otolith.twin.expressions import ExpressionError, constant
+from otolith_drivers.quantities import unit
+
+Dimension = Any
+"""pint's container of dimensions and exponents; None stands for the number zero, which has any dimension."""
+
+SAME_AS_ARGUMENT = {"abs", "min", "max"}
+NAMED_UNITS = ("V", "A", "ohm", "H", "Wb", "W", "N*m", "J", "N", "Pa", "m", "s", "kg", "m/s", "m/s^2", "rad/s^2", "1/s",
+               "kg*m^2", "N*m*s", "m^3/s", "V/s", "A/s", "N/m", "N*s/m", "Pa/s", "K", "K/s", "W/K", "J/K", "W/s", "m^2",
+               "m^3")  # fmt: skip
+BASE_UNITS = {"[mass]": "kg", "[length]": "m", "[time]": "s", "[current]": "A", "[temperature]": "K",
+              "[substance]": "mol", "[luminosity]": "cd"}  # fmt: skip
+
+
+def dimension_of(unit_text: str) -> Dimension:
+    """What a unit measures.
+
+    Raises:
+        ValueError: not a unit.
+    """
+    return unit(unit_text).dimensionality
+
+
+NONE = dimension_of("1")
+
+
+def measure(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension:
+    """What the expression measures; ``known`` has the dimension of every name in it.
+
+    Raises:
+        ExpressionError: two parts that must measure the same do not, or a function got what it cannot take.
+    """
+    match tree:
+        case ast.Constant(value=value):
+            return None if value == 0 else NONE
+        case ast.Name(id=name):
+            return NONE if name == "pi" else known[name]
+        case ast.UnaryOp(operand=operand):
+            return measure(operand, known)
+        case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
+            return _same([left, right], known, "a sum")
+        case ast.BinOp(left=left, op=ast.Mult(), right=right):
+            first, second = measure(left, known), measure(right, known)
+            return None if first is None or second is None else first * second
+        case ast.BinOp(left=left, op=ast.Div(), right=right):
+            first, second = measure(left, known), measure(right, known)
+            return None if first is None else first / (NONE if second is None else second)
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
+            base = measure(left, known)
+            return None if base is None else base ** constant(right)
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            return _call(name, arguments, known)
+        case _:
+            raise AssertionError(ast.dump(tree))
+
+
+def _call(name: str, arguments: list[ast.expr], known: Mapping[str, Dimension]) -> Dimension:
+    if name == "where":
+        condition = arguments[0]
+        assert isinstance(condition, ast.Compare)  # noqa: S101 - the parser has seen to it
+        _same([condition.left, *condition.comparators], known, "a comparison")
+        return _same(arguments[1:], known, "the two branches of where")
+    if name in SAME_AS_ARGUMENT:
+        return _same(arguments, known, name)
+    if name == "sqrt":
+        inner = measure(arguments[0], known)
+        return None if inner is None else inner**0.5
+    if name == "sign":
+        measure(arguments[0], known)
+        return NONE
+    if name == "atan2":
+        _same(arguments, known, name)
+        return NONE
+    inner = measure(arguments[0], known)
+    if inner is not None and inner != NONE:
+        text = f"{name} takes a number without a dimension, not {describe(inner)}: {ast.unparse(arguments[0])}"
+        raise ExpressionError(text, arguments[0].col_offset + 1)
+    return NONE
+
+
+def _same(parts: list[ast.expr], known: Mapping[str, Dimension], what: str) -> Dimension:
+    first = None
+    for part in parts:
+        found = measure(part, known)
+        if first is None:
+            first, owner = found, part
+        elif found is not None and found != first:
+            text = f"{what} of {describe(first)} and {describe(found)}: {ast.unparse(owner)} and {ast.unparse(part)}"
+            raise ExpressionError(text, part.col_offset + 1)
+    return first
+
+
+def describe(dimension: Dimension) -> str:
+    """A dimension in the units people know: "V", "N*m", else in base units."""
+    if dimension is None or dimension == NONE:
+        return "a plain number"
+    for name in NAMED_UNITS:
+        if dimension_of(name) == dimension:
+            return name
+    above = "*".join(_power(name, value) for name, value in sorted(dimension.items()) if value > 0)
+    below = "*".join(_power(name, -value) for name, value in sorted(dimension.items()) if value < 0)
+    return f"{above or '1'}/({below})" if "*" in below else f"{above or '1'}/{below}" if below else above
+
+
+def _power(name: str, exponent: float) -> str:
+    return BASE_UNITS.get(name, name) + ("" if exponent == 1 else f"^{exponent:g}")

@@ -1,0 +1,141 @@
+"""A twin that computes: simulation of whole swarms, exact sensitivities, innovation form.
+
+The classical Runge-Kutta method with substeps; between records an input is held (``zoh``) or runs straight to its next
+value (``foh``). With a gain the state is corrected after each record by ``gain @ (measured - predicted)``, which makes
+the outputs one-step-ahead predictions (innovation form; L. Ljung, System Identification, 2nd ed., section 4.3).
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import astuple, dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from otolith import kernel_cache
+from otolith.acquisition.window import Array
+from otolith.twin.definition import Definition
+
+MOST_SUBSTEPS = 1024
+GENERATOR = 1  # of otolith.twin.code: raised with every change of what it writes, so that no old text is used
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Excitation:
+    """What drives a twin through a window, and what corrects it on the way."""
+
+    inputs: Array
+    """(records, inputs)."""
+    sample_period: float
+    """s."""
+    substeps: int = 1
+    """Steps of the integrator per record."""
+    measured: Array | None = None
+    """(records, outputs); a measurement that is not a number corrects nothing."""
+    gain: Array | None = None
+    """(states, outputs); without it, or all zero, the twin runs in open loop."""
+
+
+class Kernel:
+    """The compiled kernels of one definition, loaded from the cache or compiled on first use."""
+
+    def __init__(self, definition: Definition) -> None:
+        self.definition = definition
+        self._open_loop = np.zeros((len(definition.states), len(definition.outputs)))
+        self._unmeasured = np.zeros((0, len(definition.outputs)))
+        self._compiled: set[str] = set()
+
+    def simulate(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
+        """Predict: ``outputs[:, 0]`` belongs to the initial state.
+
+        Shapes (particles, parameters), (particles, states) -> (particles, records, outputs). A particle that diverges
+        gets values that are not finite.
+        """
+        found: Array = self._call("simulate", parameters, initial, *self._drive(excitation))
+        return found
+
+    def sensitivities(self, parameters: Array, initial: Array, excitation: Excitation) -> tuple[Array, Array]:
+        """One prediction and its exact derivatives.
+
+        Shapes (parameters,), (states,) -> (records, outputs) and (records, outputs, parameters + states): by each
+        parameter, then by each initial state.
+        """
+        found: tuple[Array, Array] = self._call("sensitivities", parameters, initial, *self._drive(excitation))
+        return found
+
+    def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
+        """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
+
+        States are updated in the order of the page, each with the new values of those before it (Eq. 11-12).
+        """
+        period = excitation.sample_period
+        inputs = np.ascontiguousarray(excitation.inputs, dtype=np.float64)
+        found: Array = self._call("euler", parameters, initial, inputs, period, max(1, round(period / step)))
+        return found
+
+    def substeps(self, parameters: Array, initial: Array, excitation: Excitation, tolerance: Array) -> int:
+        """The fewest substeps (a power of two) whose truncation error stays under ``tolerance`` (outputs,).
+
+        Shapes (parameters,), (states,). The error is told by halving the step (Richardson; Hairer, Norsett, Wanner,
+        Solving Ordinary Differential Equations I, section II.4).
+        """
+        count = 1
+        coarse = self.simulate(parameters[None], initial[None], replace(excitation, substeps=count))
+        while count < MOST_SUBSTEPS:
+            fine = self.simulate(parameters[None], initial[None], replace(excitation, substeps=2 * count))
+            with np.errstate(invalid="ignore"):
+                error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0
+            if np.all(error <= tolerance):
+                break
+            count, coarse = 2 * count, fine
+        return count
+
+    def _drive(self, excitation: Excitation) -> tuple[Array, float, int, Array, Array]:
+        inputs = np.ascontiguousarray(excitation.inputs, dtype=np.float64)
+        measured, gain = self._unmeasured, self._open_loop
+        if excitation.measured is not None and excitation.gain is not None:
+            measured = np.ascontiguousarray(excitation.measured, dtype=np.float64)
+            gain = np.ascontiguousarray(excitation.gain, dtype=np.float64)
+        return inputs, excitation.sample_period, excitation.substeps, measured, gain
+
+    @cached_property
+    def _module(self) -> Any:
+        return kernel_cache.load(identity_of(self.definition), lambda: _source(self.definition))
+
+    def _call(self, name: str, parameters: Array, initial: Array, *rest: Any) -> Any:
+        function: Callable[..., Any] = getattr(self._module, name)
+        arguments = (np.ascontiguousarray(parameters), np.ascontiguousarray(initial), *rest)
+        if name in self._compiled:
+            return function(*arguments)
+        with kernel_cache.compiling(self._module):
+            found = function(*arguments)
+        self._compiled.add(name)
+        return found
+
+
+@lru_cache(maxsize=64)
+def kernel_of(definition: Definition) -> Kernel:
+    """The kernel of a definition, one per process."""
+    return Kernel(definition)
+
+
+def identity_of(definition: Definition) -> str:
+    """What tells one twin's kernels from another's: everything on the page that enters them, and the generator."""
+    mathematical = (
+        definition.name,
+        [(entry.name, entry.unit) for entry in definition.states],
+        [(entry.name, entry.unit, entry.hold) for entry in definition.inputs],
+        [(entry.name, entry.unit) for entry in definition.outputs],
+        [(entry.name, entry.unit) for entry in definition.parameters],
+        [astuple(entry)[:3] for entry in definition.constants],
+        [(name, expression) for name, expression, _ in definition.definitions],
+        definition.equations,
+    )
+    return hashlib.sha256(f"{GENERATOR} {mathematical!r}".encode()).hexdigest()
+
+
+def _source(definition: Definition) -> str:
+    from otolith.twin.code import source_of  # noqa: PLC0415 - loads SymPy, which a cached kernel does not need
+
+    return source_of(definition)

@@ -1,0 +1,84 @@
+"""What could be estimated at all: the structural check of a twin, by the rank of its sensitivities.
+
+Over random excitation and random parameters near the nominal ones, a parameter whose sensitivity is a combination of
+the others' can be estimated in no experiment of this kind, whatever the noise (local structural identifiability, tested
+numerically; E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data, 1997, chapter 2).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.window import Array
+from otolith.twin.definition import Definition
+from otolith.twin.kernel import Excitation, kernel_of
+
+RECORDS, TRIALS = 300, 3
+PERIODS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)  # s: one of them suits the machine's time constants
+SPREAD = 0.1  # of the bounds' width, around the nominal values
+DEAD = "no output depends on it"
+NOTHING = 1e-9  # of the longest sensitivity: as long as none at all
+DEPENDENT = 1e-5  # of its own length: how much of a sensitivity must be its own
+PARTNER = 0.05  # of the largest coefficient
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """Of one parameter."""
+
+    name: str
+    identifiable: bool
+    reason: str
+
+
+def structure_of(definition: Definition, seed: int = 1) -> list[Structure]:
+    """Whether each parameter could be estimated if all of them and the initial state were unknown."""
+    random = np.random.default_rng(seed)
+    trials: list[list[Structure]] = []
+    for period in PERIODS:
+        columns = np.vstack([_sensitivities(definition, period, random) for _ in range(TRIALS)])
+        trials.append([_judge(definition, columns, index) for index in range(len(definition.parameters))])
+    return max(trials, key=lambda found: sum(entry.identifiable - (entry.reason == DEAD) for entry in found))
+
+
+def _sensitivities(definition: Definition, period: float, random: np.random.Generator) -> Array:
+    """(records * outputs, parameters + states), each column per share of its range, each row per noise."""
+    nominal = np.array([entry.nominal for entry in definition.parameters])
+    low = np.array([entry.low for entry in definition.parameters])
+    high = np.array([entry.high for entry in definition.parameters])
+    parameters = np.clip(nominal + SPREAD * (high - low) * random.uniform(-0.5, 0.5, len(nominal)), low, high)
+    initial = np.array([entry.initial for entry in definition.states])
+    inputs = np.column_stack(
+        [np.zeros((RECORDS, 0)), *(_telegraph(entry.low, entry.high, random) for entry in definition.inputs)]
+    )
+    excitation = Excitation(inputs, period, substeps=8)
+    _, slopes = kernel_of(definition).sensitivities(parameters, initial, excitation)
+    widths = np.concatenate([high - low, [entry.high - entry.low for entry in definition.states]])
+    noise = np.array([entry.noise for entry in definition.outputs])
+    scaled = slopes * widths / noise[None, :, None]
+    found: Array = np.nan_to_num(scaled.reshape(-1, len(widths)), nan=0.0, posinf=0.0, neginf=0.0)
+    return found
+
+
+def _telegraph(low: float, high: float, random: np.random.Generator) -> Array:
+    """(records,): random levels, each held for a random while."""
+    levels = random.uniform(low, high, RECORDS)
+    changes = np.cumsum(random.random(RECORDS) < 0.05)
+    return np.asarray(levels[changes])
+
+
+def _judge(definition: Definition, columns: Array, index: int) -> Structure:
+    name = definition.parameters[index].name
+    lengths = np.linalg.norm(columns, axis=0)
+    if lengths[index] <= NOTHING * lengths.max():
+        return Structure(name, identifiable=False, reason=DEAD)
+    unit = columns / np.where(lengths > 0.0, lengths, 1.0)
+    others = np.delete(unit, index, axis=1)
+    shares, *_ = np.linalg.lstsq(others, unit[:, index], rcond=1e-12)
+    if np.linalg.norm(unit[:, index] - others @ shares) > DEPENDENT:
+        return Structure(name, identifiable=True, reason="")
+    names = [entry.name for entry in definition.parameters] + [f"initial {entry.name}" for entry in definition.states]
+    del names[index]
+    weights = abs(shares)
+    partners = [other for other, weight in zip(names, weights, strict=True) if weight > PARTNER * weights.max()]
+    return Structure(name, identifiable=False, reason=f"only together with {', '.join(partners)}")

@@ -1,0 +1,106 @@
+"""From the page to algebra: the right sides as SymPy expressions of scalars, helpers substituted, units made coherent.
+
+Importing it loads SymPy, which only those need who print equations or generate a kernel.
+"""
+
+import ast
+from dataclasses import dataclass
+from functools import lru_cache
+
+import sympy
+
+from otolith.twin.definition import Definition
+from otolith.twin.expressions import constant, parse
+from otolith_drivers.quantities import to_base
+
+UNARY = {name: getattr(sympy, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh",
+                                                   "exp", "log", "sqrt", "sign")}  # fmt: skip
+COMPARE = {ast.Lt: sympy.Lt, ast.LtE: sympy.Le, ast.Gt: sympy.Gt, ast.GtE: sympy.Ge}
+
+
+@dataclass(frozen=True)
+class System:
+    """``dx/dt = rates(x, u, p)``, ``y = outputs(x, u, p)``, every quantity a real symbol in the unit of the page."""
+
+    states: tuple[sympy.Symbol, ...]
+    inputs: tuple[sympy.Symbol, ...]
+    parameters: tuple[sympy.Symbol, ...]
+    rates: tuple[sympy.Expr, ...]
+    outputs: tuple[sympy.Expr, ...]
+
+
+@lru_cache(maxsize=64)
+def system_of(definition: Definition) -> System:
+    """The algebra of a checked definition."""
+    symbols = {name: sympy.Symbol(name, real=True) for name in definition.units()}
+    scales = {name: to_base(unit)[0] for name, unit in definition.units().items()}
+    # Equations hold in coherent units; a page may use others, so each symbol enters with its factor.
+    values: dict[str, sympy.Expr] = {name: _scaled(symbols[name], scales[name]) for name in symbols}
+    for entry in definition.constants:
+        values[entry.name] = sympy.Float(entry.value * scales[entry.name])
+    pending = {name: parse(text) for name, text, _ in definition.definitions}
+    while pending:
+        ready = [name for name in pending if not _depends(pending[name], pending)]
+        for name in ready:
+            values[name] = to_sympy(pending.pop(name), values)
+    right = {left: to_sympy(parse(text), values) for left, text in definition.equations}
+    states = [entry.name for entry in definition.states]
+    return System(
+        states=tuple(symbols[name] for name in states),
+        inputs=tuple(symbols[entry.name] for entry in definition.inputs),
+        parameters=tuple(symbols[entry.name] for entry in definition.parameters),
+        rates=tuple(_scaled(right[f"der({name})"], 1.0 / scales[name]) for name in states),
+        outputs=tuple(
+            symbols[entry.name] if entry.name in states else _scaled(right[entry.name], 1.0 / scales[entry.name])
+            for entry in definition.outputs
+        ),
+    )
+
+
+def to_sympy(tree: ast.expr, values: dict[str, sympy.Expr]) -> sympy.Expr:
+    """The expression with every name replaced by its value."""
+    match tree:
+        case ast.Constant(value=value):
+            return sympy.Integer(value) if isinstance(value, int) else sympy.Float(value)
+        case ast.Name(id=name):
+            return sympy.pi if name == "pi" else values[name]
+        case ast.UnaryOp(op=operator, operand=operand):
+            inner = to_sympy(operand, values)
+            return -inner if isinstance(operator, ast.USub) else inner
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
+            return to_sympy(left, values) ** sympy.nsimplify(constant(right), rational=True)
+        case ast.BinOp(left=left, op=operator, right=right):
+            first, second = to_sympy(left, values), to_sympy(right, values)
+            match operator:
+                case ast.Add():
+                    return first + second
+                case ast.Sub():
+                    return first - second
+                case ast.Mult():
+                    return first * second
+                case _:
+                    return first / second
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            return _call(name, arguments, values)
+        case _:
+            raise AssertionError(ast.dump(tree))
+
+
+def _call(name: str, arguments: list[ast.expr], values: dict[str, sympy.Expr]) -> sympy.Expr:
+    if name == "where":
+        condition = arguments[0]
+        assert isinstance(condition, ast.Compare)  # noqa: S101 - the parser has seen to it
+        left, right = to_sympy(condition.left, values), to_sympy(condition.comparators[0], values)
+        test = COMPARE[type(condition.ops[0])](left, right)
+        return sympy.Piecewise((to_sympy(arguments[1], values), test), (to_sympy(arguments[2], values), True))
+    found = [to_sympy(argument, values) for argument in arguments]
+    several = {"abs": sympy.Abs, "min": sympy.Min, "max": sympy.Max, "atan2": sympy.atan2}
+    return (UNARY | several)[name](*found)
+
+
+def _scaled(expression: sympy.Expr, scale: float) -> sympy.Expr:
+    return expression if scale == 1.0 else sympy.Float(scale) * expression
+
+
+def _depends(tree: ast.expr, on: dict[str, ast.expr]) -> bool:
+    return any(isinstance(node, ast.Name) and node.id in on for node in ast.walk(tree))

@@ -1,0 +1,109 @@
+"""A new twin is one TOML file: a thermal model of a winding, dropped in, estimates at once."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.health.report import Status
+from otolith.heart import adapt
+from otolith.plan import load_plan
+from otolith.state import begin
+from otolith.twin.kernel import Excitation, kernel_of
+from otolith.twin.structure import structure_of
+from otolith.twins import load_twin
+
+PAGE = """
+[twin]
+name = "winding"
+title = "temperature of a motor winding"
+source = "one thermal body: heat capacity and thermal resistance to the housing"
+
+[states]
+theta = { unit = "K", meaning = "temperature of the winding over the housing", bounds = [-50, 300] }
+
+[inputs]
+i = { unit = "A", hold = "foh", range = [0, 20], meaning = "current" }
+
+[outputs]
+theta = { unit = "K", noise = "0.1 K", meaning = "temperature of the winding over the housing" }
+
+[parameters]
+R = { unit = "ohm", nominal = 1.5, bounds = [0.5, 5], meaning = "resistance of the winding" }
+C = { unit = "J/K", nominal = 120, bounds = [20, 800], role = "estimated", meaning = "heat capacity" }
+R_th = { unit = "K/W", nominal = 0.9, bounds = [0.2, 4], role = "estimated", meaning = "thermal resistance" }
+
+[equations]
+"der(theta)" = "(R*i^2 - theta/R_th) / C"
+
+[sites]
+heat = { into = "der(theta)", mode = "additive", through = "1/C", unit = "W", meaning = "heat" }
+"""
+
+DBC = """VERSION "1"
+BU_: Drive Monitor
+BO_ 387 Thermal: 8 Drive
+ SG_ Current : 0|16@1- (0.01,0) [-300|300] "A" Monitor
+ SG_ Temperature : 16|16@1- (0.1,0) [-300|300] "K" Monitor
+"""
+
+
+@pytest.fixture
+def machine_file(tmp_path: Path) -> Path:
+    (tmp_path / "winding.toml").write_text(PAGE, encoding="utf-8")
+    (tmp_path / "thermal.dbc").write_text(DBC, encoding="utf-8")
+    path = tmp_path / "machine.toml"
+    path.write_text(
+        '[machine]\nname = "spindle"\n[driver]\ntype = "can"\ndbc = "thermal.dbc"\n[twin]\nfile = "winding.toml"\n'
+        '[signals]\ni = { signal = "Current" }\ntheta = { signal = "Temperature" }\n'
+        '[window]\nlength = "300 s"\nsample_period = "1 s"\n',
+        encoding="utf-8",
+    )
+    return path
+
+
+def test_it_estimates_what_its_roles_say(machine_file: Path) -> None:
+    plan = load_plan(machine_file)
+    assert [entry.name for entry in plan.problem.free] == ["C", "R_th"]
+    random = np.random.default_rng(4)
+    current = np.repeat(random.uniform(2.0, 15.0, 30), 10)
+    drive = Excitation(current[:, None], 1.0)
+    truth = np.array([[1.5, 95.0, 1.1]])
+    theta = kernel_of(plan.twin).simulate(truth, np.array([[20.0]]), drive)[0, :, 0] + random.normal(0.0, 0.1, 300)
+    values = np.column_stack([current, theta])
+    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
+    window = Window(0, 0.0, 1.0, ("i", "theta"), values, np.zeros(values.shape, dtype=np.bool_), quality)
+    _, report = adapt(begin("spindle", "site", plan.problem), window)
+    for name, value in (("C", 95.0), ("R_th", 1.1)):
+        found = report.document.parameters[name]
+        assert found.status is Status.ESTIMATED
+        assert found.value == pytest.approx(value, rel=0.01)
+        assert found.low is not None
+        assert found.high is not None
+        assert found.low - 2e-3 * value < value < found.high + 2e-3 * value
+
+
+def test_what_only_acts_together_is_named(tmp_path: Path) -> None:
+    """With the housing hidden behind a second resistance in series, only the sum could be estimated."""
+    page = PAGE.replace("theta/R_th", "theta/(R_th + R_2)").replace(
+        "\n[equations]",
+        'R_2 = { unit = "K/W", nominal = 0.4, bounds = [0.1, 2], meaning = "second resistance" }\n\n[equations]',
+    )
+    path = tmp_path / "twin.toml"
+    path.write_text(page, encoding="utf-8")
+    found = {entry.name: entry for entry in structure_of(load_twin(path))}
+    assert found["C"].identifiable
+    assert found["R"].identifiable
+    assert not found["R_th"].identifiable
+    assert found["R_th"].reason == "only together with R_2"
+
+
+def test_a_parameter_that_no_output_feels_is_named(tmp_path: Path) -> None:
+    page = PAGE.replace("(R*i^2 - theta/R_th) / C", "(R*i^2 - theta/R_th) / C + 0*R_2*theta/R_th/C")
+    second = 'R_2 = { unit = "1", nominal = 0.4, bounds = [0.1, 2], meaning = "nothing" }'
+    path = tmp_path / "twin.toml"
+    path.write_text(page.replace("\n[equations]", f"{second}\n\n[equations]"), encoding="utf-8")
+    found = {entry.name: entry for entry in structure_of(load_twin(path))}
+    assert found["C"].identifiable
+    assert (found["R_2"].identifiable, found["R_2"].reason) == (False, "no output depends on it")

@@ -1,0 +1,84 @@
+"""The cache of compiled kernels: shared, private, bounded, and never stale."""
+
+import dataclasses
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from otolith import kernel_cache
+from otolith.errors import ServiceError
+from otolith.twin.kernel import identity_of
+from otolith.twins import find_twin
+
+PROGRAM = """
+import sys, time
+import numpy as np
+from otolith.twins import find_twin
+from otolith.twin.kernel import Excitation, kernel_of
+twin = find_twin("dc_motor")
+drive = Excitation(np.zeros((10, 2)), 0.01)
+print(kernel_of(twin).simulate(np.array([[e.nominal for e in twin.parameters]]), np.zeros((1, 2)), drive).sum())
+print("sympy" in sys.modules)
+"""
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "otolith" / "kernels"
+
+
+def start() -> "subprocess.Popen[str]":
+    return subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, text=True)
+
+
+def test_two_processes_at_once_compile_once_and_a_third_not_at_all(cache: Path) -> None:
+    together = [start(), start()]
+    outputs = [process.communicate(timeout=60)[0] for process in together]
+    assert [output.splitlines()[0] for output in outputs] == ["0.0", "0.0"]
+    compiled = list(cache.glob("*/__pycache__/*.nbc"))
+    assert len(compiled) == 1
+    before = compiled[0].stat().st_mtime_ns
+    third = start().communicate(timeout=60)[0].splitlines()
+    assert third == ["0.0", "False"]  # a cached kernel needs no SymPy
+    assert compiled[0].stat().st_mtime_ns == before
+
+
+def test_the_folder_is_private(cache: Path) -> None:
+    kernel_cache.load("private", lambda: "")
+    assert cache.stat().st_mode & 0o077 == 0
+    cache.chmod(0o777)
+    with pytest.raises(ServiceError, match="writable by nobody else"):
+        kernel_cache.load("other", lambda: "")
+
+
+def test_another_version_of_a_library_is_another_kernel(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    def make() -> str:
+        made.append("")
+        return f"number = {len(made)}"
+
+    assert kernel_cache.load("versions", make).number == 1
+    assert kernel_cache.load("versions", make).number == 1
+    monkeypatch.setattr(kernel_cache, "version", lambda name: f"{name} of tomorrow")
+    assert kernel_cache.load("versions", make).number == 2
+    assert cache.is_dir()
+
+
+def test_what_does_not_enter_the_equations_does_not_enter_the_identity() -> None:
+    twin = find_twin("dc_motor")
+    assert identity_of(dataclasses.replace(twin, title="another")) == identity_of(twin)
+    stiffer = dataclasses.replace(twin, equations=((twin.equations[0][0], "V_a/L_a"), twin.equations[1]))
+    assert identity_of(stiffer) != identity_of(twin)
+
+
+def test_old_kernels_are_removed(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_cache, "MOST_KERNELS", 3)
+    for index in range(6):
+        kernel_cache.load(f"number {index}", lambda: "")
+        time.sleep(0.01)  # so that their times differ
+    assert len([path for path in cache.iterdir() if path.is_dir()]) == 3

@@ -1,0 +1,161 @@
+"""The twin language: wrong pages get one precise sentence each, hostile ones are never evaluated.
+
+A case is a folder with ``twin.toml`` and ``error.txt``, in which ``{file}`` stands for the file.
+``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the sentences anew: read the difference.
+"""
+
+import ast
+import builtins
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from otolith.errors import ConfigurationError
+from otolith.twin.dimensions import describe, dimension_of, measure
+from otolith.twin.expressions import FUNCTIONS, ExpressionError, names, parse
+from otolith.twin.kernel import Excitation, kernel_of
+from otolith.twin.language import read_twin
+from otolith.twin.system import to_sympy
+from otolith.twins import LIBRARY, find_twin, load_twin
+from otolith.twins import names as library
+from otolith_drivers.toml_files import Page
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "twins"
+CASES = sorted(path.parent for path in GOLDEN.glob("*/twin.toml"))
+BASE = (LIBRARY / "dc_motor.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_wrong_page_gets_its_sentence(case: Path) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_twin(case / "twin.toml")
+    said = str(caught.value).replace(str(case / "twin.toml"), "{file}")
+    if os.environ.get("OTOLITH_UPDATE_GOLDEN"):
+        (case / "error.txt").write_text(said + "\n", encoding="utf-8")
+    assert said + "\n" == (case / "error.txt").read_text(encoding="utf-8")
+
+
+def test_there_are_at_least_thirty_wrong_pages() -> None:
+    assert len(CASES) >= 30
+
+
+@pytest.mark.parametrize("name", library())
+def test_library_twins_say_all_that_a_reader_needs(name: str) -> None:
+    twin = find_twin(name)
+    assert twin.name == name
+    assert twin.source
+    assert twin.validity
+    assert twin.sites
+    groups = (twin.states, twin.inputs, twin.outputs, twin.parameters, twin.sites)
+    assert all(entry.meaning for group in groups for entry in group)
+    assert all(meaning for _, _, meaning in twin.definitions)
+
+
+ALPHABET = st.sampled_from([*"iVRxJ_019.+-*/^()[]{}<>=,'\"\\:;@ \t", *FUNCTIONS, "i", "R_a", "where", "**", "lambda ",
+                            "__class__", "()", "1e9", "if ", " else ", "for ", "\n", "é", "Ω", "\0"])  # fmt: skip
+
+
+@settings(max_examples=500)
+@given(st.lists(ALPHABET, max_size=60).map("".join) | st.text(max_size=80))
+def test_any_expression_is_refused_or_is_one_of_the_language(text: str) -> None:
+    """And if it is one, it is made of the allowed nodes only and can be turned into algebra."""
+    try:
+        tree = parse(text)
+    except ExpressionError as error:
+        if not 1 <= error.column <= len(text) + 1:
+            raise
+        return
+    allowed = (ast.Constant, ast.Name, ast.UnaryOp, ast.BinOp, ast.Call, ast.Compare, ast.operator, ast.unaryop,
+               ast.cmpop, ast.expr_context)  # fmt: skip
+    assert all(isinstance(node, allowed) for node in ast.walk(tree))
+    known = dict.fromkeys(names(tree), dimension_of("1"))
+    measure(tree, known)
+    to_sympy(tree, {name: to_sympy(parse("1 + 1"), {}) for name in known})
+
+
+@settings(max_examples=200)
+@given(st.lists(st.sampled_from(BASE.split()), max_size=80).map(" ".join) | st.text(max_size=200))
+def test_any_page_is_read_or_refused(text: str) -> None:
+    for page in (text, BASE + "\n" + text, BASE.replace("(K_t*i - T_load - D*omega) / J", text.replace('"', "'"))):
+        try:
+            read_twin(Page(Path("any.toml"), page))
+        except ConfigurationError as error:
+            assert str(error).startswith("any.toml")  # noqa: PT017 - either outcome is right, another error is not
+
+
+@pytest.mark.parametrize(
+    "case", [case for case in CASES if case.name.startswith("hostile")], ids=lambda case: case.name
+)
+def test_nothing_is_ever_evaluated(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    for name in ("eval", "exec"):
+        monkeypatch.setattr(builtins, name, never)
+    with pytest.raises(ConfigurationError):
+        load_twin(case / "twin.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "column"),
+    [("a + b.c", 5), ("  a.b", 3), ("a^2 + b^2 + c.d", 13), ("a + (b", 5), ("f(x)", 1), ("a**b", 1), ("x + 1e99", 5)],
+)
+def test_the_position_is_that_of_the_fault(text: str, column: int) -> None:
+    with pytest.raises(ExpressionError) as caught:
+        parse(text)
+    assert caught.value.column == column
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("R*i", "V"),
+        ("sqrt(R*i*i)", None),
+        ("i^2*R", "W"),
+        ("L/R", "s"),
+        ("where(i > 0, R*i, 0)", "V"),
+        ("abs(i)/i", "1"),
+        ("max(R*i, 0)", "V"),
+        ("exp(-i/i)", "1"),
+        ("sqrt(L/R/L*R)", "1"),
+        ("pi*i", "A"),
+    ],
+)
+def test_dimensions(text: str, unit: str | None) -> None:
+    known = {"R": dimension_of("ohm"), "i": dimension_of("A"), "L": dimension_of("H")}
+    found = measure(parse(text), known)
+    assert found == (dimension_of("W") ** 0.5 if unit is None else dimension_of(unit))
+
+
+def test_dimensions_are_told_in_units_people_know() -> None:
+    assert describe(dimension_of("kg*m^2/(s^3*A)")) == "V"
+    assert describe(dimension_of("kg*m^2/s^2")) == "N*m"
+    assert describe(dimension_of("mol*m^5/s^7")) == "m^5*mol/s^7"
+    assert describe(dimension_of("1")) == "a plain number"
+
+
+def test_a_page_in_other_units_is_the_same_machine() -> None:
+    """Millihenry, rpm and g·cm² in the page: the equations still hold, as every symbol enters with its factor."""
+    other = BASE
+    for old, new in (
+        ('unit = "H", nominal = 0.673, bounds = [0.2, 2]', 'unit = "mH", nominal = 673, bounds = [200, 2000]'),
+        (
+            'unit = "kg*m^2", nominal = 0.001171, bounds = [0.0003, 0.005]',
+            'unit = "kg*cm^2", nominal = 11.71, bounds = [3, 50]',
+        ),
+        ('omega = { unit = "rad/s"', 'omega = { unit = "rpm"'),
+    ):
+        assert old in other
+        other = other.replace(old, new)
+    twins = [read_twin(Page(Path("a.toml"), BASE)), read_twin(Page(Path("b.toml"), other))]
+    drive = Excitation(np.column_stack([np.full(100, 12.0), np.full(100, 0.02)]), 0.01)
+    found = []
+    for twin in twins:
+        parameters = np.array([[entry.nominal for entry in twin.parameters]])
+        found.append(kernel_of(twin).simulate(parameters, np.zeros((1, 2)), drive)[0])
+    assert found[1][:, 0] == pytest.approx(found[0][:, 0], rel=1e-9)
+    assert found[1][:, 1] == pytest.approx(found[0][:, 1] * 60 / (2 * np.pi), rel=1e-9)
