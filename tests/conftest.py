@@ -73,11 +73,11 @@ class OwnMachine:
         self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.machine, self.scenario = folder / "machine.toml", folder / "scenario.toml"
         self.dbc = EXAMPLES / "dc-motor.dbc"
-        bus = f'interface = "udp_multicast"\nmulticast_group = "{self.group}"\nmulticast_port = {self.port}\n'
+        bus = f'interface = "udp_multicast"\nchannel = "{self.group}"\nport = {self.port}\n'
         text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
         text = text.replace('dbc = "dc-motor.dbc"\n', f'dbc = "{self.dbc}"\n{bus}')
         self.machine.write_text(f'{text}\n[zenoh]\nlisten = ["{self.endpoint}"]\n', encoding="utf-8")
         text = (EXAMPLES / "scenarios" / "demo.toml").read_text(encoding="utf-8")
         text = text.replace('dbc = "../dc-motor.dbc"', f'dbc = "{self.dbc}"')
-        text = text.replace('interface = "auto"', f"{bus}#")
+        text = text.replace('interface = "auto"', f"{bus}#").replace('channel = "vcan0"', "")
         self.scenario.write_text(text, encoding="utf-8")

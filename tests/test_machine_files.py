@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from otolith.check import describe
 from otolith.errors import ConfigurationError, OtolithError
-from otolith.plan import describe, load_plan
+from otolith.plan import load_plan
 from tests.conftest import EXAMPLES, OwnMachine
 
 GOLDEN = Path(__file__).parent / "golden" / "machine_files"

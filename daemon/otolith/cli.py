@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+import re
 import signal
 import sys
 from pathlib import Path
@@ -17,10 +18,23 @@ INTERRUPTED = 128 + signal.SIGINT
 FILE = click.Path(path_type=Path, dir_okay=False)
 EXIT_CODES = """\b
 Exit codes:
-  0    done, or stopped by SIGTERM
+  0    done; run and plant also when stopped by SIGTERM
   1    the demo's estimate was wrong
   2    a file, option, bus or port cannot be used; the message says which and what to do
-  130  interrupted by Ctrl-C"""
+  130  interrupted by Ctrl-C (128 + the number of any other signal)"""
+
+
+def _endpoints(_: click.Context, __: click.Parameter, written: tuple[str, ...]) -> tuple[str, ...]:
+    for endpoint in written:
+        if not re.fullmatch(r"[a-z-]+/\S+", endpoint):
+            raise click.BadParameter(f"{endpoint!r} is no endpoint: write it like tcp/127.0.0.1:7447")
+    return written
+
+
+def _rrd(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+    if path is not None and path.suffix != ".rrd":
+        raise click.BadParameter(f"{str(path)!r}: a recording ends in .rrd")
+    return path
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog=EXIT_CODES)
@@ -41,8 +55,16 @@ def cli() -> None:
 
 @cli.command()
 @click.argument("file", type=FILE)
-@click.option("--listen", multiple=True, metavar="ENDPOINT", help="Publish here instead of where the file says.")
-@click.option("--recording", type=FILE, help="Record into this file instead of a new one in the state directory.")
+@click.option(
+    "--listen",
+    multiple=True,
+    callback=_endpoints,
+    metavar="ENDPOINT",
+    help="Publish here instead of where the file says.",
+)
+@click.option(
+    "--recording", type=FILE, callback=_rrd, help="Record into this file instead of a new one in the state directory."
+)
 @click.option("-v", "--verbose", is_flag=True, help="Say more.")
 def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bool) -> int:
     """Run the daemon for the machine in FILE until SIGTERM or Ctrl-C.
@@ -64,20 +86,16 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
 @click.argument("file", type=FILE)
 @click.option("--no-device", is_flag=True, help="Do not try to open the machine's bus.")
 def check(file: Path, no_device: bool) -> None:
-    """Read the machine file FILE, open its bus, and say what the daemon would do.
+    """Read the machine file FILE, say what the daemon would do, and listen whether the signals come.
 
     \b
     Examples:
       otolith check config/dc-motor.toml
       otolith check --no-device config/dc-motor.toml
     """
-    from otolith.plan import describe, load_plan
+    from otolith.check import check_machine
 
-    plan = load_plan(file)
-    if not no_device:
-        plan.driver.open(lambda _: None)
-        plan.driver.close()
-    for line in describe(plan):
+    for line in check_machine(file, with_device=not no_device):
         click.echo(line)
 
 
@@ -92,24 +110,34 @@ def plant(scenario: Path, truth: Path | None, duration: float) -> int:
     Example:
       otolith plant config/scenarios/demo.toml
     """
-    from otolith_drivers.plant.can_node import run as run_node
+    from otolith_drivers.plant.can_node import CanNode
     from otolith_drivers.plant.plants import load_scenario
 
     loaded = load_scenario(scenario)
     stop = _StopSignal()
-    click.echo(f"{loaded.plant} on {loaded.bus.title()}, frames of {loaded.dbc.name}; Ctrl-C ends it", err=True)
-    sent = run_node(loaded, lambda: stop.number is not None, truth, duration)
+    node = CanNode(loaded, truth)
+    try:
+        click.echo(f"{loaded.plant} on {loaded.bus.title()}, frames of {loaded.dbc.name}; Ctrl-C ends it", err=True)
+        sent = node.run(lambda: stop.number is not None, duration)
+    finally:
+        node.close()
     click.echo(f"{sent.frames} frames in {sent.seconds:.1f} s of simulated time, {sent.stalls} stalls", err=True)
-    return INTERRUPTED if stop.number == signal.SIGINT else 0
+    return stop.code(clean=signal.SIGTERM)
 
 
 @cli.command()
 @click.option(
-    "--connect", default="tcp/127.0.0.1:7447", show_default=True, metavar="ENDPOINT", help="Where daemons are."
+    "--connect",
+    multiple=True,
+    default=["tcp/127.0.0.1:7447"],
+    show_default=True,
+    callback=_endpoints,
+    metavar="ENDPOINT",
+    help="Where daemons are; may be given more than once.",
 )
 @click.option("--machine", default="*", metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
-def watch(connect: str, machine: str, as_json: bool) -> int:
+def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
     """Show the live table of a running daemon, from any process that reaches it.
 
     \b
@@ -121,7 +149,7 @@ def watch(connect: str, machine: str, as_json: bool) -> int:
 
     stop = _StopSignal()
     watch_reports(connect, machine, as_json=as_json, stopped=lambda: stop.number is not None)
-    return INTERRUPTED if stop.number == signal.SIGINT else 0
+    return stop.code()
 
 
 @cli.command()
@@ -135,11 +163,15 @@ def view(file: Path | None, listing: bool) -> int:
       otolith view
       otolith view --list
     """
+    from otolith.paths import state_directory
     from otolith.viewer import open_viewer, recordings
 
     if listing:
-        for path in recordings():
+        found = recordings()
+        for path in found:
             click.echo(path)
+        if not found:
+            click.echo(f"no recordings under {state_directory()}", err=True)
         return 0
     return open_viewer(file)
 
@@ -165,7 +197,7 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     machine = machine or examples / "dc-motor.toml"
     scenario = scenario or examples / "scenarios" / "demo.toml"
     code = Demo(machine, scenario, duration, as_json=as_json).run(lambda: stop.number is not None)
-    return code if stop.number is None else 128 + stop.number
+    return code if stop.number is None else stop.code()
 
 
 cli.add_command(twin)
@@ -178,6 +210,10 @@ class _StopSignal:
         self.number: int | None = None
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._take)
+
+    def code(self, clean: int | None = None) -> int:
+        """The exit code, as a shell counts signals; 0 for the signal that is the ordinary way to end."""
+        return 0 if self.number is None or self.number == clean else 128 + self.number
 
     def _take(self, number: int, _: FrameType | None) -> None:
         self.number = number

@@ -21,7 +21,7 @@ SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 @contextlib.contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """A child inherits the mask: Ctrl-C reaches the whole terminal, but only the daemon may act on it."""
+    """A child inherits the mask: on a signal to the whole group only the daemon acts, and ends the others."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         yield
@@ -30,8 +30,6 @@ def _signals_blocked() -> Iterator[None]:
 
 
 def _enter(connection: Any, main: str, arguments: Sequence[Any]) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the daemon is gone
         module, function = main.split(":")
         getattr(import_module(module), function)(connection, *arguments)

@@ -1,10 +1,11 @@
 """What people see in a terminal: the live table of a machine, fed by its reports."""
 
 import threading
+import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
@@ -12,16 +13,19 @@ from otolith.acquisition.window import Verdict
 from otolith.health.report import ParameterDocument, ReportDocument, Status
 from otolith.health.status import QUANTILE
 
-HISTORY = 60  # windows that the curve shows
+HISTORY = 200  # windows that the curve can show
+WITHOUT_HISTORY = 72  # columns of the table beside the curve
+SILENT_WINDOWS = 3  # lengths of a window without a report, after which the table says so
 BARS = "▁▂▃▄▅▆▇█"
 STYLES = {Status.ESTIMATED: "green", Status.HELD: "yellow", Status.INVALID: "red", Status.UNESTIMATED: "dim"}
 
 
 class Board:
-    """Takes reports from any thread, and draws."""
+    """Takes reports from any thread, and draws; ``state`` says in words what is waited for."""
 
-    def __init__(self, waiting_for: str) -> None:
-        self._waiting_for = waiting_for
+    def __init__(self, state: Callable[[], str]) -> None:
+        self._state = state
+        self._heard_at = 0.0
         self._lock = threading.Lock()
         self._latest: ReportDocument | None = None
         self._histories: dict[str, deque[float]] = {}
@@ -37,43 +41,52 @@ class Board:
             return None
         with self._lock:
             self._latest = document
+            self._heard_at = time.monotonic()
             for name, parameter in document.parameters.items():
                 if parameter.value is not None:
                     self._histories.setdefault(name, deque(maxlen=HISTORY)).append(parameter.value)
         return document
 
-    def __rich__(self) -> RenderableType:
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The table as it is now."""
+        del console
+        yield self._drawn(options.max_width)
+
+    def _drawn(self, width: int) -> RenderableType:
         with self._lock:
             document, unreadable = self._latest, self._unreadable
+            silence = time.monotonic() - self._heard_at
             histories = {name: tuple(values) for name, values in self._histories.items()}
         if document is None:
-            return Text(f"waiting for {self._waiting_for} ...", style="dim")
-        parts: list[RenderableType] = [_heading(document), _parameters(document, histories), *_words(document)]
+            return Text(self._state(), style="dim")
+        parts: list[RenderableType] = [*_heading(document), _parameters(document, histories, width), *_words(document)]
+        length = document.window.end - document.window.start
+        if silence > SILENT_WINDOWS * length:
+            parts.insert(0, Text(f"no report for {silence:.0f} s: {self._state()}", style="bold red"))
         if unreadable:
             parts.append(Text(f"{unreadable} reports could not be read: another version publishes here", style="red"))
         return Group(*parts)
 
 
-def _heading(document: ReportDocument) -> Text:
+def _heading(document: ReportDocument) -> list[Text]:
     window, quality = document.window, document.window.quality
-    text = Text.assemble(
-        (f"{document.machine}", "bold"), f" at {document.site}, twin {document.twin} ({document.model})"
-    )
-    text.append(f"   window {window.index} ")
-    text.append(quality.verdict, style="green" if quality.verdict is Verdict.GOOD else "red")
-    text.append(f", {window.records} records, {quality.missing:.1%} missing, jitter {quality.jitter_s * 1e3:.1f} ms")
-    text.append(f", adapted in {document.cost.seconds * 1e3:.0f} ms")
-    return text
+    text = Text.assemble((document.machine, "bold"), f" at {document.site}, twin {document.twin} ({document.model})")
+    line = Text(f"window {window.index} ")
+    line.append(quality.verdict, style="green" if quality.verdict is Verdict.GOOD else "red")
+    line.append(f", {window.records} records, {quality.missing:.1%} missing, jitter {quality.jitter_s * 1e3:.1f} ms")
+    if document.fit is not None:
+        line.append(f", {document.cost.seconds * 1e3:.0f} ms")
+    return [text, line]
 
 
-def _parameters(document: ReportDocument, histories: Mapping[str, tuple[float, ...]]) -> Table:
+def _parameters(document: ReportDocument, histories: Mapping[str, tuple[float, ...]], width: int) -> Table:
     table = Table(expand=False)
-    for column in ("parameter", "value", "± 95 %", "unit", "change", "status", f"last {HISTORY} windows"):
+    for column in ("parameter", "value", "± 95 %", "unit", "change", "status", "history"):
         table.add_column(column, justify="right" if column in ("value", "± 95 %", "change") else "left", no_wrap=True)
+    room = max(8, width - WITHOUT_HISTORY)
     for name, parameter in document.parameters.items():
-        table.add_row(name, *_values(parameter), Text(parameter.status, style=STYLES[parameter.status]),
-                      sparkline(histories.get(name, ())))  # fmt: skip
+        status = Text(parameter.status, style=STYLES[parameter.status])
+        table.add_row(name, *_values(parameter), status, sparkline(histories.get(name, ())[-room:]))
     return table
 
 
@@ -81,11 +94,16 @@ def _values(parameter: ParameterDocument) -> tuple[str, str, str, str]:
     if parameter.value is None or parameter.sd is None:
         return "unknown", "", parameter.unit, ""
     change = f"{parameter.value / parameter.nominal - 1:+.2%}" if parameter.nominal else ""
-    return f"{parameter.value:.5g}", f"{QUANTILE * parameter.sd:.2g}", parameter.unit, change
+    return (
+        f"{parameter.value:.5g}",
+        f"{QUANTILE * parameter.sd:.2g}",
+        parameter.unit,
+        change.replace("-0.00%", "0.00%").replace("+0.00%", "0.00%"),
+    )
 
 
 def _words(document: ReportDocument) -> list[Text]:
-    lines = [Text(f"window: {reason}", style="red") for reason in document.window.quality.reasons]
+    lines = [Text(f"bad window: {reason}", style="red") for reason in document.window.quality.reasons]
     for name, parameter in document.parameters.items():
         if parameter.reason and not document.window.quality.reasons:
             lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
@@ -95,11 +113,14 @@ def _words(document: ReportDocument) -> list[Text]:
         lines.append(Text(f"residual (RMSE): {errors}: {explained}"))
     if document.counters is not None:
         counters = document.counters
-        lost = (
-            f"{counters.received} samples, {counters.lost} lost, {counters.bad} bad, {counters.reconnects} reconnects; "
-        )
-        lost += f"{counters.windows} windows, {counters.windows_bad} bad, {counters.windows_missed} missed, "
-        lines.append(Text(f"{lost}{counters.worker_restarts} worker restarts", style="dim"))
+        lines += [
+            Text(f"samples: {counters.received}, lost {counters.lost}, bad {counters.bad}", style="dim"),
+            Text(
+                f"windows: {counters.windows}, bad {counters.windows_bad}, missed {counters.windows_missed}; "
+                f"worker restarts {counters.worker_restarts}, bus reconnects {counters.reconnects}",
+                style="dim",
+            ),
+        ]
     return lines
 
 

@@ -1,14 +1,15 @@
 """``otolith demo``: plant and daemon as processes on a bus, watched from here, and the verdict at the end."""
 
+import contextlib
 import csv
 import json
 import os
 import queue
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -20,18 +21,20 @@ from rich.table import Table
 
 from otolith.acquisition.window import Verdict
 from otolith.console import Board
-from otolith.errors import OtolithError
+from otolith.errors import OtolithError, ServiceError
 from otolith.health.report import ReportDocument, Status
 from otolith.health.status import QUANTILE
 from otolith.outlets.zenoh_session import Listener
 from otolith.paths import state_directory, writable
 from otolith.plan import load_plan
 from otolith.topics import REPORT
+from otolith_drivers.plant.plants import load_scenario
 
 TOLERANCE = 0.005  # of the injected value: what every window with current must be found within
 CURRENT_FLOWS = 0.1  # A, mean over the window
 STOP_SECONDS = 2.5  # for a process to end by itself
 PAUSE = 0.1  # s
+ROWS = 15  # of the table at the end
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +79,7 @@ class Demo:
     def __init__(self, machine: Path, scenario: Path, duration: float, *, as_json: bool) -> None:
         self._machine, self._scenario, self._duration, self._as_json = machine, scenario, duration, as_json
         self._plan = load_plan(machine)
+        load_scenario(scenario)
         stamp = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
         self._folder = writable(state_directory() / "demo" / f"{stamp}-{os.getpid()}")
         self._console = Console(stderr=as_json)
@@ -95,6 +99,7 @@ class Demo:
         say = self._console.print
         say(f"machine {self._machine}, scenario {self._scenario}, {self._duration:.0f} s", soft_wrap=True)
         say(f"frames on {self._plan.driver.describe()[0]}; reports on {connect[0]}, key {key}", soft_wrap=True)
+        _refuse_busy(connect)
         try:
             self._start("daemon", "run", str(self._machine), "--recording", str(self.recording))
             self._start("plant", "plant", str(self._scenario), "--truth", str(self._folder / "truth.csv"))
@@ -116,10 +121,10 @@ class Demo:
 
     def _watch(self, connect: Sequence[str], key: str, stopped: Callable[[], bool]) -> None:
         heard: queue.SimpleQueue[str] = queue.SimpleQueue()
-        board = Board("the first window")
+        board = Board(lambda: "waiting for the first window ...")
         live = self._console.is_terminal and not self._as_json
         end = time.monotonic() + self._duration
-        shown = Live(board, console=self._console, refresh_per_second=5) if live else nullcontext()
+        shown = Live(board, console=self._console, refresh_per_second=5) if live else contextlib.nullcontext()
         with Listener(connect, key, heard.put), shown:
             while time.monotonic() < end and not stopped():
                 self._complain_of_the_dead()
@@ -178,24 +183,26 @@ class Demo:
 
     def _print_table(self, compared: list[Comparison], wrong: list[Comparison]) -> None:
         units = {entry.name: entry.unit for entry in self._plan.problem.free}
-        table = Table(title="injected against found, good windows with current flowing")
+        step = max(1, len(compared) // ROWS)
+        every = "" if step == 1 else f" (one row of {step})"
+        table = Table(title=f"injected against found, good windows with current flowing{every}")
         for column in ("window", "parameter", "injected", "found ± 95 %", "unit", "error"):
             table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
-        step = max(1, len(compared) // 15)
         shown = [*compared[::step], *(row for row in compared[-1:] if (len(compared) - 1) % step)]
         for row in shown:
-            found = "unknown" if row.found is None else f"{row.found:.4f} ± {row.half_width or 0.0:.4f}"
+            found = "unknown" if row.found is None else f"{row.found:.5g} ± {row.half_width or 0.0:.2g}"
             style = "red" if row.error > TOLERANCE else None
             error = "" if row.found is None else f"{row.error:.3%}"
-            table.add_row(str(row.window), row.parameter, f"{row.injected:.4f}", found, units[row.parameter], error,
+            table.add_row(str(row.window), row.parameter, f"{row.injected:.5g}", found, units[row.parameter], error,
                           style=style)  # fmt: skip
         say = self._console.print
         say(table)
-        if compared:
-            first, last = compared[0], compared[-1]
-            say(f"{last.parameter} went from {first.injected:.4f} to {last.injected:.4f} {units[last.parameter]} "
-                f"({last.injected / first.injected - 1:+.1%}); largest error {max(row.error for row in compared):.3%} "
-                f"in {len(compared)} windows")  # fmt: skip
+        for name, unit in units.items():
+            rows = [row for row in compared if row.parameter == name]
+            if rows:
+                before, after = rows[0].injected, rows[-1].injected
+                change = f"{name} went from {before:.5g} to {after:.5g} {unit} ({after / before - 1:+.1%})"
+                say(f"{change}; largest error {max(row.error for row in rows):.3%} in {len(rows)} windows")
         if not compared:
             say("[red]no good window with current flowing: nothing was shown[/red]")
         elif wrong:
@@ -204,6 +211,14 @@ class Demo:
             say(f"[green]every one is within {TOLERANCE:.1%} of what was injected[/green]")
         say(f"recording: {self.recording}", soft_wrap=True)
         say(f"open it with: {Path(sys.executable).with_name('otolith')} view {self.recording}", soft_wrap=True)
+
+
+def _refuse_busy(endpoints: Sequence[str]) -> None:
+    """A daemon that already publishes there would be taken for the demo's own."""
+    for endpoint in endpoints:
+        host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+        with contextlib.suppress(OSError, ValueError), socket.create_connection((host, int(port)), timeout=0.5):
+            raise ServiceError(f"{endpoint} is in use: a daemon runs there; stop it, or set zenoh.listen")
 
 
 def _read_columns(path: Path) -> dict[str, list[float]]:

@@ -24,6 +24,7 @@ from otolith.state import State
 from otolith.twin.definition import Definition
 
 EXPLAINED = 1.5  # cost (RMSE over noise) up to which the residual counts as noise
+UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
 
 
 def adapt(state: State, window: Window) -> tuple[State, Report]:
@@ -61,6 +62,8 @@ def _document(
     for index, entry in enumerate(state.problem.free):
         said = None if found is None else found.parameters[index]
         kept, parameters[entry.name] = publish(entry, said, known[index], reason)
+        if found is not None and found.cost > EXPLAINED and not parameters[entry.name].reason:
+            parameters[entry.name] = parameters[entry.name].model_copy(update={"reason": UNEXPLAINED})
         next_known.append(kept)
     document = ReportDocument(
         machine=state.machine,

@@ -37,6 +37,19 @@ def writable(folder: Path) -> Path:
     return folder
 
 
+def complain_unless_writable(folder: Path) -> None:
+    """Refuse a folder that :func:`writable` would, without making it.
+
+    Raises:
+        ServiceError: it cannot be written to, or could not be made.
+    """
+    nearest = folder
+    while not nearest.exists() and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        raise ServiceError(f"{folder}: cannot be written by this user, as {nearest} is no folder that can be")
+
+
 def _private(systemd: str, xdg: str, fallback: str) -> Path:
     if given := os.environ.get(systemd):
         return writable(Path(given.split(":")[0]))

@@ -8,13 +8,12 @@ from otolith.acquisition.alignment import Limits
 from otolith.adaptation.problem import Problem, SwarmOptions
 from otolith.errors import ConfigurationError, nearest
 from otolith.settings import MachineFile, ParameterTable
-from otolith.topics import prefix
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twins import find_twin, load_twin
 from otolith_drivers.base import Driver, Signal
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.registry import find
-from otolith_drivers.toml_files import Page, parse, read, validate
+from otolith_drivers.toml_files import Page, expect, parse, read, validate
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,9 @@ def load_plan(path: Path) -> Plan:
         ConfigurationError: anything in it that cannot be meant, one line per fault.
     """
     page = read(path)
-    file = validate(parse(page), MachineFile, page)
+    data = parse(page)
+    expect(page, data, "machine")
+    file = validate(data, MachineFile, page)
     context = _Context(page)
     twin = _twin(file, context)
     problem = _problem(file, twin, context)
@@ -104,8 +105,8 @@ def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
     free: list[Parameter] = []
     for entry in twin.parameters:
         table = file.parameters.get(entry.name, ParameterTable())
-        parameter = _parameter(entry, table, context)
         estimated = table.value is None and entry.role is Role.ESTIMATED if table.estimate is None else table.estimate
+        parameter = _parameter(entry, table, context, estimated=estimated)
         if estimated:
             free.append(parameter)
         else:
@@ -124,16 +125,18 @@ def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
     )
 
 
-def _parameter(entry: Parameter, table: ParameterTable, context: _Context) -> Parameter:
+def _parameter(entry: Parameter, table: ParameterTable, context: _Context, *, estimated: bool) -> Parameter:
     given: dict[str, float] = {"value": entry.nominal, "low": entry.low, "high": entry.high}
     for key, written in (("low", table.low), ("high", table.high), ("value", table.value)):
         if written is not None:
             with context.at("parameters", entry.name, key):
                 given[key] = Quantity(entry.unit)(written)
     where = ("parameters", entry.name)
+    if not estimated and given["value"] <= 0.0 < entry.low:
+        context.fail(where, f"{given['value']:g} {entry.unit}: {entry.meaning} must be above zero")
     if given["low"] >= given["high"]:
         context.fail(where, f"low {given['low']:g} {entry.unit} is not under high {given['high']:g} {entry.unit}")
-    if not given["low"] <= given["value"] <= given["high"]:
+    if estimated and not given["low"] <= given["value"] <= given["high"]:
         bounds = f"between {given['low']:g} and {given['high']:g} {entry.unit}"
         context.fail(
             where, f"{given['value']:g} {entry.unit} is out of bounds: it must lie {bounds}, or move the bounds"
@@ -168,30 +171,13 @@ def _driver(file: MachineFile, twin: Definition, context: _Context) -> Driver:
         module = find(kind)
     rest = {key: value for key, value in file.driver.items() if key != "type"}
     options = validate(rest, module.Options, context.page, under=("driver",))
-    signals = [Signal(name, twin.unit_of(name), file.signals[name]) for name in wanted]
-    return module.build(options, signals, context.page.path.parent)
-
-
-def describe(plan: Plan) -> list[str]:
-    """What the daemon would do, a line per fact."""
-    file, problem = plan.file, plan.problem
-    lines = [
-        f"machine {file.machine.name} at {file.machine.site}, twin {plan.twin.name}: {plan.twin.title}",
-        *(f"  {name} = {text}" for name, text, _ in plan.twin.definitions),
-        *(f"  {left} = {right}" for left, right in plan.twin.equations),
-        *plan.driver.describe(),
-        f"windows of {file.window.length:g} s, {plan.records} records",
-    ]
-    for name, value in problem.known:
-        entry = plan.twin.parameter(name)
-        lines.append(f"known: {name} = {value:g} {entry.unit} ({entry.meaning})")
-    for entry in problem.free:
-        span = f"from {entry.low:g} to {entry.high:g}, starting at {entry.nominal:g} {entry.unit}"
-        lines.append(f"estimated: {entry.name} {span} ({entry.meaning})")
-    for output, noise in zip(plan.twin.outputs, problem.noise, strict=True):
-        lines.append(f"noise of {output.name}: {noise:g} {output.unit}")
-    endpoints = ", ".join(file.zenoh.listen) or "no endpoint"
-    lines.append(f"reports on {endpoints}, keys {prefix(file.machine.site, file.machine.name)}/...")
-    folder = plan.recording_folder or "the state directory"
-    lines.append(f"recordings into {folder}" if file.recording.enabled else "no recordings")
-    return lines
+    sources = {
+        name: validate(file.signals[name], module.Source, context.page, under=("signals", name)) for name in wanted
+    }
+    signals = [Signal(name, twin.unit_of(name), source) for name, source in sources.items()]
+    try:
+        return module.build(options, signals, context.page.path.parent)
+    except ConfigurationError as error:
+        if error.key:
+            context.fail(error.key, str(error))
+        raise

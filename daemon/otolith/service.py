@@ -20,8 +20,9 @@ from otolith.acquisition.windower import Windower
 from otolith.companion import SIGNALS, Companion
 from otolith.health.report import CountersDocument, Report, ReportDocument, Status
 from otolith.notify import Notifier
+from otolith.outlets.places import recording_folder
 from otolith.outlets.zenoh_session import Publisher
-from otolith.paths import cache_directory, state_directory, writable
+from otolith.paths import cache_directory, writable
 from otolith.plan import Plan
 from otolith.state import begin
 from otolith.supervisor import Supervisor
@@ -99,7 +100,7 @@ class Service:
         if not plan.file.recording.enabled:
             return
         if self._recording is None or self._recorder.starts:  # a second file never overwrites the first
-            folder = plan.recording_folder or state_directory() / "recordings"
+            folder = recording_folder(plan)
             stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
             self._recording = folder / f"{plan.file.machine.name}-{stamp}-{os.getpid()}.rrd"
         writable(self._recording.parent)

@@ -1,6 +1,5 @@
 """``otolith view``: the Rerun viewer on a recording."""
 
-import json
 import os
 import subprocess
 import sysconfig
@@ -8,6 +7,8 @@ from pathlib import Path
 
 from otolith.errors import ConfigurationError, ServiceError
 from otolith.paths import cache_directory, state_directory, writable
+
+MAGIC = b"RRF2"  # of Rerun's files
 
 
 def recordings() -> list[Path]:
@@ -29,6 +30,11 @@ def open_viewer(path: Path | None) -> int:
         raise ConfigurationError(
             f"{path or state_directory()}: no recording; 'otolith view --list' shows what there is"
         )
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise ConfigurationError(f"{path}: this is no recording")
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ServiceError(f"no display here: copy {path} to a computer with one, and open it with 'rerun' there")
     program = Path(sysconfig.get_path("scripts")) / "rerun"
     if not program.exists():
         raise ServiceError(f"{program}: the Rerun viewer is not installed beside Otolith; copy {path} to where it is")
@@ -37,9 +43,12 @@ def open_viewer(path: Path | None) -> int:
 
 
 def _quiet() -> dict[str, str]:
-    """An environment in which the viewer sends no analytics: it knows no option for that, only its own file."""
-    folder = writable(cache_directory() / "viewer")
-    writable(folder / "rerun")
-    settings = {"analytics_enabled": False, "analytics_id": "", "metadata": {}}
-    (folder / "rerun" / "analytics.json").write_text(json.dumps(settings), encoding="utf-8")
-    return {**os.environ, "XDG_CONFIG_HOME": str(folder)}
+    """An environment in which the viewer sends no analytics.
+
+    It knows no option for that, only a file that ``rerun analytics disable`` writes; a folder of ours keeps
+    the user's settings as they are.
+    """
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(writable(cache_directory() / "viewer"))}
+    program = str(Path(sysconfig.get_path("scripts")) / "rerun")
+    subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)  # noqa: S603
+    return environment

@@ -2,7 +2,8 @@
 
 import queue
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 
 from rich.console import Console
 from rich.live import Live
@@ -13,9 +14,10 @@ from otolith.topics import REPORT
 
 ROOM = 100  # reports between the network and a slow terminal
 PAUSE = 0.2  # s
+PATIENCE = 5.0  # s without a report, after which the stream says what it waits for
 
 
-def watch_reports(connect: str, machine: str, *, as_json: bool, stopped: Callable[[], bool]) -> None:
+def watch_reports(connect: Sequence[str], machine: str, *, as_json: bool, stopped: Callable[[], bool]) -> None:
     """Until ``stopped``; a daemon that is not there yet is waited for."""
     key = REPORT.under("*", machine)
     heard: queue.Queue[str] = queue.Queue(ROOM)
@@ -25,18 +27,34 @@ def watch_reports(connect: str, machine: str, *, as_json: bool, stopped: Callabl
             heard.get_nowait()
         heard.put_nowait(text)
 
-    board = Board(f"reports on {connect}, key {key}")
-    with Listener([connect], key, hear):
+    with Listener(connect, key, hear) as listener:
+
+        def state() -> str:
+            found = f"connected, waiting for {key}" if listener.connected else "no daemon reached yet"
+            return f"{found} ({', '.join(connect)})"
+
         if as_json:
-            while not stopped():
-                for text in _drain(heard):
-                    sys.stdout.write(text + "\n")
-                sys.stdout.flush()
+            _stream(heard, state, stopped)
             return
+        board = Board(state)
         with Live(board, console=Console(), refresh_per_second=5):
             while not stopped():
                 for text in _drain(heard):
                     board.hear(text)
+
+
+def _stream(heard: "queue.Queue[str]", state: Callable[[], str], stopped: Callable[[], bool]) -> None:
+    """Reports as lines; what is waited for is said on standard error, once per change."""
+    begun, said = time.monotonic(), ""
+    while not stopped():
+        lines = _drain(heard)
+        for text in lines:
+            sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+        if not lines and time.monotonic() - begun > PATIENCE and state() != said:
+            said = state()
+            sys.stderr.write(f"{said}\n")
+        begun = time.monotonic() if lines else begun
 
 
 def _drain(heard: "queue.Queue[str]") -> list[str]:

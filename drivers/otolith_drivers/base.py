@@ -4,7 +4,7 @@ A driver is read-only by construction: this protocol has no way to write to a ma
 reconnect loop, counts what it receives and what it loses, and never lets an exception out of its threads.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -28,8 +28,8 @@ class Signal:
 
     name: str
     unit: str
-    source: Mapping[str, Any]
-    """The keys of the machine file that say where the signal is; each driver has its own."""
+    source: Any
+    """Where the signal is: an instance of the driver's ``Source``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +82,12 @@ class Driver(Protocol):
 
 
 class DriverType(Protocol):
-    """What a row of the registry points to: a module with these two names."""
+    """What a row of the registry points to: a module with these three names."""
 
     Options: type[Closed]
     """The keys of ``[driver]`` beside ``type``."""
+    Source: type[Closed]
+    """The keys of each of ``[signals]``: where to find the signal."""
 
     def build(self, options: Any, signals: Sequence[Signal], folder: Path) -> Driver:
         """A driver ready to be opened; files in ``options`` are relative to ``folder``.

@@ -3,16 +3,20 @@
 Shared by the receiver and by the simulated plant, so that both mean the same bus by the same words.
 """
 
+import re
 import socket
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import can
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.errors import DeviceError
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
+
+DEFAULT_CHANNEL, DEFAULT_GROUP = "vcan0", "239.74.163.2"
+GROUP = re.compile(r"239\.\d{1,3}\.\d{1,3}\.\d{1,3}")
 
 
 class BusOptions(Closed):
@@ -20,24 +24,41 @@ class BusOptions(Closed):
 
     interface: str = "auto"
     """``auto``, or one of python-can: ``socketcan``, ``udp_multicast``, ``pcan``, ``kvaser``, ``slcan`` ..."""
-    channel: str = "vcan0"
-    """The kernel's network interface, or the channel as the interface of python-can names it."""
+    channel: str | None = None
+    """The kernel's network interface, or the channel as the interface of python-can names it; ``vcan0`` without it."""
     bitrate: Annotated[float, BeforeValidator(Quantity("bit/s", 1e3, 1e6))] | None = None
     """Only for interfaces that set it themselves; the kernel's is set with ``ip link``."""
-    multicast_group: Annotated[str, Field(pattern=r"^239\.\d{1,3}\.\d{1,3}\.\d{1,3}$")] = "239.74.163.2"
-    multicast_port: Annotated[int, Field(ge=1024, le=65535)] = 43113
+    port: Annotated[int, Field(ge=1024, le=65535)] = 43113
+    """Of ``udp_multicast``: two buses on one computer differ in it, or in their group."""
 
-    def resolved(self) -> str:
-        """The interface, with ``auto`` decided for this computer."""
+    @model_validator(mode="after")
+    def _channel_fits(self) -> Self:
+        if self.interface == "udp_multicast" and self.channel is not None and not GROUP.fullmatch(self.channel):
+            raise ValueError(f"channel {self.channel!r}: udp_multicast takes a group like {DEFAULT_GROUP!r}")
+        return self
+
+    def resolved(self) -> tuple[str, str]:
+        """Interface and channel, with ``auto`` decided for this computer.
+
+        Only a virtual channel has a stand-in: a real one that is missing must not turn into a bus where nobody speaks.
+        """
+        if self.interface == "udp_multicast":
+            return self.interface, self.channel or DEFAULT_GROUP
+        channel = self.channel or DEFAULT_CHANNEL
         if self.interface != "auto":
-            return self.interface
-        return "socketcan" if kernel_has(self.channel) else "udp_multicast"
+            return self.interface, channel
+        if channel.startswith("vcan") and not kernel_has(channel):
+            return "udp_multicast", DEFAULT_GROUP
+        return "socketcan", channel
 
     def title(self) -> str:
         """The bus in a few words."""
-        if self.resolved() == "udp_multicast":
-            return f"udp_multicast {self.multicast_group}:{self.multicast_port} (this computer only)"
-        return f"{self.resolved()} {self.channel}"
+        interface, channel = self.resolved()
+        return (
+            f"{interface} {channel}:{self.port} (this computer only)"
+            if interface == "udp_multicast"
+            else f"{interface} {channel}"
+        )
 
 
 def kernel_has(channel: str) -> bool:
@@ -57,11 +78,11 @@ def open_bus(options: BusOptions, filters: list[can.typechecking.CanFilter] | No
     Raises:
         DeviceError: it is not there, or refuses.
     """
-    interface = options.resolved()
-    arguments: dict[str, Any] = {"interface": interface, "channel": options.channel}
+    interface, channel = options.resolved()
+    arguments: dict[str, Any] = {"interface": interface, "channel": channel}
     if interface == "udp_multicast":
         # A hop limit of 0 keeps every frame on this computer; the library's own default reaches the network.
-        arguments |= {"channel": options.multicast_group, "port": options.multicast_port, "hop_limit": 0, "fd": False}
+        arguments |= {"port": options.port, "hop_limit": 0, "fd": False}
     elif options.bitrate is not None:
         arguments["bitrate"] = int(options.bitrate)
     try:

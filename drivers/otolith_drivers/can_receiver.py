@@ -17,8 +17,10 @@ from cantools.database import Message
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.dbc import Wanted, find_signals, load_dbc
+from otolith_drivers.dbc import Source, Wanted, find_signals, load_dbc
 from otolith_drivers.errors import DeviceError
+
+__all__ = ["CanReceiver", "Options", "Source", "build"]
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from cantools.database.can.database import Database
 from otolith_drivers.base import Signal
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.quantities import factor
-from otolith_drivers.toml_files import Closed, Page, validate
+from otolith_drivers.toml_files import Closed
 
 
 class Source(Closed):
@@ -57,12 +57,14 @@ def load_dbc(path: Path) -> Database:
     try:
         database = cantools.database.load_file(path)
     except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}", ("driver", "dbc")) from error
     except Exception as error:
         cause = " ".join(str(error).split())[:200]
-        raise ConfigurationError(f"{path}: not a CAN database: {cause}") from error
+        raise ConfigurationError(f"{path}: not a CAN database: {cause}", ("driver", "dbc")) from error
     if not isinstance(database, Database):
-        raise ConfigurationError(f"{path}: a diagnostics database; a CAN database (DBC, KCD, SYM, ARXML) is needed")
+        raise ConfigurationError(
+            f"{path}: a diagnostics database; a CAN database (DBC, KCD, SYM, ARXML) is needed", ("driver", "dbc")
+        )
     return database
 
 
@@ -76,27 +78,27 @@ def find_signals(database: Database, signals: Sequence[Signal], path: Path) -> l
 
 
 def _find(database: Database, signal: Signal, path: Path) -> Wanted:
-    source = validate(dict(signal.source), Source, Page(Path("the machine file")), under=("signals", signal.name))
-    key = f"signals.{signal.name}"
+    key = ("signals", signal.name)
+    source: Source = signal.source
     messages = [message for message in database.messages if source.message in (None, message.name)]
     if not messages:
         known = nearest(str(source.message), [message.name for message in database.messages])
-        raise ConfigurationError(f"{path}: no message {source.message!r} ({key}): {known}")
+        raise ConfigurationError(f"{path}: no message {source.message!r}: {known}", key)
     holders = [message for message in messages if any(entry.name == source.signal for entry in message.signals)]
     if not holders:
         known = nearest(source.signal, sorted({entry.name for message in messages for entry in message.signals}))
-        raise ConfigurationError(f"{path}: no signal {source.signal!r} ({key}): {known}")
+        raise ConfigurationError(f"{path}: no signal {source.signal!r}: {known}", key)
     if len(holders) > 1:
         names = ", ".join(message.name for message in holders)
-        raise ConfigurationError(f"{path}: signal {source.signal!r} ({key}) is in {names}: set 'message' beside it")
+        raise ConfigurationError(f"{path}: signal {source.signal!r} is in {names}: set 'message' beside it", key)
     if holders[0].is_container:
-        raise ConfigurationError(f"{path}: {holders[0].name} ({key}) is a container message, which is not supported")
+        raise ConfigurationError(f"{path}: {holders[0].name} is a container message, which is not supported", key)
     found = holders[0].get_signal_by_name(source.signal)
     unit = source.unit or found.unit
     if unit is None:
-        raise ConfigurationError(f"{path}: signal {source.signal!r} has no unit: set 'unit' in {key}")
+        raise ConfigurationError(f"{path}: signal {source.signal!r} has no unit: set 'unit' beside it", key)
     try:
         scale, offset = factor(unit, signal.unit)
     except ValueError as error:
-        raise ConfigurationError(f"{path}: signal {source.signal!r} ({key}): {error}") from error
+        raise ConfigurationError(f"{path}: signal {source.signal!r}: {error}", key) from error
     return Wanted(signal.name, signal.unit, holders[0], found.name, unit, scale, offset)

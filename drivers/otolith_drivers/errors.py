@@ -22,6 +22,11 @@ class ConfigurationError(OtolithError):
     Example scenarios: unknown key, value without a unit, parameter outside its bounds, DBC without the named signal.
     """
 
+    def __init__(self, message: str, key: tuple[str, ...] = ()) -> None:
+        """``key`` is where in the machine file the fault begins, for a fault found by who does not know that file."""
+        super().__init__(message)
+        self.key = key
+
 
 class DeviceError(OtolithError):
     """A device, bus or interface is missing or refuses.

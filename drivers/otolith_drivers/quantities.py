@@ -113,6 +113,8 @@ class Quantity:
             raise ValueError(f"{written!r} is not a number with a unit: {example}")
         if not match[2] and not self._is_plain_number:
             raise ValueError(f"{written!r} has no unit: {example}")
+        if match[2].startswith(","):
+            raise ValueError(f"{written!r} is not a number with a unit: the decimal sign is a point")
         scale, offset = factor(match[2], self.unit)
         value = scale * float(match[1]) + offset
         if not math.isfinite(value):

@@ -67,6 +67,28 @@ def parse(page: Page) -> dict[str, Any]:
         raise ConfigurationError(f"{page.path}: not valid TOML: {error}") from error
 
 
+SHAPES = {
+    "tuple_type": "a list, in [ ]",
+    "list_type": "a list, in [ ]",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "string_type": "a text, in quotes",
+}
+KINDS = {
+    "plant": ("a scenario of the simulated plant", "otolith plant"),
+    "machine": ("a machine file", "otolith run"),
+    "equations": ("a twin", "otolith twin check"),
+}
+"""The key that only one kind of file has, what the file is, and what it is for."""
+
+
+def expect(page: Page, data: dict[str, Any], key: str) -> None:
+    """Refuse a file of another kind, once and by its name, instead of every key in it."""
+    for other, (what, command) in KINDS.items():
+        if other != key and other in data and key not in data:
+            raise ConfigurationError(f"{page.path}: this is {what}, for '{command}'; {KINDS[key][0]} is needed here")
+
+
 def validate(data: Any, model: type[Model], page: Page, under: Location = ()) -> Model:
     """``data`` as ``model``; ``under`` is where in the file it stands."""
     try:
@@ -136,6 +158,8 @@ def _sentence(fault: dict[str, Any], location: Location, model: type[BaseModel])
         return "missing: this key must be set"
     if fault["type"] == "value_error":
         return str(fault["ctx"]["error"])
+    if fault["type"] in SHAPES:
+        return f"{fault['input']!r}: must be {SHAPES[fault['type']]}"
     message = re.sub(r"^Input", "the value", fault["msg"])
     return f"{fault['input']!r}: {message}"
 

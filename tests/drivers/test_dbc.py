@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from otolith_drivers.base import Signal
-from otolith_drivers.dbc import find_signals, load_dbc
+from otolith_drivers.dbc import Source, find_signals, load_dbc
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 
@@ -13,30 +13,29 @@ DBC = EXAMPLES / "dc-motor.dbc"
 
 
 def test_units_are_converted() -> None:
-    wanted = find_signals(load_dbc(DBC), [Signal("n", "rpm", {"signal": "RotorSpeed"})], DBC)[0]
+    wanted = find_signals(load_dbc(DBC), [Signal("n", "rpm", Source(signal="RotorSpeed"))], DBC)[0]
     assert wanted.read({"RotorSpeed": 10.471975512}) == pytest.approx(100.0)
 
 
 def test_a_frame_without_the_signal_gives_no_number() -> None:
-    wanted = find_signals(load_dbc(DBC), [Signal("n", "rad/s", {"signal": "RotorSpeed"})], DBC)[0]
+    wanted = find_signals(load_dbc(DBC), [Signal("n", "rad/s", Source(signal="RotorSpeed"))], DBC)[0]
     assert wanted.read({}) != wanted.read({})
 
 
 @pytest.mark.parametrize(
     ("unit", "source", "sentence"),
     [
-        ("rad/s", {"signal": "RotorSped"}, "no signal 'RotorSped' (signals.n): did you mean 'RotorSpeed'?"),
-        ("rad/s", {"signal": "RotorSpeed", "message": "Motor"}, "no message 'Motor' (signals.n)"),
-        ("A", {"signal": "RotorSpeed"}, "unit 'rad/s' does not measure what 'A' does"),
-        ("A", {"signal": "RotorSpeed", "scale": 2}, "unknown key 'scale'"),
-        ("A", {}, "signals.n.signal: missing"),
-        ("1", {"signal": "ElectricalAliveCounter"}, "has no unit: set 'unit' in signals.n"),
+        ("rad/s", Source(signal="RotorSped"), "no signal 'RotorSped': did you mean 'RotorSpeed'?"),
+        ("rad/s", Source(signal="RotorSpeed", message="Motor"), "no message 'Motor'"),
+        ("A", Source(signal="RotorSpeed"), "unit 'rad/s' does not measure what 'A' does"),
+        ("1", Source(signal="ElectricalAliveCounter"), "has no unit: set 'unit' beside it"),
     ],
 )
-def test_refusals(unit: str, source: dict[str, object], sentence: str) -> None:
+def test_refusals(unit: str, source: Source, sentence: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         find_signals(load_dbc(DBC), [Signal("n", unit, source)], DBC)
     assert sentence in str(caught.value)
+    assert caught.value.key == ("signals", "n")
     assert "\n" not in str(caught.value)
 
 
@@ -47,6 +46,6 @@ def test_a_broken_database_is_refused_in_one_line(tmp_path: Path, content: str) 
     path = tmp_path / "broken.dbc"
     path.write_text(content, encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
-        find_signals(load_dbc(path), [Signal("n", "V", {"signal": "S"})], path)
+        find_signals(load_dbc(path), [Signal("n", "V", Source(signal="S"))], path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)

@@ -16,12 +16,13 @@ from otolith_drivers import registry
 from otolith_drivers.base import Driver, Sample, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.can_receiver import CanReceiver, Options, build, monotonic_of
+from otolith_drivers.dbc import Source
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from tests.conftest import EXAMPLES, OwnMachine
 
 SIGNALS = [
-    Signal("i", "A", {"signal": "ArmatureCurrent"}),
-    Signal("omega", "rpm", {"signal": "RotorSpeed"}),
+    Signal("i", "A", Source(signal="ArmatureCurrent")),
+    Signal("omega", "rpm", Source(signal="RotorSpeed")),
 ]
 
 
@@ -35,9 +36,7 @@ class Rig:
 
 @contextmanager
 def can_rig(machine: OwnMachine) -> Iterator[Rig]:
-    options = Options(
-        interface="udp_multicast", multicast_group=machine.group, multicast_port=machine.port, dbc=Path("dc-motor.dbc")
-    )
+    options = Options(interface="udp_multicast", channel=machine.group, port=machine.port, dbc=Path("dc-motor.dbc"))
     bus = open_bus(BusOptions(**options.model_dump(exclude={"dbc"})))
 
     def say() -> None:
@@ -125,9 +124,7 @@ def test_an_unknown_driver_is_refused_with_the_known_ones() -> None:
 
 
 def receiver(machine: OwnMachine) -> CanReceiver:
-    options = Options(
-        interface="udp_multicast", multicast_group=machine.group, multicast_port=machine.port, dbc=Path("dc-motor.dbc")
-    )
+    options = Options(interface="udp_multicast", channel=machine.group, port=machine.port, dbc=Path("dc-motor.dbc"))
     return build(options, SIGNALS, EXAMPLES)
 
 
@@ -176,9 +173,16 @@ def test_a_bus_that_breaks_is_opened_again(own_machine: OwnMachine, monkeypatch:
         rig.driver.close()
 
 
-def test_a_bus_that_is_not_there_is_a_device_error() -> None:
+@pytest.mark.parametrize("interface", ["socketcan", "auto"])
+def test_a_bus_that_is_not_there_is_a_device_error(interface: str) -> None:
+    """A real channel has no stand-in: a bus where nobody speaks would look like a silent drive."""
     with pytest.raises(DeviceError, match="can7"):
-        open_bus(BusOptions(interface="socketcan", channel="can7"))
+        open_bus(BusOptions(interface=interface, channel="can7"))
+
+
+def test_a_channel_that_the_interface_does_not_know_is_refused() -> None:
+    with pytest.raises(ValueError, match="udp_multicast takes a group"):
+        BusOptions(interface="udp_multicast", channel="vcan9")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Zenoh: the session's configuration, the daemon's publisher, and a subscriber for people and tests."""
 
 import json
+import re
 import threading
 from collections.abc import Callable, Iterable
 from types import TracebackType
@@ -38,11 +39,15 @@ def session(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> zenoh.Se
             config.insert_json5(key, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
-        endpoints = ", ".join([*listen, *connect])
-        cause = str(error).split(" at ")[0].strip()
-        raise ServiceError(
-            f"Zenoh cannot open {endpoints}: {cause}; is another daemon using it? Set zenoh.listen in the machine file"
-        ) from error
+        raise ServiceError(f"Zenoh cannot open {', '.join([*listen, *connect])}: {_cause(str(error))}") from error
+
+
+def _cause(said: str) -> str:
+    """What went wrong and the way out, from Zenoh's nested message."""
+    inner = re.sub(r"[\[\]]|\(os error \d+\)|at /\S+", "", said.rsplit(": [", maxsplit=1)[-1]).strip()
+    if "in use" in said:
+        return f"{inner}; another daemon publishes there: set zenoh.listen in the machine file, or --listen"
+    return f"{inner}; check the endpoint, which is written like tcp/127.0.0.1:7447"
 
 
 class Publisher:
@@ -89,12 +94,18 @@ class Listener:
     """Hears the reports of any machine under ``key``, the latest one first if there is one already."""
 
     def __init__(self, connect: Iterable[str], key: str, hear: Callable[[str], None]) -> None:
+        connect = tuple(connect)
         self._session = session(connect=connect)
         self._hear = hear
         self._subscriber = self._session.declare_subscriber(key, self._take)
         for reply in self._session.get(key, timeout=1.0):
             if reply.ok is not None:
                 hear(reply.ok.payload.to_string())
+
+    @property
+    def connected(self) -> bool:
+        """Whether a daemon (or a router) is reached at all."""
+        return bool(self._session.info.peers_zid()) or bool(self._session.info.routers_zid())
 
     def __enter__(self) -> Self:
         """The listener itself."""

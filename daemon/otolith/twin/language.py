@@ -11,7 +11,7 @@ from otolith.twin.checks import check_equations
 from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, State
 from otolith.twin.expressions import check_name
 from otolith_drivers.quantities import Quantity, to_base
-from otolith_drivers.toml_files import Closed, Location, Page, validate
+from otolith_drivers.toml_files import Closed, Location, Page, expect, validate
 from otolith_drivers.toml_files import parse as parse_toml
 
 MOST_STATES, MOST_PARAMETERS, MOST_SIGNALS = 12, 40, 40
@@ -100,7 +100,9 @@ def read_twin(page: Page) -> Definition:
     Raises:
         ConfigurationError: one line per fault, each with file, line, key and the way out.
     """
-    file = validate(parse_toml(page), _File, page)
+    data = parse_toml(page)
+    expect(page, data, "equations")
+    file = validate(data, _File, page)
     reader = _Reader(page, file)
     definition = reader.definition()
     if reader.faults:

@@ -4,7 +4,6 @@ import csv
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,30 +34,49 @@ class Sent:
     """How often the computer held the node up for longer than ``CATCH_UP_LIMIT``."""
 
 
-def run(scenario: Scenario, stopped: Callable[[], bool], truth: Path | None = None, duration: float = math.inf) -> Sent:
-    """Be the machine until ``stopped`` or for ``duration`` s; ``truth`` gets what is true, as CSV over Unix time.
+class CanNode:
+    """A simulated machine on its bus."""
 
-    Raises:
-        DeviceError: the bus cannot be opened, or another node already sends these frames.
-        ConfigurationError: the DBC describes signals that the machine does not have.
-    """
-    messages = _messages(scenario)
-    bus = open_bus(scenario.bus)
-    try:
-        _refuse_twins(bus, messages, scenario)
-        with _truth_file(truth) as note:
-            stalls, index = 0, 0
-            for index, (tick, stalled) in enumerate(_in_real_time(scenario)):
-                if stopped() or tick.time >= duration:
-                    break
-                stalls += stalled
-                for message in messages:
-                    _send(bus, message, tick, index)
-                if index % TRUTH_EVERY == 0:
-                    note(tick)
-            return Sent(index * len(messages), index * scenario.sample_period, stalls)
-    finally:
-        bus.shutdown()
+    def __init__(self, scenario: Scenario, truth: Path | None = None) -> None:
+        """Open the bus; ``truth`` gets what is true, as CSV over Unix time.
+
+        Raises:
+            DeviceError: the bus cannot be opened, or another node already sends these frames.
+            ConfigurationError: the DBC describes signals that the machine does not have.
+            ServiceError: ``truth`` cannot be written.
+        """
+        self._scenario = scenario
+        self._messages = _messages(scenario)
+        self._truth = _TruthFile(truth) if truth is not None else None
+        self._bus = open_bus(scenario.bus)
+        try:
+            _refuse_twins(self._bus, self._messages, scenario)
+        except DeviceError:
+            self.close()
+            raise
+
+    def run(self, stopped: Callable[[], bool], duration: float = math.inf) -> Sent:
+        """Be the machine until ``stopped`` or for ``duration`` s.
+
+        Raises:
+            DeviceError: the bus went away.
+        """
+        stalls, index = 0, 0
+        for index, (tick, stalled) in enumerate(_in_real_time(self._scenario)):
+            if stopped() or tick.time >= duration:
+                break
+            stalls += stalled
+            for message in self._messages:
+                _send(self._bus, message, tick, index)
+            if self._truth is not None and index % TRUTH_EVERY == 0:
+                self._truth.note(tick)
+        return Sent(index * len(self._messages), index * self._scenario.sample_period, stalls)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+        if self._truth is not None:
+            self._truth.close()
 
 
 def _in_real_time(scenario: Scenario) -> Iterator[tuple[Tick, bool]]:
@@ -97,25 +115,21 @@ def _refuse_twins(bus: can.BusABC, messages: list[Message], scenario: Scenario) 
             )
 
 
-@contextmanager
-def _truth_file(path: Path | None) -> Iterator[Callable[[Tick], None]]:
-    """A function that notes a tick in ``path``; without a path it does nothing."""
-    if path is None:
-        yield lambda _: None
-        return
-    try:
-        file = path.open("w", encoding="utf-8", newline="", buffering=1)
-    except OSError as error:
-        raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
-    with file:
-        writer = csv.writer(file)
+class _TruthFile:
+    def __init__(self, path: Path) -> None:
+        try:
+            self._file = path.open("w", encoding="utf-8", newline="", buffering=1)
+        except OSError as error:
+            raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
+        self._writer = csv.writer(self._file)
 
-        def note(tick: Tick) -> None:
-            if tick.time == 0.0:
-                writer.writerow(["t", *tick.truth])
-            writer.writerow([f"{time.time():.4f}", *(f"{value:.9g}" for value in tick.truth.values())])
+    def note(self, tick: Tick) -> None:
+        if tick.time == 0.0:
+            self._writer.writerow(["t", *tick.truth])
+        self._writer.writerow([f"{time.time():.4f}", *(f"{value:.9g}" for value in tick.truth.values())])
 
-        yield note
+    def close(self) -> None:
+        self._file.close()
 
 
 def _send(bus: can.BusABC, message: Message, tick: Tick, index: int) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.plant.scenario import Scenario
 from otolith_drivers.plant.tick import Tick
-from otolith_drivers.toml_files import parse, read, validate
+from otolith_drivers.toml_files import expect, parse, read, validate
 
 # Each module has SCENARIO, the model of its scenario files, and simulate(scenario), its ticks without end.
 PLANTS = {
@@ -25,6 +25,7 @@ def load_scenario(path: Path) -> Scenario:
     """
     page = read(path)
     data = parse(page)
+    expect(page, data, "plant")
     name = data.get("plant")
     if not isinstance(name, str) or name not in PLANTS:
         raise ConfigurationError(f"{page.place(('plant',))}: no plant {name!r}: {nearest(str(name), list(PLANTS))}")

@@ -1,0 +1,71 @@
+"""``otolith check``: what the daemon would do with a machine file, and whether its signals come."""
+
+import time
+from collections import Counter
+from collections.abc import Container, Iterator, Sequence
+from pathlib import Path
+
+from otolith.outlets.places import recording_folder
+from otolith.paths import complain_unless_writable
+from otolith.plan import Plan, load_plan
+from otolith.topics import prefix
+from otolith_drivers.base import Sample
+
+LISTEN = 1.0  # s
+
+
+def check_machine(path: Path, *, with_device: bool) -> Iterator[str]:
+    """Lines to be shown, the last ones after listening to the bus for a second.
+
+    Raises:
+        OtolithError: whatever would keep the daemon from starting.
+    """
+    plan = load_plan(path)
+    yield from describe(plan)
+    if plan.file.recording.enabled:
+        complain_unless_writable(recording_folder(plan))
+    if with_device:
+        yield from _listen(plan)
+
+
+def describe(plan: Plan) -> list[str]:
+    """What the daemon would do, a line per fact; what the file leaves to the twin is marked."""
+    file, problem, twin = plan.file, plan.problem, plan.twin
+    lines = [
+        f"machine {file.machine.name} at {file.machine.site}, twin {twin.name}: {twin.title}",
+        *(f"  {name} = {text}" for name, text, _ in twin.definitions),
+        *(f"  {left} = {right}" for left, right in twin.equations),
+        *plan.driver.describe(),
+        f"windows of {file.window.length:g} s, {plan.records} records",
+    ]
+    for name, value in problem.known:
+        entry = twin.parameter(name)
+        lines.append(f"known: {name} = {value:g} {entry.unit} ({entry.meaning}){_left_open(name, file.parameters)}")
+    for entry in problem.free:
+        span = f"from {entry.low:g} to {entry.high:g} {entry.unit}, starting at {entry.nominal:g} {entry.unit}"
+        lines.append(f"estimated: {entry.name} {span} ({entry.meaning}){_left_open(entry.name, file.parameters)}")
+    for output, noise in zip(twin.outputs, problem.noise, strict=True):
+        lines.append(f"noise of {output.name}: {noise:g} {output.unit}{_left_open(output.name, file.noise)}")
+    endpoints = ", ".join(file.zenoh.listen) or "no endpoint"
+    lines.append(f"reports on {endpoints}, keys {prefix(file.machine.site, file.machine.name)}/...")
+    lines.append(f"recordings into {recording_folder(plan)}" if file.recording.enabled else "no recordings")
+    return lines
+
+
+def _left_open(name: str, said: Container[str]) -> str:
+    return "" if name in said else " [not in the file: the twin's own value]"
+
+
+def _listen(plan: Plan) -> Iterator[str]:
+    counts: Counter[str] = Counter()
+
+    def deliver(samples: Sequence[Sample]) -> None:
+        counts.update(sample.signal for sample in samples)
+
+    plan.driver.open(deliver)
+    time.sleep(LISTEN)
+    plan.driver.close()
+    wanted = LISTEN / plan.file.window.sample_period
+    for signal in plan.twin.signals:
+        verdict = "" if counts[signal] >= 0.5 * wanted else ", too few" if counts[signal] else ": is the machine on?"
+        yield f"heard {signal}: {counts[signal]} samples in {LISTEN:g} s{verdict}"
