@@ -36,7 +36,7 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
     name = f"otolith_kernel_{key}"
     if name in sys.modules:
         return sys.modules[name]
-    store = _private(cache_directory() / "kernels")
+    store = cache_directory("kernels")
     folder = store / key
     with _locked(store / f"{key}.lock"):
         file = folder / f"{name}.py"
@@ -54,17 +54,6 @@ def compiling(module: ModuleType) -> Iterator[None]:
     file = Path(module.__file__ or "")
     with _locked(file.parent.parent / f"{file.parent.name}.lock"):
         yield
-
-
-def _private(folder: Path) -> Path:
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.stat()
-    except OSError as error:
-        raise ServiceError(f"{folder}: cannot be made: {error.strerror}") from error
-    if found.st_uid != os.geteuid() or found.st_mode & 0o022:
-        raise ServiceError(f"{folder}: must belong to this user and be writable by nobody else, as what is in it runs")
-    return folder
 
 
 @contextmanager

@@ -1,57 +1,13 @@
-"""Where files go: systemd's directories in a service, the user's own (XDG) otherwise; always private."""
+"""Where files are: the private folders of :mod:`otolith_drivers.private`, and the examples that travel with Otolith."""
 
-import os
 from pathlib import Path
 
-from otolith.errors import ServiceError
+from otolith_drivers.private import cache_directory, complain_unless_writable, state_directory, writable
 
-
-def state_directory() -> Path:
-    """Recordings and what is learned."""
-    return _private("STATE_DIRECTORY", "XDG_STATE_HOME", ".local/state")
-
-
-def cache_directory() -> Path:
-    """What can be made again: compiled kernels. Private, as loading them runs them."""
-    return _private("CACHE_DIRECTORY", "XDG_CACHE_HOME", ".cache")
+__all__ = ["cache_directory", "complain_unless_writable", "examples_directory", "state_directory", "writable"]
 
 
 def examples_directory() -> Path:
     """The machine files to copy from: inside an installed package, or beside the sources of a checkout."""
     installed = Path(__file__).parent / "config"
     return installed if installed.is_dir() else Path(__file__).parents[2] / "config"
-
-
-def writable(folder: Path) -> Path:
-    """``folder``, made if it is missing.
-
-    Raises:
-        ServiceError: it cannot be written to.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError as error:
-        raise ServiceError(f"{folder}: cannot be made: {error.strerror}") from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise ServiceError(f"{folder}: not writable for this user")
-    return folder
-
-
-def complain_unless_writable(folder: Path) -> None:
-    """Refuse a folder that :func:`writable` would, without making it.
-
-    Raises:
-        ServiceError: it cannot be written to, or could not be made.
-    """
-    nearest = folder
-    while not nearest.exists() and nearest != nearest.parent:
-        nearest = nearest.parent
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
-        raise ServiceError(f"{folder}: cannot be written by this user, as {nearest} is no folder that can be")
-
-
-def _private(systemd: str, xdg: str, fallback: str) -> Path:
-    if given := os.environ.get(systemd):
-        return writable(Path(given.split(":")[0]))
-    base = os.environ.get(xdg) or str(Path.home() / fallback)
-    return writable(Path(base) / "otolith")

@@ -22,7 +22,7 @@ from otolith.health.report import CountersDocument, Report, ReportDocument, Stat
 from otolith.notify import Notifier
 from otolith.outlets.places import recording_folder
 from otolith.outlets.zenoh_session import Publisher
-from otolith.paths import cache_directory, writable
+from otolith.paths import writable
 from otolith.plan import Plan
 from otolith.state import begin
 from otolith.supervisor import Supervisor
@@ -63,8 +63,6 @@ class Service:
         """
         for number in SIGNALS:
             signal.signal(number, self._on_signal)
-        # numba runs what it finds in its cache, so the cache is a private folder.
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_directory() / "kernels"))
         try:
             self._start()
             while self._stop_signal is None:

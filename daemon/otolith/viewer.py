@@ -6,7 +6,7 @@ import sysconfig
 from pathlib import Path
 
 from otolith.errors import ConfigurationError, ServiceError
-from otolith.paths import cache_directory, state_directory, writable
+from otolith.paths import cache_directory, state_directory
 
 MAGIC = b"RRF2"  # of Rerun's files
 
@@ -48,7 +48,7 @@ def _quiet() -> dict[str, str]:
     It knows no option for that, only a file that ``rerun analytics disable`` writes; a folder of ours keeps
     the user's settings as they are.
     """
-    environment = {**os.environ, "XDG_CONFIG_HOME": str(writable(cache_directory() / "viewer"))}
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(cache_directory("viewer"))}
     program = str(Path(sysconfig.get_path("scripts")) / "rerun")
     subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)  # noqa: S603
     return environment

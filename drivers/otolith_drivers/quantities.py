@@ -4,11 +4,16 @@ Every number in a file carries its unit, is converted once on the way in, and is
 from there on. Parsing is pint's, behind a pattern that admits one number and one unit, so that nothing is evaluated.
 """
 
+import contextlib
 import math
 import re
+import shutil
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
+
+from otolith_drivers.errors import OtolithError
+from otolith_drivers.private import cache_directory
 
 if TYPE_CHECKING:
     import pint
@@ -35,9 +40,14 @@ ALIASES = {
 
 @cache
 def _registry() -> "pint.UnitRegistry[float]":
-    import pint  # noqa: PLC0415 - 0.3 s, and not every command reads a quantity
+    import pint  # noqa: PLC0415 - a quarter of a second, and not every command reads a quantity
 
-    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    try:  # parsed units are kept, which saves most of the time; half a file of a process that died is made anew
+        return pint.UnitRegistry(autoconvert_offset_to_baseunit=True, cache_folder=cache_directory("units"))
+    except Exception:  # noqa: BLE001 - whatever is wrong with the cache, the units are not
+        with contextlib.suppress(OtolithError):
+            shutil.rmtree(cache_directory("units"), ignore_errors=True)
+        return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
 
 
 @cache
