@@ -40,7 +40,7 @@ def main() -> int:
     free = tuple(entry for entry in DC_MOTOR.parameters if entry.name == "R_a")
     known = tuple((entry.name, entry.nominal) for entry in DC_MOTOR.parameters if entry.name != "R_a")
     problem = Problem(DC_MOTOR, known, free, (0.005, 0.02))
-    objective = Objective(problem, window)
+    objective = Objective(problem, window, np.array([6.5]))
     start = objective.guess(np.array([6.5]))
     swarm = np.repeat(start[None, :], problem.swarm.size, axis=0)
     generations = search(objective, problem.swarm, start, seed=1).generations

@@ -52,8 +52,9 @@ def test_every_commented_default_of_the_example_is_the_default(tmp_path: Path) -
     path = tmp_path / "dc-motor.toml"
     path.write_text(uncommented, encoding="utf-8")
     (tmp_path / "dc-motor.dbc").write_bytes((EXAMPLES / "dc-motor.dbc").read_bytes())
-    loaded = load_plan(path).file
-    assert loaded.model_copy(update={"driver": plain.driver}) == plain
+    loaded = load_plan(path)
+    assert loaded.file.model_copy(update={"driver": plain.driver, "process_noise": {}}) == plain
+    assert loaded.problem == load_plan(EXAMPLES / "dc-motor.toml").problem
 
 
 def test_units_of_the_file_are_free(own_machine: OwnMachine) -> None:

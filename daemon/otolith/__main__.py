@@ -33,6 +33,9 @@ def main() -> None:
     except BrokenPipeError:  # the reader of our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+    except OSError as error:  # a disk that is full, a file that went away: nothing that a traceback would explain
+        click.echo(f"Error: {error}", err=True)
+        code = 2
     sys.exit(code or 0)
 
 

@@ -46,6 +46,10 @@ def describe(plan: Plan) -> list[str]:
         lines.append(f"estimated: {entry.name} {span} ({entry.meaning}){_left_open(entry.name, file.parameters)}")
     for output, noise in zip(twin.outputs, problem.noise, strict=True):
         lines.append(f"noise of {output.name}: {noise:g} {output.unit}{_left_open(output.name, file.noise)}")
+    for driving, noise in zip(twin.inputs, problem.input_noise, strict=True):
+        lines += [f"noise of {driving.name}: {noise:g} {driving.unit}"] if noise else []
+    for state, noise in zip(twin.states, problem.process_noise, strict=True):
+        lines += [f"process noise of {state.name}: {noise:g} {state.unit} per square root of a second"] if noise else []
     endpoints = ", ".join(file.zenoh.listen) or "no endpoint"
     lines.append(f"reports on {endpoints}, keys {prefix(file.machine.site, file.machine.name)}/...")
     lines.append(f"recordings into {recording_folder(plan)}" if file.recording.enabled else "no recordings")

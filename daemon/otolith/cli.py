@@ -34,7 +34,15 @@ def _endpoints(_: click.Context, __: click.Parameter, written: tuple[str, ...]) 
 def _rrd(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
     if path is not None and path.suffix != ".rrd":
         raise click.BadParameter(f"{str(path)!r}: a recording ends in .rrd")
+    if path is not None and path.exists():
+        raise click.BadParameter(f"{str(path)!r} is there already and would be lost")
     return path
+
+
+def _machine_name(_: click.Context, __: click.Parameter, name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_\-*]+", name):
+        raise click.BadParameter(f"{name!r} is no name of a machine")
+    return name
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog=EXIT_CODES)
@@ -135,7 +143,7 @@ def plant(scenario: Path, truth: Path | None, duration: float) -> int:
     metavar="ENDPOINT",
     help="Where daemons are; may be given more than once.",
 )
-@click.option("--machine", default="*", metavar="NAME", help="Only this machine.")
+@click.option("--machine", default="*", callback=_machine_name, metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
 def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
     """Show the live table of a running daemon, from any process that reaches it.
@@ -209,7 +217,8 @@ class _StopSignal:
     def __init__(self) -> None:
         self.number: int | None = None
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, self._take)
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves SIGHUP
+                signal.signal(number, self._take)
 
     def code(self, clean: int | None = None) -> int:
         """The exit code, as a shell counts signals; 0 for the signal that is the ordinary way to end."""

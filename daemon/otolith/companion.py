@@ -5,15 +5,19 @@ Rerun's threads half), talks over one pipe, is never waited for, and ends by its
 """
 
 import contextlib
+import logging
 import multiprocessing
 import multiprocessing.connection
 import queue
 import signal
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from multiprocessing import resource_tracker
 from typing import Any
+
+log = logging.getLogger(__name__)
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0  # s before the second start after deaths in a row, and before any later one
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -46,30 +50,39 @@ class Companion:
         self.starts = 0
         self._main, self._room = main, room
         self._deaths = 0
+        self._started_at = 0.0
         self._start_again_at: float | None = None
         self._process: Any = None
         self._connection: Any = None
         self._outbox: queue.Queue[Any] = queue.Queue(room)
 
     def start(self, *arguments: Any) -> None:
-        """Spawn the process; what waited for an earlier one is gone."""
+        """Spawn the process; what waited for an earlier one is gone. A failure to spawn counts as a death."""
         self._release()
+        self.starts += 1
+        self._start_again_at, self._started_at = None, time.monotonic()
+        try:
+            self._spawn(arguments)
+        except OSError as error:  # no descriptors, no processes, no memory left: perhaps in a while
+            log.warning("%s cannot be started: %s", self.name, error)
+            self._release()
+
+    def _spawn(self, arguments: Sequence[Any]) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._outbox = queue.Queue(self._room)
-        self._process = context.Process(
-            target=_enter, args=(theirs, self._main, arguments), name=self.name, daemon=True
-        )
-        resource_tracker.ensure_running()  # it unblocks the signals when it starts, so not among those below
-        with _signals_blocked():
-            self._process.start()
-            sender = threading.Thread(
-                target=_send, args=(self._outbox, self._connection), name=f"to-{self.name}", daemon=True
-            )
-            sender.start()
-        theirs.close()
-        self.starts += 1
-        self._start_again_at = None
+        try:
+            self._outbox = queue.Queue(self._room)
+            process = context.Process(target=_enter, args=(theirs, self._main, arguments), name=self.name, daemon=True)
+            resource_tracker.ensure_running()  # it unblocks the signals when it starts, so not among those below
+            with _signals_blocked():
+                process.start()
+                self._process = process
+                sender = threading.Thread(
+                    target=_send, args=(self._outbox, self._connection), name=f"to-{self.name}", daemon=True
+                )
+                sender.start()
+        finally:
+            theirs.close()
 
     @property
     def pid(self) -> int | None:
@@ -96,6 +109,15 @@ class Companion:
             self._start_again_at = now + min(pause, LONGEST_PAUSE)
         return now >= self._start_again_at
 
+    def postpone(self) -> None:
+        """A start was given up before it began: the next pause is as after a death."""
+        self._start_again_at = None
+
+    @property
+    def age(self) -> float:
+        """Seconds since the process was started."""
+        return time.monotonic() - self._started_at
+
     def has_thrived(self) -> None:
         """It did its work: the next death is the first in a row again."""
         self._deaths = 0
@@ -109,7 +131,7 @@ class Companion:
         return True
 
     def replies(self) -> list[Any]:
-        """What it has said since; never waits."""
+        """What it has said since; waits only for the rest of a message that has begun to come."""
         said = []
         with contextlib.suppress(EOFError, OSError):
             while self._connection is not None and self._connection.poll():

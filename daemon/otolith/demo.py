@@ -21,7 +21,7 @@ from rich.table import Table
 
 from otolith.acquisition.window import Verdict
 from otolith.console import Board
-from otolith.errors import OtolithError, ServiceError
+from otolith.errors import ConfigurationError, OtolithError, ServiceError
 from otolith.health.report import ReportDocument, Status
 from otolith.health.status import QUANTILE
 from otolith.outlets.zenoh_session import Listener
@@ -95,6 +95,8 @@ class Demo:
         """0 if every estimate was right, 1 if not; a process that fails gives its own exit code."""
         identity = self._plan.file.machine
         connect = self._plan.file.zenoh.listen
+        if not connect:
+            raise ConfigurationError(f"{self._machine}: zenoh.listen is empty, so there is nothing to watch")
         key = REPORT.under(identity.site, identity.name)
         say = self._console.print
         say(f"machine {self._machine}, scenario {self._scenario}, {self._duration:.0f} s", soft_wrap=True)

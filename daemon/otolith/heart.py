@@ -23,6 +23,9 @@ from otolith.health.status import Known, publish
 from otolith.state import State
 from otolith.twin.definition import Definition
 
+FEWEST_RECORDS = 5
+LARGEST = 1e12  # of a value, in the unit of its signal: no sensor says that
+REFUSED = 4.0  # cost beyond which the window contradicts the twin, and nothing is taken from it
 EXPLAINED = 1.5  # cost (RMSE over noise) up to which the residual counts as noise
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
 
@@ -30,13 +33,24 @@ UNEXPLAINED = "the twin does not explain the window up to the noise: another par
 def adapt(state: State, window: Window) -> tuple[State, Report]:
     """Adapt the twin to ``window``; a bad window leaves the state where it was and is reported."""
     twin = state.problem.twin
-    if window.quality.verdict is Verdict.BAD:
-        reason = "window not estimated from: " + "; ".join(window.quality.reasons)
+    reasons = window.quality.reasons if window.quality.verdict is Verdict.BAD else _senseless(window)
+    if reasons:
+        reason = "window not estimated from: " + "; ".join(reasons)
         return state, Report(_document(state, window, state.known, None, reason)[1], _measured(state, twin, window))
-    found = estimate(state.problem, window, _start(state))
+    warm = all(entry is not None for entry in state.known)
+    found = estimate(state.problem, window, _start(state), warm=warm)
     known, document = _document(state, window, state.known, found, "")
     traces = Traces(_outputs(twin), found.measured, found.predicted, state.problem.noise)
     return replace(state, known=known), Report(document, traces)
+
+
+def _senseless(window: Window) -> tuple[str, ...]:
+    """Why nothing can be estimated from a window, however well it was sampled."""
+    if window.records < FEWEST_RECORDS:
+        return (f"{window.records} records are too few",)
+    if not (np.abs(window.values) < LARGEST).all():  # not a number is not smaller either
+        return (f"a value is not finite or beyond {LARGEST:g}",)
+    return ()
 
 
 def _start(state: State) -> Array:
@@ -61,9 +75,9 @@ def _document(
     next_known: list[Known | None] = []
     for index, entry in enumerate(state.problem.free):
         said = None if found is None else found.parameters[index]
-        kept, parameters[entry.name] = publish(entry, said, known[index], reason)
-        if found is not None and found.cost > EXPLAINED and not parameters[entry.name].reason:
-            parameters[entry.name] = parameters[entry.name].model_copy(update={"reason": UNEXPLAINED})
+        doubt = UNEXPLAINED if found is not None and found.cost > EXPLAINED else ""
+        refused = found is not None and found.cost > REFUSED
+        kept, parameters[entry.name] = publish(entry, said, known[index], reason or doubt, refused=refused)
         next_known.append(kept)
     document = ReportDocument(
         machine=state.machine,

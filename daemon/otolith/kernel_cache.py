@@ -56,6 +56,11 @@ def compiling(module: ModuleType) -> Iterator[None]:
         yield
 
 
+def discard(module: ModuleType) -> None:
+    """Remove what is compiled of a module: a file that a power cut left half would fail for ever."""
+    shutil.rmtree(Path(module.__file__ or "").parent / "__pycache__", ignore_errors=True)
+
+
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     with path.open("w", encoding="utf-8") as file:

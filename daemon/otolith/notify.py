@@ -13,8 +13,8 @@ class Notifier:
         self._address = "\0" + path[1:] if path.startswith("@") else path
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if path else None
         microseconds, pid = environment.get("WATCHDOG_USEC"), environment.get("WATCHDOG_PID")
-        ours = microseconds is not None and pid in (None, str(os.getpid()))
-        self.watchdog = float(microseconds or 0) / 1e6 if ours else None
+        ours = pid in (None, str(os.getpid()))
+        self.watchdog = float(microseconds) / 1e6 if ours and microseconds and microseconds.isdigit() else None
         """Seconds within which systemd wants to hear of progress; None if it does not."""
 
     def ready(self, status: str) -> None:

@@ -7,13 +7,15 @@ from pathlib import Path
 from otolith.acquisition.alignment import Limits
 from otolith.adaptation.problem import Problem, SwarmOptions
 from otolith.errors import ConfigurationError, nearest
-from otolith.settings import MachineFile, ParameterTable
+from otolith.settings import MachineFile, ParameterTable, Written
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twins import find_twin, load_twin
 from otolith_drivers.base import Driver, Signal
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.registry import find
 from otolith_drivers.toml_files import Page, expect, parse, read, validate
+
+SMALLEST_NOISE = 1e-12  # of an output: without any, no residual could be weighed
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,11 +115,14 @@ def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
             known.append((entry.name, parameter.nominal))
     if not free:
         context.fail(("parameters",), "nothing is to be estimated: write R_a = { estimate = true } or the like")
+    sensors = _sensor_noise(file, twin, context)
     return Problem(
         twin=twin,
         known=tuple(known),
         free=tuple(free),
-        noise=_noise(file.noise, twin, context),
+        noise=sensors[0],
+        input_noise=sensors[1],
+        process_noise=_process_noise(file, twin, context),
         swarm=SwarmOptions(
             file.swarm.size, file.swarm.generations, file.swarm.inertia, file.swarm.cognitive, file.swarm.social
         ),
@@ -144,16 +149,34 @@ def _parameter(entry: Parameter, table: ParameterTable, context: _Context, *, es
     return replace(entry, nominal=given["value"], low=given["low"], high=given["high"])
 
 
-def _noise(table: Mapping[str, str], twin: Definition, context: _Context) -> tuple[float, ...]:
-    outputs = [entry.name for entry in twin.outputs]
-    for name in table:
-        if name not in outputs:
-            context.fail(("noise", name), f"twin {twin.name!r} has no such output: {nearest(name, outputs)}")
-    levels = []
-    for entry in twin.outputs:
-        with context.at("noise", entry.name):
-            levels.append(Quantity(entry.unit, low=1e-12)(table[entry.name]) if entry.name in table else entry.noise)
-    return tuple(levels)
+def _levels(
+    table: str, written: Mapping[str, Written], entries: Mapping[str, tuple[str, float]], context: _Context
+) -> dict[str, float]:
+    """Noise levels: ``entries`` has the unit of each name that may be given, and its level if it is not."""
+    for name in written:
+        if name not in entries:
+            context.fail((table, name), f"the twin has no such signal or state: {nearest(name, list(entries))}")
+    found = {}
+    for name, (unit, level) in entries.items():
+        with context.at(table, name):
+            low = 0.0 if level == 0.0 else SMALLEST_NOISE
+            found[name] = Quantity(unit, low=low)(written[name]) if name in written else level
+    return found
+
+
+def _sensor_noise(
+    file: MachineFile, twin: Definition, context: _Context
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Of the outputs, and of the inputs."""
+    signals = {entry.name: (entry.unit, 0.0) for entry in twin.inputs}
+    signals |= {entry.name: (entry.unit, entry.noise) for entry in twin.outputs}
+    found = _levels("noise", file.noise, signals, context)
+    return tuple(found[entry.name] for entry in twin.outputs), tuple(found[entry.name] for entry in twin.inputs)
+
+
+def _process_noise(file: MachineFile, twin: Definition, context: _Context) -> tuple[float, ...]:
+    states = {entry.name: (f"({entry.unit})/s^0.5", 0.0) for entry in twin.states}
+    return tuple(_levels("process_noise", file.process_noise, states, context).values())
 
 
 def _driver(file: MachineFile, twin: Definition, context: _Context) -> Driver:

@@ -5,6 +5,7 @@
 This thread never waits for a machine, a worker, a disk or a subscriber.
 """
 
+import contextlib
 import logging
 import os
 import signal
@@ -18,6 +19,7 @@ from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.companion import SIGNALS, Companion
+from otolith.errors import OtolithError
 from otolith.health.report import CountersDocument, Report, ReportDocument, Status
 from otolith.notify import Notifier
 from otolith.outlets.places import recording_folder
@@ -30,10 +32,12 @@ from otolith.supervisor import Supervisor
 log = logging.getLogger(__name__)
 
 RING_WINDOWS = 8  # windows that the rings hold: how long this thread may be held up without losing a sample
+RING_RATE = 4  # how much faster than the grid a source may send for that to be true
 TICK = 0.1  # s; the longest wait, so how late a stop, a death or an outage can be noticed
 RECORDER_ROOM = 32  # windows
 RECORDER_FLUSH = 1.5  # s at the end
-STALL = 30.0  # s without a window finished or honestly missed, after which the watchdog is no longer fed
+STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed
+THRIVES = 60.0  # s after which a recorder counts as healthy
 
 
 class Service:
@@ -43,7 +47,7 @@ class Service:
         machine = plan.file.machine
         self._plan = plan
         self._listen = plan.file.zenoh.listen if listen is None else listen
-        self._rings = Rings(plan.twin.signals, RING_WINDOWS * plan.records)
+        self._rings = Rings(plan.twin.signals, RING_RATE * RING_WINDOWS * plan.records)
         self._windower = Windower(plan.twin.signals, plan.records, plan.file.window.sample_period, plan.limits)
         self._supervisor = Supervisor(begin(machine.name, machine.site, plan.problem), self._windower.length)
         self._recorder = Companion("otolith-recorder", "otolith.outlets.recorder:main", RECORDER_ROOM)
@@ -62,7 +66,8 @@ class Service:
             ServiceError: a port or folder of this computer cannot be had.
         """
         for number in SIGNALS:
-            signal.signal(number, self._on_signal)
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves SIGHUP
+                signal.signal(number, self._on_signal)
         try:
             self._start()
             while self._stop_signal is None:
@@ -85,13 +90,15 @@ class Service:
         log.info("machine %s, %s: reports on %s", machine.name, self._plan.twin.title, ", ".join(self._listen))
 
     def _stop(self) -> None:
-        self._notifier.stopping()
-        self._plan.driver.close()
-        self._supervisor.stop()
-        self._recorder.stop(RECORDER_FLUSH)
-        if self._publisher is not None:
-            self._publisher.close()
-        self._notifier.close()
+        """Everything that was begun, whatever becomes of the rest."""
+        with contextlib.ExitStack() as steps:
+            steps.callback(self._notifier.close)
+            if self._publisher is not None:
+                steps.callback(self._publisher.close)
+            steps.callback(self._recorder.stop, RECORDER_FLUSH)
+            steps.callback(self._supervisor.stop)
+            steps.callback(self._plan.driver.close)
+            self._notifier.stopping()
 
     def _start_recorder(self) -> None:
         plan = self._plan
@@ -131,8 +138,9 @@ class Service:
         document = document.model_copy(update={"cost": cost, "counters": self._counters()})
         if self._publisher is not None:
             self._publisher.publish(document)
-        if self._recorder.alive and not self._recorder.offer(Report(document, report.traces)):
-            self._recordings_dropped += 1
+        if self._plan.file.recording.enabled:
+            recorded = self._recorder.alive and self._recorder.offer(Report(document, report.traces))
+            self._recordings_dropped += not recorded
         line = summary(document)
         self._notifier.status(line)
         log.info("%s", line)
@@ -153,16 +161,22 @@ class Service:
 
     def _watch(self, now: float) -> None:
         """Feed the watchdog by progress, not by mere life; bring a dead recorder back with a file of its own."""
-        settled = self._supervisor.finished + self._supervisor.missed
-        if settled != self._settled:
-            self._settled, self._progress = settled, now
+        if self._supervisor.finished != self._settled:
+            self._settled, self._progress = self._supervisor.finished, now
         stalled = now - self._progress > STALL + 3 * self._windower.length
         if self._notifier.watchdog and not stalled and now - self._fed > self._notifier.watchdog / 4:
             self._fed = now
             self._notifier.progress()
-        if self._plan.file.recording.enabled and self._recorder.may_start_again(now):
-            log.warning("the recorder died; it is started again")
-            self._start_recorder()
+        if not self._plan.file.recording.enabled:
+            return
+        if self._recorder.alive and self._recorder.age > THRIVES:
+            self._recorder.has_thrived()
+        if self._recorder.may_start_again(now):
+            try:
+                self._start_recorder()
+            except OtolithError as error:  # recordings are not what the machine is watched for
+                log.warning("no recording: %s", error)
+                self._recorder.postpone()
 
 
 def summary(document: ReportDocument) -> str:

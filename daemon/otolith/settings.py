@@ -109,7 +109,10 @@ class MachineFile(Closed):
     parameters: Annotated[
         dict[str, Annotated[ParameterTable, BeforeValidator(_value_alone)]], Field(default_factory=dict)
     ]
-    noise: Annotated[dict[str, str], Field(default_factory=dict)]
+    noise: Annotated[dict[str, Written], Field(default_factory=dict)]
+    """Of sensors: standard deviation of outputs and of measured inputs."""
+    process_noise: Annotated[dict[str, Written], Field(default_factory=dict)]
+    """Of the machine itself: how far a state strays, in its unit per square root of a second."""
     window: WindowTable = WindowTable()
     swarm: SwarmTable = SwarmTable()
     zenoh: ZenohTable = ZenohTable()

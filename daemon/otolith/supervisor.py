@@ -73,11 +73,13 @@ class Supervisor:
         return reports
 
     def _take(self, result: worker.Result) -> tuple[Report, float] | None:
-        window, self._at_hand = self._at_hand, None
+        window = self._at_hand
+        if window is None or window.index != result.window_index:  # it was taken back, and is answered by another
+            return None
+        self._at_hand = None
         self._companion.has_thrived()
         if result.report is None:
-            if window is not None:
-                self._miss(window, result.failure)
+            self._miss(window, result.failure)
             return None
         self._state = result.state
         self.finished += 1

@@ -3,6 +3,7 @@
 Shared by the receiver and by the simulated plant, so that both mean the same bus by the same words.
 """
 
+import os
 import re
 import socket
 from pathlib import Path
@@ -15,6 +16,7 @@ from otolith_drivers.errors import DeviceError
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
+IP_MULTICAST_ALL = 49  # of <linux/in.h>; the socket module has no name for it
 DEFAULT_CHANNEL, DEFAULT_GROUP = "vcan0", "239.74.163.2"
 GROUP = re.compile(r"239\.\d{1,3}\.\d{1,3}\.\d{1,3}")
 
@@ -86,11 +88,20 @@ def open_bus(options: BusOptions, filters: list[can.typechecking.CanFilter] | No
     elif options.bitrate is not None:
         arguments["bitrate"] = int(options.bitrate)
     try:
-        return can.Bus(**arguments, can_filters=filters)
+        bus = can.Bus(**arguments, can_filters=filters)
+        if interface == "udp_multicast":
+            _hear_only_this_group(bus)
     except (can.CanError, OSError, ImportError, ValueError, TypeError, AttributeError, NotImplementedError) as error:
         raise DeviceError(
             f"CAN bus {options.title()} cannot be opened: {_cause(error)}; {_way_out(interface)}"
         ) from error
+    return bus
+
+
+def _hear_only_this_group(bus: can.BusABC) -> None:
+    """Linux hands a socket the frames of every group that anybody on this computer has joined on its port."""
+    with socket.socket(fileno=os.dup(bus.fileno())) as handle:
+        handle.setsockopt(socket.IPPROTO_IP, IP_MULTICAST_ALL, 0)
 
 
 def _cause(error: BaseException) -> str:

@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 RECEIVE_TIMEOUT = 0.2  # s; how late a stop can be noticed
 BACKOFF_FIRST, BACKOFF_LONGEST = 0.2, 10.0  # s
+MOST_BAD_IN_A_ROW = 50  # unreadable frames, after which the bus is opened anew
 STAMP_TOLERANCE = 1.0  # s; a kernel stamp farther from now than this met a clock that was set
 
 
@@ -65,6 +66,7 @@ class CanReceiver:
         self._link = Link(up=False, reason="not opened yet")
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
+        self._bad_in_a_row = 0
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
@@ -109,15 +111,26 @@ class CanReceiver:
             try:
                 frame = bus.recv(RECEIVE_TIMEOUT)
             except Exception as error:  # noqa: BLE001 - interfaces raise whatever their vendor's library does
+                if self._only_a_bad_frame(error):
+                    continue
                 self._link = Link(up=False, reason=f"{type(error).__name__}: {error}")
                 log.warning("CAN bus %s: %s; reconnecting", self._options.title(), error)
                 _shut(bus)
                 bus = None
                 continue
+            self._bad_in_a_row = 0
             if frame is not None:
                 self._take(frame, deliver)
         if bus is not None:
             _shut(bus)
+
+    def _only_a_bad_frame(self, error: Exception) -> bool:
+        """Whether what came could not be unpacked, while the bus itself stands; many in a row are no accident."""
+        if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
+            return False
+        self._bad_in_a_row += 1
+        self._counters = replace(self._counters, bad=self._counters.bad + 1)
+        return self._bad_in_a_row <= MOST_BAD_IN_A_ROW
 
     def _reconnect(self) -> can.BusABC | None:
         """Endless, with growing pauses that differ from machine to machine."""

@@ -36,11 +36,16 @@ class Wanted:
     source_unit: str
     scale: float
     offset: float
+    low: float = -math.inf
+    """Of the DBC, in the unit on the bus; a value beyond is a code for "no reading", or wrong."""
+    high: float = math.inf
 
     def read(self, values: Mapping[str, Any]) -> float:
-        """The value in the target unit; not a number where this (multiplexed) frame has none."""
+        """The value in the target unit; not a number where this (multiplexed) frame has none, or one out of range."""
         value = values.get(self.signal)
-        return math.nan if value is None else self.scale * float(value) + self.offset
+        if value is None or not self.low <= float(value) <= self.high:
+            return math.nan
+        return self.scale * float(value) + self.offset
 
     def describe(self) -> str:
         """Where it is read, in words."""
@@ -101,4 +106,7 @@ def _find(database: Database, signal: Signal, path: Path) -> Wanted:
         scale, offset = factor(unit, signal.unit)
     except ValueError as error:
         raise ConfigurationError(f"{path}: signal {source.signal!r}: {error}", key) from error
-    return Wanted(signal.name, signal.unit, holders[0], found.name, unit, scale, offset)
+    low, high = found.minimum, found.maximum
+    if low is None or high is None or not low < high:  # [0|0] in a DBC means that nobody said
+        low, high = -math.inf, math.inf
+    return Wanted(signal.name, signal.unit, holders[0], found.name, unit, scale, offset, float(low), float(high))

@@ -55,5 +55,10 @@ def complain_unless_writable(folder: Path) -> None:
 def _private(systemd: str, xdg: str, fallback: str) -> Path:
     if given := os.environ.get(systemd):
         return writable(Path(given.split(":")[0]))
-    base = os.environ.get(xdg) or str(Path.home() / fallback)
-    return writable(Path(base) / "otolith")
+    base = Path(os.environ.get(xdg, ""))
+    if not base.is_absolute():  # as the XDG specification asks
+        home = Path(os.environ.get("HOME", ""))
+        if not home.is_absolute():
+            raise ServiceError(f"no home directory: set {xdg} or HOME to an absolute path")
+        base = home / fallback
+    return writable(base / "otolith")

@@ -18,8 +18,11 @@ from otolith_drivers.private import cache_directory
 if TYPE_CHECKING:
     import pint
 
-QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*?)\s*")
-UNIT = re.compile(r"[\w°%·µμΩ*/^.() \-]{0,60}")
+LONGEST = 100  # characters of a quantity
+QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*)")
+# Names, each with at most one small exponent, joined by * or /: nothing that pint could be kept busy with.
+FACTOR = r"[( ]*(?:1|[^\W\d][\w°%µμΩ]*|[°%][^\W\d]*)(?: ?(?:\^|\*\*) ?\(?-?\d(?:\.\d{1,3})?\)?)?[) ]*"
+UNIT = re.compile(rf"{FACTOR}(?:[*/· ]{FACTOR}){{0,12}}")
 
 # Units as drives and DBC files write them, where pint reads something else or nothing:
 # "Nm" alone would be read as "number meter".
@@ -30,6 +33,9 @@ ALIASES = {
     "U/min": "rpm",
     "1/min": "rpm",
     "r/min": "rpm",
+    "min^-1": "rpm",
+    "min**-1": "rpm",
+    "min-1": "rpm",
     "°C": "degC",
     "°": "degree",
     "": "dimensionless",
@@ -57,8 +63,9 @@ def unit(text: str) -> "pint.Unit":
     Raises:
         ValueError: unknown or malformed unit.
     """
-    written = ALIASES.get(text.strip(), text)
-    if not UNIT.fullmatch(written) or re.search(r"\^\s*-?\d{2}|\*\*\s*-?\d{2}", written):
+    short = re.sub(r"\s+", " ", text.strip())
+    written = ALIASES.get(short.replace(" ", ""), short)
+    if len(text) > LONGEST or not UNIT.fullmatch(written):
         raise ValueError(f"{text!r} is not a unit")
     try:
         return _registry().Unit(written)
@@ -88,10 +95,16 @@ def to_base(text: str) -> tuple[float, float]:
 def _same_dimension(source: str, target: str) -> None:
     if unit(source).dimensionality != unit(target).dimensionality:
         raise ValueError(f"unit {source!r} does not measure what {target!r} does: expected a unit like {target!r}")
-    # pint takes an angle for a plain number, so that 1 Hz would become 1 rad/s: wrong by 2π.
-    written = f"{unit(source)} {unit(target)}"
-    if written.count("hertz") == 1 and "radian" in written:
+    # pint takes an angle for a plain number, so that 1 Hz or 1/s would become 1 rad/s: wrong by 2π if turns are meant.
+    if _is_angular(target) != _is_angular(source) and unit(target).dimensionality in _RATES:
         raise ValueError(f"unit {source!r} leaves open whether turns or radians are meant: write {target!r} or 'rpm'")
+
+
+def _is_angular(text: str) -> bool:
+    return any(angle in str(unit(text)) for angle in ("radian", "degree", "revolution", "turn"))
+
+
+_RATES = ({"[time]": -1}, {"[time]": -2})
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +131,8 @@ class Quantity:
         example = f'write it with its unit, like "{1.0 if math.isinf(self.low) else max(self.low, 1.0):g} {self.unit}"'
         if isinstance(written, bool) or not isinstance(written, str | int | float):
             raise ValueError(f"{written!r} is not a quantity: {example}")  # noqa: TRY004 - a fault of a file, not a bug
-        match = QUANTITY.fullmatch(str(written))
+        text = str(written).strip()
+        match = QUANTITY.fullmatch(text) if len(text) <= LONGEST else None
         if match is None:
             raise ValueError(f"{written!r} is not a number with a unit: {example}")
         if not match[2] and not self._is_plain_number:

@@ -50,6 +50,8 @@ def load(path: Path, model: type[Model]) -> Model:
 def read(path: Path) -> Page:
     """The text of a file that the user named."""
     try:
+        if path.exists() and not path.is_file():
+            raise ConfigurationError(f"{path}: is a directory or a device, not a file")
         if path.stat().st_size > FILE_SIZE_LIMIT:
             raise ConfigurationError(f"{path}: larger than {FILE_SIZE_LIMIT} bytes, so this is no file of ours")
         return Page(path, path.read_text(encoding="utf-8"))
@@ -63,7 +65,7 @@ def parse(page: Page) -> dict[str, Any]:
     """The TOML of ``page``."""
     try:
         return tomllib.loads(page.text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigurationError(f"{page.path}: not valid TOML: {error}") from error
 
 

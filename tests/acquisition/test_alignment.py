@@ -54,6 +54,47 @@ def test_anything_gives_finite_values_and_a_verdict(samples: list[tuple[float, f
     assert (quality.verdict is Verdict.GOOD) == (not quality.reasons)
 
 
+@pytest.mark.parametrize("at", [0, 1, 40, 160, 199])
+@pytest.mark.parametrize("late", [1e-5, 2e-4, 4e-3])
+def test_a_repeated_frame_moves_no_other(at: int, late: float) -> None:
+    times = np.insert(ramp(200) * PERIOD, at + 1, at * PERIOD + late)
+    values = np.insert(ramp(200), at + 1, float(at))
+    aligned = align(times, values, 0.0, 200, PERIOD)
+    assert np.array_equal(aligned.values, ramp(200))
+    assert aligned.extra == 1
+    assert judge({"x": aligned}, PERIOD, Limits()).verdict is Verdict.GOOD
+
+
+@pytest.mark.parametrize("apart", [0.001, 0.003])
+def test_two_nodes_that_send_the_same_are_a_bad_window(apart: float) -> None:
+    times = np.sort(np.concatenate([ramp(200) * PERIOD, ramp(200) * PERIOD + apart]))
+    values = np.where(np.arange(400) % 2 == 0, 5.0, 6.0)
+    quality = judge({"x": align(times, values, 0.0, 200, PERIOD)}, PERIOD, Limits())
+    assert quality.verdict is Verdict.BAD
+    assert "do two nodes send it?" in quality.reasons[0]
+
+
+def test_jitter_is_judged() -> None:
+    late = np.random.default_rng(0).uniform(0.0, 0.0045, 200)
+    aligned = align(ramp(200) * PERIOD + late, ramp(200), 0.0, 200, PERIOD)
+    quality = judge({"x": aligned}, PERIOD, Limits(jitter=0.002))
+    assert quality.jitter == pytest.approx(np.sqrt(np.mean(late**2)))
+    assert quality.verdict is Verdict.BAD
+    assert "ms of jitter" in quality.reasons[0]
+
+
+def test_skew_is_how_far_two_signals_are_apart() -> None:
+    first, second = (align(ramp(200) * PERIOD + late, ramp(200), 0.0, 200, PERIOD) for late in (0.001, 0.003))
+    assert judge({"x": first, "y": second}, PERIOD, Limits()).skew == pytest.approx(0.002)
+
+
+def test_gaps_of_a_slower_signal_are_missing() -> None:
+    times = np.delete(ramp(60) * 0.05, slice(20, 30))
+    aligned = align(times, times, 0.0, 200, PERIOD)
+    assert aligned.missing[96:149].all()
+    assert not aligned.missing[:95].any()
+
+
 def test_a_slower_signal_is_interpolated() -> None:
     times = ramp(45) * 0.05 - 0.02
     aligned = align(times, 3.0 * times, 0.0, 200, PERIOD)

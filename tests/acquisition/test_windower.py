@@ -45,12 +45,38 @@ def test_every_sample_is_in_exactly_one_window() -> None:
         assert after.start == pytest.approx(before.end, abs=PERIOD / 4)
 
 
-@pytest.mark.parametrize("drift", [-2e-4, 2e-4])
+@pytest.mark.parametrize("drift", [-2e-3, -2e-4, 2e-4, 2e-3])
 def test_the_grid_follows_a_source_whose_clock_is_off(drift: float) -> None:
     samples = [(0.1 + index * PERIOD * (1 + drift), float(index)) for index in range(6000)]
     windows = cut_all(Rings(("a", "b"), 400), samples, until=60.0)
     values = np.concatenate([window.column("a") for window in windows])
     assert np.array_equal(values, np.arange(float(len(values))))
+    assert all(window.quality.verdict is Verdict.GOOD for window in windows)
+
+
+def test_a_burst_over_the_end_of_a_window_is_put_back_on_both_sides() -> None:
+    """The computer stalls for 60 ms around the end of the third window."""
+    end = 0.1 + 3 * RECORDS * PERIOD
+    moments = [0.1 + index * PERIOD for index in range(300)]
+    samples = [(end + 0.03 if end - 0.03 < t < end + 0.03 else t, float(k)) for k, t in enumerate(moments)]
+    windows = cut_all(Rings(("a", "b"), 400), samples, until=3.3)
+    values = np.concatenate([window.column("a") for window in windows])
+    assert np.array_equal(values, np.arange(float(len(values))))
+
+
+def test_the_first_window_is_centred_though_its_first_sample_came_late() -> None:
+    samples = [(0.1 + index * PERIOD + (0.004 if index == 0 else 0.0), float(index)) for index in range(300)]
+    first, second, *_ = cut_all(Rings(("a", "b"), 400), samples, until=3.2)
+    assert first.start == pytest.approx(1000.1, abs=0.001)
+    assert second.start == pytest.approx(first.end, abs=1e-3)
+
+
+def test_a_complete_window_is_not_waited_for() -> None:
+    rings = Rings(("a", "b"), 400)
+    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    feed(rings, [(index * PERIOD, 1.0) for index in range(RECORDS + 1)])
+    assert windower.begin(rings, 0.5, 0.5)
+    assert windower.due(rings, windower.next_end)
 
 
 def test_an_outage_gives_bad_windows_that_say_so_and_the_next_ones_are_good() -> None:

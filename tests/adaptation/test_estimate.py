@@ -13,6 +13,7 @@ from otolith.adaptation.problem import HOPELESS, Objective, Problem, SwarmOption
 from otolith.health.report import Status
 from otolith.heart import adapt
 from otolith.state import State, begin
+from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twins import find_twin
 from otolith_drivers.plant.dc_motor import MotorScenario
 
@@ -98,9 +99,102 @@ def test_the_truth_outside_the_bounds_is_reported_as_invalid(scenario: MotorScen
     assert "bound" in found.reason
 
 
+def test_a_window_that_contradicts_the_twin_teaches_nothing(scenario: MotorScenario, windows: Cut) -> None:
+    (first, _), (second, _) = windows(scenario, 6)[-2:]
+    state, _ = adapt(state_for("R_a"), first)
+    values = second.values.copy()
+    values[80, 0] = 65.5  # one corrupt voltage
+    after, report = adapt(state, replace(second, values=values))
+    found = report.document.parameters["R_a"]
+    assert report.document.fit is not None
+    assert not report.document.fit.explained
+    assert found.status is Status.INVALID
+    assert "does not explain" in found.reason
+    assert after.known == state.known
+
+
+@pytest.mark.parametrize("lost", [1, 2, 5])
+def test_lost_first_records_do_not_bias(scenario: MotorScenario, windows: Cut, lost: int) -> None:
+    quiet = scenario.model_copy(update={"faults": ()})
+    window, _ = windows(quiet, 11)[-1]  # the set-point has just been doubled
+    missing, values = window.missing.copy(), window.values.copy()
+    missing[:lost], values[:lost] = True, values[lost]
+    told = replace(problem_for("R_a"), input_noise=(0.0, 0.0002))
+    entry = estimate(told, replace(window, values=values, missing=missing), np.array([6.5])).parameters[0]
+    assert entry.sd < 0.005
+    assert entry.value == pytest.approx(6.5, abs=4.0 * entry.sd)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-300, 1.0, 1e6, 1e11, 1e15, 1e29, 1e100, np.inf, np.nan])
+@pytest.mark.parametrize("records", [1, 2, 5, 200])
+@pytest.mark.parametrize("names", [("R_a",), ("R_a", "K_e"), ("R_a", "L_a", "J", "K_e", "K_t", "D")])
+def test_constant_windows_are_answered_honestly(value: float, records: int, names: tuple[str, ...]) -> None:
+    values = np.full((records, 4), value)
+    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
+    window = Window(0, 0.0, 0.01, DC_MOTOR.signals, values, np.zeros(values.shape, dtype=np.bool_), quality)
+    problem = replace(problem_for(*names), swarm=SwarmOptions(generations=3))
+    _, report = adapt(begin("motor", "here", problem), window)
+    text = report.document.to_json()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    for entry in report.document.parameters.values():
+        assert entry.status is not Status.ESTIMATED or entry.sd is not None
+        assert entry.status is Status.ESTIMATED or entry.reason
+
+
+def test_a_constant_equilibrium_cannot_tell_resistance_from_the_electromotive_force() -> None:
+    """Nominal equilibrium to the last digit: only V_a - R_a i - K_e omega is seen, so neither alone is known."""
+    i, omega = (0.00143 + 0.006) * 10.0 / 0.038, 10.0
+    row = [6.5 * i + 0.038 * omega, 0.06, i, omega]
+    values = np.tile(row, (200, 1))
+    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
+    window = Window(0, 0.0, 0.01, DC_MOTOR.signals, values, np.zeros(values.shape, dtype=np.bool_), quality)
+    found = estimate(problem_for("R_a", "K_e"), window, np.array([6.5, 0.038]))
+    assert {entry.identifiability for entry in found.parameters} == {Identifiability.TRADED}
+
+
+def test_a_fast_motor_is_integrated_finely_enough() -> None:
+    """An inductance of 10 mH: the time constant is a sixth of the sample period."""
+    truth = {**{entry.name: entry.nominal for entry in DC_MOTOR.parameters}, "L_a": 0.01}
+    parameters = np.array([list(truth.values())])
+    random = np.random.default_rng(3)
+    inputs = np.column_stack([np.repeat(random.uniform(5.0, 20.0, 20), 10), np.full(200, 0.03)])
+    outputs = kernel_of(DC_MOTOR).simulate(parameters, np.zeros((1, 2)), Excitation(inputs, 0.01, 64))[0]
+    values = np.column_stack([inputs, outputs + random.normal(size=(200, 2)) * [0.005, 0.02]])
+    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
+    window = Window(0, 0.0, 0.01, DC_MOTOR.signals, values, np.zeros(values.shape, dtype=np.bool_), quality)
+    known = tuple((name, value) for name, value in truth.items() if name != "R_a")
+    entry = estimate(replace(problem_for("R_a"), known=known), window, np.array([6.0])).parameters[0]
+    assert entry.value == pytest.approx(6.5, abs=4.0 * entry.sd)
+    assert entry.sd < 0.01
+
+
+def test_noise_of_a_measured_input_widens_the_interval(scenario: MotorScenario, windows: Cut) -> None:
+    """The load torque is as noisy as its sensor; the interval that knows it covers the truth, the other does not."""
+    told = replace(problem_for("R_a"), input_noise=(0.0, 0.0002))
+    inside = {True: 0, False: 0}
+    count = 60
+    for seed in range(count):
+        changed = scenario.model_copy(update={"seed": seed, "faults": ()})
+        window, _ = windows(changed, 5)[-1]
+        for knows, problem in ((True, told), (False, problem_for("R_a"))):
+            entry = estimate(problem, window, np.array([6.5]), warm=True).parameters[0]
+            inside[knows] += abs(entry.value - 6.5) <= 1.96 * entry.sd
+    assert inside[True] >= 0.87 * count  # the binomial's 0.5 % quantile for 95 %
+    assert inside[False] < 0.75 * count
+
+
+def test_a_residual_beyond_the_noise_widens_the_interval(scenario: MotorScenario, windows: Cut) -> None:
+    window, _ = windows(scenario, 5)[-1]
+    told = estimate(problem_for("R_a"), window, np.array([6.5])).parameters[0]
+    optimist = replace(problem_for("R_a"), noise=(0.005 / 3.0, 0.02 / 3.0))
+    doubted = estimate(optimist, window, np.array([6.5])).parameters[0]
+    assert doubted.sd == pytest.approx(told.sd, rel=0.15)
+
+
 def test_a_guess_that_diverges_never_wins(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 1)[-1]
-    objective = Objective(problem_for("J"), window)
+    objective = Objective(problem_for("J"), window, np.array([0.001171]))
     cost = objective.cost(np.vstack([objective.guess(np.array([1e-300])), objective.guess(np.array([np.nan]))]))
     assert cost.tolist() == [HOPELESS, HOPELESS]
 

@@ -22,6 +22,12 @@ def test_a_frame_without_the_signal_gives_no_number() -> None:
     assert wanted.read({}) != wanted.read({})
 
 
+def test_a_value_out_of_the_databases_range_is_no_reading() -> None:
+    wanted = find_signals(load_dbc(DBC), [Signal("i", "A", Source(signal="ArmatureCurrent"))], DBC)[0]
+    assert wanted.read({"ArmatureCurrent": 31.9}) == pytest.approx(31.9)
+    assert wanted.read({"ArmatureCurrent": 32.767}) != wanted.read({"ArmatureCurrent": 32.767})
+
+
 @pytest.mark.parametrize(
     ("unit", "source", "sentence"),
     [

@@ -148,6 +148,40 @@ def test_any_frame_is_decoded_or_counted(
     assert len(got) == counters.received
 
 
+def test_buses_on_the_same_port_do_not_hear_each_other(own_machine: OwnMachine) -> None:
+    options = BusOptions(interface="udp_multicast", channel="239.74.163.77", port=own_machine.port)
+    with can_rig(own_machine) as rig:
+        got: list[Sample] = []
+        rig.driver.open(got.extend)
+        stranger = open_bus(options)
+        for _ in range(20):
+            stranger.send(can.Message(arbitration_id=385, data=bytes(8), is_extended_id=False))
+        stranger.shutdown()
+        while len(got) < 4:
+            rig.say()
+            time.sleep(0.01)
+        assert all(sample.value != 0.0 for sample in got if sample.signal == "i")
+        rig.driver.close()
+
+
+def test_a_frame_that_cannot_be_unpacked_does_not_cost_the_bus(own_machine: OwnMachine) -> None:
+    import socket  # noqa: PLC0415 - to send what no CAN node would
+
+    with can_rig(own_machine) as rig:
+        collect(rig, 2)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+            for _ in range(5):
+                sender.sendto(b"\xc1 no frame", (own_machine.group, own_machine.port))
+        deadline = time.monotonic() + 5.0
+        while rig.driver.counters().bad < 5 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert rig.driver.counters().bad == 5
+        assert rig.driver.counters().reconnects == 0
+        assert rig.driver.link().up
+        rig.driver.close()
+
+
 def test_a_bus_that_breaks_is_opened_again(own_machine: OwnMachine, monkeypatch: pytest.MonkeyPatch) -> None:
     with can_rig(own_machine) as rig:
         collect(rig, 2)

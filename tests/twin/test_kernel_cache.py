@@ -47,6 +47,17 @@ def test_two_processes_at_once_compile_once_and_a_third_not_at_all(cache: Path) 
     assert compiled[0].stat().st_mtime_ns == before
 
 
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+@pytest.mark.parametrize("keep", [0, 0.5])
+def test_a_file_that_a_power_cut_left_half_is_made_anew(cache: Path, ending: str, keep: float) -> None:
+    start().communicate(timeout=60)
+    (half,) = cache.glob(f"*/__pycache__/*.{ending}")
+    content = half.read_bytes()
+    half.write_bytes(content[: int(keep * len(content))])
+    assert start().communicate(timeout=60)[0].splitlines()[0] == "0.0"
+    assert half.stat().st_size == pytest.approx(len(content), rel=0.01)
+
+
 def test_the_folder_is_private(cache: Path) -> None:
     kernel_cache.load("private", lambda: "")
     assert cache.stat().st_mode & 0o077 == 0

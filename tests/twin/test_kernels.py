@@ -54,7 +54,7 @@ def test_it_agrees_with_an_independent_integrator(twin: Definition) -> None:
 def test_sensitivities_are_the_derivatives_of_the_reference(twin: Definition) -> None:
     drive, expected, _ = resolved(twin, excitation(twin, records=30))
     drive = replace(drive, substeps=8 * drive.substeps)  # a derivative is less smooth than what it is the derivative of
-    predicted, slopes = kernel_of(twin).sensitivities(nominal(twin), initial(twin), drive)
+    predicted, slopes, _, _ = kernel_of(twin).sensitivities(nominal(twin), initial(twin), drive)
     assert predicted == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.ptp(expected))
     widths = [e.high - e.low for e in twin.parameters] + [e.high - e.low for e in twin.states]
     point = np.concatenate([nominal(twin), initial(twin)])
@@ -135,7 +135,7 @@ def test_the_innovation_forms_sensitivities_are_its_derivatives() -> None:
     measured = np.random.default_rng(2).normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
     drive = replace(drive, measured=measured, gain=np.array([[0.3, 0.01], [-0.2, 0.4]]))
-    _, slopes = kernel.sensitivities(nominal(twin), initial(twin), drive)
+    slopes = kernel.sensitivities(nominal(twin), initial(twin), drive).slopes
     point = np.concatenate([nominal(twin), initial(twin)])
     for column in range(len(point)):
         step = np.zeros(len(point))

@@ -10,9 +10,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array, Mask, Quality, Verdict
 
+MOST_EXTRA = 20  # samples too many in a window that are told from a burst
+EXTRA_LIMIT = 0.02  # share of records
+IRREGULAR_LIMIT = 0.3
 CYCLIC_TOLERANCE = 0.3  # a source whose median period is this close to the grid's is taken to be on it
 
 
@@ -28,13 +32,20 @@ class Limits:
     """s, of the worst signal."""
 
 
+Indices = NDArray[np.int64]
+
+
 class Aligned(NamedTuple):
     """One signal on the grid."""
 
     values: Array
     missing: Mask
     lateness: Array
-    """s between each sample and its slot; empty if there was none."""
+    """s between each sample and its slot; empty if there was none, or if it was interpolated."""
+    extra: int = 0
+    """Samples that were one too many for the grid."""
+    irregular: float = 0.0
+    """Of an interpolated signal: standard deviation of its sampling interval over the mean."""
 
 
 def align(times: Array, values: Array, start: float, records: int, period: float) -> Aligned:
@@ -47,24 +58,38 @@ def align(times: Array, values: Array, start: float, records: int, period: float
     times, values = times[finite], values[finite]
     if len(times) > 1 and not _cyclic(times, period):
         return _interpolated(times, values, start, records, period)
-    slots = _slots(times, start, period)
+    kept, slots = _slots(times, start, period)
     inside = (slots >= 0) & (slots < records)
-    slots, times, values = slots[inside], times[inside], values[inside]
+    extra = len(times) - len(kept)
+    slots, times, values = slots[inside], times[kept][inside], values[kept][inside]
     grid = np.full(records, np.nan)
     grid[slots] = values
     missing = np.isnan(grid)
-    return Aligned(*_finite(_bridged(grid, missing), missing), times - (start + slots * period))
+    return Aligned(*_finite(_bridged(grid, missing), missing), times - (start + slots * period), extra)
 
 
 def _cyclic(times: Array, period: float) -> bool:
     return bool(abs(np.median(np.diff(times)) / period - 1.0) <= CYCLIC_TOLERANCE)
 
 
-def _slots(times: Array, start: float, period: float) -> "np.ndarray[tuple[int, ...], np.dtype[np.int64]]":
-    """The nearest slot of each sample, pushed back where several came in a burst after a stall."""
-    order = np.arange(len(times))
-    nearest = np.rint((times - start) / period).astype(np.int64)
-    return np.minimum.accumulate((nearest - order)[::-1])[::-1] + order if len(times) else nearest
+def _slots(times: Array, start: float, period: float) -> tuple[Indices, Indices]:
+    """Which samples are kept, and the slot of each: the nearest, pushed back where several came in a burst.
+
+    A push that runs into no gap on its way back means a sample too many, not a stall: the one closest to its
+    predecessor goes. A source that sends far too many keeps the push, and its lateness tells.
+    """
+    kept = np.arange(len(times))
+    for _ in range(MOST_EXTRA + 1):
+        order = np.arange(len(kept))
+        nearest = np.rint((times[kept] - start) / period).astype(np.int64)
+        slots = np.minimum.accumulate((nearest - order)[::-1])[::-1] + order
+        pushed = nearest > slots
+        if not len(kept) or not pushed[0]:
+            break
+        reach = len(pushed) if pushed.all() else int(np.argmin(pushed))
+        surplus = int(np.argmin(np.diff(times[kept][: reach + 1]))) + 1 if reach > 0 and len(kept) > 1 else 0
+        kept = np.delete(kept, surplus)
+    return kept, slots
 
 
 def _interpolated(times: Array, values: Array, start: float, records: int, period: float) -> Aligned:
@@ -75,7 +100,9 @@ def _interpolated(times: Array, values: Array, start: float, records: int, perio
     gap = times[after] - times[after - 1]
     outside = (grid < times[0] - usual) | (grid > times[-1] + usual)
     missing: Mask = (gap > 2.5 * usual) | outside
-    return Aligned(*_finite(np.interp(grid, times, values), missing), np.zeros(0))
+    steps = np.diff(times)
+    irregular = float(steps.std() / steps.mean()) if len(steps) > 1 and steps.mean() > 0.0 else 0.0
+    return Aligned(*_finite(np.interp(grid, times, values), missing), np.zeros(0), irregular=irregular)
 
 
 def _bridged(grid: Array, missing: Mask) -> Array:
@@ -85,6 +112,10 @@ def _bridged(grid: Array, missing: Mask) -> Array:
         return grid
     known = np.flatnonzero(~missing)
     return np.interp(np.arange(len(grid)), known, grid[known])
+
+
+def _root_mean_square(lateness: Array) -> float:
+    return float(np.sqrt(np.mean(lateness**2))) if len(lateness) else 0.0
 
 
 def _finite(values: Array, missing: Mask) -> tuple[Array, Mask]:
@@ -97,11 +128,21 @@ def judge(aligned: Mapping[str, Aligned], period: float, limits: Limits) -> Qual
     """The quality of a window from its signals."""
     missing = {signal: float(found.missing.mean()) for signal, found in aligned.items()}
     gaps = {signal: _longest_run(found.missing) * period for signal, found in aligned.items()}
-    jitters = {signal: float(found.lateness.std()) if len(found.lateness) else 0.0 for signal, found in aligned.items()}
+    jitters = {signal: _root_mean_square(found.lateness) for signal, found in aligned.items()}
     offsets = [float(np.median(found.lateness)) for found in aligned.values() if len(found.lateness)]
     reasons = _silent(missing) or [
         *_over(missing, limits.missing, lambda signal, share: f"{share:.0%} of {signal} is missing"),
         *_over(gaps, limits.gap, lambda signal, gap: f"{signal} has a gap of {gap * 1e3:.0f} ms"),
+        *_over(
+            {signal: found.extra / max(len(found.values), 1) for signal, found in aligned.items()},
+            EXTRA_LIMIT,
+            lambda signal, _: f"{signal} comes more often than it should: do two nodes send it?",
+        ),
+        *_over(
+            {signal: found.irregular for signal, found in aligned.items()},
+            IRREGULAR_LIMIT,
+            lambda signal, _: f"{signal} comes at irregular intervals: do two nodes send it?",
+        ),
         *_over(jitters, limits.jitter, lambda signal, jitter: f"{signal} arrives with {jitter * 1e3:.1f} ms of jitter"),
     ]
     return Quality(

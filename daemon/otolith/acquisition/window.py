@@ -29,7 +29,7 @@ class Quality:
     jitter: float
     """Root mean square distance of the samples from the grid, s."""
     skew: float
-    """Largest difference between two signals' mean distances from the grid, s."""
+    """Largest difference between two signals' median distances from the grid, s."""
     reasons: tuple[str, ...] = ()
     """Why the verdict is not good, in words."""
 

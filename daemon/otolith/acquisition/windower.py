@@ -71,14 +71,20 @@ class Windower:
         return window
 
     def _align(self, rings: Rings) -> dict[str, Aligned]:
-        samples = rings.between(self._start - self.sample_period / 2, self.next_end + GRACE)
+        samples = rings.between(self._start - GRACE, self.next_end + GRACE)
         return {
             signal: align(*samples[signal], self._start, self.records, self.sample_period) for signal in self.signals
         }
 
     def _drift(self, aligned: dict[str, Aligned]) -> float:
-        """How far (s) the source's clock has moved against ours: the grid follows it, a quarter of a period at most."""
-        lateness = np.concatenate([found.lateness for found in aligned.values()])
-        if not len(lateness):
+        """How far (s) to move the grid so that it meets the next window's samples in their middle.
+
+        The source's clock drifts against ours; the lateness of the two halves of this window tells how fast.
+        """
+        halves = [(len(found.lateness) // 2, found.lateness) for found in aligned.values() if len(found.lateness) > 1]
+        if not halves:
             return 0.0
-        return float(np.clip(np.median(lateness), -self.sample_period / 4, self.sample_period / 4))
+        early = float(np.median(np.concatenate([lateness[:half] for half, lateness in halves])))
+        late = float(np.median(np.concatenate([lateness[half:] for half, lateness in halves])))
+        ahead = late + (1.5 * (late - early) if self._index else 0.5 * (early - late))
+        return float(np.clip(ahead, -self.sample_period / 2, self.sample_period / 2))

@@ -7,9 +7,9 @@ from enum import StrEnum
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.adaptation.problem import Objective
 
-RELATIVE_STEP = 1e-4  # of the width of the bounds, for the central difference
+SINGULAR = 1e-8  # relative singular value under which a direction is not seen at all
+BLIND = 1e-4  # share in an unseen direction beyond which a parameter is not seen either
 FLAT = 1e-9  # a sensitivity this far under the largest is none
 TRADED = 0.98  # correlation beyond which two parameters cannot be told apart
 
@@ -46,34 +46,30 @@ class ParameterEstimate:
     reason: str
 
 
-def information(objective: Objective, values: Array, cost: float) -> Information:
-    """Standard deviations at ``values`` (guess,) from the inverse of the Fisher information.
+def information(jacobian: Array, width: Array, cost: float) -> Information:
+    """Standard deviations (guess,) from the inverse of the Fisher information ``jacobian.T @ jacobian``.
 
-    Residuals are in units of the noise; where they are larger than it (``cost`` above one), the standard deviations
-    grow with them.
+    ``jacobian`` (residuals, guess) is of whitened residuals; ``width`` (guess,) scales the entries. Where the residuals
+    are larger than the noise (``cost`` above one), the standard deviations grow with them.
     """
-    sensitivities = _sensitivities(objective, values)
-    width = objective.high - objective.low
-    scaled = sensitivities * width
+    scaled = jacobian * width
     norms = np.linalg.norm(scaled, axis=0)
     alive = norms > FLAT * max(float(norms.max(initial=0.0)), 1.0)
-    sd = np.full(len(values), np.inf)
-    correlation = np.eye(len(values))
+    sd = np.full(len(width), np.inf)
+    correlation = np.eye(len(width))
     if alive.any():
-        covariance = np.linalg.pinv(scaled[:, alive].T @ scaled[:, alive], hermitian=True)
+        # By singular values of the sensitivities: the normal matrix would square the condition number.
+        _, singular, rows = np.linalg.svd(scaled[:, alive] / norms[alive], full_matrices=False)
+        seen = singular > SINGULAR * singular[0]
+        inverse = rows[seen].T / singular[seen]
+        covariance = inverse @ inverse.T
         deviation = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-        sd[alive] = deviation * width[alive] * max(cost, 1.0)
-        correlation[np.ix_(alive, alive)] = covariance / np.outer(deviation, deviation)
+        blind = np.abs(rows[~seen]).max(axis=0, initial=0.0) > BLIND
+        sd[alive] = np.where(blind, np.inf, deviation / norms[alive] * width[alive] * max(cost, 1.0))
+        correlation[np.ix_(alive, alive)] = np.where(
+            np.outer(blind, blind), 1.0, covariance / np.outer(deviation, deviation)
+        )
     return Information(sd, correlation)
-
-
-def _sensitivities(objective: Objective, values: Array) -> Array:
-    """(records * outputs, guess): change of the residuals per unit of each entry of the guess."""
-    step = RELATIVE_STEP * (objective.high - objective.low)
-    guesses = np.vstack([values + np.diag(step), values - np.diag(step)])
-    residuals = objective.residuals(objective.predict(guesses)).reshape(2 * len(values), -1)
-    change: Array = (residuals[: len(values)] - residuals[len(values) :]) / (2 * step[:, None])
-    return np.nan_to_num(change, nan=0.0, posinf=0.0, neginf=0.0).T
 
 
 def classify(
@@ -83,13 +79,13 @@ def classify(
     reach = 1.96 * found.sd[index]
     if at_bound:
         return Identifiability.AT_BOUND, "the best value lies at the bound: widen the bounds or doubt the twin"
-    if not np.isfinite(reach):
-        return Identifiability.FLAT, "the window does not depend on it"
     if reach <= half_width:
         return Identifiability.DETERMINED, ""
     row = np.abs(found.correlation[index]).copy()
     row[index] = 0.0
     partner = int(row.argmax())
+    if not np.isfinite(reach) and row[partner] <= TRADED:
+        return Identifiability.FLAT, "the window does not depend on it"
     if row[partner] > TRADED:
         return Identifiability.TRADED, f"it can be traded with {names[partner]} (correlation {row[partner]:.3f})"
     return Identifiability.WEAK, f"the window pins it to ±{reach:.3g} only: too little excitation"

@@ -15,10 +15,10 @@ from otolith.adaptation.problem import Objective, SwarmOptions
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The best guess of a swarm."""
+    """The best parameters of a swarm."""
 
     values: Array
-    """(guess,), see :class:`otolith.adaptation.problem.Objective`."""
+    """(free parameters,)."""
     cost: float
     generations: int
     evaluations: int
@@ -28,20 +28,22 @@ class Found:
 class _Bounded(PymooProblem):  # type: ignore[misc]  # pymoo has no types
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
-        super().__init__(n_var=len(objective.low), n_obj=1, xl=objective.low, xu=objective.high)
+        count = objective.free
+        super().__init__(n_var=count, n_obj=1, xl=objective.low[:count], xu=objective.high[:count])
 
     def _evaluate(self, x: Array, out: dict[str, Any], *_: Any, **__: Any) -> None:
-        out["F"] = self._objective.cost(x)
+        out["F"] = self._objective.cost_of_parameters(x)
 
 
 def search(objective: Objective, options: SwarmOptions, start: Array, seed: int) -> Found:
-    """The best guess within the bounds; ``start`` (guess,) is one of the first particles.
+    """The best parameters within the bounds; ``start`` (free parameters,) is one of the first particles.
 
-    The inertia weight adapts from the given one: held fixed at the paper's 0.9, the swarm does not converge.
+    The initial state is left to the polish: here every particle starts at the first record. The inertia weight adapts
+    from the given one: held fixed at the paper's 0.9, the swarm does not converge.
     """
     problem = _Bounded(objective)
     others = LHS()(problem, options.size - 1, random_state=np.random.default_rng(seed)).get("X")
-    first = np.clip(np.vstack([start, others]), objective.low, objective.high)
+    first = np.clip(np.vstack([start, others]), problem.xl, problem.xu)
     algorithm = PSO(
         pop_size=options.size, sampling=first, w=options.inertia, c1=options.cognitive, c2=options.social, adaptive=True
     )

@@ -5,12 +5,13 @@ Every number is finite or absent; what has no content yet is absent, not invente
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal
 
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.information import Identifiability
 from otolith_drivers.toml_files import Closed
 
-SCHEMA = "otolith.report/1"
+SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"
 
 
 class Status(StrEnum):
@@ -105,7 +106,7 @@ class CountersDocument(Closed):
 class ReportDocument(Closed):
     """The document itself."""
 
-    schema_: str = SCHEMA
+    schema_: Literal["otolith.report/1"] = SCHEMA
     machine: str
     site: str
     twin: str

@@ -19,20 +19,26 @@ class Known:
 
 
 def publish(
-    parameter: Parameter, estimate: ParameterEstimate | None, known: Known | None, reason: str = ""
+    parameter: Parameter,
+    estimate: ParameterEstimate | None,
+    known: Known | None,
+    reason: str = "",
+    *,
+    refused: bool = False,
 ) -> tuple[Known | None, ParameterDocument]:
-    """What is known from now on, and what is said; ``estimate`` is None for a window that was not estimated from."""
+    """What is known from now on, and what is said.
+
+    ``estimate`` is None for a window that was not estimated from; ``refused`` is a window that contradicts the twin:
+    nothing is learned from it.
+    """
     identifiability = None if estimate is None else estimate.identifiability
+    status = Status.UNESTIMATED if known is None else Status.HELD
     if estimate is not None:
-        reason = estimate.reason
-        if identifiability is Identifiability.DETERMINED and math.isfinite(abs(estimate.value) + 2 * estimate.sd):
-            known, status = Known(estimate.value, estimate.sd), Status.ESTIMATED
-        elif identifiability is Identifiability.AT_BOUND:
+        reason = estimate.reason or reason
+        if refused or identifiability is Identifiability.AT_BOUND:
             status = Status.INVALID
-        else:
-            status = Status.UNESTIMATED if known is None else Status.HELD
-    else:
-        status = Status.UNESTIMATED if known is None else Status.HELD
+        elif identifiability is Identifiability.DETERMINED and math.isfinite(abs(estimate.value) + 2 * estimate.sd):
+            known, status = Known(estimate.value, estimate.sd), Status.ESTIMATED
     return known, ParameterDocument(
         value=None if known is None else known.value,
         unit=parameter.unit,

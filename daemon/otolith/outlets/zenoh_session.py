@@ -25,6 +25,7 @@ def session(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> zenoh.Se
     settings = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},

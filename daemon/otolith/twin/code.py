@@ -113,7 +113,9 @@ class _Writer:
                 *self._preamble(),
                 *self._read("parameters[{}]", "initial[{}]"),
                 *_loop(loop),
-                "return found, slopes",
+                f"last = np.empty({len(self.x)})",
+                *(f"last[{row}] = {name}" for row, name in enumerate(self.x)),
+                "return found, slopes, last, state",
             ]),
         ]  # fmt: skip
 

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from otolith.acquisition.window import Array
 from otolith.twin.definition import Definition
 
 MOST_SUBSTEPS = 1024
-GENERATOR = 1  # of otolith.twin.code: raised with every change of what it writes, so that no old text is used
+GENERATOR = 2  # of otolith.twin.code: raised with every change of what it writes, so that no old text is used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +35,19 @@ class Excitation:
     """(records, outputs); a measurement that is not a number corrects nothing."""
     gain: Array | None = None
     """(states, outputs); without it, or all zero, the twin runs in open loop."""
+
+
+class Sensitivities(NamedTuple):
+    """A prediction and its exact derivatives, by each parameter and then by each initial state."""
+
+    outputs: Array
+    """(records, outputs)."""
+    slopes: Array
+    """(records, outputs, parameters + states)."""
+    last: Array
+    """(states,) at the last record, corrected by it."""
+    last_slopes: Array
+    """(states, parameters + states)."""
 
 
 class Kernel:
@@ -55,14 +68,9 @@ class Kernel:
         found: Array = self._call("simulate", parameters, initial, *self._drive(excitation))
         return found
 
-    def sensitivities(self, parameters: Array, initial: Array, excitation: Excitation) -> tuple[Array, Array]:
-        """One prediction and its exact derivatives.
-
-        Shapes (parameters,), (states,) -> (records, outputs) and (records, outputs, parameters + states): by each
-        parameter, then by each initial state.
-        """
-        found: tuple[Array, Array] = self._call("sensitivities", parameters, initial, *self._drive(excitation))
-        return found
+    def sensitivities(self, parameters: Array, initial: Array, excitation: Excitation) -> "Sensitivities":
+        """One prediction and its exact derivatives; shapes (parameters,), (states,)."""
+        return Sensitivities(*self._call("sensitivities", parameters, initial, *self._drive(excitation)))
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
@@ -109,7 +117,11 @@ class Kernel:
         if name in self._compiled:
             return function(*arguments)
         with kernel_cache.compiling(self._module):
-            found = function(*arguments)
+            try:
+                found = function(*arguments)
+            except Exception:  # noqa: BLE001 - whatever unpickling half a file raises; a real fault comes again
+                kernel_cache.discard(self._module)
+                found = function(*arguments)
         self._compiled.add(name)
         return found
 

@@ -52,7 +52,7 @@ def _sensitivities(definition: Definition, period: float, random: np.random.Gene
         [np.zeros((RECORDS, 0)), *(_telegraph(entry.low, entry.high, random) for entry in definition.inputs)]
     )
     excitation = Excitation(inputs, period, substeps=8)
-    _, slopes = kernel_of(definition).sensitivities(parameters, initial, excitation)
+    slopes = kernel_of(definition).sensitivities(parameters, initial, excitation).slopes
     widths = np.concatenate([high - low, [entry.high - entry.low for entry in definition.states]])
     noise = np.array([entry.noise for entry in definition.outputs])
     scaled = slopes * widths / noise[None, :, None]

@@ -1,0 +1,72 @@
+"""The last digits: Gauss-Newton with the exact sensitivities, damped as by Levenberg and Marquardt, within bounds.
+
+(J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., section 10.3; bounds by the active set.)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.window import Array
+from otolith.adaptation.problem import Objective
+
+STEPS = 40
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e12
+DONE = 1e-6  # in χ²: the improvement that is not worth another step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Polished:
+    """Where Gauss-Newton came to rest."""
+
+    guess: Array
+    """(guess,)."""
+    chi_square: float
+    jacobian: Array
+    """(residuals, guess): of the whitened residuals by each entry of the guess."""
+    evaluations: int
+    converged: bool
+
+
+def polish(objective: Objective, start: Array) -> Polished:
+    """The minimum of χ² that ``start`` (guess,) leads to; ``start`` itself where no step improves it."""
+    scale = objective.high - objective.low
+    guess = np.clip(start, objective.low, objective.high)
+    residuals, jacobian = objective.linearised(guess)
+    chi_square, damping, evaluations, converged = float(residuals @ residuals), FIRST_DAMPING, 1, False
+    for _ in range(STEPS):
+        step = _step(residuals, jacobian, guess, objective, damping)
+        trial = np.clip(guess + step, objective.low, objective.high)
+        if np.all(np.abs(trial - guess) <= 1e-14 * scale):
+            converged = True
+            break
+        new_residuals, new_jacobian = objective.linearised(trial)
+        evaluations += 1
+        new = float(new_residuals @ new_residuals)
+        if new < chi_square:
+            converged = chi_square - new <= DONE * max(1.0, 1e-6 * chi_square)
+            guess, residuals, jacobian, chi_square = trial, new_residuals, new_jacobian, new
+            damping = max(damping / 10.0, LEAST_DAMPING)
+            if converged:
+                break
+        else:
+            converged = float(np.abs(new - chi_square)) <= DONE
+            damping *= 10.0
+            if converged or damping > MOST_DAMPING:
+                break
+    return Polished(guess, chi_square, jacobian, evaluations, converged)
+
+
+def _step(residuals: Array, jacobian: Array, guess: Array, objective: Objective, damping: float) -> Array:
+    """The damped step, with what leans on a bound held there."""
+    gradient = jacobian.T @ residuals
+    free = ~(((guess <= objective.low) & (gradient > 0.0)) | ((guess >= objective.high) & (gradient < 0.0)))
+    step = np.zeros(len(guess))
+    if not free.any():
+        return step
+    normal = jacobian[:, free].T @ jacobian[:, free]
+    weight = np.maximum(np.diag(normal), 1e-30)
+    root = np.sqrt(weight)
+    scaled = normal / np.outer(root, root) + damping * np.eye(len(weight))
+    step[free] = -np.linalg.solve(scaled, gradient[free] / root) / root
+    return step
