@@ -1,0 +1,126 @@
+"""The service towards systemd, its recorder and its disk."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+
+from otolith.outlets import recorder
+from otolith.twins import find_twin
+from tests.conftest import OwnMachine
+from tests.system.conftest import Running
+
+
+def test_it_tells_systemd_when_it_is_ready_and_of_every_progress(own_machine: OwnMachine, tmp_path: Path) -> None:
+    """A datagram socket stands in for systemd's; in a booted one the unit is tried by hand."""
+    plant = subprocess.Popen(
+        [sys.executable, "-m", "otolith", "plant", str(own_machine.scenario)], stderr=subprocess.DEVNULL
+    )
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(30.0)
+        environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "4000000"}
+        command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
+        daemon = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+        said: list[str] = []
+        while sum("WATCHDOG=1" in text for text in said) < 4 or not any("window 1 good" in text for text in said):
+            said.append(manager.recv(4096).decode())
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(timeout=10) == 0
+        while not any("STOPPING=1" in text for text in said):
+            said.append(manager.recv(4096).decode())
+    plant.terminate()
+    plant.wait(timeout=10)
+    assert said[0].startswith("READY=1\nSTATUS=listening: CAN bus udp_multicast")
+    assert f"MAINPID={daemon.pid}" in said[0]
+
+
+def test_a_stopped_worker_starves_the_watchdog(
+    own_machine: OwnMachine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fed by finished windows only: the rule itself, without waiting for half a minute."""
+    from otolith import service as module  # noqa: PLC0415
+    from otolith.plan import load_plan  # noqa: PLC0415
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "4000000")
+        text = own_machine.machine.read_text(encoding="utf-8") + "\n[recording]\nenabled = false\n"
+        own_machine.machine.write_text(text, encoding="utf-8")
+        watched = module.Service(load_plan(own_machine.machine))
+
+        def fed() -> bool:
+            try:
+                return manager.recv(4096) == b"WATCHDOG=1"
+            except BlockingIOError:
+                return False
+
+        watched._progress = 1000.0
+        watched._watch(1002.0)
+        assert fed()
+        patience = module.STALL + 3 * 2.0
+        watched._watch(1000.0 + patience + 0.1)
+        assert not fed()
+        watched._supervisor.missed += 1
+        watched._watch(1000.0 + patience + 3.0)
+        assert not fed()
+        watched._supervisor.finished += 1
+        watched._watch(1000.0 + patience + 6.0)
+        assert fed()
+        watched._notifier.close()
+
+
+def test_windows_without_a_recorder_are_counted(running: Running) -> None:
+    running.wait_for(lambda reports: len(reports) >= 2)
+    os.kill(running.child("recorder").pid, signal.SIGKILL)
+    shutil.rmtree(running.folder / "state", ignore_errors=True)
+    (running.folder / "state").write_text("no folder any more", encoding="utf-8")
+    reports = running.wait_for(
+        lambda found: bool(found and found[-1].counters and found[-1].counters.recordings_dropped >= 2)
+    )
+    last = reports[-1].counters
+    assert last is not None
+    assert (last.windows_missed, last.lost) == (0, 0)
+    code, seconds = running.stop()
+    assert code == 0
+    assert seconds < 3.0
+
+
+class Pipe:
+    """A connection on which reports would come for ever."""
+
+    def recv(self) -> object:
+        raise AssertionError
+
+
+def test_a_full_disk_ends_the_recorder_before_it_ends_in_silence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = namedtuple("usage", ["total", "used", "free"])
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(1 << 40, 1 << 40, 1 << 20))
+    twin = find_twin("dc_motor")
+    recorder.main(Pipe(), tmp_path / "full.rrd", "full", twin.outputs, twin.parameters[:1])
+    assert not (tmp_path / "full.rrd").exists()
+
+
+def test_nohup_is_respected(own_machine: OwnMachine) -> None:
+    command = ["/usr/bin/nohup", sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
+    daemon = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert daemon.stderr is not None
+    while "reports on" not in (line := daemon.stderr.readline()):
+        assert line
+    daemon.send_signal(signal.SIGHUP)
+    time.sleep(0.5)  # long enough for it to have ended
+    assert daemon.poll() is None
+    daemon.terminate()
+    assert daemon.wait(timeout=5) == 0
+    daemon.stderr.close()
