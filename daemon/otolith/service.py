@@ -2,7 +2,7 @@
 
     driver thread -> rings -> [this thread] window -> worker process -> [this thread] report -> Zenoh, recorder process
 
-This thread never waits for a machine, a worker, a disk or a subscriber.
+This thread never waits for a machine, a worker, a disk or a subscriber; only for a process that it has killed.
 """
 
 import contextlib
