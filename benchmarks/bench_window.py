@@ -1,25 +1,25 @@
-"""What one window costs, and where: printed as times of this run and as ratios that hold elsewhere."""
+"""What one window costs, cold and warm, and where: as times of this run and as ratios that hold elsewhere."""
 
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.adaptation.estimate import estimate
 from otolith.adaptation.problem import Objective, Problem
 from otolith.adaptation.swarm import search
 from otolith.heart import adapt
+from otolith.plan import load_plan
 from otolith.state import begin
-from otolith.twins import find_twin
 from otolith_drivers.plant.plants import load_scenario, simulate
 
-SCENARIO = Path(__file__).parents[1] / "config" / "scenarios" / "demo.toml"
+CONFIG = Path(__file__).parents[1] / "config"
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
-
-DC_MOTOR = find_twin("dc_motor")
 
 
 def median_seconds(work: Callable[[], object], runs: int) -> float:
@@ -32,26 +32,45 @@ def median_seconds(work: Callable[[], object], runs: int) -> float:
     return float(np.median(times))
 
 
-def main() -> int:
-    ticks = list(islice(simulate(load_scenario(SCENARIO)), 1000))[-200:]
-    values = np.array([[tick.measured[name] for name in SIGNALS.values()] for tick in ticks])
+def windows(count: int) -> list[Window]:
+    ticks = list(islice(simulate(load_scenario(CONFIG / "scenarios" / "demo.toml")), 200 * count))
     quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    window = Window(0, 0.0, 0.01, tuple(SIGNALS), values, np.zeros(values.shape, dtype=np.bool_), quality)
-    free = tuple(entry for entry in DC_MOTOR.parameters if entry.name == "R_a")
-    known = tuple((entry.name, entry.nominal) for entry in DC_MOTOR.parameters if entry.name != "R_a")
-    problem = Problem(DC_MOTOR, known, free, (0.005, 0.02))
-    objective = Objective(problem, window, np.array([6.5]))
-    start = objective.guess(np.array([6.5]))
-    swarm = np.repeat(start[None, :], problem.swarm.size, axis=0)
-    generations = search(objective, problem.swarm, start, seed=1).generations
+    found = []
+    for index in range(count):
+        part = ticks[200 * index : 200 * (index + 1)]
+        values = np.array([[tick.measured[name] for name in SIGNALS.values()] for tick in part])
+        missing = np.zeros(values.shape, dtype=np.bool_)
+        found.append(Window(index, part[0].time, 0.01, tuple(SIGNALS), values, missing, quality))
+    return found
+
+
+def of(problem: Problem, names: tuple[str, ...]) -> Problem:
+    """``problem`` with these parameters free."""
+    twin = problem.twin
+    known = tuple((entry.name, entry.nominal) for entry in twin.parameters if entry.name not in names)
+    return replace(problem, known=known, free=tuple(entry for entry in twin.parameters if entry.name in names))
+
+
+def main() -> int:
+    problem = load_plan(CONFIG / "dc-motor.toml").problem
+    record = windows(12)
+    for names in (("R_a",), ("R_a", "D"), ("R_a", "D", "J")):
+        free = of(problem, names)
+        start = np.array([entry.nominal for entry in free.free])
+        cold = median_seconds(lambda p=free, s=start: estimate(p, record[-1], s), 5)  # type: ignore[misc]
+        warm = median_seconds(lambda p=free, s=start: estimate(p, record[-1], s, warm=True), 50)  # type: ignore[misc]
+        objective = Objective(free, record[-1], start)
+        guess = objective.guess(start)
+        kernel = median_seconds(lambda o=objective, g=guess: o.linearised(g), 200)  # type: ignore[misc]
+        generations = search(objective, free.swarm, start, seed=1).generations
+        print(f"200 records, unknown: {', '.join(names)}, and the initial state")
+        print(f"  warm {warm * 1e3:8.2f} ms   one linearisation is {kernel / warm:.1%} of it")
+        print(f"  cold {cold * 1e3:8.2f} ms   {cold / warm:.0f} x warm, {generations} generations of the swarm")
     state = begin("motor", "bench", problem)
-    whole = median_seconds(lambda: adapt(state, window), 20)
-    kernel = median_seconds(lambda: objective.predict(swarm), 200)
-    cost = median_seconds(lambda: objective.cost(swarm), 200)
-    print(f"window of 200 records, R_a and initial state: {whole * 1e3:.1f} ms, {generations} generations")
-    print(f"  simulating the swarm: {kernel * generations / whole:.1%} of it ({kernel * 1e6:.0f} us a generation)")
-    print(f"  the objective around it: {(cost - kernel) * generations / whole:.1%}")
-    print(f"  the swarm's own bookkeeping and the rest: {1.0 - cost * generations / whole:.1%}")
+    for window in record:
+        state, _ = adapt(state, window)
+    whole = median_seconds(lambda: adapt(state, record[-1]), 50)
+    print(f"the whole heart, warm: {whole * 1e3:.2f} ms a window")
     return 0
 
 

@@ -8,6 +8,7 @@ from otolith.acquisition.alignment import Aligned, Limits, align, judge
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Window
 
+PROMPT = 0.1  # quantile of lateness that stands for samples that nothing held up on their way
 GRACE = 0.1  # s; how long after its end a window waits for late samples
 
 
@@ -84,7 +85,7 @@ class Windower:
         halves = [(len(found.lateness) // 2, found.lateness) for found in aligned.values() if len(found.lateness) > 1]
         if not halves:
             return 0.0
-        early = float(np.median(np.concatenate([lateness[:half] for half, lateness in halves])))
-        late = float(np.median(np.concatenate([lateness[half:] for half, lateness in halves])))
+        early = float(np.quantile(np.concatenate([lateness[:half] for half, lateness in halves]), PROMPT))
+        late = float(np.quantile(np.concatenate([lateness[half:] for half, lateness in halves]), PROMPT))
         ahead = late + (1.5 * (late - early) if self._index else 0.5 * (early - late))
         return float(np.clip(ahead, -self.sample_period / 2, self.sample_period / 2))

@@ -23,9 +23,9 @@ class SwarmOptions:
     inertia: float = 0.9
     cognitive: float = 2.0
     social: float = 2.0
-    tolerance: float = 0.01
-    """The swarm has converged when its particles' best guesses differ by no more than this in χ²: a tenth of a
-    standard deviation, so that what is left of the search is far under what the noise leaves open."""
+    tolerance: float = 0.1
+    """The swarm is done when the best guesses of its particles lie within this share of χ²: all are in one valley then,
+    and the polish finds its floor."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,6 +53,6 @@ def search(objective: Objective, options: SwarmOptions, start: Array, seed: int)
         algorithm.next()
         generations += 1
         chi_square = objective.count * algorithm.pop.get("F")[:, 0] ** 2
-        converged = bool(np.ptp(chi_square) <= options.tolerance)
+        converged = bool(np.ptp(chi_square) <= options.tolerance * max(float(chi_square.min()), 1.0))
     winner = algorithm.opt[0]
     return Found(winner.X.copy(), float(winner.F[0]), generations, algorithm.evaluator.n_eval, converged)
