@@ -66,17 +66,30 @@ class Reference:
             ]
         )
 
-    def simulate(self, initial: Array, inputs: Array, period: float) -> Array:
-        """(records, outputs), each record integrated to a tight tolerance."""
-        state, found = np.asarray(initial, dtype=float), []
+    def simulate(self, initial: Array, inputs: Array, period: float, drifts: dict[str, float] | None = None) -> Array:
+        """(records, outputs), each record integrated to a tight tolerance.
+
+        ``drifts`` has parameters that move, in their unit per second, to the given value at the last record.
+        """
+        state, found, nominal = np.asarray(initial, dtype=float), [], dict(self._known)
+
+        def move(time: float) -> None:
+            for name, rate in (drifts or {}).items():
+                self._known[name] = nominal[name] + rate * self._scale[name] * (time - (len(inputs) - 1) * period)
+
         for record in range(len(inputs)):
+            move(record * period)
             found.append(self.outputs(state, inputs[record]))
             if record + 1 < len(inputs):
                 drive = self._drive(inputs[record], inputs[record + 1], period)
-                state = solve_ivp(
-                    lambda t, x, drive=drive: self.rates(x, drive(t)), (0.0, period), state,
-                    method="DOP853", rtol=1e-12, atol=1e-14,
-                ).y[:, -1]  # fmt: skip
+
+                def rates(t: float, x: Array, drive: Callable[[float], Array] = drive, k: int = record) -> Array:
+                    move(k * period + t)
+                    return self.rates(x, drive(t))
+
+                done = solve_ivp(rates, (0.0, period), state, method="DOP853", rtol=1e-12, atol=1e-14)
+                state = done.y[:, -1]
+        self._known = nominal
         return np.array(found)
 
     def _drive(self, now: Array, then: Array, period: float) -> Callable[[float], Array]:

@@ -73,6 +73,26 @@ def test_sensitivities_are_the_derivatives_of_the_reference(twin: Definition) ->
         assert (wrong <= 1e-5 * np.maximum(largest, floor)).all(), (column, wrong, largest)
 
 
+@pytest.mark.parametrize("name", ["dc_motor", "hydraulic_actuator", "pmsm"])
+def test_drifts_are_the_derivatives_by_a_parameter_that_moves(name: str) -> None:
+    """Against the reference with a parameter that runs straight through the window to its value at the last record."""
+    twin = find_twin(name)
+    drive, _, _ = resolved(twin, excitation(twin, records=20))
+    drive = replace(drive, substeps=8 * drive.substeps)
+    slopes = kernel_of(twin).sensitivities(nominal(twin), initial(twin), drive, drifts=True).slopes
+    base = len(twin.parameters) + len(twin.states)
+    for index, entry in enumerate(twin.parameters):
+        reach = min(entry.high - entry.low, max(abs(entry.nominal), 0.01 * (entry.high - entry.low)))
+        rate = 1e-4 * reach / (20 * drive.sample_period)
+        ahead, behind = (
+            Reference(twin, nominal(twin)).simulate(initial(twin), drive.inputs, drive.sample_period, {entry.name: r})
+            for r in (rate, -rate)
+        )
+        change = (ahead - behind) / (2.0 * rate)
+        floor = 1e-6 * np.abs(slopes[:, :, base + index]).max(axis=0)
+        assert slopes[:, :, base + index] == pytest.approx(change, rel=1e-4, abs=max(floor.max(), 1e-12))
+
+
 @pytest.mark.parametrize("name", ["dc_motor", "two_mass", "pmsm"])
 def test_order_four(name: str) -> None:
     """Halving the step divides the error by sixteen."""

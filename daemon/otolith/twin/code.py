@@ -77,20 +77,33 @@ class _Writer:
             ]),
         ]  # fmt: skip
 
-    def sensitivities(self) -> list[str]:
-        entries, columns = [*self.c.names("c"), *self.d.names("d")], len(self.p) + len(self.x)
+    def sensitivities(self, name: str, *, drifts: bool) -> list[str]:
+        """Columns: each parameter, each initial state and, with ``drifts``, each parameter's drift.
+
+        A drift moves its parameter by one unit per second and leaves it as it is at the last record, so its column is
+        driven as the parameter's, weighted with the time until then.
+        """
+        entries, base = [*self.c.names("c"), *self.d.names("d")], len(self.p) + len(self.x)
+        columns = base + len(self.p) * drifts
         slope = {row: [] for row in range(self.outputs)}  # type: dict[int, list[str]]
-        for (row, column), name in zip(self.c.places, self.c.names("c"), strict=True):
-            slope[row].append(f"{name} * state[{column}, column]")
+        for (row, column), entry in zip(self.c.places, self.c.names("c"), strict=True):
+            slope[row].append(f"{entry} * state[{column}, column]")
         stages = [f"{_tuple([*self._k(n), *self._jacobians(n)])} = linearise_({{}})" for n in range(1, 5)]
+        drifting = ["when = (record - records + 1) * sample_period"] if drifts else []
+        drifting += [
+            f"slopes[record, {row}, {base + column}] += when * {entry}"
+            for (row, column), entry in zip(self.d.places, self.d.names("d"), strict=True)
+            if drifts
+        ]
         loop = [
             *self._read_inputs(),
             f"{_tuple([*self._y(), *entries])} = linearise_outputs_({self._arguments(self.x, self.u)})",
-            *(f"found[record, {index}] = {name}" for index, name in enumerate(self._y())),
+            *(f"found[record, {index}] = {entry}" for index, entry in enumerate(self._y())),
             f"for column in range({columns}):",
             *_indent([f"slopes[record, {row}, column] = {_sum(terms)}" for row, terms in slope.items()]),
-            *(f"slopes[record, {row}, {column}] += {name}"
-              for (row, column), name in zip(self.d.places, self.d.names("d"), strict=True)),
+            *(f"slopes[record, {row}, {column}] += {entry}"
+              for (row, column), entry in zip(self.d.places, self.d.names("d"), strict=True)),
+            *drifting,
             "if correct:",
             *_indent([
                 *self._innovations(),
@@ -102,7 +115,7 @@ class _Writer:
         ]  # fmt: skip
         return [
             KERNEL,
-            "def sensitivities(parameters, initial, inputs, sample_period, substeps, measured, gain):",
+            f"def {name}(parameters, initial, inputs, sample_period, substeps, measured, gain):",
             *_indent([
                 "records = inputs.shape[0]",
                 f"found = np.empty((records, {self.outputs}))",
@@ -247,6 +260,14 @@ class _Writer:
             for stage in range(1, 5)
             for (row, column), name in zip(self.b.places, self.b.names(f"b{stage}"), strict=True)
         ]
+        base = len(self.p) + len(self.x)
+        if columns > base:
+            lines.append("begins = when + substep * step")
+            lines += [
+                f"drive[{stage - 1}, {row}, {base + column}] = (begins + {share} * step) * {name}"
+                for stage, share in ((1, 0.0), (2, 0.5), (3, 0.5), (4, 1.0))
+                for (row, column), name in zip(self.b.places, self.b.names(f"b{stage}"), strict=True)
+            ]
         rows, driven = range(len(self.x)), {row for row, _ in self.b.places}
         inner = [f"s_{row} = state[{row}, column]" for row in rows]
         for stage, length in ((1, ""), (2, "half"), (3, "half"), (4, "step")):
@@ -266,7 +287,9 @@ def source_of(definition: Definition) -> str:
     """The text of the kernel module, with ``simulate``, ``sensitivities`` and ``euler``."""
     writer = _Writer(definition)
     blank = ["", ""]
-    lines = [*writer.helpers(), *writer.simulate(), *blank, *writer.sensitivities(), *blank, *writer.euler()]
+    lines = [*writer.helpers(), *writer.simulate(), *blank]
+    lines += [*writer.sensitivities("sensitivities", drifts=False), *blank]
+    lines += [*writer.sensitivities("drifting_sensitivities", drifts=True), *blank, *writer.euler()]
     return HEAD.format(name=definition.name) + "\n\n" + "\n".join(lines) + "\n"
 
 

@@ -18,7 +18,7 @@ from otolith.acquisition.window import Array
 from otolith.twin.definition import Definition
 
 MOST_SUBSTEPS = 1024
-GENERATOR = 2  # of otolith.twin.code: raised with every change of what it writes, so that no old text is used
+GENERATOR = 4  # of otolith.twin.code: raised with every change of what it writes, so that no old text is used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,16 +38,19 @@ class Excitation:
 
 
 class Sensitivities(NamedTuple):
-    """A prediction and its exact derivatives, by each parameter and then by each initial state."""
+    """A prediction and its exact derivatives, by each parameter, each initial state, and each parameter's drift.
+
+    A drift is one unit per second, about the value at the last record.
+    """
 
     outputs: Array
     """(records, outputs)."""
     slopes: Array
-    """(records, outputs, parameters + states)."""
+    """(records, outputs, parameters + states [+ parameters])."""
     last: Array
     """(states,) at the last record, corrected by it."""
     last_slopes: Array
-    """(states, parameters + states)."""
+    """(states, parameters + states [+ parameters])."""
 
 
 class Kernel:
@@ -68,9 +71,15 @@ class Kernel:
         found: Array = self._call("simulate", parameters, initial, *self._drive(excitation))
         return found
 
-    def sensitivities(self, parameters: Array, initial: Array, excitation: Excitation) -> "Sensitivities":
-        """One prediction and its exact derivatives; shapes (parameters,), (states,)."""
-        return Sensitivities(*self._call("sensitivities", parameters, initial, *self._drive(excitation)))
+    def sensitivities(
+        self, parameters: Array, initial: Array, excitation: Excitation, *, drifts: bool = False
+    ) -> "Sensitivities":
+        """One prediction and its exact derivatives, also by the parameters' ``drifts`` if asked for.
+
+        Shapes (parameters,), (states,).
+        """
+        name = "drifting_sensitivities" if drifts else "sensitivities"
+        return Sensitivities(*self._call(name, parameters, initial, *self._drive(excitation)))
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
