@@ -160,7 +160,7 @@ def _levels(
     for name, (unit, level) in entries.items():
         with context.at(table, name):
             low = 0.0 if level == 0.0 else SMALLEST_NOISE
-            found[name] = Quantity(unit, low=low)(written[name]) if name in written else level
+            found[name] = Quantity(unit, low=low, difference=True)(written[name]) if name in written else level
     return found
 
 

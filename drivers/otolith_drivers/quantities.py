@@ -114,6 +114,8 @@ class Quantity:
     unit: str
     low: float = -math.inf
     high: float = math.inf
+    difference: bool = False
+    """Of two such quantities, like a noise level: 0.1 degC is 0.1 K then."""
 
     def __call__(self, written: Any) -> float:
         """The value in ``self.unit``.
@@ -140,7 +142,7 @@ class Quantity:
         if match[2].startswith(","):
             raise ValueError(f"{written!r} is not a number with a unit: the decimal sign is a point")
         scale, offset = factor(match[2], self.unit)
-        value = scale * float(match[1]) + offset
+        value = scale * float(match[1]) + (0.0 if self.difference else offset)
         if not math.isfinite(value):
             raise ValueError(f"{written!r} is not finite")
         return value

@@ -84,26 +84,73 @@ def test_it_estimates_what_its_roles_say(machine_file: Path) -> None:
         assert found.low - 2e-3 * value < value < found.high + 2e-3 * value
 
 
-def test_what_only_acts_together_is_named(tmp_path: Path) -> None:
-    """With the housing hidden behind a second resistance in series, only the sum could be estimated."""
-    page = PAGE.replace("theta/R_th", "theta/(R_th + R_2)").replace(
-        "\n[equations]",
-        'R_2 = { unit = "K/W", nominal = 0.4, bounds = [0.1, 2], meaning = "second resistance" }\n\n[equations]',
-    )
+def verdicts(tmp_path: Path, page: str) -> dict[str, str]:
+    """Of each parameter: why it could not be estimated, or nothing."""
     path = tmp_path / "twin.toml"
     path.write_text(page, encoding="utf-8")
-    found = {entry.name: entry for entry in structure_of(load_twin(path))}
-    assert found["C"].identifiable
-    assert found["R"].identifiable
-    assert not found["R_th"].identifiable
-    assert found["R_th"].reason == "only together with R_2"
+    return {entry.name: entry.reason for entry in structure_of(load_twin(path))}
+
+
+KNOWN_HEAT = PAGE.replace(
+    'R = { unit = "ohm", nominal = 1.5, bounds = [0.5, 5], meaning = "resistance of the winding" }\n', ""
+).replace(
+    "[equations]",
+    '[constants]\nR = { unit = "ohm", value = 1.5, meaning = "resistance of the winding" }\n\n[equations]',
+)
+
+
+def with_second(page: str, line: str) -> str:
+    """``page`` with one more parameter."""
+    return page.replace("\n[constants]", f"{line}\n\n[constants]")
+
+
+def test_what_only_acts_together_is_named(tmp_path: Path) -> None:
+    """Only R/C and R_th*C act: whoever wants one of the three must be given another."""
+    found = verdicts(tmp_path, PAGE)
+    assert all(reason.startswith("only together with") for reason in found.values())
+    assert verdicts(tmp_path, KNOWN_HEAT) == {"C": "", "R_th": ""}
+
+
+def test_two_resistances_in_series_are_one(tmp_path: Path) -> None:
+    second = 'R_2 = { unit = "K/W", nominal = 0.4, bounds = [0.1, 2], meaning = "second resistance" }'
+    found = verdicts(tmp_path, with_second(KNOWN_HEAT, second).replace("theta/R_th", "theta/(R_th + R_2)"))
+    assert found == {"C": "", "R_th": "only together with R_2", "R_2": "only together with R_th"}
 
 
 def test_a_parameter_that_no_output_feels_is_named(tmp_path: Path) -> None:
-    page = PAGE.replace("(R*i^2 - theta/R_th) / C", "(R*i^2 - theta/R_th) / C + 0*R_2*theta/R_th/C")
     second = 'R_2 = { unit = "1", nominal = 0.4, bounds = [0.1, 2], meaning = "nothing" }'
-    path = tmp_path / "twin.toml"
-    path.write_text(page.replace("\n[equations]", f"{second}\n\n[equations]"), encoding="utf-8")
-    found = {entry.name: entry for entry in structure_of(load_twin(path))}
-    assert found["C"].identifiable
-    assert (found["R_2"].identifiable, found["R_2"].reason) == (False, "no output depends on it")
+    found = verdicts(tmp_path, with_second(KNOWN_HEAT, second).replace('/ C"', '/ C + 0*R_2*theta/R_th/C"'))
+    assert found == {"C": "", "R_th": "", "R_2": "no output depends on it"}
+
+
+def test_a_threshold_is_not_called_dead(tmp_path: Path) -> None:
+    second = 'i_0 = { unit = "A", nominal = 5, bounds = [1, 9], meaning = "current from which it heats" }'
+    found = verdicts(tmp_path, with_second(KNOWN_HEAT, second).replace("R*i^2", "where(i > i_0, R*i^2, 0)"))
+    assert found["i_0"].startswith("it acts as a threshold only")
+
+
+def test_a_fast_circuit_is_judged_by_its_equations_and_not_by_the_integrator(tmp_path: Path) -> None:
+    """A time constant of a microsecond: only the product of resistance and capacitance acts."""
+    path = tmp_path / "rc.toml"
+    path.write_text(
+        """
+[twin]
+name = "rc"
+title = "low pass"
+source = "Kirchhoff"
+[states]
+v = { unit = "V", meaning = "voltage" }
+[inputs]
+u = { unit = "V", hold = "zoh", range = [0, 10], meaning = "input" }
+[outputs]
+v = { unit = "V", noise = 0.01, meaning = "voltage" }
+[parameters]
+R = { unit = "ohm", nominal = 10, bounds = [1, 100], meaning = "resistance" }
+C = { unit = "nF", nominal = 100, bounds = [10, 1000], meaning = "capacitance" }
+[equations]
+"der(v)" = "(u - v)/(R*C)"
+""",
+        encoding="utf-8",
+    )
+    found = {entry.name: entry.reason for entry in structure_of(load_twin(path))}
+    assert found == {"R": "only together with C", "C": "only together with R"}

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith.errors import ConfigurationError
+from otolith.twin.code import source_of
 from otolith.twin.dimensions import describe, dimension_of, measure
 from otolith.twin.expressions import FUNCTIONS, ExpressionError, names, parse
 from otolith.twin.kernel import Excitation, kernel_of
@@ -23,6 +24,7 @@ from otolith.twin.system import to_sympy
 from otolith.twins import LIBRARY, find_twin, load_twin
 from otolith.twins import names as library
 from otolith_drivers.toml_files import Page
+from tests.twin.reference import Reference
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "twins"
 CASES = sorted(path.parent for path in GOLDEN.glob("*/twin.toml"))
@@ -102,7 +104,19 @@ def test_nothing_is_ever_evaluated(case: Path, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize(
     ("text", "column"),
-    [("a + b.c", 5), ("  a.b", 3), ("a^2 + b^2 + c.d", 13), ("a + (b", 5), ("f(x)", 1), ("a**b", 1), ("x + 1e99", 5)],
+    [
+        ("a + 1/0", 5),
+        ("a + log(0 - 1)", 5),
+        ("a*(0-1)^0.5", 3),
+        ("0/0", 1),
+        ("a + b.c", 5),
+        ("  a.b", 3),
+        ("a^2 + b^2 + c.d", 13),
+        ("a + (b", 5),
+        ("f(x)", 1),
+        ("a**b", 1),
+        ("x + 1e99", 5),
+    ],
 )
 def test_the_position_is_that_of_the_fault(text: str, column: int) -> None:
     with pytest.raises(ExpressionError) as caught:
@@ -123,6 +137,9 @@ def test_the_position_is_that_of_the_fault(text: str, column: int) -> None:
         ("exp(-i/i)", "1"),
         ("sqrt(L/R/L*R)", "1"),
         ("pi*i", "A"),
+        ("i^0", "1"),
+        ("i^0.1*i^0.2/i^0.3", "1"),
+        ("i^1.1/i^0.4/i^0.7*R", "ohm"),
     ],
 )
 def test_dimensions(text: str, unit: str | None) -> None:
@@ -159,3 +176,63 @@ def test_a_page_in_other_units_is_the_same_machine() -> None:
         found.append(kernel_of(twin).simulate(parameters, np.zeros((1, 2)), drive)[0])
     assert found[1][:, 0] == pytest.approx(found[0][:, 0], rel=1e-9)
     assert found[1][:, 1] == pytest.approx(found[0][:, 1] * 60 / (2 * np.pi), rel=1e-9)
+
+
+FORMULAS = [
+    "where(u > 0, a*x, -b)", "max(where(x < 1, u, a), b)", "abs(where(x < 1, u, -a))*x", "sign(sqrt(x/b + 4) - 2)*x",
+    "where(u < 1, where(x < a, u, b), x)", "-x^2 + (-x)^3 - x^-2", "x^(1/3) + x^0.5*sign(u)", "atan2(u, x + 3)",
+    "min(x, max(u, a))", "exp(a*log(x + 2)) + 2^-1*x", "abs(u - x)*(u - x)", "tanh(u/a)*cosh(x) - sinh(x)/3",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_every_kind_of_formula_is_what_it_says(formula: str) -> None:
+    """Value and derivatives of an output, against Python's own evaluation of the text and its differences."""
+    page = f"""
+[twin]
+name = "any"
+title = "any"
+source = "test"
+[states]
+x = {{ unit = "1", meaning = "state", initial = 1.3, bounds = [-10, 10] }}
+[inputs]
+u = {{ unit = "1", hold = "zoh", meaning = "input" }}
+[outputs]
+y = {{ unit = "1", noise = 1, meaning = "output" }}
+[parameters]
+a = {{ unit = "1", nominal = 0.7, bounds = [0, 5], meaning = "a" }}
+b = {{ unit = "1", nominal = 1.9, bounds = [0, 5], meaning = "b" }}
+k = {{ unit = "1/s", nominal = 0.3, bounds = [0, 5], meaning = "rate" }}
+[equations]
+"der(x)" = "-k*x + 0*k*u*a*b"
+y = "{formula}"
+"""
+    twin = read_twin(Page(Path("any.toml"), page))
+    parameters, initial = np.array([0.7, 1.9, 0.3]), np.array([1.3])
+    drive = Excitation(np.array([[0.4], [2.3], [-1.1], [0.9], [0.2]]), 0.1, 8)
+    found = kernel_of(twin).sensitivities(parameters, initial, drive)
+    expected = Reference(twin, parameters).simulate(initial, drive.inputs, 0.1)
+    assert found.outputs == pytest.approx(expected, rel=1e-9, abs=1e-11)
+    for column, step in enumerate(1e-6 * np.eye(4)):
+        ahead, behind = (
+            Reference(twin, parameters + sign * step[:3]).simulate(initial + sign * step[3:], drive.inputs, 0.1)
+            for sign in (1.0, -1.0)
+        )
+        assert found.slopes[:, :, column] == pytest.approx((ahead - behind) / 2e-6, rel=1e-5, abs=1e-7)
+
+
+def test_definitions_that_swell_are_refused() -> None:
+    swelling = "\n".join(f'd{n} = "d{n - 1}*(d{n - 1} + i)"' for n in range(2, 15))
+    page = BASE.replace("[equations]", f'[definitions]\nd1 = "i"\n{swelling}\n\n[equations]').replace(
+        "K_e*omega)", "K_e*omega + 0*d14*V_a)"
+    )
+    with pytest.raises(ConfigurationError, match="written out"):
+        read_twin(Page(Path("any.toml"), page.replace('d1 = "i"', 'd1 = "i/i"').replace(" + i)", " + 1)")))
+
+
+def test_nothing_but_checked_names_reaches_the_generated_code() -> None:
+    page = BASE.replace('title = "', 'title = "\\"\\"\\"\\nINJECTED ').replace('source = "', 'source = "INJECTED ')
+    assert "INJECTED" not in source_of(read_twin(Page(Path("any.toml"), page)))
+    for name in ('x\\"\\"\\"\\nimport os', "a b", "a.b", "1a", ""):
+        with pytest.raises(ConfigurationError, match="is no name"):
+            read_twin(Page(Path("any.toml"), BASE.replace('name = "dc_motor"', f'name = "{name}"', 1)))

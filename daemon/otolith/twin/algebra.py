@@ -27,6 +27,9 @@ class Printer(PythonCodePrinter):  # type: ignore[misc]  # sympy has no types
         text = self._print(expr.args[0])
         return f"(1.0 if {text} > 0.0 else (-1.0 if {text} < 0.0 else 0.0))"
 
+    def _print_absolute(self, expr: Any) -> str:
+        return f"abs({self._print(expr.args[0])})"
+
     def _print_Heaviside(self, expr: Any) -> str:  # noqa: N802
         return f"(1.0 if {self._print(expr.args[0])} > 0.0 else 0.0)"
 
@@ -70,6 +73,8 @@ class Hoist:
             return expression
         if self._alone(expression):
             return self._symbol(expression)
+        if isinstance(expression, sympy.Piecewise):
+            return sympy.Piecewise(*((self(value), self._condition(condition)) for value, condition in expression.args))
         if not (expression.is_Add or expression.is_Mul):
             return expression.func(*(self(part) for part in expression.args))
         alone = [part for part in expression.args if self._alone(part)]
@@ -77,6 +82,13 @@ class Hoist:
         if alone and not (len(alone) == 1 and alone[0].is_Symbol):
             alone = [self._symbol(expression.func(*alone))]
         return expression.func(*alone, *rest)
+
+    def _condition(self, condition: Any) -> Any:
+        """A comparison is no number and stays; what it compares may be hoisted."""
+        if condition.is_Atom:
+            return condition
+        inside = self._condition if not condition.is_Relational else self
+        return condition.func(*(inside(part) for part in condition.args))
 
     def _alone(self, expression: sympy.Expr) -> bool:
         return bool(expression.free_symbols) and expression.free_symbols <= self._parameters

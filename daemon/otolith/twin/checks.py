@@ -10,6 +10,8 @@ from otolith.twin.dimensions import NONE, describe, dimension_of, measure
 from otolith.twin.expressions import ExpressionError, check_known, names, parse
 from otolith_drivers.toml_files import Location
 
+MOST_TERMS, MOST_LEVELS = 3000, 100  # of an expression with its definitions written out
+
 Fault = Callable[[Location, str], None]
 
 
@@ -37,14 +39,17 @@ class _Checker:
                 del known[output.name]
         trees = self._definitions(known)
         self._check_left_sides()
-        used = set().union(*(names(tree) for tree in trees.values()))
+        used: set[str] = set()
         for left, text in self._definition.equations:
             tree = self._tree(("equations", left), text, known)
             if tree is not None and not self._faulty:
                 used |= names(tree)
                 self._check_sides(("equations", left), tree, known, _left_dimension(left, self._definition))
+                self._check_size(("equations", left), tree, trees)
+        for site in self._definition.sites:
+            used |= _names_in(site.through)
         if not self._faulty:
-            self._check_used(used)
+            self._check_used(_reachable(used, trees))
             for site in self._definition.sites:
                 self._check_site(site, known)
 
@@ -110,12 +115,26 @@ class _Checker:
                 self._fault(("equations",), f"the equation of {left} is missing")
 
     def _check_used(self, used: set[str]) -> None:
-        used = used | {name for site in self._definition.sites for name in _names_in(site.through)}
-        for table, entries in (("parameters", self._definition.parameters), ("inputs", self._definition.inputs),
-                               ("constants", self._definition.constants)):  # fmt: skip
-            for entry in entries:
-                if entry.name not in used:
-                    self._fault((table, entry.name), "appears in no equation: use it or leave it out")
+        tables: dict[str, list[str]] = {
+            "parameters": [entry.name for entry in self._definition.parameters],
+            "inputs": [entry.name for entry in self._definition.inputs],
+            "constants": [entry.name for entry in self._definition.constants],
+            "definitions": [name for name, _, _ in self._definition.definitions],
+        }
+        for table, entries in tables.items():
+            for name in entries:
+                if name not in used:
+                    self._fault((table, name), "appears in no equation: use it or leave it out")
+
+    def _check_size(self, location: Location, tree: ast.expr, trees: Mapping[str, ast.expr]) -> None:
+        """Definitions are written out in what uses them, so their sizes multiply."""
+        terms, depth = _written_out(tree, trees, {})
+        if terms > MOST_TERMS or depth > MOST_LEVELS:
+            self._fault(
+                location,
+                f"with its definitions written out it has {terms} terms, {depth} levels deep: "
+                f"at most {MOST_TERMS} and {MOST_LEVELS} are supported, so make one of them a state or simplify",
+            )
 
     def _check_site(self, site: Site, known: Mapping[str, Any]) -> None:
         at: Location = ("sites", site.name)
@@ -129,7 +148,7 @@ class _Checker:
             if site.through != "1" or dimension_of(site.unit) != NONE:
                 self._fault(at, 'a multiplicative component is a plain number: unit = "1", and no through')
             return
-        tree = self._tree(at, f"({site.through})", known)
+        tree = self._tree(at, site.through, known)
         if tree is None:
             return
         left = known.get(site.into) if site.into in known else _left_dimension(site.into, self._definition)
@@ -141,6 +160,33 @@ class _Checker:
         if left is not None and entering != left:
             text = f"through * component is in {describe(entering)}, but {site.into} is in {describe(left)}"
             self._fault(at, text)
+
+
+def _written_out(tree: ast.expr, trees: Mapping[str, ast.expr], known: dict[str, tuple[int, int]]) -> tuple[int, int]:
+    """Terms and levels of an expression with its definitions written out; ``known`` remembers those of definitions."""
+    terms, levels = 0, 0
+    pending: list[tuple[ast.AST, int]] = [(tree, 1)]
+    while pending:
+        node, level = pending.pop()
+        inner = (1, 0)
+        if isinstance(node, ast.Name) and node.id in trees:
+            if node.id not in known:
+                known[node.id] = _written_out(trees[node.id], trees, known)
+            inner = known[node.id]
+        terms += inner[0]
+        levels = max(levels, level + inner[1])
+        pending += [(child, level + 1) for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
+    return terms, levels
+
+
+def _reachable(used: set[str], trees: Mapping[str, ast.expr]) -> set[str]:
+    """``used``, and what the definitions in it use."""
+    found, pending = set(used), list(used)
+    while pending:
+        inner = names(trees[name]) if (name := pending.pop()) in trees else set()
+        pending += inner - found
+        found |= inner
+    return found
 
 
 def _left_dimension(left: str, definition: Definition) -> Any:

@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Mapping
+from fractions import Fraction
 from typing import Any
 
 from otolith.twin.expressions import ExpressionError, constant
@@ -47,17 +48,23 @@ def measure(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension:
             return _same([left, right], known, "a sum")
         case ast.BinOp(left=left, op=ast.Mult(), right=right):
             first, second = measure(left, known), measure(right, known)
-            return None if first is None or second is None else first * second
+            return None if first is None or second is None else _tidy(first * second)
         case ast.BinOp(left=left, op=ast.Div(), right=right):
             first, second = measure(left, known), measure(right, known)
-            return None if first is None else first / (NONE if second is None else second)
+            return None if first is None else _tidy(first / (NONE if second is None else second))
         case ast.BinOp(left=left, op=ast.Pow(), right=right):
             base = measure(left, known)
-            return None if base is None else base ** constant(right)
+            return None if base is None else _tidy(base ** constant(right))
         case ast.Call(func=ast.Name(id=name), args=arguments):
             return _call(name, arguments, known)
         case _:
             raise AssertionError(ast.dump(tree))
+
+
+def _tidy(dimension: Dimension) -> Dimension:
+    """Without what rounding leaves of exponents: s^0.1 * s^0.2 / s^0.3 is a plain number."""
+    exact = {name: Fraction(float(value)).limit_denominator(1000) for name, value in dimension.items()}
+    return type(dimension)({name: float(value) for name, value in exact.items() if value})
 
 
 def _call(name: str, arguments: list[ast.expr], known: Mapping[str, Dimension]) -> Dimension:
@@ -70,7 +77,7 @@ def _call(name: str, arguments: list[ast.expr], known: Mapping[str, Dimension]) 
         return _same(arguments, known, name)
     if name == "sqrt":
         inner = measure(arguments[0], known)
-        return None if inner is None else inner**0.5
+        return None if inner is None else _tidy(inner**0.5)
     if name == "sign":
         measure(arguments[0], known)
         return NONE

@@ -7,8 +7,10 @@ exponent, calls of the functions below and comparisons inside ``where``; anythin
 import ast
 import keyword
 import math
+import operator
 import re
 from collections.abc import Callable, Collection
+from typing import Any
 
 from otolith.errors import nearest
 
@@ -25,7 +27,10 @@ FUNCTIONS: dict[str, int] = {
 """Every function, and how many arguments it takes."""
 
 RESERVED = frozenset({*FUNCTIONS, "t", "der", "pi", "Piecewise"})
-OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "^"}
+ARITHMETIC: dict[type[ast.operator], Callable[..., Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+}  # fmt: skip
 COMPARISONS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 
 
@@ -67,6 +72,7 @@ def parse(text: str) -> ast.expr:
         if hasattr(node, "col_offset"):
             node.col_offset = columns(node.col_offset) - 1
     _check(tree)
+    _check_constants(tree)
     return tree
 
 
@@ -114,6 +120,52 @@ def _check(tree: ast.expr) -> None:
         if seen > LARGEST_TREE:
             raise ExpressionError(f"more than {LARGEST_TREE} terms: use definitions", column)
         pending += [(child, depth + 1) for child in _children(node, column)]
+
+
+def _check_constants(tree: ast.expr) -> float | None:
+    """The value of an expression without names, None of one with; refuses what has no real value, like 1/0."""
+    try:
+        found = _folded(tree, [_check_constants(part) for part in _parts(tree)])
+    except ExpressionError:
+        raise
+    except (ArithmeticError, ValueError) as error:
+        raise ExpressionError(f"{ast.unparse(tree)} has no real value", tree.col_offset + 1) from error
+    if isinstance(found, complex) or (found is not None and not math.isfinite(found)):
+        raise ExpressionError(f"{ast.unparse(tree)} has no real value", tree.col_offset + 1)
+    return found
+
+
+def _parts(tree: ast.expr) -> list[ast.expr]:
+    match tree:
+        case ast.BinOp(left=left, right=right):
+            return [left, right]
+        case ast.UnaryOp(operand=operand):
+            return [operand]
+        case ast.Call(args=arguments):
+            return arguments
+        case ast.Compare(left=left, comparators=others):
+            return [left, *others]
+        case _:
+            return []
+
+
+def _folded(tree: ast.expr, parts: list[float | None]) -> float | complex | None:
+    if isinstance(tree, ast.Constant):
+        return float(tree.value)  # type: ignore[arg-type]  # the check before has left numbers only
+    if isinstance(tree, ast.Name):
+        return math.pi if tree.id == "pi" else None
+    if isinstance(tree, ast.BinOp) and isinstance(tree.op, ast.Div) and parts[1] == 0.0:
+        raise ZeroDivisionError
+    known = [part for part in parts if part is not None]
+    if not parts or len(known) < len(parts):
+        return None
+    if isinstance(tree, ast.UnaryOp):
+        return -known[0] if isinstance(tree.op, ast.USub) else known[0]
+    if isinstance(tree, ast.BinOp):
+        found: float | complex = ARITHMETIC[type(tree.op)](*known)
+        return found
+    name = tree.func.id if isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name) else ""
+    return float(getattr(math, name)(*known)) if name in FUNCTIONS and hasattr(math, name) else None
 
 
 def _children(node: ast.AST, column: int) -> list[ast.expr]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from otolith import kernel_cache
 from otolith.acquisition.window import Array
+from otolith.errors import ConfigurationError
 from otolith.twin.definition import Definition
 
 MOST_SUBSTEPS = 1024
@@ -159,4 +160,8 @@ def identity_of(definition: Definition) -> str:
 def _source(definition: Definition) -> str:
     from otolith.twin.code import source_of  # noqa: PLC0415 - loads SymPy, which a cached kernel does not need
 
-    return source_of(definition)
+    try:
+        return source_of(definition)
+    except Exception as error:
+        text = f"twin {definition.name!r}: its equations cannot be turned into code: {type(error).__name__}: {error}"
+        raise ConfigurationError(text) from error

@@ -1,10 +1,11 @@
 """Reading a page of the twin language: TOML in, a checked :class:`Definition` out, or every fault with its line."""
 
 import math
+import re
 from collections.abc import Iterable
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.errors import ConfigurationError
 from otolith.twin.checks import check_equations
@@ -14,7 +15,7 @@ from otolith_drivers.quantities import Quantity, to_base
 from otolith_drivers.toml_files import Closed, Location, Page, expect, validate
 from otolith_drivers.toml_files import parse as parse_toml
 
-MOST_STATES, MOST_PARAMETERS, MOST_SIGNALS = 12, 40, 40
+MOST_STATES, MOST_PARAMETERS, MOST_SIGNALS, MOST_DEFINITIONS = 12, 40, 40, 60
 
 
 def _unit(written: str) -> str:
@@ -23,13 +24,25 @@ def _unit(written: str) -> str:
     return written
 
 
+def _twin_name(written: str) -> str:
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_\-]{0,63}", written):
+        raise ValueError(f"{written!r} is no name: a letter, then letters, digits, '_' and '-', at most 64")
+    return written
+
+
+def _no_flag(written: object) -> object:
+    if isinstance(written, bool):
+        raise ValueError(f"{written!r} is not a number")  # noqa: TRY004 - a fault of a file, not a bug
+    return written
+
+
 Unit = Annotated[str, AfterValidator(_unit)]
-Number = float | str
+Number = Annotated[float | str, BeforeValidator(_no_flag)]
 Bounds = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
 
 
 class _Head(Closed):
-    name: str
+    name: Annotated[str, AfterValidator(_twin_name)]
     title: str
     source: str
     validity: str = ""
@@ -153,6 +166,7 @@ class _Reader:
             ("parameters", file.parameters, MOST_PARAMETERS),
             ("inputs", file.inputs, MOST_SIGNALS),
             ("outputs", file.outputs, MOST_SIGNALS),
+            ("definitions", file.definitions, MOST_DEFINITIONS),
         ):
             if len(entries) > most:
                 self._fault((table,), f"{len(entries)} entries, at most {most} are supported")
@@ -177,10 +191,12 @@ class _Reader:
                     self._fault((table, name), f"{name!r} is already the name of one of [{owner[name]}]")
                 owner.setdefault(name, table)
 
-    def _number(self, location: Location, unit: str, written: Number) -> float:
+    def _number(self, location: Location, unit: str, written: Number, *, difference: bool = False) -> float:
         """A number in the declared unit, or a quantity in any unit that fits."""
         try:
-            return written if isinstance(written, int | float) else Quantity(unit).convert(written)
+            if isinstance(written, int | float):
+                return written
+            return Quantity(unit, difference=difference).convert(written)
         except ValueError as error:
             self._fault(location, str(error))
             return math.nan
@@ -203,7 +219,7 @@ class _Reader:
         return Input(name, entry.unit, entry.meaning, entry.hold, low, high)
 
     def _output(self, name: str, entry: _Output) -> Output:
-        noise = self._number(("outputs", name, "noise"), entry.unit, entry.noise)
+        noise = self._number(("outputs", name, "noise"), entry.unit, entry.noise, difference=True)
         if noise <= 0.0:
             self._fault(("outputs", name), f"noise {noise:g} {entry.unit} must be above zero")
         state = self._file.states.get(name)

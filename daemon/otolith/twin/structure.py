@@ -5,7 +5,7 @@ the others' can be estimated in no experiment of this kind, whatever the noise (
 numerically; E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data, 1997, chapter 2).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,9 +14,12 @@ from otolith.twin.definition import Definition
 from otolith.twin.kernel import Excitation, kernel_of
 
 RECORDS, TRIALS = 300, 3
-PERIODS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)  # s: one of them suits the machine's time constants
+PERIODS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # s: one of them suits the machine's time constants
 SPREAD = 0.1  # of the bounds' width, around the nominal values
 DEAD = "no output depends on it"
+THRESHOLD = "it acts as a threshold only, without a slope that an estimation could follow"
+NOT_FINITE = "the equations are not finite, or not smooth, around the nominal values and the initial state"
+RESOLVED = 1e-4  # of an output's range: how little a finer step may change it
 NOTHING = 1e-9  # of the longest sensitivity: as long as none at all
 DEPENDENT = 1e-5  # of its own length: how much of a sensitivity must be its own
 PARTNER = 0.05  # of the largest coefficient
@@ -36,9 +39,17 @@ def structure_of(definition: Definition, seed: int = 1) -> list[Structure]:
     random = np.random.default_rng(seed)
     trials: list[list[Structure]] = []
     for period in PERIODS:
-        columns = np.vstack([_sensitivities(definition, period, random) for _ in range(TRIALS)])
-        trials.append([_judge(definition, columns, index) for index in range(len(definition.parameters))])
-    return max(trials, key=lambda found: sum(entry.identifiable - (entry.reason == DEAD) for entry in found))
+        # Each at parameters of its own, judged alone: a combination that acts alone differs from point to point.
+        found = [_sensitivities(definition, period, random) for _ in range(TRIALS)]
+        trials += [
+            [_judge(definition, columns, index) for index in range(len(definition.parameters))]
+            for columns in found
+            if np.isfinite(columns).all()
+        ]
+    if not trials:
+        return [Structure(entry.name, identifiable=False, reason=NOT_FINITE) for entry in definition.parameters]
+    best = max(trials, key=lambda found: sum(entry.identifiable - (entry.reason == DEAD) for entry in found))
+    return [_unless_threshold(definition, entry) if entry.reason == DEAD else entry for entry in best]
 
 
 def _sensitivities(definition: Definition, period: float, random: np.random.Generator) -> Array:
@@ -52,12 +63,31 @@ def _sensitivities(definition: Definition, period: float, random: np.random.Gene
         [np.zeros((RECORDS, 0)), *(_telegraph(entry.low, entry.high, random) for entry in definition.inputs)]
     )
     excitation = Excitation(inputs, period, substeps=8)
-    slopes = kernel_of(definition).sensitivities(parameters, initial, excitation).slopes
+    outputs, slopes, _, _ = kernel_of(definition).sensitivities(parameters, initial, excitation)
+    finer = kernel_of(definition).simulate(parameters[None], initial[None], replace(excitation, substeps=16))[0]
+    with np.errstate(over="ignore", invalid="ignore"):
+        resolved = np.abs(outputs - finer).max(axis=0) <= RESOLVED * np.ptp(finer, axis=0)
+    if not resolved.all():  # a step too long for the machine: what comes out is the integrator's, not the equations'
+        return np.full((1, 1), np.nan)
     widths = np.concatenate([high - low, [entry.high - entry.low for entry in definition.states]])
     noise = np.array([entry.noise for entry in definition.outputs])
-    scaled = slopes * widths / noise[None, :, None]
-    found: Array = np.nan_to_num(scaled.reshape(-1, len(widths)), nan=0.0, posinf=0.0, neginf=0.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        found: Array = (slopes * widths / noise[None, :, None]).reshape(-1, len(widths))
     return found
+
+
+def _unless_threshold(definition: Definition, entry: Structure) -> Structure:
+    """A parameter without a slope may still act, as the threshold of a ``where``."""
+    random = np.random.default_rng(1)
+    columns = [_telegraph(e.low, e.high, random) for e in definition.inputs]
+    inputs = np.column_stack([np.zeros((RECORDS, 0)), *columns])
+    initial = np.array([[state.initial for state in definition.states]])
+    outputs = []
+    for value in (definition.parameter(entry.name).low, definition.parameter(entry.name).high):
+        parameters = [value if e.name == entry.name else e.nominal for e in definition.parameters]
+        outputs.append(kernel_of(definition).simulate(np.array([parameters]), initial, Excitation(inputs, 1e-2, 8)))
+    acts = not np.array_equal(outputs[0], outputs[1], equal_nan=True)
+    return Structure(entry.name, identifiable=False, reason=THRESHOLD) if acts else entry
 
 
 def _telegraph(low: float, high: float, random: np.random.Generator) -> Array:

@@ -13,8 +13,34 @@ from otolith.twin.definition import Definition
 from otolith.twin.expressions import constant, parse
 from otolith_drivers.quantities import to_base
 
+
+class sign(sympy.Function):  # type: ignore[misc]  # noqa: N801 - printed as it is called
+    """The sign, with the slope that it has beside its step: SymPy's own asks whether its argument is real."""
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        """Zero."""
+        del argindex
+        return sympy.Integer(0)
+
+
+class absolute(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as above
+    """The absolute value of a real quantity."""
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        """The sign."""
+        del argindex
+        return sign(self.args[0])
+
+    def _pretty(self, printer: object) -> object:
+        return printer._print(sympy.Abs(self.args[0]))  # type: ignore[attr-defined]
+
+    def _latex(self, printer: object) -> str:
+        found: str = printer._print(sympy.Abs(self.args[0]))  # type: ignore[attr-defined]
+        return found
+
+
 UNARY = {name: getattr(sympy, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh",
-                                                   "exp", "log", "sqrt", "sign")}  # fmt: skip
+                                                   "exp", "log", "sqrt")}  # fmt: skip
 COMPARE = {ast.Lt: sympy.Lt, ast.LtE: sympy.Le, ast.Gt: sympy.Gt, ast.GtE: sympy.Ge}
 
 
@@ -94,7 +120,7 @@ def _call(name: str, arguments: list[ast.expr], values: dict[str, sympy.Expr]) -
         test = COMPARE[type(condition.ops[0])](left, right)
         return sympy.Piecewise((to_sympy(arguments[1], values), test), (to_sympy(arguments[2], values), True))
     found = [to_sympy(argument, values) for argument in arguments]
-    several = {"abs": sympy.Abs, "min": sympy.Min, "max": sympy.Max, "atan2": sympy.atan2}
+    several = {"sign": sign, "abs": absolute, "min": sympy.Min, "max": sympy.Max, "atan2": sympy.atan2}
     return (UNARY | several)[name](*found)
 
 
