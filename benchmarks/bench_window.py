@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -57,11 +58,11 @@ def main() -> int:
     for names in (("R_a",), ("R_a", "D"), ("R_a", "D", "J")):
         free = of(problem, names)
         start = np.array([entry.nominal for entry in free.free])
-        cold = median_seconds(lambda p=free, s=start: estimate(p, record[-1], s), 5)  # type: ignore[misc]
-        warm = median_seconds(lambda p=free, s=start: estimate(p, record[-1], s, warm=True), 50)  # type: ignore[misc]
+        cold = median_seconds(partial(estimate, free, record[-1], start), 5)
+        warm = median_seconds(partial(estimate, free, record[-1], start, warm=True), 50)
         objective = Objective(free, record[-1], start)
         guess = objective.guess(start)
-        kernel = median_seconds(lambda o=objective, g=guess: o.linearised(g), 200)  # type: ignore[misc]
+        kernel = median_seconds(partial(objective.linearised, guess), 200)
         generations = search(objective, free.swarm, start, seed=1).generations
         print(f"200 records, unknown: {', '.join(names)}, and the initial state")
         print(f"  warm {warm * 1e3:8.2f} ms   one linearisation is {kernel / warm:.1%} of it")

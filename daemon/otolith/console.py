@@ -10,8 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from otolith.acquisition.window import Verdict
+from otolith.adaptation.information import QUANTILE
 from otolith.health.report import ParameterDocument, ReportDocument, Status
-from otolith.health.status import QUANTILE
 
 HISTORY = 200  # windows that the curve can show
 WITHOUT_HISTORY = 72  # columns of the table beside the curve

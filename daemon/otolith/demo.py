@@ -20,10 +20,10 @@ from rich.live import Live
 from rich.table import Table
 
 from otolith.acquisition.window import Verdict
+from otolith.adaptation.information import QUANTILE
 from otolith.console import Board
 from otolith.errors import ConfigurationError, OtolithError, ServiceError
 from otolith.health.report import ReportDocument, Status
-from otolith.health.status import QUANTILE
 from otolith.outlets.zenoh_session import Listener
 from otolith.paths import state_directory, writable
 from otolith.plan import load_plan
@@ -63,9 +63,11 @@ def compare(reports: Sequence[ReportDocument], truth: Mapping[str, Sequence[floa
         inside = (times >= report.window.start) & (times <= report.window.end)
         if report.window.quality.verdict is not Verdict.GOOD or not inside.any():
             continue
-        if np.abs(np.asarray(truth["i"])[inside]).mean() < CURRENT_FLOWS:
+        if "i" in truth and np.abs(np.asarray(truth["i"])[inside]).mean() < CURRENT_FLOWS:
             continue
         for name, parameter in report.parameters.items():
+            if name not in truth:  # the simulated machine has no such parameter
+                continue
             found = parameter.value if parameter.status is Status.ESTIMATED else None
             half = None if found is None or parameter.sd is None else QUANTILE * parameter.sd
             injected = float(np.asarray(truth[name])[inside].mean())
@@ -142,7 +144,7 @@ class Demo:
         if report is not None:
             self._reports.append(report)
             if aloud and not self._as_json:
-                values = (f"{name} {entry.value:.4f} {entry.unit}" if entry.value else f"{name} unknown"
+                values = (f"{name} {entry.value:.5g} {entry.unit}" if entry.value is not None else f"{name} unknown"
                           for name, entry in report.parameters.items())  # fmt: skip
                 self._console.print(
                     f"window {report.window.index} {report.window.quality.verdict}: {', '.join(values)}"
@@ -187,7 +189,7 @@ class Demo:
         units = {entry.name: entry.unit for entry in self._plan.problem.free}
         step = max(1, len(compared) // ROWS)
         every = "" if step == 1 else f" (one row of {step})"
-        table = Table(title=f"injected against found, good windows with current flowing{every}")
+        table = Table(title=f"injected against found, good windows with excitation{every}")
         for column in ("window", "parameter", "injected", "found ± 95 %", "unit", "error"):
             table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
         shown = [*compared[::step], *(row for row in compared[-1:] if (len(compared) - 1) % step)]
@@ -206,7 +208,7 @@ class Demo:
                 change = f"{name} went from {before:.5g} to {after:.5g} {unit} ({after / before - 1:+.1%})"
                 say(f"{change}; largest error {max(row.error for row in rows):.3%} in {len(rows)} windows")
         if not compared:
-            say("[red]no good window with current flowing: nothing was shown[/red]")
+            say("[red]no good window with excitation: nothing was shown[/red]")
         elif wrong:
             say(f"[red]{len(wrong)} windows are wrong by more than {TOLERANCE:.1%}[/red]")
         else:
@@ -231,4 +233,4 @@ def _read_columns(path: Path) -> dict[str, list[float]]:
                 continue
             for name, value in row.items():
                 columns.setdefault(name, []).append(float(value))
-    return columns or {"t": [], "i": []}
+    return columns or {"t": []}

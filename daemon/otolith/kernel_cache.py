@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +23,7 @@ from otolith.errors import ServiceError
 from otolith.paths import cache_directory
 
 MOST_KERNELS = 64  # folders; the oldest beyond are removed
+GENERATOR = sorted((Path(__file__).parent / "twin").glob("*.py"))
 LIBRARIES = ("numba", "llvmlite", "numpy", "sympy")
 
 
@@ -32,7 +34,8 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
         ServiceError: the cache folder belongs to somebody else or can be written by others.
     """
     versions = " ".join(f"{name} {version(name)}" for name in LIBRARIES)
-    key = hashlib.sha256(f"{identity}\n{versions}\npython {sys.version}".encode()).hexdigest()[:24]
+    text = f"{identity}\n{versions}\npython {sys.version}\n{_generator()}"
+    key = hashlib.sha256(text.encode()).hexdigest()[:24]
     name = f"otolith_kernel_{key}"
     if name in sys.modules:
         return sys.modules[name]
@@ -46,6 +49,12 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
             _remove_old(store, keep=folder)
         os.utime(folder)
         return _import(name, file)
+
+
+@cache
+def _generator() -> str:
+    """What tells one version of the generator from another: its own text, so that nobody has to remember a number."""
+    return hashlib.sha256(b"".join(path.read_bytes() for path in GENERATOR)).hexdigest()
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from types import FrameType
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
+from otolith.adaptation.information import QUANTILE
 from otolith.companion import SIGNALS, Companion
 from otolith.errors import OtolithError
 from otolith.health.report import CountersDocument, Report, ReportDocument, Status
@@ -187,5 +188,5 @@ def summary(document: ReportDocument) -> str:
             parts.append(f"{name} unknown ({parameter.reason})")
         else:
             held = "" if parameter.status is Status.ESTIMATED else f" ({parameter.status}: {parameter.reason})"
-            parts.append(f"{name} {parameter.value:.5g} {parameter.unit} ± {1.96 * parameter.sd:.2g}{held}")
+            parts.append(f"{name} {parameter.value:.5g} {parameter.unit} ± {QUANTILE * parameter.sd:.2g}{held}")
     return ", ".join(parts)

@@ -3,10 +3,10 @@
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
+from otolith_drivers.can_bus import BusOptions, open_bus
 from tests.conftest import OwnMachine
 
 PLANT = [sys.executable, "-m", "otolith", "plant"]
@@ -16,7 +16,8 @@ def test_a_second_plant_on_the_same_bus_is_refused(own_machine: OwnMachine) -> N
     first = subprocess.Popen([*PLANT, str(own_machine.scenario)], stderr=subprocess.PIPE, text=True)
     assert first.stderr is not None
     assert "frames of dc-motor.dbc" in first.stderr.readline()
-    time.sleep(0.5)  # it listens before it speaks
+    with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus:
+        assert bus.recv(10.0) is not None  # it listens before it speaks
     second = subprocess.run(
         [*PLANT, str(own_machine.scenario)], capture_output=True, text=True, timeout=20, check=False
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 
+QUANTILE = 1.959964  # of the standard normal distribution, two-sided 95 %
 SINGULAR = 1e-8  # relative singular value under which a direction is not seen at all
 BLIND = 1e-4  # share in an unseen direction beyond which a parameter is not seen either
 FLAT = 1e-9  # a sensitivity this far under the largest is none
@@ -76,7 +77,7 @@ def classify(
     found: Information, index: int, names: Sequence[str], *, half_width: float, at_bound: bool
 ) -> tuple[Identifiability, str]:
     """The verdict on parameter ``index``, and what to say of it; ``half_width`` is what its 95 % interval may have."""
-    reach = 1.96 * found.sd[index]
+    reach = QUANTILE * found.sd[index]
     if at_bound:
         return Identifiability.AT_BOUND, "the best value lies at the bound: widen the bounds or doubt the twin"
     if reach <= half_width:

@@ -3,11 +3,9 @@
 import math
 from dataclasses import dataclass
 
-from otolith.adaptation.information import Identifiability, ParameterEstimate
+from otolith.adaptation.information import QUANTILE, Identifiability, ParameterEstimate
 from otolith.health.report import ParameterDocument, Status
 from otolith.twin.definition import Parameter
-
-QUANTILE = 1.959964  # of the standard normal distribution, two-sided 95 %
 
 
 @dataclass(frozen=True, slots=True)

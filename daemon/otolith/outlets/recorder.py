@@ -16,8 +16,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from otolith.acquisition.window import Array
+from otolith.adaptation.information import QUANTILE
 from otolith.health.report import Report, ReportDocument, Status, Traces
-from otolith.health.status import QUANTILE
 from otolith.twin.definition import Output, Parameter
 
 log = logging.getLogger(__name__)

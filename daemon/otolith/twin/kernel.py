@@ -19,7 +19,6 @@ from otolith.errors import ConfigurationError
 from otolith.twin.definition import Definition
 
 MOST_SUBSTEPS = 1024
-GENERATOR = 4  # of otolith.twin.code: raised with every change of what it writes, so that no old text is used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +142,7 @@ def kernel_of(definition: Definition) -> Kernel:
 
 
 def identity_of(definition: Definition) -> str:
-    """What tells one twin's kernels from another's: everything on the page that enters them, and the generator."""
+    """What tells one twin's kernels from another's: everything on the page that enters them."""
     mathematical = (
         definition.name,
         [(entry.name, entry.unit) for entry in definition.states],
@@ -154,7 +153,7 @@ def identity_of(definition: Definition) -> str:
         [(name, expression) for name, expression, _ in definition.definitions],
         definition.equations,
     )
-    return hashlib.sha256(f"{GENERATOR} {mathematical!r}".encode()).hexdigest()
+    return hashlib.sha256(repr(mathematical).encode()).hexdigest()
 
 
 def _source(definition: Definition) -> str:

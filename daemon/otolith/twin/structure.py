@@ -15,6 +15,7 @@ from otolith.twin.kernel import Excitation, kernel_of
 
 RECORDS, TRIALS = 300, 3
 PERIODS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # s: one of them suits the machine's time constants
+THRESHOLD_PERIOD = 1e-2  # s
 SPREAD = 0.1  # of the bounds' width, around the nominal values
 DEAD = "no output depends on it"
 THRESHOLD = "it acts as a threshold only, without a slope that an estimation could follow"
@@ -59,10 +60,7 @@ def _sensitivities(definition: Definition, period: float, random: np.random.Gene
     high = np.array([entry.high for entry in definition.parameters])
     parameters = np.clip(nominal + SPREAD * (high - low) * random.uniform(-0.5, 0.5, len(nominal)), low, high)
     initial = np.array([entry.initial for entry in definition.states])
-    inputs = np.column_stack(
-        [np.zeros((RECORDS, 0)), *(_telegraph(entry.low, entry.high, random) for entry in definition.inputs)]
-    )
-    excitation = Excitation(inputs, period, substeps=8)
+    excitation = _excitation(definition, period, random)
     outputs, slopes, _, _ = kernel_of(definition).sensitivities(parameters, initial, excitation)
     finer = kernel_of(definition).simulate(parameters[None], initial[None], replace(excitation, substeps=16))[0]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -78,16 +76,19 @@ def _sensitivities(definition: Definition, period: float, random: np.random.Gene
 
 def _unless_threshold(definition: Definition, entry: Structure) -> Structure:
     """A parameter without a slope may still act, as the threshold of a ``where``."""
-    random = np.random.default_rng(1)
-    columns = [_telegraph(e.low, e.high, random) for e in definition.inputs]
-    inputs = np.column_stack([np.zeros((RECORDS, 0)), *columns])
+    excitation = _excitation(definition, THRESHOLD_PERIOD, np.random.default_rng(1))
     initial = np.array([[state.initial for state in definition.states]])
     outputs = []
     for value in (definition.parameter(entry.name).low, definition.parameter(entry.name).high):
         parameters = [value if e.name == entry.name else e.nominal for e in definition.parameters]
-        outputs.append(kernel_of(definition).simulate(np.array([parameters]), initial, Excitation(inputs, 1e-2, 8)))
+        outputs.append(kernel_of(definition).simulate(np.array([parameters]), initial, excitation))
     acts = not np.array_equal(outputs[0], outputs[1], equal_nan=True)
     return Structure(entry.name, identifiable=False, reason=THRESHOLD) if acts else entry
+
+
+def _excitation(definition: Definition, period: float, random: np.random.Generator) -> Excitation:
+    columns = [_telegraph(entry.low, entry.high, random) for entry in definition.inputs]
+    return Excitation(np.column_stack([np.zeros((RECORDS, 0)), *columns]), period, substeps=8)
 
 
 def _telegraph(low: float, high: float, random: np.random.Generator) -> Array:
