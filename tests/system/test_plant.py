@@ -3,11 +3,13 @@
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from otolith_drivers.can_bus import BusOptions, open_bus
-from tests.conftest import OwnMachine
+from otolith_drivers.dbc import load_dbc
+from tests.conftest import EXAMPLES, OwnMachine
 
 PLANT = [sys.executable, "-m", "otolith", "plant"]
 
@@ -65,3 +67,28 @@ def test_a_port_in_use_is_one_line(own_machine: OwnMachine) -> None:
     assert done.returncode == 2
     assert own_machine.endpoint in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_lift_speaks_in_the_units_of_its_database(own_machine: OwnMachine, tmp_path: Path) -> None:
+    """The plant computes in metres; its DBC says millimetres."""
+    text = (EXAMPLES / "scenarios" / "hydraulic-fluid.toml").read_text(encoding="utf-8")
+    bus = (
+        f'[bus]\ninterface = "udp_multicast"\nchannel = "{own_machine.group}"\nport = {own_machine.port}\n\n[[faults]]'
+    )
+    text = text.replace("../hydraulic-actuator.dbc", str(EXAMPLES / "hydraulic-actuator.dbc")).replace(
+        "[[faults]]", bus
+    )
+    (tmp_path / "lift.toml").write_text(text, encoding="utf-8")
+    node = subprocess.Popen([*PLANT, str(tmp_path / "lift.toml")], stderr=subprocess.DEVNULL)
+    database = load_dbc(EXAMPLES / "hydraulic-actuator.dbc")
+    found: dict[str, float] = {}
+    with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus_:
+        while len(found) < 6:
+            frame = bus_.recv(10.0)
+            assert frame is not None
+            found |= database.decode_message(frame.arbitration_id, frame.data)  # type: ignore[arg-type]
+    node.terminate()
+    assert node.wait(timeout=5) == 0
+    assert found["ValveArea"] == pytest.approx(63.28, abs=5.0)  # mm², in balance at first
+    assert found["LoadForce"] == pytest.approx(9806.65)
+    assert found["SystemPressure"] == pytest.approx(49945.0, abs=50.0)

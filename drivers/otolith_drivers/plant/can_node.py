@@ -13,9 +13,10 @@ from cantools.database import Message
 from otolith_drivers.can_bus import open_bus
 from otolith_drivers.dbc import load_dbc
 from otolith_drivers.errors import ConfigurationError, DeviceError, ServiceError
-from otolith_drivers.plant.plants import simulate
+from otolith_drivers.plant.plants import signals, simulate
 from otolith_drivers.plant.scenario import Scenario
 from otolith_drivers.plant.tick import Tick
+from otolith_drivers.quantities import factor
 
 ALIVE_COUNTER = "AliveCounter"  # signals whose name ends so count the frames of their message
 LISTEN_FIRST = 0.15  # s; longer than ten periods of a node that is already there
@@ -47,6 +48,7 @@ class CanNode:
         """
         self._scenario = scenario
         self._messages = _messages(scenario)
+        self._conversions = _conversions(self._messages, scenario)
         self._truth = _TruthFile(truth) if truth is not None else None
         self._bus = open_bus(scenario.bus)
         try:
@@ -67,7 +69,7 @@ class CanNode:
                 break
             stalls += stalled
             for message in self._messages:
-                _send(self._bus, message, tick, index)
+                self._send(message, tick, index)
             if self._truth is not None and index % TRUTH_EVERY == 0:
                 self._truth.note(tick)
         return Sent(index * len(self._messages), index * self._scenario.sample_period, stalls)
@@ -77,6 +79,23 @@ class CanNode:
         self._bus.shutdown()
         if self._truth is not None:
             self._truth.close()
+
+    def _send(self, message: Message, tick: Tick, index: int) -> None:
+        values: dict[str, float] = {}
+        for signal in message.signals:
+            if signal.name.endswith(ALIVE_COUNTER):
+                values[signal.name] = index % 2**signal.length
+            else:  # a sensor saturates at the ends of its range
+                scale, offset = self._conversions[signal.name]
+                low = -math.inf if signal.minimum is None else float(signal.minimum)
+                high = math.inf if signal.maximum is None else float(signal.maximum)
+                values[signal.name] = min(max(scale * tick.measured[signal.name] + offset, low), high)
+        data = message.encode(values, padding=True)
+        frame = can.Message(arbitration_id=message.frame_id, data=data, is_extended_id=message.is_extended_frame)
+        try:
+            self._bus.send(frame)
+        except (can.CanError, OSError) as error:
+            raise DeviceError(f"sending on the bus failed: {error}") from error
 
 
 def _in_real_time(scenario: Scenario) -> Iterator[tuple[Tick, bool]]:
@@ -93,7 +112,7 @@ def _in_real_time(scenario: Scenario) -> Iterator[tuple[Tick, bool]]:
 
 def _messages(scenario: Scenario) -> list[Message]:
     messages = load_dbc(scenario.dbc).messages
-    known = set(next(simulate(scenario)).measured)
+    known = signals(scenario)
     for message in messages:
         for signal in message.signals:
             if signal.name not in known and not signal.name.endswith(ALIVE_COUNTER):
@@ -132,18 +151,12 @@ class _TruthFile:
         self._file.close()
 
 
-def _send(bus: can.BusABC, message: Message, tick: Tick, index: int) -> None:
-    values: dict[str, float] = {}
-    for signal in message.signals:
-        if signal.name.endswith(ALIVE_COUNTER):
-            values[signal.name] = index % 2**signal.length
-        else:  # a sensor saturates at the ends of its range
-            low = -math.inf if signal.minimum is None else float(signal.minimum)
-            high = math.inf if signal.maximum is None else float(signal.maximum)
-            values[signal.name] = min(max(tick.measured[signal.name], low), high)
-    data = message.encode(values, padding=True)
-    frame = can.Message(arbitration_id=message.frame_id, data=data, is_extended_id=message.is_extended_frame)
-    try:
-        bus.send(frame)
-    except (can.CanError, OSError) as error:
-        raise DeviceError(f"sending on the bus failed: {error}") from error
+def _conversions(messages: list[Message], scenario: Scenario) -> dict[str, tuple[float, float]]:
+    """Scale and offset of each signal from the plant's unit to that of the DBC."""
+    units = signals(scenario)
+    return {
+        signal.name: factor(units[signal.name], signal.unit or units[signal.name])
+        for message in messages
+        for signal in message.signals
+        if signal.name in units
+    }

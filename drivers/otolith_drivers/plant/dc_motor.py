@@ -84,6 +84,7 @@ class MotorScenario(Scenario):
 
 
 SCENARIO = MotorScenario
+SIGNALS = {"ArmatureVoltage": "V", "ArmatureCurrent": "A", "RotorSpeed": "rad/s", "LoadTorque": "N*m"}
 
 
 def simulate(scenario: Any) -> Iterator[Tick]:

@@ -84,6 +84,7 @@ class LiftScenario(Scenario):
 
 
 SCENARIO = LiftScenario
+SIGNALS = {"ValveArea": "m^2", "LoadForce": "N", "PistonPosition": "m", "SystemPressure": "Pa"}
 
 
 def simulate(scenario: Any) -> Iterator[Tick]:

@@ -10,7 +10,8 @@ from otolith_drivers.plant.scenario import Scenario
 from otolith_drivers.plant.tick import Tick
 from otolith_drivers.toml_files import expect, parse, read, validate
 
-# Each module has SCENARIO, the model of its scenario files, and simulate(scenario), its ticks without end.
+# Each module has SCENARIO, the model of its scenario files, SIGNALS, the unit of each signal that it measures, and
+# simulate(scenario), its ticks without end.
 PLANTS = {
     "dc_motor": "otolith_drivers.plant.dc_motor",
     "hydraulic_actuator": "otolith_drivers.plant.hydraulic_actuator",
@@ -37,6 +38,12 @@ def simulate(scenario: Scenario) -> Iterator[Tick]:
     """The machine of ``scenario``, one tick per sample period, without end; the same for the same seed."""
     ticks: Iterator[Tick] = _module(scenario.plant).simulate(scenario)
     return ticks
+
+
+def signals(scenario: Scenario) -> dict[str, str]:
+    """What the machine of ``scenario`` measures, and the unit of each."""
+    found: dict[str, str] = _module(scenario.plant).SIGNALS
+    return found
 
 
 def _module(name: str) -> Any:
