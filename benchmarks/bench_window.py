@@ -12,7 +12,8 @@ import numpy as np
 
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.estimate import estimate
-from otolith.adaptation.problem import Objective, Problem
+from otolith.adaptation.objective import Objective
+from otolith.adaptation.problem import Problem
 from otolith.adaptation.swarm import search
 from otolith.heart import adapt
 from otolith.plan import load_plan

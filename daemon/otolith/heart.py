@@ -4,12 +4,16 @@ Time comes in with the window and randomness with the seed, so that every run ca
 work can move between processes without loss.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Verdict, Window
+from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.estimate import WindowEstimate, estimate
+from otolith.adaptation.fusion import carried, overall
+from otolith.adaptation.gate import REFUSED, Lesson, Memory, doubt, is_surprising, learn, refuse
+from otolith.adaptation.prior import Prior
+from otolith.adaptation.problem import Problem
 from otolith.health.report import (
     CostDocument,
     FitDocument,
@@ -19,29 +23,64 @@ from otolith.health.report import (
     Traces,
     window_document,
 )
-from otolith.health.status import Known, publish
+from otolith.health.status import Fused, Heard, Standing, publish
 from otolith.state import State
 from otolith.twin.definition import Definition
 
 FEWEST_RECORDS = 5
 LARGEST = 1e12  # of a value, in the unit of its signal: no sensor says that
-REFUSED = 4.0  # cost beyond which the window contradicts the twin, and nothing is taken from it
 EXPLAINED = 1.5  # cost (RMSE over noise) up to which the residual counts as noise
+SCATTERED = 3.0  # ratio of variances: windows disagree that much more than they say
+CONTRADICTORY = "windows disagree with each other {:.1f} times more than they should: the twin lacks something"
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
 
 
 def adapt(state: State, window: Window) -> tuple[State, Report]:
-    """Adapt the twin to ``window``; a bad window leaves the state where it was and is reported."""
-    twin = state.problem.twin
+    """Adapt the twin to ``window``; a bad window leaves what is known where it was and is reported."""
     reasons = window.quality.reasons if window.quality.verdict is Verdict.BAD else _senseless(window)
     if reasons:
         reason = "window not estimated from: " + "; ".join(reasons)
-        return state, Report(_document(state, window, state.known, None, reason)[1], _measured(state, twin, window))
-    warm = all(entry is not None for entry in state.known)
-    found = estimate(state.problem, window, _start(state), warm=warm)
-    known, document = _document(state, window, state.known, found, "")
-    traces = Traces(_outputs(twin), found.measured, found.predicted, state.problem.noise)
-    return replace(state, known=known), Report(document, traces)
+        standing, document = _document(state, window, _Learned(state.memory, reason=reason))
+        return replace(state, standing=standing), Report(document, _measured(state, window))
+    learned = _learn(state, window)
+    standing, document = _document(state, window, learned)
+    found = learned.found
+    traces = _measured(state, window) if found is None else _traces(state, found)
+    return replace(state, memory=learned.memory, standing=standing), Report(document, traces)
+
+
+@dataclass(frozen=True, slots=True)
+class _Learned:
+    """What is known after a window, and how it came about."""
+
+    memory: Memory
+    found: WindowEstimate | None = None
+    lesson: Lesson | None = None
+    reason: str = ""
+
+
+def _learn(state: State, window: Window) -> _Learned:
+    problem, memory, end = state.problem, state.memory, window.end
+    prior = overall(carried(memory.belief, end), problem)
+    warm = any(entry.known for entry in state.standing)
+    found = estimate(problem, window, _start(prior, problem), prior, warm=warm)
+    if found.cost > REFUSED:
+        return _learned(refuse(memory), found, Lesson.REFUSED)
+    if not is_surprising(memory, found.evidence, end, problem):
+        return _learned(learn(memory, found.evidence, end, problem), found, Lesson.LEARNED)
+    alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
+    after, lesson = doubt(memory, alone.evidence, end, problem)
+    return _learned(after, alone, lesson)
+
+
+def _learned(memory: Memory, found: WindowEstimate, lesson: Lesson) -> _Learned:
+    """With what there is to say of the window as a whole."""
+    reasons = [] if lesson is Lesson.LEARNED else [lesson.value]
+    if found.cost > EXPLAINED and lesson is not Lesson.REFUSED:
+        reasons.append(UNEXPLAINED)
+    if memory.belief.scatter > SCATTERED:
+        reasons.append(CONTRADICTORY.format(memory.belief.scatter**0.5))
+    return _Learned(memory, found, lesson, "; ".join(reasons))
 
 
 def _senseless(window: Window) -> tuple[str, ...]:
@@ -53,53 +92,79 @@ def _senseless(window: Window) -> tuple[str, ...]:
     return ()
 
 
-def _start(state: State) -> Array:
-    """Where the search begins: at what is known, else as configured."""
-    pairs = zip(state.known, state.problem.free, strict=True)
-    return np.array([entry.nominal if known is None else known.value for known, entry in pairs])
+def _start(prior: Prior, problem: Problem) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """(free,) where the search begins."""
+    return np.clip(prior.mean[: len(problem.free)], *problem.bounds)
 
 
 def _outputs(twin: Definition) -> tuple[str, ...]:
     return tuple(entry.name for entry in twin.outputs)
 
 
-def _measured(state: State, twin: Definition, window: Window) -> Traces:
-    columns = [np.where(window.missing_in(name), np.nan, window.column(name)) for name in _outputs(twin)]
-    return Traces(_outputs(twin), np.column_stack(columns), None, state.problem.noise)
+def _traces(state: State, found: WindowEstimate) -> Traces:
+    return Traces(_outputs(state.problem.twin), found.measured, found.predicted, state.problem.noise)
 
 
-def _document(
-    state: State, window: Window, known: tuple[Known | None, ...], found: WindowEstimate | None, reason: str
-) -> tuple[tuple[Known | None, ...], ReportDocument]:
+def _measured(state: State, window: Window) -> Traces:
+    names = _outputs(state.problem.twin)
+    columns = [np.where(window.missing_in(name), np.nan, window.column(name)) for name in names]
+    return Traces(names, np.column_stack(columns), None, state.problem.noise)
+
+
+def _document(state: State, window: Window, learned: _Learned) -> tuple[tuple[Standing, ...], ReportDocument]:
+    problem, memory, found, lesson = state.problem, learned.memory, learned.found, learned.lesson
     parameters: dict[str, ParameterDocument] = {}
-    next_known: list[Known | None] = []
-    for index, entry in enumerate(state.problem.free):
+    standing: list[Standing] = []
+    allowed = problem.determined_within * problem.scale
+    for index, (entry, fused) in enumerate(zip(problem.free, _fused(state, memory, window.end), strict=True)):
         said = None if found is None else found.parameters[index]
-        doubt = UNEXPLAINED if found is not None and found.cost > EXPLAINED else ""
-        refused = found is not None and found.cost > REFUSED
-        kept, parameters[entry.name] = publish(entry, said, known[index], reason or doubt, refused=refused)
-        next_known.append(kept)
+        heard = Heard(said, lesson, memory.contradictions, memory.belief.scatter, learned.reason)
+        now, parameters[entry.name] = publish(entry, float(allowed[index]), fused, heard, state.standing[index])
+        standing.append(now)
     document = ReportDocument(
         machine=state.machine,
         site=state.site,
-        twin=state.problem.twin.name,
-        model="DT" if all(kept is None for kept in next_known) else "DT'",
+        twin=problem.twin.name,
+        model="DT'" if any(entry.known for entry in standing) else "DT",
         window=window_document(window),
         parameters=parameters,
     )
-    if found is not None:
-        outputs = _outputs(state.problem.twin)
-        document = document.model_copy(
-            update={
-                "fit": FitDocument(
-                    rmse_configured=_finite(outputs, found.rmse_configured),
-                    rmse_estimated=_finite(outputs, found.rmse_estimated),
-                    explained=found.cost <= EXPLAINED,
-                ),
-                "cost": CostDocument(evaluations=found.evaluations, generations=found.generations),
-            }
+    if found is not None and lesson is not None:
+        document = document.model_copy(update=_fit(found, lesson, memory, _outputs(problem.twin)))
+    return tuple(standing), document
+
+
+def _fused(state: State, memory: Memory, end: float) -> list[Fused]:
+    """Of each free parameter, what is known at ``end`` (Unix s), and what this window did to it."""
+    free = len(state.problem.free)
+    before = overall(carried(state.memory.belief, end), state.problem)
+    after = overall(carried(memory.belief, end), state.problem)
+    sd, sd_before = (np.sqrt(np.diag(known.covariance)) for known in (after, before))
+    return [
+        Fused(
+            value=float(after.mean[index]),
+            sd=float(sd[index]),
+            trend=float(after.mean[free + index]),
+            trend_sd=float(sd[free + index]),
+            kept=float((sd[index] / sd_before[index]) ** 2),
         )
-    return tuple(next_known), document
+        for index in range(free)
+    ]
+
+
+def _fit(found: WindowEstimate, lesson: Lesson, memory: Memory, outputs: tuple[str, ...]) -> dict[str, object]:
+    return {
+        "fit": FitDocument(
+            rmse_configured=_finite(outputs, found.rmse_configured),
+            rmse_estimated=_finite(outputs, found.rmse_estimated),
+            explained=found.cost <= EXPLAINED,
+            cost=found.cost,
+            scatter=memory.belief.scatter,
+            outcome=found.outcome,
+            lesson=lesson,
+        ),
+        "cost": CostDocument(evaluations=found.evaluations, generations=found.generations),
+    }
 
 
 def _finite(names: tuple[str, ...], values: tuple[float, ...]) -> dict[str, float]:

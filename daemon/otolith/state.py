@@ -2,21 +2,23 @@
 
 from dataclasses import dataclass
 
+from otolith.adaptation.gate import Memory, begin_memory
 from otolith.adaptation.problem import Problem
-from otolith.health.status import Known
+from otolith.health.status import Standing
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class State:
     """All that is carried from window to window. Plain and frozen: it pickles."""
 
     machine: str
     site: str
     problem: Problem
-    known: tuple[Known | None, ...]
+    memory: Memory
+    standing: tuple[Standing, ...]
     """Of each free parameter."""
 
 
 def begin(machine: str, site: str, problem: Problem) -> State:
     """The state before the first window."""
-    return State(machine, site, problem, tuple(None for _ in problem.free))
+    return State(machine, site, problem, begin_memory(problem), tuple(Standing() for _ in problem.free))

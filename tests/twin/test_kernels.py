@@ -7,7 +7,7 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import Excitation, kernel_of
+from otolith.twin.kernel import Excitation, Noise, kernel_of
 from otolith.twins import find_twin, names
 from tests.twin.reference import Reference
 
@@ -139,12 +139,12 @@ def test_the_innovation_form_is_a_kalman_filters_prediction() -> None:
     random = np.random.default_rng(2)
     measured = random.normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
-    gain = np.array([[0.3, 0.01], [-0.2, 0.4]])
+    gain = random.uniform(-0.3, 0.3, (RECORDS, 2, 2))
     found = kernel.simulate(nominal(twin)[None], initial(twin)[None], replace(drive, measured=measured, gain=gain))[0]
     state = initial(twin)
     for record in range(RECORDS - 1):
         assert found[record] == pytest.approx(state, rel=1e-12)
-        state = state + gain @ np.nan_to_num(measured[record] - state)
+        state = state + gain[record] @ np.nan_to_num(measured[record] - state)
         piece = replace(drive, inputs=drive.inputs[record : record + 2])
         state = kernel.simulate(nominal(twin)[None], state[None], piece)[0, 1]
 
@@ -152,9 +152,10 @@ def test_the_innovation_form_is_a_kalman_filters_prediction() -> None:
 def test_the_innovation_forms_sensitivities_are_its_derivatives() -> None:
     twin = find_twin("dc_motor")
     kernel, drive = kernel_of(twin), excitation(twin)
-    measured = np.random.default_rng(2).normal(size=(RECORDS, 2))
+    random = np.random.default_rng(2)
+    measured = random.normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
-    drive = replace(drive, measured=measured, gain=np.array([[0.3, 0.01], [-0.2, 0.4]]))
+    drive = replace(drive, measured=measured, gain=random.uniform(-0.3, 0.3, (RECORDS, 2, 2)))
     slopes = kernel.sensitivities(nominal(twin), initial(twin), drive).slopes
     point = np.concatenate([nominal(twin), initial(twin)])
     for column in range(len(point)):
@@ -163,6 +164,39 @@ def test_the_innovation_forms_sensitivities_are_its_derivatives() -> None:
         ahead, behind = (kernel.simulate(p[None, :6], p[None, 6:], drive)[0] for p in (point + step, point - step))
         change = (ahead - behind) / (2.0 * step[column])
         assert slopes[:, :, column] == pytest.approx(change, rel=1e-5, abs=1e-6 * np.abs(change).max())
+
+
+def test_the_gain_is_that_of_an_extended_kalman_filter() -> None:
+    """Against the textbook's matrices, record by record, with a missing measurement and a noisy input on the way."""
+    twin = find_twin("dc_motor")
+    kernel, drive = kernel_of(twin), excitation(twin)
+    random = np.random.default_rng(4)
+    measured = kernel.simulate(nominal(twin)[None], initial(twin)[None], drive)[0] + random.normal(size=(RECORDS, 2))
+    measured[7, 0] = np.nan
+    noise = Noise(np.array([0.5, 1.0]), np.array([0.0, 0.01]), np.array([0.2, 3.0]))
+    found = kernel.correction(nominal(twin), initial(twin), replace(drive, measured=measured), noise)
+    state, covariance, log_determinant = initial(twin), np.zeros((2, 2)), 0.0
+    for record in range(RECORDS):
+        seen = np.flatnonzero(np.isfinite(measured[record]))
+        output = np.eye(2)[seen]
+        innovation = output @ covariance @ output.T + np.diag(noise.outputs**2)[np.ix_(seen, seen)]
+        gain = covariance @ output.T @ np.linalg.inv(innovation)
+        log_determinant += np.linalg.slogdet(innovation)[1]
+        assert found.gain[record][:, seen] == pytest.approx(gain, rel=1e-6, abs=1e-12)
+        whitening = found.whitening[record][np.ix_(seen, seen)]
+        assert whitening @ innovation @ whitening.T == pytest.approx(np.eye(len(seen)), abs=1e-9)
+        if record + 1 == RECORDS:
+            break
+        state = state + gain @ (measured[record, seen] - state[seen])
+        covariance = covariance - gain @ innovation @ gain.T
+        piece = replace(drive, inputs=drive.inputs[record : record + 2])
+        step = kernel.sensitivities(nominal(twin), state, piece)
+        nudged = piece.inputs + noise.inputs
+        driven = kernel.sensitivities(nominal(twin), state, replace(piece, inputs=nudged)).last - step.last
+        transition = step.last_slopes[:, 6:]
+        strays = np.diag(noise.states**2 * drive.sample_period) + np.outer(driven, driven)
+        state, covariance = step.last, transition @ covariance @ transition.T + strays
+    assert found.log_determinant == pytest.approx(log_determinant, rel=1e-6)
 
 
 def test_fewer_substeps_would_be_too_few() -> None:

@@ -5,13 +5,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.information import ParameterEstimate, classify, information
+from otolith.adaptation.information import (
+    Identifiability,
+    Information,
+    ParameterEstimate,
+    Wanted,
+    classify,
+    information,
+)
+from otolith.adaptation.objective import Objective
+from otolith.adaptation.outcome import Outcome
 from otolith.adaptation.polish import Polished, polish
-from otolith.adaptation.problem import Objective, Problem
+from otolith.adaptation.prior import Evidence, Informed, Prior, vague
+from otolith.adaptation.problem import Problem
 from otolith.adaptation.swarm import search
 
 AT_BOUND = 1e-4  # of the width of the bounds
 SURPRISING = 1.5  # cost of a warm fit beyond which the swarm looks whether there is a better valley
+ALONE_STEPS = 12  # of the polish of the window alone, which begins where the window with all before it ended
+APART = 5.0  # standard deviations between two results that are not the same
+ALIKE = 9.0  # in χ²: what two explanations of a window may differ by and be equally good
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +32,10 @@ class WindowEstimate:
     """What one window says. The traces are (records, outputs) in the units of the twin."""
 
     parameters: tuple[ParameterEstimate, ...]
+    """Of this window alone: about its middle, if they drift."""
+    evidence: Evidence
+    """Of parameters at its end and their trends, to be weighed with what was known."""
+    outcome: Outcome
     cost: float
     """RMSE in units of the noise."""
     rmse_configured: tuple[float, ...]
@@ -29,48 +46,117 @@ class WindowEstimate:
     evaluations: int
 
 
-def estimate(problem: Problem, window: Window, start: Array, *, warm: bool = False) -> WindowEstimate:
+def estimate(
+    problem: Problem, window: Window, start: Array, prior: Prior | None = None, *, warm: bool = False
+) -> WindowEstimate:
     """Fit the free parameters to ``window``; ``start`` (free parameters,) is where the search begins.
 
     A swarm finds the valley and Gauss-Newton its floor; a ``warm`` start is taken to lie in the valley, and the swarm
-    only looks for a better one if the floor does not explain the window. The same problem, window and start give the
-    same estimate, bit for bit.
+    only looks for a better one if the floor does not explain the window. The same problem, window, start and prior give
+    the same estimate, bit for bit.
     """
-    objective = Objective(problem, window, start)
-    generations = evaluations = 0
-    found = polish(objective, objective.guess(start)) if warm else None
-    if found is None or not found.converged or found.chi_square > SURPRISING**2 * objective.count:
-        searched = search(objective, problem.swarm, start, seed=problem.seed + window.index)
-        generations, evaluations = searched.generations, searched.evaluations
-        polished = polish(objective, objective.guess(searched.values))
-        if found is None or polished.chi_square < found.chi_square:
-            found = polished
-    return _result(problem, objective, found, generations, evaluations + found.evaluations)
+    return _Fit(problem, window, start, prior or vague(problem)).run(warm=warm)
 
 
-def _result(
-    problem: Problem, objective: Objective, found: Polished, generations: int, evaluations: int
-) -> WindowEstimate:
-    cost = float(np.sqrt(found.chi_square / objective.count))
-    width = objective.high - objective.low
-    told = information(found.jacobian, width, cost)
-    at_bound = (found.guess <= objective.low + AT_BOUND * width) | (found.guess >= objective.high - AT_BOUND * width)
-    parameters = []
-    for index, entry in enumerate(problem.free):
-        allowed = problem.determined_within * max(abs(entry.nominal), 0.01 * (entry.high - entry.low))
-        verdict, reason = classify(told, index, objective.names, half_width=allowed, at_bound=bool(at_bound[index]))
-        parameters.append(
-            ParameterEstimate(entry.name, float(found.guess[index]), float(told.sd[index]), verdict, reason)
+class _Fit:
+    """One window's fit, step by step."""
+
+    def __init__(self, problem: Problem, window: Window, start: Array, prior: Prior) -> None:
+        self._problem, self._window = problem, window
+        self._objective = Objective(problem, window, start)
+        self._informed = Informed(self._objective, problem, prior)
+        self._disturbed = bool(self._objective.noise.inputs.any() or self._objective.noise.states.any())
+        self._generations = self._evaluations = 0
+        first = self._objective.guess(start)
+        self._fit = self._polish(self._informed.guess(start, first[len(start) :]))
+        self._alone, self._told = self._window_alone()
+
+    def run(self, *, warm: bool) -> WindowEstimate:
+        outcome = Outcome.CONTINUED
+        unexplained = self._cost() > SURPRISING
+        if unexplained or not (warm or self._says_nothing()):
+            outcome = self._search()
+        elif not warm:
+            outcome = Outcome.NOTHING_TO_FIND
+        if not self._fit.converged and not self._alone.converged:
+            outcome = Outcome.UNFINISHED
+        return self._result(outcome)
+
+    def _polish(self, guess: Array) -> Polished:
+        found = polish(self._informed, guess)
+        self._evaluations += found.evaluations
+        return found
+
+    def _cost(self) -> float:
+        """Of the window alone, with what explains it best."""
+        best = min(self._alone.chi_square, self._informed.chi_square(self._fit))
+        return float(np.sqrt(best / self._objective.count))
+
+    def _still(self, fit: Polished) -> Array:
+        """A guess of the window alone: the parameters at its end, taken to hold throughout."""
+        free = self._objective.free
+        return np.concatenate([fit.guess[:free], fit.guess[2 * free :]])
+
+    def _window_alone(self) -> tuple[Polished, Information]:
+        found = polish(self._objective, self._still(self._fit), ALONE_STEPS)
+        self._evaluations += found.evaluations
+        cost = float(np.sqrt(found.chi_square / self._objective.count))
+        return found, information(found.jacobian, self._objective.high - self._objective.low, cost)
+
+    def _says_nothing(self) -> bool:
+        reach = self._told.sd[: self._objective.free]
+        return not bool((reach < 0.25 * (self._objective.high - self._objective.low)[: len(reach)]).any())
+
+    def _search(self) -> Outcome:
+        problem, objective, known = self._problem, self._objective, self._fit
+        free = objective.free
+        searched = search(objective, problem.swarm, known.guess[:free], seed=problem.seed + self._window.index)
+        self._generations = searched.generations
+        self._evaluations += searched.evaluations
+        first = objective.guess(searched.values)[free:]
+        found = self._polish(self._informed.guess(searched.values, first))
+        if self._disturbed:  # the gain was made for parameters that may have been far off
+            better = min(found, known, key=lambda fit: fit.chi_square)
+            objective.centre(better.guess[:free], better.guess[2 * free :])
+            found, known = self._polish(found.guess), self._polish(known.guess)
+        apart = np.abs(found.guess - known.guess)[:free] > APART * self._told.sd[:free]
+        self._fit = min(known, found, key=lambda fit: fit.chi_square)
+        self._alone, self._told = self._window_alone()
+        if not apart.any():
+            return Outcome.AGREED
+        if abs(found.chi_square - known.chi_square) <= ALIKE * max(self._cost(), 1.0) ** 2:
+            return Outcome.AMBIGUOUS
+        return Outcome.SWARM_WAS_BETTER if self._fit is found else Outcome.POLISH_WAS_BETTER
+
+    def _result(self, outcome: Outcome) -> WindowEstimate:
+        objective, problem = self._objective, self._problem
+        cost = self._cost()
+        predictions = objective.predict(np.vstack([self._still(self._fit), objective.guess(problem.nominal)]))
+        return WindowEstimate(
+            parameters=self._parameters(outcome),
+            evidence=self._informed.evidence(self._fit, cost),
+            outcome=outcome,
+            cost=cost,
+            rmse_configured=tuple(map(float, objective.rmse(predictions[1]))),
+            rmse_estimated=tuple(map(float, objective.rmse(predictions[0]))),
+            measured=objective.measured,
+            predicted=predictions[0],
+            generations=self._generations,
+            evaluations=self._evaluations,
         )
-    configured = objective.guess(np.array([entry.nominal for entry in problem.free]))
-    predictions = objective.predict(np.vstack([found.guess, configured]))
-    return WindowEstimate(
-        parameters=tuple(parameters),
-        cost=cost,
-        rmse_configured=tuple(map(float, objective.rmse(predictions[1]))),
-        rmse_estimated=tuple(map(float, objective.rmse(predictions[0]))),
-        measured=objective.measured,
-        predicted=predictions[0],
-        generations=generations,
-        evaluations=evaluations,
-    )
+
+    def _parameters(self, outcome: Outcome) -> tuple[ParameterEstimate, ...]:
+        objective, guess = self._objective, self._alone.guess
+        width = objective.high - objective.low
+        at_bound = (guess <= objective.low + AT_BOUND * width) | (guess >= objective.high - AT_BOUND * width)
+        found = []
+        allowed = self._problem.determined_within * self._problem.scale
+        for index, entry in enumerate(self._problem.free):
+            wanted = Wanted(float(allowed[index]), float(width[index]), bool(at_bound[index]))
+            verdict, reason = classify(self._told, index, objective.names, wanted)
+            if outcome is Outcome.AMBIGUOUS and verdict is Identifiability.DETERMINED:
+                verdict, reason = Identifiability.WEAK, outcome.value
+            found.append(
+                ParameterEstimate(entry.name, float(guess[index]), float(self._told.sd[index]), verdict, reason)
+            )
+        return tuple(found)

@@ -12,6 +12,7 @@ QUANTILE = 1.959964  # of the standard normal distribution, two-sided 95 %
 SINGULAR = 1e-8  # relative singular value under which a direction is not seen at all
 BLIND = 1e-4  # share in an unseen direction beyond which a parameter is not seen either
 FLAT = 1e-9  # a sensitivity this far under the largest is none
+PUSHED = 0.25  # of the width of the bounds: a wider interval does not tell on which side of a bound a value lies
 TRADED = 0.98  # correlation beyond which two parameters cannot be told apart
 
 
@@ -73,14 +74,23 @@ def information(jacobian: Array, width: Array, cost: float) -> Information:
     return Information(sd, correlation)
 
 
-def classify(
-    found: Information, index: int, names: Sequence[str], *, half_width: float, at_bound: bool
-) -> tuple[Identifiability, str]:
-    """The verdict on parameter ``index``, and what to say of it; ``half_width`` is what its 95 % interval may have."""
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is asked of one parameter, and where its best value lies."""
+
+    half_width: float
+    """Of the 95 % interval: what a determined parameter may have at most."""
+    width: float
+    """Distance of its bounds."""
+    at_bound: bool
+
+
+def classify(found: Information, index: int, names: Sequence[str], wanted: Wanted) -> tuple[Identifiability, str]:
+    """The verdict on parameter ``index`` and what to say of it."""
     reach = QUANTILE * found.sd[index]
-    if at_bound:
+    if wanted.at_bound and reach <= PUSHED * wanted.width:
         return Identifiability.AT_BOUND, "the best value lies at the bound: widen the bounds or doubt the twin"
-    if reach <= half_width:
+    if reach <= wanted.half_width:
         return Identifiability.DETERMINED, ""
     row = np.abs(found.correlation[index]).copy()
     row[index] = 0.0

@@ -4,15 +4,27 @@
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.adaptation.problem import Objective
 
 STEPS = 40
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e12
 DONE = 1e-6  # in χ²: the improvement that is not worth another step
+
+
+class LeastSquares(Protocol):
+    """Residuals whose squares are to be least, within bounds."""
+
+    low: Array
+    """(guess,)."""
+    high: Array
+    """(guess,)."""
+
+    def linearised(self, guess: Array) -> tuple[Array, Array]:
+        """(guess,) -> residuals (residuals,) and their derivatives (residuals, guess)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,18 +35,20 @@ class Polished:
     """(guess,)."""
     chi_square: float
     jacobian: Array
-    """(residuals, guess): of the whitened residuals by each entry of the guess."""
+    """(residuals, guess): of the residuals by each entry of the guess."""
+    residuals: Array
+    """(residuals,)."""
     evaluations: int
     converged: bool
 
 
-def polish(objective: Objective, start: Array) -> Polished:
+def polish(objective: LeastSquares, start: Array, steps: int = STEPS) -> Polished:
     """The minimum of χ² that ``start`` (guess,) leads to; ``start`` itself where no step improves it."""
     scale = objective.high - objective.low
     guess = np.clip(start, objective.low, objective.high)
     residuals, jacobian = objective.linearised(guess)
     chi_square, damping, evaluations, converged = float(residuals @ residuals), FIRST_DAMPING, 1, False
-    for _ in range(STEPS):
+    for _ in range(steps):
         step = _step(residuals, jacobian, guess, objective, damping)
         trial = np.clip(guess + step, objective.low, objective.high)
         if np.all(np.abs(trial - guess) <= 1e-14 * scale):
@@ -54,10 +68,10 @@ def polish(objective: Objective, start: Array) -> Polished:
             damping *= 10.0
             if converged or damping > MOST_DAMPING:
                 break
-    return Polished(guess, chi_square, jacobian, evaluations, converged)
+    return Polished(guess, chi_square, jacobian, residuals, evaluations, converged)
 
 
-def _step(residuals: Array, jacobian: Array, guess: Array, objective: Objective, damping: float) -> Array:
+def _step(residuals: Array, jacobian: Array, guess: Array, objective: LeastSquares, damping: float) -> Array:
     """The damped step, with what leans on a bound held there."""
     gradient = jacobian.T @ residuals
     free = ~(((guess <= objective.low) & (gradient > 0.0)) | ((guess >= objective.high) & (gradient < 0.0)))

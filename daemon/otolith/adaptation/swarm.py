@@ -10,7 +10,8 @@ from pymoo.core.termination import NoTermination
 from pymoo.operators.sampling.lhs import LHS
 
 from otolith.acquisition.window import Array
-from otolith.adaptation.problem import Objective, SwarmOptions
+from otolith.adaptation.objective import Objective
+from otolith.adaptation.problem import SwarmOptions
 
 
 @dataclass(frozen=True, slots=True)

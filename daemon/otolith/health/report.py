@@ -8,7 +8,9 @@ from enum import StrEnum
 from typing import Literal
 
 from otolith.acquisition.window import Array, Verdict, Window
+from otolith.adaptation.gate import Lesson
 from otolith.adaptation.information import Identifiability
+from otolith.adaptation.outcome import Outcome
 from otolith_drivers.toml_files import Closed
 
 SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"
@@ -20,11 +22,11 @@ class Status(StrEnum):
     UNESTIMATED = "unestimated"
     """No window has determined it yet; there is no value."""
     ESTIMATED = "estimated"
-    """From this window."""
+    """From this window and those before it."""
     HELD = "held"
-    """From an earlier window; this one did not determine it, and the reason says why."""
+    """From earlier windows; this one adds nothing, and the reason says why."""
     INVALID = "invalid"
-    """This window contradicts the twin or the bounds, and the reason says how."""
+    """The windows contradict the twin or the bounds, and the reason says how; the value is the last that did not."""
 
 
 class QualityDocument(Closed):
@@ -60,7 +62,13 @@ class ParameterDocument(Closed):
     nominal: float
     raw: float | None = None
     """What this window alone says."""
+    raw_sd: float | None = None
+    trend_per_hour: float | None = None
+    """How it changes now, in its unit per hour."""
+    trend_sd_per_hour: float | None = None
     status: Status
+    progress: float = 0.0
+    """How far its interval has come from the bounds to what is asked for, 0 to 1."""
     identifiability: Identifiability | None = None
     reason: str = ""
 
@@ -72,6 +80,15 @@ class FitDocument(Closed):
     rmse_estimated: dict[str, float]
     explained: bool
     """Whether the estimated twin leaves nothing but noise."""
+    cost: float
+    """RMSE of all outputs in units of their noise."""
+    scatter: float
+    """How much more windows differ from each other than each of them says, as a ratio of variances: one if all is well.
+    """
+    outcome: Outcome
+    """How the search ended."""
+    lesson: Lesson
+    """What was made of the window."""
 
 
 class CostDocument(Closed):

@@ -89,22 +89,26 @@ class Fragments:
 
     def correction(self, row: int) -> str:
         """Of a state, by the gain."""
-        return added([f"gain[{row}, {index}] * e_{index}" for index in range(self.outputs)])
+        return added([f"gain[record, {row}, {index}] * e_{index}" for index in range(self.outputs)])
 
     def slope_correction(self, row: int) -> str:
         """Of a state's sensitivity, by the gain."""
-        terms = [f"gain[{row}, {i}] * m_{i} * slopes[record, {i}, column]" for i in range(self.outputs)]
+        terms = [f"gain[record, {row}, {i}] * m_{i} * slopes[record, {i}, column]" for i in range(self.outputs)]
         return f"({added(terms)})"
 
-    def slopes(self) -> list[str]:
+    def slopes(self, following: str = "inputs[record + 1, {index}]") -> list[str]:
         """How a ``foh`` input runs from substep to substep."""
         return [
-            f"g_{name} = (inputs[record + 1, {index}] - {name}) / substeps"
+            f"g_{name} = ({following.format(index=index)} - {name}) / substeps"
             for index, (name, linear) in enumerate(zip(self.u, self.linear, strict=True))
             if linear
         ]
 
     def step(self, stages: list[str], then: list[str]) -> list[str]:
+        """From a record to the next, if there is one; see :meth:`substeps`."""
+        return ["if record + 1 == records:", "    break", *self.slopes(), *self.substeps(stages, then)]
+
+    def substeps(self, stages: list[str], then: list[str]) -> list[str]:
         """The substeps of a record by the classical Runge-Kutta method; ``stages`` wait for their arguments."""
         running = [name for name, linear in zip(self.u, self.linear, strict=True) if linear]
         at = {"": "", "half": "m", "step": "z"}
@@ -128,13 +132,19 @@ class Fragments:
             *then,
             *(f"{name} = z{name}" for name in running),
         ]
-        return [
-            "if record + 1 == records:",
-            "    break",
-            *self.slopes(),
-            "for substep in range(substeps):",
-            *indent(substep),
+        return ["for substep in range(substeps):", *indent(substep)]
+
+    def advance(self) -> list[str]:
+        """A function of scalars: the states at the next record, where the inputs are ``w``."""
+        following = [f"w_{index}" for index in range(len(self.u))]
+        head = ", ".join(["step", "substeps", *self.x, *self.u, *following, *self.fixed])
+        body = [
+            "half, sixth = step / 2.0, step / 6.0",
+            *self.slopes("w_{index}"),
+            *self.substeps([f"{unpacked(self.k(stage))} = rates_({{}})" for stage in range(1, 5)], []),
+            f"return {unpacked(self.x)}",
         ]
+        return [HELPER, f"def advance_({head}):", *indent(body), "", ""]
 
     def propagate(self, columns: int) -> list[str]:
         """The derivative of the step: each column of the state's sensitivities through the four stages."""

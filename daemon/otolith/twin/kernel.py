@@ -34,7 +34,30 @@ class Excitation:
     measured: Array | None = None
     """(records, outputs); a measurement that is not a number corrects nothing."""
     gain: Array | None = None
-    """(states, outputs); without it, or all zero, the twin runs in open loop."""
+    """(records, states, outputs); without it, or all zero, the twin runs in open loop."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """Standard deviations, each in the unit of its signal or state."""
+
+    outputs: Array
+    """(outputs,) of the sensors."""
+    inputs: Array
+    """(inputs,) of what the twin is told to be driven by; independent from record to record."""
+    states: Array
+    """(states,) per square root of a second, of what strays in the machine itself."""
+
+
+class Correction(NamedTuple):
+    """How a disturbed twin is corrected on its way, and how far off each prediction may then be."""
+
+    gain: Array
+    """(records, states, outputs)."""
+    whitening: Array
+    """(records, outputs, outputs): makes each innovation's covariance the identity."""
+    log_determinant: float
+    """Sum over the records, of the innovations' covariances."""
 
 
 class Sensitivities(NamedTuple):
@@ -58,7 +81,7 @@ class Kernel:
 
     def __init__(self, definition: Definition) -> None:
         self.definition = definition
-        self._open_loop = np.zeros((len(definition.states), len(definition.outputs)))
+        self._open_loop = np.zeros((0, len(definition.states), len(definition.outputs)))
         self._unmeasured = np.zeros((0, len(definition.outputs)))
         self._compiled: set[str] = set()
 
@@ -90,6 +113,16 @@ class Kernel:
         inputs = np.ascontiguousarray(excitation.inputs, dtype=np.float64)
         found: Array = self._call("euler", parameters, initial, inputs, period, max(1, round(period / step)))
         return found
+
+    def correction(self, parameters: Array, initial: Array, excitation: Excitation, noise: Noise) -> Correction:
+        """The extended Kalman filter along ``excitation.measured``; shapes (parameters,), (states,).
+
+        Entries are not finite where the filter diverges.
+        """
+        inputs, period, substeps, measured, _ = self._drive(replace(excitation, gain=self._open_loop))
+        noises = (noise.outputs**2, noise.states**2, noise.inputs)
+        found = self._call("kalman", parameters, initial, inputs, period, substeps, measured, *noises)
+        return Correction(*found)
 
     def substeps(self, parameters: Array, initial: Array, excitation: Excitation, tolerance: Array) -> int:
         """The fewest substeps (a power of two) whose truncation error stays under ``tolerance`` (outputs,).

@@ -1,0 +1,180 @@
+"""The objective of one window: how far a guess of parameters and initial state is from what was measured."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Mask, Window
+from otolith.adaptation.disturbance import open_loop, predictor
+from otolith.adaptation.problem import Problem
+from otolith.twin.definition import Definition
+from otolith.twin.kernel import Excitation, Noise, kernel_of
+
+INITIAL_STATE_REACH = 10.0  # standard deviations around the first record, in which the twin may start at least
+TRUNCATION = 1e-3  # of the noise: how large the integrator's error may be
+HOPELESS = 1e30  # the cost of a guess whose prediction is not finite: worse than any other, and finite
+WHOLE = 0.01  # of a quantum: how far the steps between values may be from whole multiples of it
+FEWEST_LEVELS = 4  # that tell a converter's steps from a signal's own
+
+
+class Objective:
+    """The cost of guesses over one window: RMSE as in paper.txt section 3.2, of whitened innovations.
+
+    A guess is the free parameters, then the initial state: the first record is as noisy as any other, so the state it
+    shows is a nuisance parameter, estimated along with the rest. Innovations are divided by what they may be, so that
+    outputs of different units add up, and a cost of one means that the twin explains the window up to the noise.
+    """
+
+    def __init__(self, problem: Problem, window: Window, start: Array) -> None:
+        """``start`` (free parameters,): around it the predictor is made."""
+        twin = problem.twin
+        self.kernel = kernel_of(twin)
+        self.measured = np.column_stack([window.column(entry.name) for entry in twin.outputs])
+        self.present = ~np.column_stack([window.missing_in(entry.name) for entry in twin.outputs])
+        self.count = max(float(self.present.sum()), 1.0)
+        self._inputs = np.column_stack([np.zeros((window.records, 0)), *(window.column(e.name) for e in twin.inputs)])
+        self.noise = self._noise(problem)
+        lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
+        self._template = np.array([dict(problem.known).get(entry.name, entry.nominal) for entry in twin.parameters])
+        order = [entry.name for entry in twin.parameters]
+        self._places = [order.index(entry.name) for entry in problem.free]
+        self.free = len(self._places)
+        self._initial = [len(order) + index for index in range(len(twin.states))]
+        self._drifts = [len(order) + len(twin.states) + place for place in self._places]
+        low, high = problem.bounds
+        self.low, self.high = np.concatenate([low, lowest]), np.concatenate([high, highest])
+        self.names = (*(entry.name for entry in problem.free), *(f"initial {state.name}" for state in twin.states))
+        self._open_loop = problem.open_loop
+        self._excitation = Excitation(self._inputs, window.sample_period)
+        self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
+        self.centre(start, self._first)
+
+    def centre(self, parameters: Array, initial: Array) -> None:
+        """Make the predictor around these (free parameters,), (states,): substeps, gain, whitening."""
+        full = self.parameters(parameters[None])[0]
+        scales = TRUNCATION * self.noise.outputs
+        plain = replace(self._excitation, gain=None, substeps=1)
+        plain = replace(plain, substeps=self.kernel.substeps(full, initial, plain, scales))
+        if self._open_loop:
+            made = open_loop(self.kernel, plain, self.noise)
+        else:
+            made = predictor(self.kernel, full, initial, plain, self.noise)
+        self._whitening, self.log_determinant = made.whitening, made.log_determinant
+        self._excitation = replace(plain, gain=made.gain)
+
+    def guess(self, parameters: Array) -> Array:
+        """(free parameters,) -> a guess that starts at the first record."""
+        return np.concatenate([parameters, self._first])
+
+    def cost_of_parameters(self, parameters: Array) -> Array:
+        """(particles, free parameters) -> (particles,), every one started at the first record."""
+        starts = np.repeat(self._first[None, :], len(parameters), axis=0)
+        return self.cost(np.hstack([parameters, starts]))
+
+    def parameters(self, guesses: Array) -> Array:
+        """(particles, guess) -> (particles, parameters of the twin)."""
+        found = np.repeat(self._template[None, :], len(guesses), axis=0)
+        found[:, self._places] = guesses[:, : self.free]
+        return found
+
+    def linearised(self, guess: Array) -> tuple[Array, Array]:
+        """(guess,) -> whitened residuals (residuals,) and their derivatives (residuals, guess).
+
+        A prediction that is not finite gives residuals beyond hope, and no direction.
+        """
+        return self._linearised(guess, [*self._places, *self._initial])
+
+    def drifting(self, guess: Array) -> tuple[Array, Array]:
+        """The same with (free parameters at the end, their drifts per second, initial state) for a guess.
+
+        A drift enters to first order, as what it moves within a window is small.
+        """
+        free = self.free
+        still = np.concatenate([guess[:free], guess[2 * free :]])
+        residuals, jacobian = self._linearised(still, [*self._places, *self._drifts, *self._initial])
+        return residuals + jacobian[:, free : 2 * free] @ guess[free : 2 * free], jacobian
+
+    def _linearised(self, guess: Array, columns: list[int]) -> tuple[Array, Array]:
+        parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
+        with np.errstate(over="ignore", invalid="ignore"):
+            drifts = len(columns) > len(guess)
+            found = self.kernel.sensitivities(parameters, initial, self._excitation, drifts=drifts)
+            residuals = self.residuals(found.outputs[None])[0].ravel()
+            slopes = np.where(self.present[..., None], found.slopes[:, :, columns], 0.0)
+            jacobian = -np.matmul(self._whitening, slopes).reshape(len(residuals), -1)
+        if np.isfinite(residuals).all() and np.isfinite(jacobian).all():
+            return residuals, jacobian
+        return np.full(len(residuals), HOPELESS / len(residuals)), np.zeros(jacobian.shape)
+
+    def predict(self, guesses: Array) -> Array:
+        """(particles, guess) -> (particles, records, outputs), one step ahead, in the units of the twin."""
+        initial = guesses[:, self.free :]
+        return self.kernel.simulate(self.parameters(guesses), initial, self._excitation)
+
+    def simulate(self, guess: Array) -> Array:
+        """(guess,) -> (records, outputs) in open loop, from its initial state on."""
+        free = replace(self._excitation, gain=None)
+        found: Array = self.kernel.simulate(self.parameters(guess[None]), guess[None, self.free :], free)[0]
+        return found
+
+    def residuals(self, predicted: Array) -> Array:
+        """(particles, records, outputs): whitened innovations, zero where not measured."""
+        innovations = np.where(self.present, self.measured - predicted, 0.0)
+        found: Array = np.einsum("rop,nrp->nro", self._whitening, innovations)
+        return found
+
+    def cost(self, guesses: Array) -> Array:
+        """(particles, guess) -> (particles,); a prediction that is not finite never wins."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            errors = self.residuals(self.predict(guesses))
+            cost = np.sqrt(np.einsum("pro,pro->p", errors, errors) / self.count)
+        return np.where(np.isfinite(cost), np.minimum(cost, HOPELESS), HOPELESS)
+
+    def rmse(self, predicted: Array) -> Array:
+        """(records, outputs) -> (outputs,), each in its own unit, over the records that were measured."""
+        errors = np.where(self.present, self.measured - predicted, 0.0)
+        counts = np.maximum(self.present.sum(axis=0), 1.0)
+        return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
+
+    def _noise(self, problem: Problem) -> Noise:
+        twin = problem.twin
+        columns = zip(self.measured.T, self.present.T, strict=True)
+        quanta = np.array([quantum(values[there]) for values, there in columns])
+        return Noise(
+            outputs=np.sqrt(np.array(problem.noise) ** 2 + quanta**2 / 12.0),
+            inputs=np.array(problem.input_noise or [0.0] * len(twin.inputs)),
+            states=np.array(problem.process_noise or [0.0] * len(twin.states)),
+        )
+
+
+def quantum(values: Array) -> float:
+    """The step of a converter behind ``values`` (n,), as its rounding adds a twelfth of its square; 0 if none is seen.
+
+    (B. Widrow, I. Kollar, Quantization Noise, section 4.4.)
+    """
+    levels = np.unique(values)
+    if len(levels) < FEWEST_LEVELS:
+        return 0.0
+    steps = np.diff(levels)
+    multiples = steps / steps.min()
+    return float(steps.min()) if np.abs(multiples - np.rint(multiples)).max() <= WHOLE else 0.0
+
+
+def _initial_state(twin: Definition, measured: Array, present: Mask, noise: Array) -> tuple[Array, Array, Array]:
+    """(states,) lower bound, start and upper bound: around the first measurement where an output shows the state.
+
+    The bounds are as wide as the signal moves, as the first record may be missing or wrong.
+    """
+    outputs = [entry.name for entry in twin.outputs]
+    rows = []
+    for state in twin.states:
+        if state.name in outputs:
+            index = outputs.index(state.name)
+            seen = measured[present[:, index], index]
+            first = float(seen[0]) if len(seen) else state.initial
+            reach = max(INITIAL_STATE_REACH * noise[index], float(np.ptp(seen)) if len(seen) else 0.0)
+            rows.append((first - reach, first, first + reach))
+        else:
+            rows.append((state.low, state.initial, state.high))
+    low, start, high = np.array(rows).T
+    return low, start, high

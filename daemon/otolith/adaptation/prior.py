@@ -1,0 +1,104 @@
+"""What is believed of the parameters before a window: the arrival cost of moving-horizon estimation.
+
+(C. V. Rao, J. B. Rawlings, D. Q. Mayne, Constrained state estimation for nonlinear discrete-time systems: stability and
+moving horizon approximations, IEEE Transactions on Automatic Control 48, 2003.)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.window import Array
+from otolith.adaptation.objective import Objective
+from otolith.adaptation.polish import Polished
+from otolith.adaptation.problem import Problem
+
+FASTEST = 1e-3  # 1/s: standard deviation of a trend that nothing is known of, in shares of the parameter's size
+TREND_REACH = 1.0  # 1/s: no parameter changes by more than its own size in a second
+UNSEEN = 1e-10  # relative singular value under which the initial state is not seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """A normal distribution of the parameters at the end of a window, then of their trends per second."""
+
+    mean: Array
+    """(2 free,)."""
+    covariance: Array
+    """(2 free, 2 free)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What a window says of parameters and trends: residuals of unit variance, linear around ``point``.
+
+    They are ``rest + root @ (z - point)``: the square-root information form (G. J. Bierman, Factorization Methods for
+    Discrete Sequential Estimation, chapter V), the initial state eliminated.
+    """
+
+    point: Array
+    """(2 free,)."""
+    root: Array
+    """(2 free, 2 free)."""
+    rest: Array
+    """(2 free,)."""
+
+    @property
+    def information(self) -> Array:
+        """(2 free, 2 free) the Fisher information."""
+        return np.asarray(self.root.T @ self.root)
+
+
+def vague(problem: Problem) -> Prior:
+    """All that is known before the first window: the machine file's values and bounds."""
+    low, high = problem.bounds
+    deviations = np.concatenate([(high - low) / np.sqrt(12.0), FASTEST * problem.scale])
+    return Prior(np.concatenate([problem.nominal, np.zeros(len(low))]), np.diag(deviations**2))
+
+
+class Informed:
+    """The objective of a window together with the prior; a guess is parameters at the end, trends, initial state."""
+
+    def __init__(self, objective: Objective, problem: Problem, prior: Prior) -> None:
+        free = objective.free
+        reach = TREND_REACH * problem.scale
+        self.low = np.concatenate([objective.low[:free], -reach, objective.low[free:]])
+        self.high = np.concatenate([objective.high[:free], reach, objective.high[free:]])
+        self._objective = objective
+        self._mean = prior.mean
+        size = np.sqrt(np.diag(prior.covariance))
+        factor = np.linalg.cholesky(prior.covariance / np.outer(size, size))
+        self._root = np.linalg.inv(factor) / size
+
+    def guess(self, parameters: Array, initial: Array) -> Array:
+        """(guess,) from (free,) and (states,), with the trends of the prior."""
+        return np.concatenate([parameters, self._mean[len(parameters) :], initial])
+
+    def linearised(self, guess: Array) -> tuple[Array, Array]:
+        """(guess,) -> residuals of the window, then of the prior, and their derivatives."""
+        residuals, jacobian = self._objective.drifting(guess)
+        count = len(self._mean)
+        believed = np.zeros((count, len(guess)))
+        believed[:, :count] = self._root
+        off = self._root @ (guess[:count] - self._mean)
+        return np.concatenate([residuals, off]), np.vstack([jacobian, believed])
+
+    def chi_square(self, fit: Polished) -> float:
+        """Of the window alone."""
+        own = fit.residuals[: -len(self._mean)]
+        return float(own @ own)
+
+    def evidence(self, fit: Polished, cost: float) -> Evidence:
+        """What the window says around ``fit``; residuals beyond the noise (``cost`` above one) make it say less."""
+        count = len(self._mean)
+        residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
+        scale = (self.high - self.low)[count:]
+        states, singular, _ = np.linalg.svd(jacobian[:, count:] * scale, full_matrices=False)
+        seen = states[:, singular > UNSEEN * max(singular.max(initial=0.0), 1.0)]
+        both = np.column_stack([jacobian[:, :count], residuals])
+        triangle = np.linalg.qr(both - seen @ (seen.T @ both), mode="r")
+        padded = np.zeros((count, count + 1))
+        rows = min(count, len(triangle))
+        padded[:rows] = triangle[:rows]
+        padded /= max(cost, 1.0)
+        return Evidence(fit.guess[:count], padded[:, :count], padded[:, count])
