@@ -4,13 +4,17 @@ Laws of paper.txt section 5.2 and 5.3: exponential drift of a parameter, a torqu
 """
 
 import math
+from collections.abc import Callable, Iterable
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
+Array = NDArray[np.float64]
 Seconds = Annotated[float, BeforeValidator(Quantity("s", 0.0, 1e9))]
 
 
@@ -24,9 +28,9 @@ class Drift(Closed):
     """In a unit of the parameter."""
     rate: Annotated[float, BeforeValidator(Quantity("1/s", -10.0, 10.0))]
 
-    def change(self, time: float, amount: float) -> float:
-        """What is added to the parameter at ``time`` (s), in its unit."""
-        return amount * math.expm1(self.rate * (time - self.start)) if time > self.start else 0.0
+    def change(self, times: Array, amount: float) -> Array:
+        """What is added to the parameter at ``times`` (s), in its unit."""
+        return amount * np.expm1(self.rate * np.maximum(times - self.start, 0.0))
 
 
 class Step(Closed):
@@ -37,9 +41,9 @@ class Step(Closed):
     start: Seconds
     amount: str
 
-    def change(self, time: float, amount: float) -> float:
-        """What is added to the parameter at ``time`` (s), in its unit."""
-        return amount if time > self.start else 0.0
+    def change(self, times: Array, amount: float) -> Array:
+        """What is added to the parameter at ``times`` (s), in its unit."""
+        return np.where(times > self.start, amount, 0.0)
 
 
 class Unbalance(Closed):
@@ -51,12 +55,19 @@ class Unbalance(Closed):
     frequency: Annotated[float, BeforeValidator(Quantity("rad/s", 0.0, 1e4))] | None = None
     order: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
 
-    def value(self, time: float, angle: float) -> float:
-        """The acceleration in rad/s² at ``time`` (s) and shaft ``angle`` (rad)."""
-        if time < self.start:
-            return 0.0
-        phase = self.order * angle if self.order is not None else (self.frequency or 0.0) * time
-        return self.acceleration * math.sin(phase)
+
+def shaking(unbalances: Iterable[Unbalance]) -> Callable[[float, float], float]:
+    """The acceleration by all of them, in rad/s², at a time (s) and a shaft angle (rad)."""
+    sines = [(fault.start, fault.acceleration, fault.frequency or 0.0, fault.order or 0.0) for fault in unbalances]
+
+    def acceleration(time: float, angle: float) -> float:
+        total = 0.0
+        for start, amplitude, frequency, order in sines:
+            if time >= start:
+                total += amplitude * math.sin(frequency * time + order * angle)
+        return total
+
+    return acceleration
 
 
 Fault = Annotated[Drift | Step | Unbalance, Field(discriminator="kind")]

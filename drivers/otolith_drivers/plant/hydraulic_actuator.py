@@ -15,13 +15,12 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator
 
-from otolith_drivers.plant.scenario import POSITIVE, Ageing, Scenario
+from otolith_drivers.plant.scenario import POSITIVE, Scenario, Stretch, stretches
 from otolith_drivers.plant.tick import Tick
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
 STEP = 1e-4  # s: of the integrator and, as in the paper, of the controller
-ITERATIONS = 6  # of the pressure; each gains three digits
 UNITS = {
     "k_spring": "N/m",
     "D": "N*s/m",
@@ -89,86 +88,79 @@ SIGNALS = {"ValveArea": "m^2", "LoadForce": "N", "PistonPosition": "m", "SystemP
 
 def simulate(scenario: Any) -> Iterator[Tick]:
     """The lift from its lowest reference on, one tick per sample period, without end; the same for the same seed."""
-    machine = _Machine(scenario)
-    random = np.random.default_rng(scenario.seed)
     noise = scenario.noise
-    steps = max(1, round(scenario.sample_period / STEP))
-    index = 0
-    while True:
-        time = index * scenario.sample_period
-        parameters = machine.parameters(time)
-        machine.control(time, parameters)
-        errors = random.standard_normal(3)
+    for stretch, index, position, pressure, valve in _run(scenario):
+        errors = stretch.noise[index]
         measured = {
-            "ValveArea": machine.valve + noise.valve * errors[0],
+            "ValveArea": valve + noise.valve * errors[0],
             "LoadForce": scenario.load,
-            "PistonPosition": machine.position + noise.position * errors[1],
-            "SystemPressure": machine.shown_pressure(parameters) + noise.pressure * errors[2],
+            "PistonPosition": position + noise.position * errors[1],
+            "SystemPressure": pressure + noise.pressure * errors[2],
         }
-        truth = parameters | {"x": machine.position, "p": machine.shown_pressure(parameters)}
-        yield Tick(time, measured, truth)
-        for step in range(steps):
-            moment = time + step * scenario.sample_period / steps
-            machine.advance(moment, scenario.sample_period / steps, first=step == 0)
-        index += 1
+        yield Tick(stretch.times.item(index), measured, stretch.truth[index] | {"x": position, "p": pressure})
 
 
-class _Machine:
-    """Position (m), pressure (Pa) and the controller's memory, moved forward a step at a time."""
+def _run(scenario: LiftScenario) -> Iterator[tuple[Stretch, int, float, float, float]]:
+    """Position (m), pressure (Pa) and valve (m²) at each sampling instant; the controller acts at every step."""
+    gains, accurate = scenario.controller, scenario.integrator == "accurate"
+    k_p, k_i, k_d, n = gains.K_p, gains.K_i, gains.K_d, gains.N
+    steps = max(1, round(scenario.sample_period / STEP))
+    step = scenario.sample_period / steps
+    position, filtered = 0.0, 0.0
+    pressure, integral = _balance_of_flows(scenario)
+    for stretch in stretches(scenario, steps, where=0.0):
+        columns = _columns(scenario, stretch)
+        for index in range(stretch.times.size):
+            for number, values in enumerate(stretch.steps(index, columns)):
+                _, wanted, a_max, inflow, outflow, rest, spring, damping = values
+                # Eq. 17 with the forward operator z: what is held has been summed up to the step before.
+                error = position - wanted
+                derivative = n * (k_d * error - filtered)
+                valve = k_p * error + integral + derivative
+                if 0.0 < valve < a_max:
+                    integral += k_i * error * STEP
+                else:
+                    valve = min(max(valve, 0.0), a_max)
+                filtered += derivative * STEP
+                flow = outflow * valve
+                if accurate:
+                    blocked, drag = rest + damping * inflow, damping * flow
+                    root = _root_of_pressure(blocked + spring * position, drag)
+                    pressure = blocked + spring * position - drag * root
+                else:
+                    root = math.sqrt(pressure) if pressure > 0.0 else 0.0
+                if number == 0:
+                    yield stretch, index, position, pressure, valve
+                if accurate:
+                    middle = position + step / 2 * (inflow - flow * root)
+                    root = _root_of_pressure(blocked + spring * middle, drag)
+                velocity = inflow - flow * root
+                position += step * velocity
+                if not accurate:
+                    pressure = rest + spring * position + damping * velocity
 
-    def __init__(self, scenario: LiftScenario) -> None:
-        self._scenario = scenario
-        self.parameters = Ageing(scenario).at
-        p = self.parameters(0.0)
-        self.position = 0.0
-        self._pressure = scenario.load / p["A_piston"]
-        # In balance at first, so that the loop has nothing to recover from.
-        self.valve = p["q_pump"] / math.sqrt(2.0 * (1.0 + p["leak"]) * self._pressure / p["rho"])
-        self._integral, self._filter = self.valve, 0.0
 
-    def shown_pressure(self, p: dict[str, float]) -> float:
-        """System pressure (Pa) now."""
-        if self._scenario.integrator == "accurate":
-            self._pressure = self._balance(p, self.position)
-        return self._pressure
+def _columns(scenario: LiftScenario, stretch: Stretch) -> tuple[Any, ...]:
+    """Of each step: the position asked for, the valve's limit, and Eq. 7, 8, 16 and 18 as numbers.
 
-    def control(self, time: float, p: dict[str, float]) -> None:
-        """Eq. 17 with the forward operator z: what is held has been summed up to the step before."""
-        gains, reference = self._scenario.controller, self._scenario.reference
-        wanted = reference.amplitude * math.sin(2.0 * math.pi * reference.frequency * time)
-        error = self.position - wanted
-        derivative = gains.N * (gains.K_d * error - self._filter)
-        self.valve = min(max(gains.K_p * error + self._integral + derivative, 0.0), p["A_max"])
-        saturated = self.valve in (0.0, p["A_max"])
-        self._integral += 0.0 if saturated else gains.K_i * error * STEP
-        self._filter += derivative * STEP
+    The piston moves with ``inflow - outflow * valve * sqrt(pressure)``; the pressure is
+    ``rest + spring * position + damping * velocity``.
+    """
+    p, reference = stretch.parameters, scenario.reference
+    wanted = reference.amplitude * np.sin(2.0 * math.pi * reference.frequency * stretch.moments)
+    area = p["A_piston"]
+    per_force = (1.0 + p["leak"]) / area
+    flows = p["q_pump"] / area, (2.0 / p["rho"]) ** 0.5 / area
+    return wanted, p["A_max"], *flows, per_force * scenario.load, per_force * p["k_spring"], per_force * p["D"]
 
-    def advance(self, time: float, step: float, *, first: bool) -> None:
-        p = self.parameters(time)
-        if not first:
-            self.control(time, p)
-        if self._scenario.integrator == "euler":
-            velocity = self._velocity(p, self._pressure)
-            self.position += step * velocity
-            self._pressure = self._pressure_of(p, self.position, velocity)
-            return
-        velocity = self._velocity(p, self._balance(p, self.position))
-        middle = self._velocity(p, self._balance(p, self.position + step / 2.0 * velocity))
-        self.position += step * middle
 
-    def _velocity(self, p: dict[str, float], pressure: float) -> float:
-        """Eq. 7 and 8."""
-        flow = self.valve * math.sqrt(2.0 * max(pressure, 0.0) / p["rho"])
-        return (p["q_pump"] - flow) / p["A_piston"]
+def _balance_of_flows(scenario: LiftScenario) -> tuple[float, float]:
+    """Pressure and valve at first, so that the loop has nothing to recover from."""
+    p = scenario.parameters
+    pressure = scenario.load / p.A_piston
+    return pressure, p.q_pump / math.sqrt(2.0 * (1.0 + p.leak) * pressure / p.rho)
 
-    def _pressure_of(self, p: dict[str, float], position: float, velocity: float) -> float:
-        """Eq. 16 and, with a leak, Eq. 18."""
-        force = self._scenario.load + p["k_spring"] * position + p["D"] * velocity
-        return (1.0 + p["leak"]) * force / p["A_piston"]
 
-    def _balance(self, p: dict[str, float], position: float) -> float:
-        """The pressure that its own flow leaves as it is, by iteration."""
-        pressure = self._pressure
-        for _ in range(ITERATIONS):
-            pressure = self._pressure_of(p, position, self._velocity(p, pressure))
-        return pressure
+def _root_of_pressure(blocked: float, drag: float) -> float:
+    """The root of the pressure that its own flow leaves as it is: ``blocked - drag * root``."""
+    return 2.0 * blocked / (drag + math.sqrt(drag * drag + 4.0 * blocked)) if blocked > 0.0 else 0.0

@@ -1,17 +1,24 @@
 """What every scenario says, whatever the machine: seed, bus, sampling, and what happens to its parameters."""
 
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import count, repeat
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import BeforeValidator, model_validator
 
 from otolith_drivers.can_bus import BusOptions
 from otolith_drivers.errors import nearest
-from otolith_drivers.plant.faults import Drift, Fault, Step, Unbalance
+from otolith_drivers.plant.faults import Array, Drift, Fault, Step, Unbalance
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
 POSITIVE = 1e-12
+SENSORS = 3  # with noise, on every machine
+STRETCH_PERIODS = 256  # numpy's overhead is shared by so many, and a node in real time is held up for few ms
+STRETCH_STEPS = 32768  # at most, however many a sample period has
 
 
 class Scenario(Closed):
@@ -55,18 +62,54 @@ class Scenario(Closed):
         return Quantity(self.UNITS[fault.parameter])(fault.amount)
 
 
-class Ageing:
-    """The parameters of a scenario as time goes by."""
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Some sample periods in a row, and what is known of them before the machine has lived them."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._initial = dict(scenario.parameters)
-        self._changes = [
-            (fault, scenario.amount(fault)) for fault in scenario.faults if isinstance(fault, Drift | Step)
-        ]
+    times: Array
+    """Of the sampling instants, s."""
+    noise: list[list[float]]
+    """Of each sensor at each of them, in standard deviations."""
+    truth: list[dict[str, float]]
+    """The parameters at each of them."""
+    moments: Array
+    """When each step of the integrator begins, s: a row for each step, a column for each sample period."""
+    parameters: dict[str, Any]
+    """In each step: an array like ``moments``, or the number that holds in all of them."""
 
-    def at(self, time: float) -> dict[str, float]:
-        """Every parameter at ``time`` (s), in its unit."""
-        values = dict(self._initial)
-        for fault, amount in self._changes:
-            values[fault.parameter] += fault.change(time, amount)
-        return values
+    def steps(self, index: int, columns: Iterable[Any]) -> Iterator[tuple[float, ...]]:
+        """Of one sample period the steps: the moment of each, and what ``columns``, like parameters, say of it."""
+        values = (column[:, index].tolist() if isinstance(column, np.ndarray) else repeat(column) for column in columns)
+        return zip(self.moments[:, index].tolist(), *values, strict=False)
+
+
+def stretches(scenario: Scenario, steps: int, where: float) -> Iterator[Stretch]:
+    """The time of ``scenario`` without end, each sample period divided into ``steps``.
+
+    The parameters of a step are those that hold at ``where`` in it: 0 at its beginning, 0.5 in its middle.
+    """
+    random = np.random.default_rng(scenario.seed)
+    changes = [(fault, scenario.amount(fault)) for fault in scenario.faults if not isinstance(fault, Unbalance)]
+    size = max(1, min(STRETCH_PERIODS, STRETCH_STEPS // steps))
+    step = scenario.sample_period / steps
+    begins = step * np.arange(steps, dtype=np.float64)[:, np.newaxis]
+    for first in count(0, size):
+        times = np.arange(first, first + size, dtype=np.float64) * scenario.sample_period
+        now = _parameters(scenario, changes, times)
+        values = zip(*(np.broadcast_to(value, size).tolist() for value in now.values()), strict=True)
+        yield Stretch(
+            times=times,
+            noise=random.standard_normal((size, SENSORS)).tolist(),
+            truth=[dict(zip(now, row, strict=True)) for row in values],
+            moments=times + begins,
+            parameters=_parameters(scenario, changes, times + begins + where * step),
+        )
+
+
+def _parameters(scenario: Scenario, changes: list[tuple[Drift | Step, float]], times: Array) -> dict[str, Any]:
+    """Each parameter at ``times`` (s), in its unit: an array, or a number if nothing changes it meanwhile."""
+    values: dict[str, Any] = dict(scenario.parameters)
+    for fault, amount in changes:
+        change = fault.change(times, amount)
+        values[fault.parameter] += change if np.ptp(change) else change.item(0)
+    return values
