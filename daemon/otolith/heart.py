@@ -60,16 +60,17 @@ class _Learned:
 
 
 def _learn(state: State, window: Window) -> _Learned:
-    problem, memory, end = state.problem, state.memory, window.end
-    prior = overall(carried(memory.belief, end), problem)
+    problem, memory = state.problem, state.memory
+    expected = carried(memory.belief, window.end)
+    prior = overall(expected, problem)
     warm = any(entry.known for entry in state.standing)
     found = estimate(problem, window, _start(prior, problem), prior, warm=warm)
     if found.cost > REFUSED:
         return _learned(refuse(memory), found, Lesson.REFUSED)
-    if not is_surprising(memory, found.evidence, end, problem):
-        return _learned(learn(memory, found.evidence, end, problem), found, Lesson.LEARNED)
+    if not is_surprising(expected, found.evidence, problem):
+        return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
     alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
-    after, lesson = doubt(memory, alone.evidence, end, problem)
+    after, lesson = doubt(memory, expected, alone.evidence, problem)
     return _learned(after, alone, lesson)
 
 
@@ -138,7 +139,7 @@ def _fused(state: State, memory: Memory, end: float) -> list[Fused]:
     """Of each free parameter, what is known at ``end`` (Unix s), and what this window did to it."""
     free = len(state.problem.free)
     before = overall(carried(state.memory.belief, end), state.problem)
-    after = overall(carried(memory.belief, end), state.problem)
+    after = overall(carried(memory.belief, end), state.problem) if memory is not state.memory else before
     sd, sd_before = (np.sqrt(np.diag(known.covariance)) for known in (after, before))
     return [
         Fused(

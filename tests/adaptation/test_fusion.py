@@ -82,9 +82,10 @@ def test_a_clock_that_goes_back_does_no_harm() -> None:
 
 def told(memory: Memory, value: float, end: float, seed: int, sd: float = 0.01) -> tuple[Memory, Lesson]:
     found = evidence(value, 0.0, sd, np.random.default_rng(seed))
-    if is_surprising(memory, found, end, PROBLEM):
-        return doubt(memory, found, end, PROBLEM)
-    return learn(memory, found, end, PROBLEM), Lesson.LEARNED
+    expected = carried(memory.belief, end)
+    if is_surprising(expected, found, PROBLEM):
+        return doubt(memory, expected, found, PROBLEM)
+    return learn(memory, expected, found, PROBLEM), Lesson.LEARNED
 
 
 def healthy(windows: int = 30) -> Memory:

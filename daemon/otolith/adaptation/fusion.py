@@ -1,22 +1,29 @@
 """From window to window: every parameter as value and trend, with covariance, under several ideas of how it changes.
 
 Windows are not independent experiments. What is known after one, carried on to the end of the next, is that one's prior
-(see :mod:`otolith.adaptation.prior`). How fast a healthy parameter may change is not known beforehand, so a bank of
-models from "it hardly does" to "it runs away" is carried along, each weighted by how well it foretold the windows
-(interacting multiple models: H. A. P. Blom, Y. Bar-Shalom, IEEE Transactions on Automatic Control 33, 1988).
+(see :mod:`otolith.adaptation.prior`). How fast a parameter may change is not known beforehand, from "it hardly does" to
+"it runs away". So a bank of models is carried along, each weighted by how well it foretold the windows: one with what
+seems right for every parameter, and some in which one of them is calmer, livelier or runs away (interacting multiple
+models: H. A. P. Blom, Y. Bar-Shalom, IEEE Transactions on Automatic Control 33, 1988; with a model set that moves:
+X. R. Li, Y. Bar-Shalom, IEEE Transactions on Automatic Control 41, 1996).
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.prior import Evidence, Prior, vague
 from otolith.adaptation.problem import Problem
 
-AGITATIONS = np.array([1e-8, 1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: how much a trend strays, in shares of the parameter
+AGITATIONS = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: how much a trend strays, in shares of the parameter
 MEMORY = 1000.0  # s: a trend that nothing confirms dies away, so that no held value runs off
-STAY = 0.9  # probability that from one window to the next the same model holds
+STAY = 0.97  # probability that from one window to the next the same model holds
+LIVELIEST = len(AGITATIONS) - 1
+FIRST_LEVEL = 2
+CALMER = 1.5  # how much likelier a calmer model must be to be believed: calm is the assumption that does harm
+NEWCOMER = 0.02  # weight of a model that comes into the bank
 LEAST_WEIGHT = 1e-12
 LONGEST_GAP = 1e7  # s between windows: the models are stationary by then
 SCATTER_MEMORY = 0.1  # share of the newest window in the scatter
@@ -24,11 +31,15 @@ MOST_SCATTER = 1e4
 CLIPPED = 9.0  # surprise of one window that counts at most, so that none alone makes everything doubtful
 CONTRADICTION = 25.0  # the most that a window may raise the scatter that contradicted those before and after it
 
+Levels = NDArray[np.int64]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Belief:
     """What is known of parameters and trends, in shares of the parameters' sizes; plain, so that it pickles."""
 
+    level: Levels
+    """(models, free) which of the agitations; the first model is the one that the others are neighbours of."""
     mean: Array
     """(models, 2 free) at ``end``."""
     covariance: Array
@@ -44,35 +55,70 @@ class Belief:
 def begin_belief(problem: Problem) -> Belief:
     """Before the first window."""
     prior, size = vague(problem), _size(problem)
-    free, models = len(problem.free), len(AGITATIONS)
-    mean = np.tile(prior.mean / size, (models, 1))
-    covariance = np.tile(prior.covariance / np.outer(size, size), (models, 1, 1))
+    free = len(problem.free)
+    level = _around(np.full(free, FIRST_LEVEL))
+    mean = np.tile(prior.mean / size, (len(level), 1))
+    covariance = np.tile(prior.covariance / np.outer(size, size), (len(level), 1, 1))
     trends = np.arange(free, 2 * free)
-    covariance[:, trends, trends] = (AGITATIONS**2 * MEMORY / 2.0)[:, None]
-    return Belief(mean, covariance, np.full(models, 1.0 / models), -np.inf)
+    covariance[:, trends, trends] = AGITATIONS[level] ** 2 * MEMORY / 2.0
+    return Belief(level, mean, covariance, np.full(len(level), 1.0 / len(level)), -np.inf)
+
+
+def _around(centre: Levels) -> Levels:
+    """(free,) -> (models, free): itself, and others in which one parameter is calmer, livelier or runs away."""
+    models = [centre]
+    for parameter, level in enumerate(centre):
+        for other in sorted({max(level - 1, 0), min(level + 1, LIVELIEST), LIVELIEST} - {level}):
+            models.append(centre.copy())
+            models[-1][parameter] = other
+    return np.array(models)
 
 
 def carried(belief: Belief, end: float) -> Belief:
     """The belief at a later time (Unix s): values run on along their trends, and everything becomes less certain."""
     if not np.isfinite(belief.end):
         return replace(belief, end=end)
+    if end <= belief.end:  # a clock that was set back tells nothing
+        return belief
     belief = _mixed(belief)
-    passed = float(np.clip(end - belief.end, 0.0, LONGEST_GAP))
     free = belief.mean.shape[1] // 2
-    transition, noise = _motion(passed)
-    move = np.kron(transition, np.eye(free))
-    strays = AGITATIONS[:, None, None] ** 2 * np.kron(noise, np.eye(free))
-    mean = belief.mean @ move.T
-    return replace(belief, mean=mean, covariance=move @ belief.covariance @ move.T + strays, end=end)
+    transition, noise = _motion(min(end - belief.end, LONGEST_GAP))
+    move, strays = _per_parameter(transition, np.ones(free)), _per_parameter(noise, AGITATIONS[belief.level] ** 2)
+    covariance = move @ belief.covariance @ move.T + strays
+    return replace(belief, mean=belief.mean @ move.T, covariance=covariance, end=end)
 
 
 def overall(belief: Belief, problem: Problem) -> Prior:
     """All models as one normal distribution, in the units of the parameters."""
+    size = _size(problem)
+    mean, covariance = _moments(belief)
+    return Prior(mean * size, covariance * np.outer(size, size))
+
+
+def _moments(belief: Belief) -> tuple[Array, Array]:
     mean = belief.weight @ belief.mean
     off = belief.mean - mean
-    covariance = np.einsum("m,mij->ij", belief.weight, belief.covariance + off[:, :, None] * off[:, None, :])
-    size = _size(problem)
-    return Prior(mean * size, covariance * np.outer(size, size))
+    return mean, np.einsum("m,mij->ij", belief.weight, belief.covariance + off[:, :, None] * off[:, None, :])
+
+
+def _recentred(belief: Belief) -> Belief:
+    """The bank around its likeliest model."""
+    calmer = (belief.level < belief.level[0]).any(axis=1)
+    best = int(np.where(calmer, belief.weight / CALMER, belief.weight).argmax())
+    if best == 0:
+        return belief
+    level = _around(belief.level[best])
+    mean, covariance = _moments(belief)
+    old = {tuple(row): index for index, row in enumerate(belief.level.tolist())}
+    kept = [old.get(tuple(row)) for row in level.tolist()]
+    weight = np.array([NEWCOMER if index is None else belief.weight[index] for index in kept])
+    return replace(
+        belief,
+        level=level,
+        mean=np.array([mean if index is None else belief.mean[index] for index in kept]),
+        covariance=np.array([covariance if index is None else belief.covariance[index] for index in kept]),
+        weight=weight / weight.sum(),
+    )
 
 
 def surprise(belief: Belief, evidence: Evidence, problem: Problem) -> float:
@@ -94,13 +140,9 @@ def updated(belief: Belief, evidence: Evidence, problem: Problem) -> Belief:
     likelihood = -0.5 * (distance + np.linalg.slogdet(foretold)[1])
     weight = belief.weight * np.exp(likelihood - likelihood.max())
     weight = np.maximum(weight / weight.sum(), LEAST_WEIGHT)
-    return replace(
-        belief,
-        mean=mean,
-        covariance=covariance,
-        weight=weight / weight.sum(),
-        scatter=_scattered(belief.scatter, float(distance.min()) / len(root)),
-    )
+    scatter = _scattered(belief.scatter, float(distance.min()) / len(root))
+    learned = Belief(belief.level, mean, covariance, weight / weight.sum(), belief.end, scatter)
+    return _recentred(learned)
 
 
 def contradicted(belief: Belief, surprise_per_degree: float) -> Belief:
@@ -123,15 +165,21 @@ def _scattered(scatter: float, surprise_per_degree: float) -> float:
     return float(np.clip(scatter * change, 1.0, MOST_SCATTER))
 
 
+def _per_parameter(block: Array, weight: Array) -> Array:
+    """(2, 2) of value and trend, (..., free) -> (..., 2 free, 2 free), each parameter's share times its weight."""
+    free = weight.shape[-1]
+    apart = weight[..., None, :, None, None] * np.eye(free)[:, None, :]  # (..., 1, free, 1, free)
+    found: Array = (block[:, None, :, None] * apart).reshape(*weight.shape[:-1], 2 * free, 2 * free)
+    return found
+
+
 def _mixed(belief: Belief) -> Belief:
-    """Models change into their neighbours with a small probability, so that none dies out."""
+    """Models change into each other with a small probability, so that none dies out."""
     models = len(belief.weight)
-    move = STAY * np.eye(models)
-    for index in range(models):
-        neighbours = [other for other in (index - 1, index + 1) if 0 <= other < models]
-        move[index, neighbours] = (1.0 - STAY) / len(neighbours)
-    weight = belief.weight @ move
-    share = belief.weight[:, None] * move / weight  # of each old model in each new one
+    change = np.full((models, models), (1.0 - STAY) / (models - 1))
+    np.fill_diagonal(change, STAY)
+    weight = belief.weight @ change
+    share = belief.weight[:, None] * change / weight  # of each old model in each new one
     mean = share.T @ belief.mean
     off = belief.mean[:, None, :] - mean[None, :, :]
     spread = belief.covariance[:, None] + off[..., :, None] * off[..., None, :]

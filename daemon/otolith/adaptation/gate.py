@@ -50,27 +50,28 @@ def limit(problem: Problem) -> float:
     return float(degrees * (1.0 - 2.0 / (9.0 * degrees) + DEVIATE * np.sqrt(2.0 / (9.0 * degrees))) ** 3)
 
 
-def is_surprising(memory: Memory, evidence: Evidence, end: float, problem: Problem) -> bool:
-    """Whether no model of change foretold the window that ends at ``end`` (Unix s)."""
-    return surprise(carried(memory.belief, end), evidence, problem) > limit(problem)
+def is_surprising(expected: Belief, evidence: Evidence, problem: Problem) -> bool:
+    """Whether no model of change foretold the window; ``expected`` is the belief carried to its end."""
+    return surprise(expected, evidence, problem) > limit(problem)
 
 
-def learn(memory: Memory, evidence: Evidence, end: float, problem: Problem) -> Memory:
+def learn(memory: Memory, expected: Belief, evidence: Evidence, problem: Problem) -> Memory:
     """After a window that was to be expected."""
-    belief = carried(memory.belief, end)
+    belief = expected
     if memory.suspect is not None:  # the window before was wrong, and nobody knows why
         belief = contradicted(belief, memory.surprise)
     return Memory(updated(belief, evidence, problem))
 
 
-def doubt(memory: Memory, evidence: Evidence, end: float, problem: Problem) -> tuple[Memory, Lesson]:
+def doubt(memory: Memory, expected: Belief, evidence: Evidence, problem: Problem) -> tuple[Memory, Lesson]:
     """After a surprising window; ``evidence`` is of that window alone."""
+    end = expected.end
     if memory.suspect is not None:
         fresh = carried(memory.suspect, end)
         if surprise(fresh, evidence, problem) <= limit(problem):
             return Memory(updated(fresh, evidence, problem)), Lesson.STEPPED
     suspect = updated(carried(begin_belief(problem), end), evidence, problem)
-    found = surprise(carried(memory.belief, end), evidence, problem) / (2.0 * len(problem.free))
+    found = surprise(expected, evidence, problem) / (2.0 * len(problem.free))
     return Memory(memory.belief, suspect, max(found, memory.surprise), memory.contradictions + 1), Lesson.SUSPECTED
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from otolith.acquisition.window import Array
 
 STEPS = 40
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e12
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e-12, 1e12
 DONE = 1e-6  # in χ²: the improvement that is not worth another step
 
 
@@ -44,14 +44,15 @@ class Polished:
 
 def polish(objective: LeastSquares, start: Array, steps: int = STEPS) -> Polished:
     """The minimum of χ² that ``start`` (guess,) leads to; ``start`` itself where no step improves it."""
-    scale = objective.high - objective.low
-    guess = np.clip(start, objective.low, objective.high)
+    low, high = objective.low, objective.high
+    guess = np.minimum(np.maximum(start, low), high)
     residuals, jacobian = objective.linearised(guess)
     chi_square, damping, evaluations, converged = float(residuals @ residuals), FIRST_DAMPING, 1, False
     for _ in range(steps):
         step = _step(residuals, jacobian, guess, objective, damping)
-        trial = np.clip(guess + step, objective.low, objective.high)
-        if np.all(np.abs(trial - guess) <= 1e-14 * scale):
+        trial = np.minimum(np.maximum(guess + step, low), high)
+        foretold = residuals + jacobian @ (trial - guess)
+        if chi_square - float(foretold @ foretold) <= DONE * max(1.0, 1e-6 * chi_square):
             converged = True
             break
         new_residuals, new_jacobian = objective.linearised(trial)
@@ -65,7 +66,7 @@ def polish(objective: LeastSquares, start: Array, steps: int = STEPS) -> Polishe
                 break
         else:
             converged = float(np.abs(new - chi_square)) <= DONE
-            damping *= 10.0
+            damping = max(100.0 * damping, FIRST_DAMPING)
             if converged or damping > MOST_DAMPING:
                 break
     return Polished(guess, chi_square, jacobian, residuals, evaluations, converged)
