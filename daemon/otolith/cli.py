@@ -108,6 +108,30 @@ def check(file: Path, no_device: bool) -> None:
 
 
 @cli.command()
+@click.argument("file", type=FILE)
+@click.argument("data", type=FILE)
+@click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a summary.")
+@click.option("--recording", type=FILE, callback=_rrd, help="Record into this file, as the daemon does.")
+def replay(file: Path, data: Path, as_json: bool, recording: Path | None) -> int:
+    """Let the daemon of the machine in FILE hear the table DATA, as fast as it can, and sum up what it says.
+
+    DATA is CSV: a column 't' (seconds) and one for each signal of the twin, in its unit or the one in brackets.
+    FILE needs no [driver] and no [signals].
+
+    \b
+    Examples:
+      otolith replay my-machine.toml monday.csv
+      otolith replay my-machine.toml monday.csv --json | jq .parameters.R_a.value
+      otolith replay my-machine.toml monday.csv --recording monday.rrd
+    """
+    from otolith.replay import replay
+
+    stop = _StopSignal()
+    replay(file, data, recording, as_json=as_json, stopped=lambda: stop.number is not None)
+    return stop.code()
+
+
+@cli.command()
 @click.argument("scenario", type=FILE)
 @click.option("--truth", type=FILE, help="Write the parameters as they really are into this CSV file.")
 @click.option("--duration", type=click.FloatRange(0.1), default=math.inf, metavar="SECONDS", help="End by then.")

@@ -86,11 +86,12 @@ def _parameters(document: ReportDocument, histories: Mapping[str, tuple[float, .
     room = max(8, width - WITHOUT_HISTORY)
     for name, parameter in document.parameters.items():
         status = Text(parameter.status, style=STYLES[parameter.status])
-        table.add_row(name, *_values(parameter), status, sparkline(histories.get(name, ())[-room:]))
+        table.add_row(name, *value_cells(parameter), status, sparkline(histories.get(name, ())[-room:]))
     return table
 
 
-def _values(parameter: ParameterDocument) -> tuple[str, str, str, str]:
+def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
+    """Value, half of its interval, unit and change against nominal, as a table shows them."""
     if parameter.value is None or parameter.sd is None:
         return "unknown", "", parameter.unit, ""
     change = f"{parameter.value / parameter.nominal - 1:+.2%}" if parameter.nominal else ""

@@ -28,7 +28,19 @@ class Plan:
     problem: Problem
     records: int
     limits: Limits
-    driver: Driver
+    source: Driver | None
+    """None where the file was loaded without its driver."""
+
+    @property
+    def driver(self) -> Driver:
+        """Where the signals come from.
+
+        Raises:
+            ConfigurationError: the file was loaded without it.
+        """
+        if self.source is None:
+            raise ConfigurationError(f"{self.path}: loaded without its driver")
+        return self.source
 
     @property
     def recording_folder(self) -> Path | None:
@@ -37,8 +49,10 @@ class Plan:
         return None if folder is None else self.path.parent / folder
 
 
-def load_plan(path: Path) -> Plan:
+def load_plan(path: Path, *, with_driver: bool = True) -> Plan:
     """The machine file at ``path``, its twin, its estimation problem and its driver (not yet opened).
+
+    Without ``with_driver`` nobody looks at ``[driver]`` and ``[signals]``, and they may be absent.
 
     Raises:
         ConfigurationError: anything in it that cannot be meant, one line per fault.
@@ -61,7 +75,7 @@ def load_plan(path: Path) -> Plan:
         problem=problem,
         records=records,
         limits=Limits(table.missing_limit, table.gap_limit, table.jitter_limit),
-        driver=_driver(file, twin, context),
+        source=_driver(file, twin, context) if with_driver else None,
     )
 
 
@@ -180,6 +194,9 @@ def _process_noise(file: MachineFile, twin: Definition, context: _Context) -> tu
 
 
 def _driver(file: MachineFile, twin: Definition, context: _Context) -> Driver:
+    if not file.driver:
+        way_out = "[driver] with type = \"can\" and the like, and [signals]; only 'otolith replay' does without"
+        context.fail(("driver",), f"missing: say where the signals come from by {way_out}")
     wanted = list(twin.signals)
     for name in file.signals:
         if name not in wanted:

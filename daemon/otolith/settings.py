@@ -103,8 +103,9 @@ class MachineFile(Closed):
     """The whole file."""
 
     machine: MachineTable
-    driver: dict[str, Any]
-    signals: dict[str, dict[str, Any]]
+    driver: Annotated[dict[str, Any], Field(default_factory=dict)]
+    """With ``signals`` what the daemon needs; a replay does without."""
+    signals: Annotated[dict[str, dict[str, Any]], Field(default_factory=dict)]
     twin: TwinTable
     parameters: Annotated[
         dict[str, Annotated[ParameterTable, BeforeValidator(_value_alone)]], Field(default_factory=dict)

@@ -83,6 +83,16 @@ def test_jitter_is_judged() -> None:
     assert "ms of jitter" in quality.reasons[0]
 
 
+@pytest.mark.parametrize("surplus", [1, 20, 21, 22, 190])
+def test_samples_that_come_twice_are_left_out_up_to_a_limit_and_never_an_exception(surplus: int) -> None:
+    times = np.sort(np.concatenate([ramp(210) - 10.0, ramp(200)[-surplus:]])) * PERIOD
+    aligned = align(times, times, 0.0, 200, PERIOD)
+    assert aligned.extra == min(surplus, 20)
+    assert not aligned.missing.any()
+    verdict = judge({"x": aligned}, PERIOD, Limits()).verdict
+    assert verdict is (Verdict.GOOD if surplus == 1 else Verdict.BAD)
+
+
 def test_skew_is_how_far_two_signals_are_apart() -> None:
     first, second = (align(ramp(200) * PERIOD + late, ramp(200), 0.0, 200, PERIOD) for late in (0.001, 0.003))
     assert judge({"x": first, "y": second}, PERIOD, Limits()).skew == pytest.approx(0.002)

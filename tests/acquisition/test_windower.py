@@ -4,6 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from otolith.acquisition.alignment import Limits
 from otolith.acquisition.ring import Rings
@@ -123,3 +125,24 @@ def test_rings_are_bounded_and_count_what_falls_out() -> None:
     assert len(times) == 100
     rings.deliver([Sample("a", 200.0, 0.0)])
     assert rings.counters().overwritten == 30  # what was read before is not lost
+
+
+@given(
+    st.lists(st.lists(st.floats(-10.0, 10.0), max_size=30), max_size=10),
+    st.integers(1, 12),
+    st.lists(st.floats(-10.0, 10.0), max_size=10),
+)
+def test_many_samples_at_once_are_the_same_as_one_by_one(
+    parts: list[list[float]], capacity: int, reads: list[float]
+) -> None:
+    one_by_one, at_once = Rings(("a",), capacity), Rings(("a",), capacity)
+    for index, part in enumerate(parts):
+        one_by_one.deliver([Sample(name, time, 2.0 * time) for time in part for name in ("a", "x")])
+        columns = np.array(part), 2.0 * np.array(part)
+        at_once.deliver_columns({"a": columns, "x": columns})
+        for rings in (one_by_one, at_once):
+            rings.between(-10.0, reads[index % len(reads)] if reads else -10.0)
+        assert one_by_one.counters() == at_once.counters()
+        assert one_by_one.last_times() == at_once.last_times()
+    old, new = one_by_one.between(-20.0, 20.0)["a"], at_once.between(-20.0, 20.0)["a"]
+    assert np.array_equal(old, new)

@@ -79,12 +79,12 @@ def _slots(times: Array, start: float, period: float) -> tuple[Indices, Indices]
     predecessor goes. A source that sends far too many keeps the push, and its lateness tells.
     """
     kept = np.arange(len(times))
-    for _ in range(MOST_EXTRA + 1):
+    for spare in range(MOST_EXTRA, -1, -1):
         order = np.arange(len(kept))
         nearest = np.rint((times[kept] - start) / period).astype(np.int64)
         slots = np.minimum.accumulate((nearest - order)[::-1])[::-1] + order
         pushed = nearest > slots
-        if not len(kept) or not pushed[0]:
+        if not len(kept) or not pushed[0] or not spare:
             break
         reach = len(pushed) if pushed.all() else int(np.argmin(pushed))
         surplus = int(np.argmin(np.diff(times[kept][: reach + 1]))) + 1 if reach > 0 and len(kept) > 1 else 0

@@ -2,7 +2,7 @@
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,18 @@ class Ring:
         self._times[place] = time
         self._values[place] = value
         self._count += 1
+
+    def extend(self, times: Array, values: Array) -> None:
+        """The same as :meth:`append` for each sample (s, value), at once."""
+        capacity = len(self._times)
+        for begun in range(0, len(times), capacity):
+            part = slice(begun, begun + capacity)
+            places = np.arange(self._count, self._count + len(times[part]))
+            full = places[places >= capacity] % capacity
+            self.overwritten += int(np.count_nonzero(self._times[full] > self._read_up_to))
+            self._times[places % capacity] = times[part]
+            self._values[places % capacity] = values[part]
+            self._count += len(places)
 
     def between(self, start: float, end: float) -> tuple[Array, Array]:
         """Times (s) and values of the samples with ``start <= time < end``, by time; they count as read."""
@@ -81,6 +93,17 @@ class Rings:
                 else:
                     ring.append(sample.time, sample.value)
                     self._received += 1
+
+    def deliver_columns(self, columns: Mapping[str, tuple[Array, Array]]) -> None:
+        """Take many samples at once: times (s) and values of each signal, in the order of their arrival."""
+        with self._lock:
+            for signal, (times, values) in columns.items():
+                ring = self._rings.get(signal)
+                if ring is None:
+                    self._unknown += len(times)
+                else:
+                    ring.extend(times, values)
+                    self._received += len(times)
 
     def between(self, start: float, end: float) -> dict[str, tuple[Array, Array]]:
         """See :meth:`Ring.between`, for every signal."""

@@ -30,18 +30,18 @@ MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]
 
 def main(connection: Any, path: Path, title: str, outputs: Sequence[Output], parameters: Sequence[Parameter]) -> None:
     """Record what comes until None comes or the connection closes."""
-    if not _has_room(path):
+    if not has_room(path):
         return
     recording = Recording(path, title, outputs, parameters)
     try:
-        while (report := connection.recv()) is not None and _has_room(path):
+        while (report := connection.recv()) is not None and has_room(path):
             recording.add(report)
     finally:
         recording.close()
 
 
-def _has_room(path: Path) -> bool:
-    """Rerun's writer ends without a word on a full disk, so the recorder ends before, and is started again later."""
+def has_room(path: Path) -> bool:
+    """Rerun's writer ends without a word on a full disk, so who records ends before."""
     free = shutil.disk_usage(path.parent).free
     if free < LEAST_FREE:
         log.warning("recording stopped: %d MB free in %s, %d MB are kept", free >> 20, path.parent, LEAST_FREE >> 20)

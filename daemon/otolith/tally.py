@@ -1,0 +1,78 @@
+"""What many reports come to, for people: a table of parameters, and how the windows were."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from otolith.acquisition.window import Verdict
+from otolith.console import STYLES, value_cells
+from otolith.health.report import ReportDocument, Status
+
+MOST_REASONS = 5  # that are told
+FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")
+
+
+class Tally:
+    """Takes reports, keeps the last one and counts; draws itself."""
+
+    def __init__(self) -> None:
+        self._first: ReportDocument | None = None
+        self._last: ReportDocument | None = None
+        self._windows = self._good = self._fitted = self._explained = 0
+        self._statuses: dict[str, Counter[Status]] = {}
+        self._reasons: Counter[str] = Counter()
+        self._examples: dict[str, str] = {}
+
+    def add(self, document: ReportDocument) -> None:
+        """Count one report."""
+        self._first = self._first or document
+        self._last = document
+        self._windows += 1
+        self._good += document.window.quality.verdict is Verdict.GOOD
+        if document.fit is not None:
+            self._fitted += 1
+            self._explained += document.fit.explained
+        for name, parameter in document.parameters.items():
+            self._statuses.setdefault(name, Counter())[parameter.status] += 1
+        for reason in document.window.quality.reasons:
+            kind = FIGURE.sub("…", reason)  # one window lacks 7 %, another 8 %
+            self._reasons[kind] += 1
+            self._examples.setdefault(kind, f"{reason} (window {document.window.index})")
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The table and the counts."""
+        del console, options
+        if self._first is None or self._last is None:
+            yield Text("no window")
+            return
+        last = self._last
+        start, end = (round(moment, 6) + 0.0 for moment in (self._first.window.start, last.window.end))
+        span = f"from {start:.12g} s to {end:.12g} s"
+        yield Text.assemble((last.machine, "bold"), f" at {last.site}, twin {last.twin} ({last.model}), {span}")
+        yield self._parameters(last)
+        for name, parameter in last.parameters.items():
+            if parameter.reason:
+                yield Text(f"{name} in the last window: {parameter.reason}", style="yellow")
+        yield from self._words()
+
+    def _parameters(self, last: ReportDocument) -> Table:
+        table = Table(expand=False)
+        for column in ("parameter", "value", "± 95 %", "unit", "change", "last window", *Status):
+            right = column in ("value", "± 95 %", "change", *Status)
+            table.add_column(column, justify="right" if right else "left", no_wrap=True)
+        for name, parameter in last.parameters.items():
+            status = Text(parameter.status, style=STYLES[parameter.status])
+            counts = (str(self._statuses[name][kind]) for kind in Status)
+            table.add_row(name, *value_cells(parameter), status, *counts)
+        return table
+
+    def _words(self) -> Iterator[Text]:
+        bad = self._windows - self._good
+        explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
+        yield Text(f"{self._windows} windows: {self._good} good, {bad} bad; {explained}")
+        for kind, count in self._reasons.most_common(MOST_REASONS):
+            yield Text(f"  {count} bad like: {self._examples[kind]}", style="red")
