@@ -14,6 +14,8 @@ from otolith.adaptation.fusion import carried, overall
 from otolith.adaptation.gate import REFUSED, Lesson, Memory, doubt, is_surprising, learn, refuse
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
+from otolith.adaptation.sensors import stuck, wrong_scale
+from otolith.adaptation.spikes import without_spikes
 from otolith.health.report import (
     CostDocument,
     FitDocument,
@@ -42,7 +44,7 @@ def adapt(state: State, window: Window) -> tuple[State, Report]:
         reason = "window not estimated from: " + "; ".join(reasons)
         standing, document = _document(state, window, _Learned(state.memory, reason=reason))
         return replace(state, standing=standing), Report(document, _measured(state, window))
-    learned = _learn(state, window)
+    learned = _judge(state, window)
     standing, document = _document(state, window, learned)
     found = learned.found
     traces = _measured(state, window) if found is None else _traces(state, found)
@@ -59,16 +61,32 @@ class _Learned:
     reason: str = ""
 
 
+def _judge(state: State, window: Window) -> _Learned:
+    """Sensors are looked at first: what lies must not teach."""
+    problem, memory = state.problem, state.memory
+    window, notes, vetoes = without_spikes(window, problem.twin, problem.noise)
+    if not vetoes:
+        vetoes = stuck(problem, window, _start(overall(carried(memory.belief, window.end), problem), problem))
+    if vetoes:
+        return _Learned(refuse(memory), reason="; ".join(["window not estimated from", *vetoes]), lesson=Lesson.SENSOR)
+    learned = _learn(state, window)
+    return replace(learned, reason="; ".join(filter(None, (*notes, learned.reason))))
+
+
 def _learn(state: State, window: Window) -> _Learned:
     problem, memory = state.problem, state.memory
     expected = carried(memory.belief, window.end)
     prior = overall(expected, problem)
     warm = any(entry.known for entry in state.standing)
     found = estimate(problem, window, _start(prior, problem), prior, warm=warm)
-    if found.cost > REFUSED:
-        return _learned(refuse(memory), found, Lesson.REFUSED)
-    if not is_surprising(expected, found.evidence, problem):
+    refused = found.cost > REFUSED
+    if not refused and not is_surprising(expected, found.evidence, problem):
         return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
+    fault = wrong_scale(problem, window, prior, found.chi_square, memory.lying) if warm else None
+    if fault is not None:
+        return _Learned(refuse(memory, fault.output), found, Lesson.SENSOR, str(fault))
+    if refused:
+        return _learned(refuse(memory), found, Lesson.REFUSED)
     alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
     after, lesson = doubt(memory, expected, alone.evidence, problem)
     return _learned(after, alone, lesson)

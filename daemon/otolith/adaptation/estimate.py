@@ -38,6 +38,8 @@ class WindowEstimate:
     outcome: Outcome
     cost: float
     """RMSE in units of the noise."""
+    chi_square: float
+    """Of the window alone."""
     rmse_configured: tuple[float, ...]
     rmse_estimated: tuple[float, ...]
     measured: Array
@@ -137,6 +139,7 @@ class _Fit:
             evidence=self._informed.evidence(self._fit, cost),
             outcome=outcome,
             cost=cost,
+            chi_square=cost**2 * objective.count,
             rmse_configured=tuple(map(float, objective.rmse(predictions[1]))),
             rmse_estimated=tuple(map(float, objective.rmse(predictions[0]))),
             measured=objective.measured,

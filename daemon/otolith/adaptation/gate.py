@@ -23,6 +23,7 @@ class Lesson(StrEnum):
     LEARNED = "learned"
     SUSPECTED = "it contradicts what was known: a sudden change or a wrong window; the next one decides"
     STEPPED = "two windows agree on a sudden change"
+    SENSOR = "a sensor is wrong: nothing is learned from the window"
     REFUSED = "the twin cannot explain the window, whatever its parameters: nothing is learned from it"
 
 
@@ -35,6 +36,8 @@ class Memory:
     """What the last window alone says, if it contradicts the belief."""
     surprise: float = 0.0
     """Of the last window if it contradicts the belief, per degree of freedom."""
+    lying: str = ""
+    """The output whose scale has been found wrong; empty as soon as a window is as expected."""
     contradictions: int = 0
     """Windows in a row that taught nothing because they contradict twin or belief."""
 
@@ -72,9 +75,10 @@ def doubt(memory: Memory, expected: Belief, evidence: Evidence, problem: Problem
             return Memory(updated(fresh, evidence, problem)), Lesson.STEPPED
     suspect = updated(carried(begin_belief(problem), end), evidence, problem)
     found = surprise(expected, evidence, problem) / (2.0 * len(problem.free))
-    return Memory(memory.belief, suspect, max(found, memory.surprise), memory.contradictions + 1), Lesson.SUSPECTED
+    after = replace(memory, suspect=suspect, surprise=max(found, memory.surprise))
+    return replace(after, contradictions=memory.contradictions + 1), Lesson.SUSPECTED
 
 
-def refuse(memory: Memory) -> Memory:
-    """After a window that nothing explains."""
-    return replace(memory, suspect=None, contradictions=memory.contradictions + 1)
+def refuse(memory: Memory, lying: str = "") -> Memory:
+    """After a window that nothing explains, or only a wrong scale of the output ``lying``."""
+    return replace(memory, suspect=None, lying=lying or memory.lying, contradictions=memory.contradictions + 1)

@@ -1,5 +1,7 @@
 """The objective of one window: how far a guess of parameters and initial state is from what was measured."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -61,6 +63,18 @@ class Objective:
             made = predictor(self.kernel, full, initial, plain, self.noise)
         self._whitening, self.log_determinant = made.whitening, made.log_determinant
         self._excitation = replace(plain, gain=made.gain)
+
+    @contextmanager
+    def reading(self, output: int, gain: float, offset: float) -> Iterator["Objective"]:
+        """The objective as if what ``output`` measured had been ``gain`` times the truth, and ``offset`` more."""
+        measured, excitation = self.measured, self._excitation
+        self.measured = measured.copy()
+        self.measured[:, output] = (measured[:, output] - offset) / gain
+        self._excitation = replace(excitation, measured=np.where(self.present, self.measured, np.nan))
+        try:
+            yield self
+        finally:
+            self.measured, self._excitation = measured, excitation
 
     def guess(self, parameters: Array) -> Array:
         """(free parameters,) -> a guess that starts at the first record."""
