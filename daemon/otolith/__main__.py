@@ -9,6 +9,10 @@ _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 import os  # noqa: E402
 import sys  # noqa: E402
 
+# Matrices here are small: threads of the linear algebra would only get into each other's way. Before NumPy is loaded.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 INTERRUPTED = 130  # as a shell reports a command that Ctrl-C ended
 
 

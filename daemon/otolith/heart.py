@@ -4,34 +4,25 @@ Time comes in with the window and randomness with the seed, so that every run ca
 work can move between processes without loss.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from otolith.acquisition.window import Verdict, Window
+from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.estimate import WindowEstimate, estimate
 from otolith.adaptation.fusion import carried, overall
 from otolith.adaptation.gate import REFUSED, Lesson, Memory, doubt, is_surprising, learn, refuse
+from otolith.adaptation.length import Need, next_records
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
 from otolith.adaptation.sensors import stuck, wrong_scale
 from otolith.adaptation.spikes import without_spikes
-from otolith.health.report import (
-    CostDocument,
-    FitDocument,
-    ParameterDocument,
-    Report,
-    ReportDocument,
-    Traces,
-    window_document,
-)
-from otolith.health.status import Fused, Heard, Standing, publish
+from otolith.health.report import Report
+from otolith.reporting import EXPLAINED, Learned, document_of, traces_of
 from otolith.state import State
-from otolith.twin.definition import Definition
 
 FEWEST_RECORDS = 5
 LARGEST = 1e12  # of a value, in the unit of its signal: no sensor says that
-EXPLAINED = 1.5  # cost (RMSE over noise) up to which the residual counts as noise
 SCATTERED = 3.0  # ratio of variances: windows disagree that much more than they say
 CONTRADICTORY = "windows disagree with each other {:.1f} times more than they should: the twin lacks something"
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
@@ -39,67 +30,25 @@ UNEXPLAINED = "the twin does not explain the window up to the noise: another par
 
 def adapt(state: State, window: Window) -> tuple[State, Report]:
     """Adapt the twin to ``window``; a bad window leaves what is known where it was and is reported."""
+    learned = _judge(state, window)
+    standing, document = document_of(state, window, learned)
+    after = replace(state, memory=learned.memory, standing=standing, records=_next_records(state, window, learned))
+    return after, Report(document, traces_of(state, window, learned))
+
+
+def _judge(state: State, window: Window) -> Learned:
+    """Sampling and sensors are looked at first: what lies must not teach."""
+    problem, memory = state.problem, state.memory
     reasons = window.quality.reasons if window.quality.verdict is Verdict.BAD else _senseless(window)
     if reasons:
-        reason = "window not estimated from: " + "; ".join(reasons)
-        standing, document = _document(state, window, _Learned(state.memory, reason=reason))
-        return replace(state, standing=standing), Report(document, _measured(state, window))
-    learned = _judge(state, window)
-    standing, document = _document(state, window, learned)
-    found = learned.found
-    traces = _measured(state, window) if found is None else _traces(state, found)
-    return replace(state, memory=learned.memory, standing=standing), Report(document, traces)
-
-
-@dataclass(frozen=True, slots=True)
-class _Learned:
-    """What is known after a window, and how it came about."""
-
-    memory: Memory
-    found: WindowEstimate | None = None
-    lesson: Lesson | None = None
-    reason: str = ""
-
-
-def _judge(state: State, window: Window) -> _Learned:
-    """Sensors are looked at first: what lies must not teach."""
-    problem, memory = state.problem, state.memory
+        return Learned(memory, reason="window not estimated from: " + "; ".join(reasons))
     window, notes, vetoes = without_spikes(window, problem.twin, problem.noise)
     if not vetoes:
         vetoes = stuck(problem, window, _start(overall(carried(memory.belief, window.end), problem), problem))
     if vetoes:
-        return _Learned(refuse(memory), reason="; ".join(["window not estimated from", *vetoes]), lesson=Lesson.SENSOR)
+        return Learned(refuse(memory), None, Lesson.SENSOR, "window not estimated from: " + "; ".join(vetoes))
     learned = _learn(state, window)
     return replace(learned, reason="; ".join(filter(None, (*notes, learned.reason))))
-
-
-def _learn(state: State, window: Window) -> _Learned:
-    problem, memory = state.problem, state.memory
-    expected = carried(memory.belief, window.end)
-    prior = overall(expected, problem)
-    warm = any(entry.known for entry in state.standing)
-    found = estimate(problem, window, _start(prior, problem), prior, warm=warm)
-    refused = found.cost > REFUSED
-    if not refused and not is_surprising(expected, found.evidence, problem):
-        return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
-    fault = wrong_scale(problem, window, prior, found.chi_square, memory.lying) if warm else None
-    if fault is not None:
-        return _Learned(refuse(memory, fault.output), found, Lesson.SENSOR, str(fault))
-    if refused:
-        return _learned(refuse(memory), found, Lesson.REFUSED)
-    alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
-    after, lesson = doubt(memory, expected, alone.evidence, problem)
-    return _learned(after, alone, lesson)
-
-
-def _learned(memory: Memory, found: WindowEstimate, lesson: Lesson) -> _Learned:
-    """With what there is to say of the window as a whole."""
-    reasons = [] if lesson is Lesson.LEARNED else [lesson.value]
-    if found.cost > EXPLAINED and lesson is not Lesson.REFUSED:
-        reasons.append(UNEXPLAINED)
-    if memory.belief.scatter > SCATTERED:
-        reasons.append(CONTRADICTORY.format(memory.belief.scatter**0.5))
-    return _Learned(memory, found, lesson, "; ".join(reasons))
 
 
 def _senseless(window: Window) -> tuple[str, ...]:
@@ -111,80 +60,47 @@ def _senseless(window: Window) -> tuple[str, ...]:
     return ()
 
 
-def _start(prior: Prior, problem: Problem) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _learn(state: State, window: Window) -> Learned:
+    """What the window says, weighed with what was known."""
+    problem, memory = state.problem, state.memory
+    expected = carried(memory.belief, window.end)
+    prior = overall(expected, problem)
+    warm = any(entry.known for entry in state.standing)
+    found = estimate(problem, window, _start(prior, problem), prior, warm=warm)
+    refused = found.cost > REFUSED
+    if not refused and not is_surprising(expected, found.evidence, problem):
+        return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
+    fault = wrong_scale(problem, window, prior, found.chi_square, memory.lying) if warm else None
+    if fault is not None:
+        return Learned(refuse(memory, fault.output), found, Lesson.SENSOR, str(fault))
+    if refused:
+        return _learned(refuse(memory), found, Lesson.REFUSED)
+    alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
+    after, lesson = doubt(memory, expected, alone.evidence, problem)
+    return _learned(after, alone, lesson)
+
+
+def _learned(memory: Memory, found: WindowEstimate, lesson: Lesson) -> Learned:
+    """With what there is to say of the window as a whole."""
+    reasons = [] if lesson is Lesson.LEARNED else [lesson.value]
+    if found.cost > EXPLAINED and lesson is not Lesson.REFUSED:
+        reasons.append(UNEXPLAINED)
+    if memory.belief.scatter > SCATTERED:
+        reasons.append(CONTRADICTORY.format(memory.belief.scatter**0.5))
+    return Learned(memory, found, lesson, "; ".join(reasons))
+
+
+def _start(prior: Prior, problem: Problem) -> Array:
     """(free,) where the search begins."""
     return np.clip(prior.mean[: len(problem.free)], *problem.bounds)
 
 
-def _outputs(twin: Definition) -> tuple[str, ...]:
-    return tuple(entry.name for entry in twin.outputs)
-
-
-def _traces(state: State, found: WindowEstimate) -> Traces:
-    return Traces(_outputs(state.problem.twin), found.measured, found.predicted, state.problem.noise)
-
-
-def _measured(state: State, window: Window) -> Traces:
-    names = _outputs(state.problem.twin)
-    columns = [np.where(window.missing_in(name), np.nan, window.column(name)) for name in names]
-    return Traces(names, np.column_stack(columns), None, state.problem.noise)
-
-
-def _document(state: State, window: Window, learned: _Learned) -> tuple[tuple[Standing, ...], ReportDocument]:
-    problem, memory, found, lesson = state.problem, learned.memory, learned.found, learned.lesson
-    parameters: dict[str, ParameterDocument] = {}
-    standing: list[Standing] = []
-    allowed = problem.determined_within * problem.scale
-    for index, (entry, fused) in enumerate(zip(problem.free, _fused(state, memory, window.end), strict=True)):
-        said = None if found is None else found.parameters[index]
-        heard = Heard(said, lesson, memory.contradictions, memory.belief.scatter, learned.reason)
-        now, parameters[entry.name] = publish(entry, float(allowed[index]), fused, heard, state.standing[index])
-        standing.append(now)
-    document = ReportDocument(
-        machine=state.machine,
-        site=state.site,
-        twin=problem.twin.name,
-        model="DT'" if any(entry.known for entry in standing) else "DT",
-        window=window_document(window),
-        parameters=parameters,
-    )
-    if found is not None and lesson is not None:
-        document = document.model_copy(update=_fit(found, lesson, memory, _outputs(problem.twin)))
-    return tuple(standing), document
-
-
-def _fused(state: State, memory: Memory, end: float) -> list[Fused]:
-    """Of each free parameter, what is known at ``end`` (Unix s), and what this window did to it."""
-    free = len(state.problem.free)
-    before = overall(carried(state.memory.belief, end), state.problem)
-    after = overall(carried(memory.belief, end), state.problem) if memory is not state.memory else before
-    sd, sd_before = (np.sqrt(np.diag(known.covariance)) for known in (after, before))
-    return [
-        Fused(
-            value=float(after.mean[index]),
-            sd=float(sd[index]),
-            trend=float(after.mean[free + index]),
-            trend_sd=float(sd[free + index]),
-            kept=float((sd[index] / sd_before[index]) ** 2),
-        )
-        for index in range(free)
-    ]
-
-
-def _fit(found: WindowEstimate, lesson: Lesson, memory: Memory, outputs: tuple[str, ...]) -> dict[str, object]:
-    return {
-        "fit": FitDocument(
-            rmse_configured=_finite(outputs, found.rmse_configured),
-            rmse_estimated=_finite(outputs, found.rmse_estimated),
-            explained=found.cost <= EXPLAINED,
-            cost=found.cost,
-            scatter=memory.belief.scatter,
-            outcome=found.outcome,
-            lesson=lesson,
-        ),
-        "cost": CostDocument(evaluations=found.evaluations, generations=found.generations),
-    }
-
-
-def _finite(names: tuple[str, ...], values: tuple[float, ...]) -> dict[str, float]:
-    return {name: value for name, value in zip(names, values, strict=True) if np.isfinite(value)}
+def _next_records(state: State, window: Window, learned: Learned) -> int:
+    problem, found = state.problem, learned.found
+    if found is None:
+        return state.records
+    free = len(problem.free)
+    known = overall(learned.memory.belief, problem)
+    trend: Array = np.sqrt(known.mean[free:] ** 2 + np.diag(known.covariance)[free:])
+    need = Need(np.array([entry.sd for entry in found.parameters]), trend, found.cost <= EXPLAINED)
+    return next_records(problem.window, window.records, window.sample_period, need)

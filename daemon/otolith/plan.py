@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from otolith.acquisition.alignment import Limits
-from otolith.adaptation.problem import Problem, SwarmOptions
+from otolith.adaptation.problem import Problem, SwarmOptions, WindowOptions
 from otolith.errors import ConfigurationError, nearest
-from otolith.settings import MachineFile, ParameterTable, Written
+from otolith.settings import MachineFile, ParameterTable, WindowTable, Written
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twins import find_twin, load_twin
 from otolith_drivers.base import Driver, Signal
@@ -65,15 +65,12 @@ def load_plan(path: Path, *, with_driver: bool = True) -> Plan:
     twin = _twin(file, context)
     problem = _problem(file, twin, context)
     table = file.window
-    records = round(table.length / table.sample_period)
-    if abs(records * table.sample_period - table.length) > 1e-6 * table.length or not 10 <= records <= 1_000_000:
-        context.fail(("window", "length"), f"{table.length:g} s must be 10 to 1000000 times {table.sample_period:g} s")
     return Plan(
         path=path,
         file=file,
         twin=twin,
         problem=problem,
-        records=records,
+        records=problem.window.records,
         limits=Limits(table.missing_limit, table.gap_limit, table.jitter_limit),
         source=_driver(file, twin, context) if with_driver else None,
     )
@@ -130,6 +127,7 @@ def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
     if not free:
         context.fail(("parameters",), "nothing is to be estimated: write R_a = { estimate = true } or the like")
     sensors = _sensor_noise(file, twin, context)
+    estimation = file.estimation
     return Problem(
         twin=twin,
         known=tuple(known),
@@ -137,11 +135,27 @@ def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
         noise=sensors[0],
         input_noise=sensors[1],
         process_noise=_process_noise(file, twin, context),
+        open_loop=estimation.open_loop,
+        determined_within=estimation.determined_within,
+        window=_window(file.window, context),
         swarm=SwarmOptions(
             file.swarm.size, file.swarm.generations, file.swarm.inertia, file.swarm.cognitive, file.swarm.social
         ),
         seed=file.swarm.seed,
     )
+
+
+def _window(table: WindowTable, context: _Context) -> WindowOptions:
+    found = {}
+    for key, length in (("length", table.length), ("shortest", table.shortest), ("longest", table.longest)):
+        whole = table.length if length is None else length
+        records = round(whole / table.sample_period)
+        if abs(records * table.sample_period - whole) > 1e-6 * whole or not 10 <= records <= 1_000_000:
+            context.fail(("window", key), f"{whole:g} s must be 10 to 1000000 times {table.sample_period:g} s")
+        found[key] = records
+    if not found["shortest"] <= found["length"] <= found["longest"]:
+        context.fail(("window", "length"), f"{table.length:g} s must lie between shortest and longest")
+    return WindowOptions(found["length"], found["shortest"], found["longest"])
 
 
 def _parameter(entry: Parameter, table: ParameterTable, context: _Context, *, estimated: bool) -> Parameter:

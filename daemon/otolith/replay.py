@@ -119,7 +119,8 @@ class Replay:
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
         result = perform(Task(self._state, window))
-        self._state = result.state  # the one place where the next window may get another number of records
+        self._state = result.state
+        self._playback.windower.records = result.state.records
         if result.report is None:
             self._missed += 1
             return None

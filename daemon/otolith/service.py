@@ -48,9 +48,10 @@ class Service:
         machine = plan.file.machine
         self._plan = plan
         self._listen = plan.file.zenoh.listen if listen is None else listen
-        self._rings = Rings(plan.twin.signals, RING_RATE * RING_WINDOWS * plan.records)
+        self._rings = Rings(plan.twin.signals, RING_RATE * RING_WINDOWS * plan.problem.window.longest)
         self._windower = Windower(plan.twin.signals, plan.records, plan.file.window.sample_period, plan.limits)
-        self._supervisor = Supervisor(begin(machine.name, machine.site, plan.problem), self._windower.length)
+        longest = plan.problem.window.longest * plan.file.window.sample_period
+        self._supervisor = Supervisor(begin(machine.name, machine.site, plan.problem), longest)
         self._recorder = Companion("otolith-recorder", "otolith.outlets.recorder:main", RECORDER_ROOM)
         self._recording = recording if plan.file.recording.enabled else None
         self._publisher: Publisher | None = None
@@ -124,6 +125,7 @@ class Service:
         wait(self._supervisor.waitables, timeout=pause)
         for report, seconds in self._supervisor.poll(time.monotonic()):
             self._publish(report, seconds)
+            self._windower.records = self._supervisor.records
         self._watch(time.monotonic())
 
     def _cut(self, now: float) -> None:

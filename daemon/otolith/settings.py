@@ -67,10 +67,22 @@ class WindowTable(Closed):
     """How samples become windows, and what a window may lack and still be estimated from."""
 
     length: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] = 2.0
+    shortest: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] | None = None
+    longest: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] | None = None
+    """With either of these the length follows what drift and noise ask for, from ``length`` on."""
     sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-4, 10.0))] = 0.01
     missing_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.05
     gap_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 60.0))] = 0.05
     jitter_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 10.0))] = 0.005
+
+
+class EstimationTable(Closed):
+    """What is asked of estimates."""
+
+    open_loop: bool = False
+    """The paper's cost: nothing corrects the twin within a window; noise other than the sensors' is left out."""
+    determined_within: Annotated[float, BeforeValidator(Quantity("1", 1e-6, 1.0))] = 0.1
+    """A parameter counts as determined when the half of its 95 % interval is at most this share of its value."""
 
 
 class SwarmTable(Closed):
@@ -115,6 +127,7 @@ class MachineFile(Closed):
     process_noise: Annotated[dict[str, Written], Field(default_factory=dict)]
     """Of the machine itself: how far a state strays, in its unit per square root of a second."""
     window: WindowTable = WindowTable()
+    estimation: EstimationTable = EstimationTable()
     swarm: SwarmTable = SwarmTable()
     zenoh: ZenohTable = ZenohTable()
     recording: RecordingTable = RecordingTable()

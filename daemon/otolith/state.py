@@ -17,8 +17,11 @@ class State:
     memory: Memory
     standing: tuple[Standing, ...]
     """Of each free parameter."""
+    records: int
+    """Of the next window."""
 
 
 def begin(machine: str, site: str, problem: Problem) -> State:
     """The state before the first window."""
-    return State(machine, site, problem, begin_memory(problem), tuple(Standing() for _ in problem.free))
+    standing = tuple(Standing() for _ in problem.free)
+    return State(machine, site, problem, begin_memory(problem), standing, problem.window.records)

@@ -35,6 +35,11 @@ class Supervisor:
         self._deadline = 0.0
 
     @property
+    def records(self) -> int:
+        """How many the next window should have."""
+        return self._state.records
+
+    @property
     def restarts(self) -> int:
         """How often the worker had to be started again."""
         return max(0, self._companion.starts - 1)

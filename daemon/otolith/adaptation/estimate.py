@@ -18,10 +18,11 @@ from otolith.adaptation.outcome import Outcome
 from otolith.adaptation.polish import Polished, polish
 from otolith.adaptation.prior import Evidence, Informed, Prior, vague
 from otolith.adaptation.problem import Problem
-from otolith.adaptation.swarm import search
+from otolith.adaptation.swarm import Found, scattered, search
 
 AT_BOUND = 1e-4  # of the width of the bounds
 SURPRISING = 1.5  # cost of a warm fit beyond which the swarm looks whether there is a better valley
+OTHERS, SCATTERED, GLANCE = 4, 12, 15  # starts from the swarm, all over the bounds, and their steps
 ALONE_STEPS = 12  # of the polish of the window alone, which begins where the window with all before it ended
 APART = 5.0  # standard deviations between two results that are not the same
 ALIKE = 9.0  # in χ²: what two explanations of a window may differ by and be equally good
@@ -44,6 +45,8 @@ class WindowEstimate:
     rmse_estimated: tuple[float, ...]
     measured: Array
     predicted: Array
+    last_state: Array
+    """(states,) of the twin at the last record."""
     generations: int
     evaluations: int
 
@@ -67,11 +70,11 @@ class _Fit:
         self._problem, self._window = problem, window
         self._objective = Objective(problem, window, start)
         self._informed = Informed(self._objective, problem, prior)
-        self._disturbed = bool(self._objective.noise.inputs.any() or self._objective.noise.states.any())
         self._generations = self._evaluations = 0
         first = self._objective.guess(start)
         self._fit = self._polish(self._informed.guess(start, first[len(start) :]))
-        self._alone, self._told = self._window_alone()
+        self._alone = self._window_alone()
+        self._told = self._tell()
 
     def run(self, *, warm: bool) -> WindowEstimate:
         outcome = Outcome.CONTINUED
@@ -99,11 +102,16 @@ class _Fit:
         free = self._objective.free
         return np.concatenate([fit.guess[:free], fit.guess[2 * free :]])
 
-    def _window_alone(self) -> tuple[Polished, Information]:
+    def _window_alone(self) -> Polished:
         found = polish(self._objective, self._still(self._fit), ALONE_STEPS)
         self._evaluations += found.evaluations
-        cost = float(np.sqrt(found.chi_square / self._objective.count))
-        return found, information(found.jacobian, self._objective.high - self._objective.low, cost)
+        return found
+
+    def _tell(self) -> Information:
+        """What the window alone can know."""
+        objective, alone = self._objective, self._alone
+        cost = float(np.sqrt(alone.chi_square / objective.count))
+        return information(alone.jacobian, objective.high - objective.low, cost)
 
     def _says_nothing(self) -> bool:
         reach = self._told.sd[: self._objective.free]
@@ -115,35 +123,55 @@ class _Fit:
         searched = search(objective, problem.swarm, known.guess[:free], seed=problem.seed + self._window.index)
         self._generations = searched.generations
         self._evaluations += searched.evaluations
-        first = objective.guess(searched.values)[free:]
-        found = self._polish(self._informed.guess(searched.values, first))
-        if self._disturbed:  # the gain was made for parameters that may have been far off
-            better = min(found, known, key=lambda fit: fit.chi_square)
-            objective.centre(better.guess[:free], better.guess[2 * free :])
-            found, known = self._polish(found.guess), self._polish(known.guess)
+        found = self._best_of(searched)
+        # Gain and substeps were made for parameters that may have been far off.
+        better = min(found, known, key=lambda fit: fit.chi_square)
+        objective.centre(better.guess[:free], better.guess[2 * free :])
+        found, known = self._polish(found.guess), self._polish(known.guess)
         apart = np.abs(found.guess - known.guess)[:free] > APART * self._told.sd[:free]
         self._fit = min(known, found, key=lambda fit: fit.chi_square)
-        self._alone, self._told = self._window_alone()
+        self._alone = self._window_alone()
+        self._told = self._tell()
         if not apart.any():
             return Outcome.AGREED
         if abs(found.chi_square - known.chi_square) <= ALIKE * max(self._cost(), 1.0) ** 2:
             return Outcome.AMBIGUOUS
         return Outcome.SWARM_WAS_BETTER if self._fit is found else Outcome.POLISH_WAS_BETTER
 
+    def _best_of(self, searched: Found) -> Polished:
+        """The polished best of where the swarm came to rest and of starts all over the bounds.
+
+        A swarm looks at parameters alone, from the first record on; where an initial state is not measured, or the
+        valley is narrow, it rests on a slope that only the polish goes down.
+        """
+        objective, problem = self._objective, self._problem
+        spread = scattered(*problem.bounds, SCATTERED, problem.seed + self._window.index)
+        best: Polished | None = None
+        for start in (searched.values, *searched.others[1:OTHERS], *spread):
+            found = polish(objective, objective.guess(start), GLANCE)
+            self._evaluations += found.evaluations
+            best = found if best is None or found.chi_square < best.chi_square else best
+        if best is None:
+            raise AssertionError("a swarm has at least one particle")
+        free = objective.free
+        return self._polish(self._informed.guess(best.guess[:free], best.guess[free:]))
+
     def _result(self, outcome: Outcome) -> WindowEstimate:
         objective, problem = self._objective, self._problem
         cost = self._cost()
-        predictions = objective.predict(np.vstack([self._still(self._fit), objective.guess(problem.nominal)]))
+        configured = objective.predict(objective.guess(problem.nominal)[None])[0]
+        predicted, last_state = objective.followed(self._fit.guess)
         return WindowEstimate(
             parameters=self._parameters(outcome),
             evidence=self._informed.evidence(self._fit, cost),
             outcome=outcome,
             cost=cost,
             chi_square=cost**2 * objective.count,
-            rmse_configured=tuple(map(float, objective.rmse(predictions[1]))),
-            rmse_estimated=tuple(map(float, objective.rmse(predictions[0]))),
+            rmse_configured=tuple(map(float, objective.rmse(configured))),
+            rmse_estimated=tuple(map(float, objective.rmse(predicted))),
             measured=objective.measured,
-            predicted=predictions[0],
+            predicted=predicted,
+            last_state=last_state,
             generations=self._generations,
             evaluations=self._evaluations,
         )

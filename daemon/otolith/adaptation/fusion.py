@@ -18,8 +18,9 @@ from otolith.adaptation.prior import Evidence, Prior, vague
 from otolith.adaptation.problem import Problem
 
 AGITATIONS = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: how much a trend strays, in shares of the parameter
-MEMORY = 1000.0  # s: a trend that nothing confirms dies away, so that no held value runs off
+MEMORY = 300.0  # s: a trend that nothing confirms dies away, so that no held value runs off
 STAY = 0.97  # probability that from one window to the next the same model holds
+CALMEST = 1  # levels under the liveliest parameter's
 LIVELIEST = len(AGITATIONS) - 1
 FIRST_LEVEL = 2
 CALMER = 1.5  # how much likelier a calmer model must be to be believed: calm is the assumption that does harm
@@ -65,13 +66,17 @@ def begin_belief(problem: Problem) -> Belief:
 
 
 def _around(centre: Levels) -> Levels:
-    """(free,) -> (models, free): itself, and others in which one parameter is calmer, livelier or runs away."""
+    """(free,) -> (models, free): itself, and others in which one parameter is calmer, livelier or runs away.
+
+    None is much calmer than the liveliest: what drifts could be any of those it is traded with.
+    """
     models = [centre]
     for parameter, level in enumerate(centre):
         for other in sorted({max(level - 1, 0), min(level + 1, LIVELIEST), LIVELIEST} - {level}):
             models.append(centre.copy())
             models[-1][parameter] = other
-    return np.array(models)
+    bank = [np.maximum(model, model.max() - CALMEST) for model in models]
+    return np.array(list({tuple(model.tolist()): None for model in bank}))  # each once, the centre first
 
 
 def carried(belief: Belief, end: float) -> Belief:

@@ -10,7 +10,7 @@ from otolith.acquisition.window import Array, Mask, Window
 from otolith.adaptation.disturbance import open_loop, predictor
 from otolith.adaptation.problem import Problem
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import Excitation, Noise, kernel_of
+from otolith.twin.kernel import Correction, Excitation, Noise, kernel_of
 
 INITIAL_STATE_REACH = 10.0  # standard deviations around the first record, in which the twin may start at least
 TRUNCATION = 1e-3  # of the noise: how large the integrator's error may be
@@ -27,8 +27,8 @@ class Objective:
     outputs of different units add up, and a cost of one means that the twin explains the window up to the noise.
     """
 
-    def __init__(self, problem: Problem, window: Window, start: Array) -> None:
-        """``start`` (free parameters,): around it the predictor is made."""
+    def __init__(self, problem: Problem, window: Window, start: Array, initial: Array | None = None) -> None:
+        """``start`` (free parameters,): around it the predictor is made, and around ``initial`` (states,) if given."""
         twin = problem.twin
         self.kernel = kernel_of(twin)
         self.measured = np.column_stack([window.column(entry.name) for entry in twin.outputs])
@@ -49,20 +49,27 @@ class Objective:
         self._open_loop = problem.open_loop
         self._excitation = Excitation(self._inputs, window.sample_period)
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
-        self.centre(start, self._first)
+        self.centre(start, self._first if initial is None else initial)
 
     def centre(self, parameters: Array, initial: Array) -> None:
         """Make the predictor around these (free parameters,), (states,): substeps, gain, whitening."""
         full = self.parameters(parameters[None])[0]
-        scales = TRUNCATION * self.noise.outputs
+        allowed = TRUNCATION * self.noise.outputs
         plain = replace(self._excitation, gain=None, substeps=1)
-        plain = replace(plain, substeps=self.kernel.substeps(full, initial, plain, scales))
+        while True:
+            made = self._correction(full, initial, plain)
+            driven = replace(plain, gain=made.gain)
+            substeps = self.kernel.substeps(full, initial, driven, allowed)
+            if substeps <= plain.substeps:  # else the gain was made by an integrator that is too coarse
+                break
+            plain = replace(plain, substeps=substeps)
+        self.whitening, self.log_determinant = made.whitening, made.log_determinant
+        self._excitation = driven
+
+    def _correction(self, parameters: Array, initial: Array, plain: Excitation) -> Correction:
         if self._open_loop:
-            made = open_loop(self.kernel, plain, self.noise)
-        else:
-            made = predictor(self.kernel, full, initial, plain, self.noise)
-        self._whitening, self.log_determinant = made.whitening, made.log_determinant
-        self._excitation = replace(plain, gain=made.gain)
+            return open_loop(self.kernel, plain, self.noise)
+        return predictor(self.kernel, parameters, initial, plain, self.noise)
 
     @contextmanager
     def reading(self, output: int, gain: float, offset: float) -> Iterator["Objective"]:
@@ -115,7 +122,7 @@ class Objective:
             found = self.kernel.sensitivities(parameters, initial, self._excitation, drifts=drifts)
             residuals = self.residuals(found.outputs[None])[0].ravel()
             slopes = np.where(self.present[..., None], found.slopes[:, :, columns], 0.0)
-            jacobian = -np.matmul(self._whitening, slopes).reshape(len(residuals), -1)
+            jacobian = -np.matmul(self.whitening, slopes).reshape(len(residuals), -1)
         if np.isfinite(residuals).all() and np.isfinite(jacobian).all():
             return residuals, jacobian
         return np.full(len(residuals), HOPELESS / len(residuals)), np.zeros(jacobian.shape)
@@ -124,6 +131,13 @@ class Objective:
         """(particles, guess) -> (particles, records, outputs), one step ahead, in the units of the twin."""
         initial = guesses[:, self.free :]
         return self.kernel.simulate(self.parameters(guesses), initial, self._excitation)
+
+    def followed(self, guess: Array) -> tuple[Array, Array]:
+        """(parameters at the end, drifts, initial state) -> prediction (records, outputs) and last state (states,)."""
+        free = self.free
+        parameters = self.parameters(guess[None])[0]
+        found = self.kernel.sensitivities(parameters, guess[2 * free :], self._excitation, drifts=True)
+        return found.outputs + found.slopes[:, :, self._drifts] @ guess[free : 2 * free], found.last
 
     def simulate(self, guess: Array) -> Array:
         """(guess,) -> (records, outputs) in open loop, from its initial state on."""
@@ -134,7 +148,7 @@ class Objective:
     def residuals(self, predicted: Array) -> Array:
         """(particles, records, outputs): whitened innovations, zero where not measured."""
         innovations = np.where(self.present, self.measured - predicted, 0.0)
-        found: Array = np.einsum("rop,nrp->nro", self._whitening, innovations)
+        found: Array = np.einsum("rop,nrp->nro", self.whitening, innovations)
         return found
 
     def cost(self, guesses: Array) -> Array:
@@ -182,11 +196,11 @@ def _initial_state(twin: Definition, measured: Array, present: Mask, noise: Arra
     outputs = [entry.name for entry in twin.outputs]
     rows = []
     for state in twin.states:
-        if state.name in outputs:
-            index = outputs.index(state.name)
+        index = outputs.index(state.name) if state.name in outputs else None
+        if index is not None and present[:, index].any():
             seen = measured[present[:, index], index]
-            first = float(seen[0]) if len(seen) else state.initial
-            reach = max(INITIAL_STATE_REACH * noise[index], float(np.ptp(seen)) if len(seen) else 0.0)
+            first = float(seen[0])
+            reach = max(INITIAL_STATE_REACH * noise[index], float(np.ptp(seen)))
             rows.append((first - reach, first, first + reach))
         else:
             rows.append((state.low, state.initial, state.high))

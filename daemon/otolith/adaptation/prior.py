@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
+from otolith.adaptation.curvature import bends, discounted
 from otolith.adaptation.objective import Objective
 from otolith.adaptation.polish import Polished
 from otolith.adaptation.problem import Problem
@@ -95,10 +96,17 @@ class Informed:
         scale = (self.high - self.low)[count:]
         states, singular, _ = np.linalg.svd(jacobian[:, count:] * scale, full_matrices=False)
         seen = states[:, singular > UNSEEN * max(singular.max(initial=0.0), 1.0)]
-        both = np.column_stack([jacobian[:, :count], residuals])
-        triangle = np.linalg.qr(both - seen @ (seen.T @ both), mode="r")
-        padded = np.zeros((count, count + 1))
-        rows = min(count, len(triangle))
-        padded[:rows] = triangle[:rows]
-        padded /= max(cost, 1.0)
-        return Evidence(fit.guess[:count], padded[:, :count], padded[:, count])
+        bent = self._bends(fit)
+        both = np.column_stack([jacobian[:, :count], residuals, bent])
+        both -= seen @ (seen.T @ both)
+        directions, triangle = np.linalg.qr(both[:, :count])
+        rest = directions.T @ both[:, count:]
+        root, rest = discounted(triangle / max(cost, 1.0), rest[:, 0] / max(cost, 1.0), rest[:, 1:])
+        return Evidence(fit.guess[:count], root, rest)
+
+    def _bends(self, fit: Polished) -> Array:
+        """(residuals, directions) how the window bends away from the linear picture around ``fit``."""
+        count = len(self._mean)
+        free = count // 2
+        still = np.concatenate([np.arange(free), np.arange(count, len(fit.guess))])
+        return bends(self._objective, fit.guess[still], fit.jacobian[:, still])

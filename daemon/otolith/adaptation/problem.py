@@ -25,6 +25,16 @@ class SwarmOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class WindowOptions:
+    """How many records a window has."""
+
+    records: int = 200
+    """Of the first, and of all if there is nothing to choose."""
+    shortest: int = 200
+    longest: int = 200
+
+
+@dataclass(frozen=True, slots=True)
 class Problem:
     """A machine's estimation problem."""
 
@@ -43,6 +53,7 @@ class Problem:
     """The paper's cost: nothing corrects the twin within a window, whatever disturbs the machine."""
     determined_within: float = 0.1
     """A parameter is determined when the half of its 95 % interval is at most this share of its nominal value."""
+    window: WindowOptions = WindowOptions()
     swarm: SwarmOptions = SwarmOptions()
     seed: int = 1
 

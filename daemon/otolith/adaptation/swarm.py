@@ -13,6 +13,8 @@ from otolith.acquisition.window import Array
 from otolith.adaptation.objective import Objective
 from otolith.adaptation.problem import SwarmOptions
 
+WIDE = 10.0  # ratio of the bounds from which on a parameter is searched for by its order of magnitude
+
 
 @dataclass(frozen=True, slots=True)
 class Found:
@@ -20,6 +22,8 @@ class Found:
 
     values: Array
     """(free parameters,)."""
+    others: Array
+    """(particles, free parameters) where the other particles came to rest, the best first."""
     cost: float
     generations: int
     evaluations: int
@@ -56,4 +60,17 @@ def search(objective: Objective, options: SwarmOptions, start: Array, seed: int)
         chi_square = objective.count * algorithm.pop.get("F")[:, 0] ** 2
         converged = bool(np.ptp(chi_square) <= options.tolerance * max(float(chi_square.min()), 1.0))
     winner = algorithm.opt[0]
-    return Found(winner.X.copy(), float(winner.F[0]), generations, algorithm.evaluator.n_eval, converged)
+    order = np.argsort(algorithm.pop.get("F")[:, 0], kind="stable")
+    rest: Array = algorithm.pop.get("X")[order].copy()
+    return Found(winner.X.copy(), rest, float(winner.F[0]), generations, algorithm.evaluator.n_eval, converged)
+
+
+def scattered(low: Array, high: Array, count: int, seed: int) -> Array:
+    """(count, free) starts all over the bounds, evenly in orders of magnitude where both bounds have the same sign."""
+    random = np.random.default_rng(seed)
+    share = (np.argsort(random.random((len(low), count)), axis=1).T + random.random((count, len(low)))) / count
+    small, large = np.minimum(np.abs(low), np.abs(high)), np.maximum(np.abs(low), np.abs(high))
+    by_order = (low * high > 0.0) & (large > WIDE * small)
+    ratio = np.where(by_order, large / np.where(by_order, small, 1.0), 1.0)
+    found: Array = np.where(by_order, np.sign(high) * small * ratio**share, low + (high - low) * share)
+    return found

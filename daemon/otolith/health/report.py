@@ -71,6 +71,8 @@ class ParameterDocument(Closed):
     """How far its interval has come from the bounds to what is asked for, 0 to 1."""
     identifiability: Identifiability | None = None
     reason: str = ""
+    advice: str | None = None
+    """What move of the machine would pin it down, if it is not."""
 
 
 class FitDocument(Closed):

@@ -8,8 +8,8 @@ from otolith.adaptation.information import QUANTILE, Identifiability, ParameterE
 from otolith.health.report import ParameterDocument, Status
 from otolith.twin.definition import Parameter
 
-CONTRIBUTES = 0.9  # of its variance must be left at most, if a window that does not pin a parameter estimates it
-STILL_CONTRIBUTES = 0.97  # the same for a parameter that the window before estimated
+CONTRIBUTES = 0.98  # of its variance must be left at most, if a window that does not pin a parameter estimates it
+STILL_CONTRIBUTES = 0.995  # the same for a parameter that the window before estimated
 STILL_DETERMINED = 2.0  # times the interval that is asked for: what a window may leave to one estimated before
 INVALID_AFTER = 2  # windows in a row that contradict the twin
 FORGOTTEN = 0.5  # of the width of the bounds: an interval this wide is no knowledge
@@ -107,6 +107,8 @@ def _status(known: bool, allowed: float, fused: Fused, heard: Heard, before: Sta
         return Status.UNESTIMATED
     if not heard.taught or estimate is None:
         return Status.HELD
+    if not before.known:
+        return Status.ESTIMATED
     stays = before.status is Status.ESTIMATED
     pinned = QUANTILE * estimate.sd <= allowed * (STILL_DETERMINED if stays else 1.0)
     helped = fused.kept <= (STILL_CONTRIBUTES if stays else CONTRIBUTES)

@@ -1,0 +1,101 @@
+"""A day of healthy running, simulated and adapted to: how often something is found that is not there.
+
+    python -m benchmarks.healthy_day --hours 24
+
+Twice: with set-points that change, and at constant speed. Sensors have noise and 12-bit converters; resistance and
+damping are unknown. What must not happen is a step of a parameter; windows held back for a while are told as well.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.heart import adapt
+from otolith.plan import load_plan
+from otolith.state import begin
+from otolith_drivers.plant.plants import load_scenario, simulate
+from otolith_drivers.plant.scenario import Scenario
+
+CONFIG = Path(__file__).parents[1] / "config"
+SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
+QUANTA = np.array([0.0, 0.0, 20.0 / 4096, 100.0 / 4096])  # A, rad/s
+RECORDS = 200
+GOOD = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
+
+
+def scenarios() -> dict[str, Scenario]:
+    """Without a fault: with the demo's set-points, and at one speed."""
+    demo: Any = load_scenario(CONFIG / "scenarios" / "demo.toml").model_copy(update={"faults": ()})
+    first = demo.set_points[0]
+    return {"excited": demo, "constant speed": demo.model_copy(update={"set_points": (first,), "repeat_every": None})}
+
+
+def windows(scenario: Scenario, count: int) -> Iterator[Window]:
+    """As the daemon would cut them."""
+    ticks = simulate(scenario)
+    for index in range(count):
+        values = np.array([[tick.measured[name] for name in SIGNALS.values()] for tick in islice(ticks, RECORDS)])
+        steps = np.where(QUANTA > 0.0, QUANTA, 1.0)
+        values = np.where(QUANTA > 0.0, np.rint(values / steps) * steps, values)
+        missing = np.zeros(values.shape, dtype=np.bool_)
+        start = index * RECORDS * scenario.sample_period
+        yield Window(index, start, scenario.sample_period, tuple(SIGNALS), values, missing, GOOD)
+
+
+def run(scenario: Scenario, hours: float) -> dict[str, Any]:
+    """Lessons, statuses, and how far R_a and D strayed from the truth."""
+    plan = load_plan(CONFIG / "dc-motor.toml", with_driver=False)
+    twin = plan.twin
+    free = tuple(twin.parameter(name) for name in ("R_a", "D"))
+    known = tuple((entry.name, entry.nominal) for entry in twin.parameters if entry not in free)
+    problem = type(plan.problem)(twin, known, free, plan.problem.noise, plan.problem.input_noise)
+    state = begin("motor", "bench", problem)
+    lessons: Counter[str] = Counter()
+    statuses: Counter[str] = Counter()
+    errors, pulls, seconds = [], [], []
+    for window in windows(scenario, round(hours * 3600.0 / (RECORDS * scenario.sample_period))):
+        begun = time.perf_counter()
+        state, report = adapt(state, window)
+        seconds.append(time.perf_counter() - begun)
+        document = report.document
+        lessons["none" if document.fit is None else document.fit.lesson.name] += 1
+        for entry in document.parameters.values():
+            statuses[entry.status] += 1
+        found = [(entry.value, entry.sd, entry.nominal) for entry in document.parameters.values()]
+        if all(value is not None for value, _, _ in found):
+            errors.append([abs(value / nominal - 1.0) for value, _, nominal in found if value is not None])
+            pulls.append([(value - nominal) / sd for value, sd, nominal in found if value is not None and sd])
+    return {
+        "hours": hours,
+        "windows": sum(lessons.values()),
+        "lessons": dict(lessons),
+        "statuses": dict(statuses),
+        "largest_error": np.max(errors, axis=0).tolist(),
+        "median_error": np.median(errors, axis=0).tolist(),
+        "intervals_that_hold": np.mean(np.abs(pulls) <= 1.959964, axis=0).tolist(),
+        "median_seconds": float(np.median(seconds)),
+        "p99_seconds": float(np.quantile(seconds, 0.99)),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", type=float, default=24.0)
+    parser.add_argument("--only", choices=sorted(scenarios()))
+    options = parser.parse_args()
+    found = {name: run(each, options.hours) for name, each in scenarios().items() if options.only in (None, name)}
+    print(json.dumps(found, indent=2))
+    return 1 if any("STEPPED" in each["lessons"] for each in found.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
