@@ -12,6 +12,8 @@ from types import FrameType
 import click
 
 from otolith import __version__
+from otolith.cli_noise import noise
+from otolith.cli_paper import paper
 from otolith.cli_twin import twin
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -19,7 +21,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 EXIT_CODES = """\b
 Exit codes:
   0    done; run and plant also when stopped by SIGTERM
-  1    the demo's estimate was wrong
+  1    the demo's estimate was wrong, or a target of paper was missed
   2    a file, option, bus or port cannot be used; the message says which and what to do
   130  interrupted by Ctrl-C (128 + the number of any other signal)"""
 
@@ -232,6 +234,8 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return code if stop.number is None else stop.code()
 
 
+cli.add_command(noise)
+cli.add_command(paper)
 cli.add_command(twin)
 
 

@@ -23,6 +23,7 @@ from otolith.adaptation.swarm import Found, scattered, search
 AT_BOUND = 1e-4  # of the width of the bounds
 SURPRISING = 1.5  # cost of a warm fit beyond which the swarm looks whether there is a better valley
 OTHERS, SCATTERED, GLANCE = 4, 12, 15  # starts from the swarm, all over the bounds, and their steps
+WORTH = 20_000  # steps of the integrator in a prediction, beyond which fewer starts are tried
 ALONE_STEPS = 12  # of the polish of the window alone, which begins where the window with all before it ended
 APART = 5.0  # standard deviations between two results that are not the same
 ALIKE = 9.0  # in χ²: what two explanations of a window may differ by and be equally good
@@ -145,9 +146,11 @@ class _Fit:
         valley is narrow, it rests on a slope that only the polish goes down.
         """
         objective, problem = self._objective, self._problem
-        spread = scattered(*problem.bounds, SCATTERED, problem.seed + self._window.index)
+        count = min(SCATTERED, SCATTERED * WORTH // max(objective.work, 1))
+        spread = scattered(*problem.bounds, count, problem.seed + self._window.index)
         best: Polished | None = None
-        for start in (searched.values, *searched.others[1:OTHERS], *spread):
+        others = searched.others[1 : OTHERS if count else 1]
+        for start in (searched.values, *others, *spread):
             found = polish(objective, objective.guess(start), GLANCE)
             self._evaluations += found.evaluations
             best = found if best is None or found.chi_square < best.chi_square else best

@@ -83,6 +83,11 @@ class Objective:
         finally:
             self.measured, self._excitation = measured, excitation
 
+    @property
+    def work(self) -> int:
+        """Steps of the integrator in one prediction."""
+        return len(self.measured) * self._excitation.substeps
+
     def guess(self, parameters: Array) -> Array:
         """(free parameters,) -> a guess that starts at the first record."""
         return np.concatenate([parameters, self._first])

@@ -53,8 +53,12 @@ def polish(objective: LeastSquares, start: Array, steps: int = STEPS) -> Polishe
         trial = np.minimum(np.maximum(guess + step, low), high)
         foretold = residuals + jacobian @ (trial - guess)
         if chi_square - float(foretold @ foretold) <= DONE * max(1.0, 1e-6 * chi_square):
-            converged = True
-            break
+            cut_off = (step != 0.0) & ((trial <= low) | (trial >= high))
+            converged = not cut_off.any()
+            if converged or damping > MOST_DAMPING:
+                break
+            damping = max(100.0 * damping, FIRST_DAMPING)  # a long step that a bound cuts off may lead uphill
+            continue
         new_residuals, new_jacobian = objective.linearised(trial)
         evaluations += 1
         new = float(new_residuals @ new_residuals)
@@ -73,15 +77,20 @@ def polish(objective: LeastSquares, start: Array, steps: int = STEPS) -> Polishe
 
 
 def _step(residuals: Array, jacobian: Array, guess: Array, objective: LeastSquares, damping: float) -> Array:
-    """The damped step, with what leans on a bound held there."""
+    """The damped step; what leans on a bound is held there, and what would go beyond one goes as far as to it."""
     gradient = jacobian.T @ residuals
     free = ~(((guess <= objective.low) & (gradient > 0.0)) | ((guess >= objective.high) & (gradient < 0.0)))
     step = np.zeros(len(guess))
-    if not free.any():
-        return step
-    normal = jacobian[:, free].T @ jacobian[:, free]
-    weight = np.maximum(np.diag(normal), 1e-30)
-    root = np.sqrt(weight)
-    scaled = normal / np.outer(root, root) + damping * np.eye(len(weight))
-    step[free] = -np.linalg.solve(scaled, gradient[free] / root) / root
+    while free.any():
+        normal = jacobian[:, free].T @ jacobian[:, free]
+        weight = np.maximum(np.diag(normal), 1e-30)
+        root = np.sqrt(weight)
+        scaled = normal / np.outer(root, root) + damping * np.eye(len(weight))
+        step[free] = -np.linalg.solve(scaled, gradient[free] / root) / root
+        beyond = free & ((guess + step < objective.low) | (guess + step > objective.high))
+        if not beyond.any():
+            break
+        step[beyond] = np.clip(guess + step, objective.low, objective.high)[beyond] - guess[beyond]
+        free &= ~beyond
+        gradient = jacobian.T @ (residuals + jacobian[:, ~free] @ step[~free])
     return step

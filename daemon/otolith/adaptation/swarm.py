@@ -13,6 +13,7 @@ from otolith.acquisition.window import Array
 from otolith.adaptation.objective import Objective
 from otolith.adaptation.problem import SwarmOptions
 
+MOST_WORK = 300_000_000  # steps of the integrator in one search: seconds, where the data is absurd or the window huge
 WIDE = 10.0  # ratio of the bounds from which on a parameter is searched for by its order of magnitude
 
 
@@ -54,7 +55,8 @@ def search(objective: Objective, options: SwarmOptions, start: Array, seed: int)
     )
     algorithm.setup(problem, termination=NoTermination(), seed=seed)
     generations, converged = 0, False
-    while generations < options.generations and not converged:
+    most = max(1, min(options.generations, MOST_WORK // (options.size * max(objective.work, 1))))
+    while generations < most and not converged:
         algorithm.next()
         generations += 1
         chi_square = objective.count * algorithm.pop.get("F")[:, 0] ** 2

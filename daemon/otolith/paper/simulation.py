@@ -58,17 +58,19 @@ def plan_of(row: Row) -> Plan:
 
 
 def problem_of(row: Row, plan: Plan, deviations: Mapping[str, float]) -> Problem:
-    """The plan's, with the row's parameter sought and all others known, told ``deviations`` of the sensors."""
+    """The plan's, with the row's parameter sought and all others known, told ``deviations`` of the sensors.
+
+    An input that is measured by an ideal sensor is exact; outputs are weighed as the machine file says.
+    """
     problem, twin = plan.problem, plan.twin
     nominal = dict(problem.known) | {entry.name: entry.nominal for entry in problem.free}
     sought = next((entry for entry in problem.free if entry.name == row.parameter), twin.parameter(row.parameter))
-    inputs = problem.input_noise or (0.0,) * len(twin.inputs)
     return replace(
         problem,
         known=tuple((name, value) for name, value in nominal.items() if name != row.parameter),
         free=(replace(sought, nominal=nominal[row.parameter]),),
         noise=tuple(deviations.get(entry.name, own) for entry, own in zip(twin.outputs, problem.noise, strict=True)),
-        input_noise=tuple(deviations.get(entry.name, own) for entry, own in zip(twin.inputs, inputs, strict=True)),
+        input_noise=tuple(deviations.get(entry.name, 0.0) for entry in twin.inputs),
     )
 
 
