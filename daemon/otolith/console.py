@@ -108,6 +108,8 @@ def _words(document: ReportDocument) -> list[Text]:
     for name, parameter in document.parameters.items():
         if parameter.reason and not document.window.quality.reasons:
             lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
+        if parameter.advice:
+            lines.append(Text(f"{name}: {parameter.advice}", style="cyan"))
     if document.fit is not None:
         errors = ", ".join(f"{name} {value:.3g}" for name, value in document.fit.rmse_estimated.items())
         explained = "explained up to the noise" if document.fit.explained else "more than noise is left"

@@ -39,7 +39,7 @@ ROWS = 15  # of the table at the end
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One parameter in one window: injected (mean over the window) against found."""
+    """One parameter in one window: injected (at its end, as reports speak of it) against found."""
 
     window: int
     end: float
@@ -70,7 +70,7 @@ def compare(reports: Sequence[ReportDocument], truth: Mapping[str, Sequence[floa
                 continue
             found = parameter.value if parameter.status is Status.ESTIMATED else None
             half = None if found is None or parameter.sd is None else QUANTILE * parameter.sd
-            injected = float(np.asarray(truth[name])[inside].mean())
+            injected = float(np.asarray(truth[name])[inside][-1])
             compared.append(Comparison(report.window.index, report.window.end, name, injected, found, half))
     return compared
 

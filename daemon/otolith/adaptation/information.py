@@ -13,7 +13,7 @@ SINGULAR = 1e-8  # relative singular value under which a direction is not seen a
 BLIND = 1e-4  # share in an unseen direction beyond which a parameter is not seen either
 FLAT = 1e-9  # a sensitivity this far under the largest is none
 PUSHED = 0.25  # of the width of the bounds: a wider interval does not tell on which side of a bound a value lies
-TRADED = 0.98  # correlation beyond which two parameters cannot be told apart
+TRADED = 0.95  # correlation beyond which two parameters cannot be told apart
 
 
 class Identifiability(StrEnum):

@@ -27,10 +27,12 @@ class Drift(Closed):
     amount: str
     """In a unit of the parameter."""
     rate: Annotated[float, BeforeValidator(Quantity("1/s", -10.0, 10.0))]
+    until: Seconds = 1e9
+    """From then on the parameter stays where it has come to: an exponential has no other end."""
 
     def change(self, times: Array, amount: float) -> Array:
         """What is added to the parameter at ``times`` (s), in its unit."""
-        return amount * np.expm1(self.rate * np.maximum(times - self.start, 0.0))
+        return amount * np.expm1(self.rate * np.maximum(np.minimum(times, self.until) - self.start, 0.0))
 
 
 class Step(Closed):
