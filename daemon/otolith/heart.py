@@ -68,11 +68,14 @@ def _learn(state: State, window: Window) -> Learned:
     warm = any(entry.known for entry in state.standing)
     found = estimate(problem, window, _start(prior, problem), prior, warm=warm)
     refused = found.cost > REFUSED
-    if not refused and not is_surprising(expected, found.evidence, problem):
+    expectable = not refused and not is_surprising(expected, found.evidence, problem)
+    if expectable and found.cost <= EXPLAINED:
         return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
     fault = wrong_scale(problem, window, prior, found.chi_square, memory.lying) if warm else None
     if fault is not None:
         return Learned(refuse(memory, fault.output), found, Lesson.SENSOR, str(fault))
+    if expectable:
+        return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
     if refused:
         return _learned(refuse(memory), found, Lesson.REFUSED)
     alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)

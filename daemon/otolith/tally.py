@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from otolith.acquisition.window import Verdict
+from otolith.adaptation.gate import Lesson
 from otolith.console import STYLES, value_cells
 from otolith.health.report import ReportDocument, Status
 
@@ -23,6 +24,7 @@ class Tally:
         self._first: ReportDocument | None = None
         self._last: ReportDocument | None = None
         self._windows = self._good = self._fitted = self._explained = 0
+        self._lessons: Counter[Lesson] = Counter()
         self._statuses: dict[str, Counter[Status]] = {}
         self._reasons: Counter[str] = Counter()
         self._examples: dict[str, str] = {}
@@ -36,6 +38,9 @@ class Tally:
         if document.fit is not None:
             self._fitted += 1
             self._explained += document.fit.explained
+            self._lessons[document.fit.lesson] += 1
+        elif document.window.quality.verdict is Verdict.GOOD:
+            self._lessons[Lesson.SENSOR] += 1
         for name, parameter in document.parameters.items():
             self._statuses.setdefault(name, Counter())[parameter.status] += 1
         for reason in document.window.quality.reasons:
@@ -74,5 +79,8 @@ class Tally:
         bad = self._windows - self._good
         explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
         yield Text(f"{self._windows} windows: {self._good} good, {bad} bad; {explained}")
+        for lesson, count in self._lessons.items():
+            if lesson is not Lesson.LEARNED:
+                yield Text(f"  {count} good, but: {lesson}", style="yellow")
         for kind, count in self._reasons.most_common(MOST_REASONS):
             yield Text(f"  {count} bad like: {self._examples[kind]}", style="red")

@@ -21,6 +21,7 @@ RECORDS = 200  # at most, of a trial
 WORTH = 0.5  # of the interval that is known: what a move must bring it down to, to be worth a word
 SUBSTEPS = 4
 TINY = 1e-12
+ELSE = " if the other inputs stay as they are"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +60,7 @@ def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[st
         enough = np.flatnonzero(reach <= allowed[index])
         best = int(enough[0]) if len(enough) else int(np.argmin(reach))
         if reach[best] <= WORTH * deviations[index]:
-            advice[entry.name] = f"{moves[best].words} would pin it down to ±{reach[best]:.2g} {entry.unit}"
+            advice[entry.name] = f"{moves[best].words} would pin it down to ±{reach[best]:.2g} {entry.unit}{ELSE}"
     return advice
 
 

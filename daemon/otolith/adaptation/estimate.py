@@ -11,6 +11,7 @@ from otolith.adaptation.information import (
     ParameterEstimate,
     Wanted,
     classify,
+    doubt,
     information,
 )
 from otolith.adaptation.objective import Objective
@@ -111,8 +112,13 @@ class _Fit:
     def _tell(self) -> Information:
         """What the window alone can know."""
         objective, alone = self._objective, self._alone
-        cost = float(np.sqrt(alone.chi_square / objective.count))
-        return information(alone.jacobian, objective.high - objective.low, cost)
+        return information(alone.jacobian, objective.high - objective.low, self._doubt())
+
+    def _doubt(self) -> float:
+        """By what standard deviations grow with what is left unexplained."""
+        objective, alone = self._objective, self._alone
+        residuals = alone.residuals.reshape(objective.measured.shape)
+        return doubt(residuals, float(np.sqrt(alone.chi_square / objective.count)))
 
     def _says_nothing(self) -> bool:
         reach = self._told.sd[: self._objective.free]
@@ -166,7 +172,7 @@ class _Fit:
         predicted, last_state = objective.followed(self._fit.guess)
         return WindowEstimate(
             parameters=self._parameters(outcome),
-            evidence=self._informed.evidence(self._fit, cost),
+            evidence=self._informed.evidence(self._fit, self._doubt()),
             outcome=outcome,
             cost=cost,
             chi_square=cost**2 * objective.count,
@@ -186,7 +192,7 @@ class _Fit:
         found = []
         allowed = self._problem.determined_within * self._problem.scale
         for index, entry in enumerate(self._problem.free):
-            wanted = Wanted(float(allowed[index]), float(width[index]), bool(at_bound[index]))
+            wanted = Wanted(float(allowed[index]), entry.unit, bool(at_bound[index]))
             verdict, reason = classify(self._told, index, objective.names, wanted)
             if outcome is Outcome.AMBIGUOUS and verdict is Identifiability.DETERMINED:
                 verdict, reason = Identifiability.WEAK, outcome.value

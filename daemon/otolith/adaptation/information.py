@@ -12,7 +12,9 @@ QUANTILE = 1.959964  # of the standard normal distribution, two-sided 95 %
 SINGULAR = 1e-8  # relative singular value under which a direction is not seen at all
 BLIND = 1e-4  # share in an unseen direction beyond which a parameter is not seen either
 FLAT = 1e-9  # a sensitivity this far under the largest is none
-PUSHED = 0.25  # of the width of the bounds: a wider interval does not tell on which side of a bound a value lies
+PUSHED = 2.0  # times the interval asked for: a wider one does not tell on which side of a bound the value lies
+LONGEST_MEMORY = 0.25  # of a window: lags over which residuals are looked at for what they have in common
+NOTICED = 1.1  # cost from which on it is looked at all: noise alone hardly gets there
 TRADED = 0.95  # correlation beyond which two parameters cannot be told apart
 
 
@@ -48,11 +50,11 @@ class ParameterEstimate:
     reason: str
 
 
-def information(jacobian: Array, width: Array, cost: float) -> Information:
+def information(jacobian: Array, width: Array, grown: float) -> Information:
     """Standard deviations (guess,) from the inverse of the Fisher information ``jacobian.T @ jacobian``.
 
     ``jacobian`` (residuals, guess) is of whitened residuals; ``width`` (guess,) scales the entries. Where the residuals
-    are larger than the noise (``cost`` above one), the standard deviations grow with them.
+    are larger than the noise, standard deviations are ``grown`` (see :func:`doubt`).
     """
     scaled = jacobian * width
     norms = np.linalg.norm(scaled, axis=0)
@@ -67,11 +69,30 @@ def information(jacobian: Array, width: Array, cost: float) -> Information:
         covariance = inverse @ inverse.T
         deviation = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
         blind = np.abs(rows[~seen]).max(axis=0, initial=0.0) > BLIND
-        sd[alive] = np.where(blind, np.inf, deviation / norms[alive] * width[alive] * max(cost, 1.0))
+        sd[alive] = np.where(blind, np.inf, deviation / norms[alive] * width[alive] * grown)
         correlation[np.ix_(alive, alive)] = np.where(
             np.outer(blind, blind), 1.0, covariance / np.outer(deviation, deviation)
         )
     return Information(sd, correlation)
+
+
+def doubt(residuals: Array, cost: float) -> float:
+    """By what standard deviations grow with what is left unexplained; ``residuals`` (records, outputs) are whitened.
+
+    What is left beyond noise lasts from record to record, so it does not average out: its long-run variance counts
+    (W. K. Newey, K. D. West, Econometrica 55, 1987), summed until the correlation ends.
+    """
+    if cost <= NOTICED:
+        return max(cost, 1.0)
+    records = len(residuals)
+    most = max(int(LONGEST_MEMORY * records), 1)
+    long_run = cost**2
+    for series in residuals.T:
+        variances = np.array([series[lag:] @ series[: records - lag] for lag in range(most)]) / max(records, 1)
+        ends = np.flatnonzero(variances <= 0.0)
+        lasting = variances[1 : int(ends[0]) if len(ends) else most]
+        long_run = max(long_run, float(variances[0] + 2.0 * lasting.sum()))
+    return float(np.sqrt(long_run)) if np.isfinite(long_run) else float(cost)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,15 +101,14 @@ class Wanted:
 
     half_width: float
     """Of the 95 % interval: what a determined parameter may have at most."""
-    width: float
-    """Distance of its bounds."""
+    unit: str
     at_bound: bool
 
 
 def classify(found: Information, index: int, names: Sequence[str], wanted: Wanted) -> tuple[Identifiability, str]:
     """The verdict on parameter ``index`` and what to say of it."""
     reach = QUANTILE * found.sd[index]
-    if wanted.at_bound and reach <= PUSHED * wanted.width:
+    if wanted.at_bound and reach <= PUSHED * wanted.half_width:
         return Identifiability.AT_BOUND, "the best value lies at the bound: widen the bounds or doubt the twin"
     if reach <= wanted.half_width:
         return Identifiability.DETERMINED, ""
@@ -99,4 +119,4 @@ def classify(found: Information, index: int, names: Sequence[str], wanted: Wante
         return Identifiability.FLAT, "the window does not depend on it"
     if row[partner] > TRADED:
         return Identifiability.TRADED, f"it can be traded with {names[partner]} (correlation {row[partner]:.3f})"
-    return Identifiability.WEAK, f"the window pins it to ±{reach:.3g} only: too little excitation"
+    return Identifiability.WEAK, f"the window pins it to ±{reach:.3g} {wanted.unit} only: too little excitation"

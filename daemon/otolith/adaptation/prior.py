@@ -89,8 +89,8 @@ class Informed:
         own = fit.residuals[: -len(self._mean)]
         return float(own @ own)
 
-    def evidence(self, fit: Polished, cost: float) -> Evidence:
-        """What the window says around ``fit``; residuals beyond the noise (``cost`` above one) make it say less."""
+    def evidence(self, fit: Polished, grown: float) -> Evidence:
+        """What the window says around ``fit``, with standard deviations ``grown`` by what is left unexplained."""
         count = len(self._mean)
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
         scale = (self.high - self.low)[count:]
@@ -101,7 +101,7 @@ class Informed:
         both -= seen @ (seen.T @ both)
         directions, triangle = np.linalg.qr(both[:, :count])
         rest = directions.T @ both[:, count:]
-        root, rest = discounted(triangle / max(cost, 1.0), rest[:, 0] / max(cost, 1.0), rest[:, 1:])
+        root, rest = discounted(triangle / grown, rest[:, 0] / grown, rest[:, 1:])
         return Evidence(fit.guess[:count], root, rest)
 
     def _bends(self, fit: Polished) -> Array:

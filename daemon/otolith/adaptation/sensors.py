@@ -18,7 +18,8 @@ STUCK = 0.05  # share of records beyond which a channel is not believed
 FAR = 6.0  # standard deviations that the twin must move, or be away, while the channel stands still
 STEP = 1e-4  # of gain (1) and offset (of the noise), for differences
 SENSOR_STEPS = 12  # of the polish
-LARGEST_ERROR = 0.9  # of a gain
+LARGEST_ERROR = 0.5  # of a gain
+KINDS = ((True, False), (False, True), (True, True))  # gain, offset, both: at constant speed one of them will do
 CLEARLY = 10.0  # in -2 log evidence: a Bayes factor of 150
 EXPLAINED = 1.5  # cost that a wrong scale may leave: an explanation that explains little is none
 
@@ -76,13 +77,16 @@ class SensorFault:
     gain: float
     offset: float
     unit: str
-    chi_square: float
+    evidence: float
+    """-2 log evidence (BIC), smaller is better."""
 
     def __str__(self) -> str:
         """What an engineer would say."""
+        parts = [f"{self.gain - 1.0:+.1%}"] if self.gain != 1.0 else []
+        parts += [f"{self.offset:+.2g} {self.unit}"] if self.offset != 0.0 else []
         return (
-            f"{self.output} reads {self.gain - 1.0:+.1%} and {self.offset:+.2g} {self.unit} off: that explains the "
-            "window better than any change of the parameters, so look at the sensor and its scale"
+            f"{self.output} reads {' and '.join(parts)} off: that explains the window better than any change of the "
+            "parameters, so look at the sensor and its scale"
         )
 
 
@@ -98,29 +102,32 @@ def wrong_scale(
     penalty = np.log(objective.count)
     faults = []
     for index, entry in enumerate(problem.twin.outputs):
-        scaled = _Scaled(objective, prior, index)
-        fit = polish(scaled, scaled.start(), SENSOR_STEPS)
-        if fit.chi_square <= EXPLAINED**2 * objective.count:
+        for freedom in KINDS:
+            scaled = _Scaled(objective, prior, index, freedom)
+            fit = polish(scaled, scaled.start(), SENSOR_STEPS)
             gain, offset = map(float, fit.guess[:2])
-            faults.append(SensorFault(entry.name, gain, offset, entry.unit, fit.chi_square))
+            inside = abs(gain - 1.0) < 0.99 * LARGEST_ERROR
+            if inside and fit.chi_square <= EXPLAINED**2 * objective.count:
+                evidence = fit.chi_square + sum(freedom) * penalty
+                faults.append(SensorFault(entry.name, gain, offset, entry.unit, evidence))
+    faults.sort(key=lambda fault: fault.evidence)
     for fault in faults:
         if fault.output == known:
             return fault
-    best = min(faults, key=lambda fault: fault.chi_square, default=None)
-    other = chi_square + objective.free * penalty
-    return best if best is not None and best.chi_square + 2.0 * penalty + CLEARLY < other else None
+    return faults[0] if faults and faults[0].evidence + CLEARLY < chi_square + objective.free * penalty else None
 
 
 class _Scaled:
     """The objective of one sensor's gain and offset, beside the parameters as they were known and the initial state."""
 
-    def __init__(self, objective: Objective, prior: Prior, index: int) -> None:
+    def __init__(self, objective: Objective, prior: Prior, index: int, freedom: tuple[bool, bool]) -> None:
         self._objective, self._index, free = objective, index, objective.free
         self._mean = prior.mean[:free]
         self._root = np.linalg.inv(np.linalg.cholesky(prior.covariance[:free, :free]))
         reach = max(float(np.ptp(objective.measured[:, index])), 1e3 * float(objective.noise.outputs[index]))
-        self.low = np.concatenate([[1.0 - LARGEST_ERROR, -reach], objective.low])
-        self.high = np.concatenate([[1.0 + LARGEST_ERROR, reach], objective.high])
+        gain, offset = LARGEST_ERROR * freedom[0], reach * freedom[1]
+        self.low = np.concatenate([[1.0 - gain, -offset], objective.low])
+        self.high = np.concatenate([[1.0 + gain, offset], objective.high])
 
     def start(self) -> Array:
         """(guess,) with a sensor that is right."""
