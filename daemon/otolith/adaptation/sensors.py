@@ -17,7 +17,7 @@ SHORTEST = 5  # records of the same value that are looked at
 STUCK = 0.05  # share of records beyond which a channel is not believed
 FAR = 6.0  # standard deviations that the twin must move, or be away, while the channel stands still
 STEP = 1e-4  # of gain (1) and offset (of the noise), for differences
-SENSOR_STEPS = 12  # of the polish
+SENSOR_STEPS = 30  # of the polish
 LARGEST_ERROR = 0.5  # of a gain
 KINDS = ((True, False), (False, True), (True, True))  # gain, offset, both: at constant speed one of them will do
 CLEARLY = 10.0  # in -2 log evidence: a Bayes factor of 150
@@ -126,8 +126,12 @@ class _Scaled:
         self._root = np.linalg.inv(np.linalg.cholesky(prior.covariance[:free, :free]))
         reach = max(float(np.ptp(objective.measured[:, index])), 1e3 * float(objective.noise.outputs[index]))
         gain, offset = LARGEST_ERROR * freedom[0], reach * freedom[1]
-        self.low = np.concatenate([[1.0 - gain, -offset], objective.low])
-        self.high = np.concatenate([[1.0 + gain, offset], objective.high])
+        # The initial state lies where the sensor would have shown it, had it been right.
+        wider = np.zeros(len(objective.low))
+        first = 0.5 * (objective.low + objective.high)[free:]
+        wider[free:] = 2.0 * LARGEST_ERROR * np.abs(first) + reach
+        self.low = np.concatenate([[1.0 - gain, -offset], objective.low - wider])
+        self.high = np.concatenate([[1.0 + gain, offset], objective.high + wider])
 
     def start(self) -> Array:
         """(guess,) with a sensor that is right."""
