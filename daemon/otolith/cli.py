@@ -1,19 +1,16 @@
 """The command line: speech only. Each command imports what it needs, so that ``otolith --help`` is quick."""
 
-import logging
 import math
-import os
 import re
 import signal
-import sys
 from pathlib import Path
-from types import FrameType
 
 import click
 
 from otolith import __version__
 from otolith.cli_noise import noise
 from otolith.cli_paper import paper
+from otolith.cli_process import StopSignal, log_to_stderr
 from otolith.cli_twin import twin
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -87,7 +84,7 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
     from otolith.plan import load_plan
     from otolith.service import Service
 
-    _log(verbose)
+    log_to_stderr(verbose=verbose)
     ended_by = Service(load_plan(file), listen or None, recording).run()
     return INTERRUPTED if ended_by == signal.SIGINT else 0
 
@@ -128,7 +125,7 @@ def replay(file: Path, data: Path, as_json: bool, recording: Path | None) -> int
     """
     from otolith.replay import replay
 
-    stop = _StopSignal()
+    stop = StopSignal()
     replay(file, data, recording, as_json=as_json, stopped=lambda: stop.number is not None)
     return stop.code()
 
@@ -148,7 +145,7 @@ def plant(scenario: Path, truth: Path | None, duration: float) -> int:
     from otolith_drivers.plant.plants import load_scenario
 
     loaded = load_scenario(scenario)
-    stop = _StopSignal()
+    stop = StopSignal()
     node = CanNode(loaded, truth)
     try:
         click.echo(f"{loaded.plant} on {loaded.bus.title()}, frames of {loaded.dbc.name}; Ctrl-C ends it", err=True)
@@ -181,7 +178,7 @@ def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
     """
     from otolith.watch import watch_reports
 
-    stop = _StopSignal()
+    stop = StopSignal()
     watch_reports(connect, machine, as_json=as_json, stopped=lambda: stop.number is not None)
     return stop.code()
 
@@ -227,7 +224,7 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     from otolith.paths import examples_directory
 
     examples = examples_directory()
-    stop = _StopSignal()
+    stop = StopSignal()
     machine = machine or examples / "dc-motor.toml"
     scenario = scenario or examples / "scenarios" / "demo.toml"
     code = Demo(machine, scenario, duration, as_json=as_json).run(lambda: stop.number is not None)
@@ -237,40 +234,3 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
 cli.add_command(noise)
 cli.add_command(paper)
 cli.add_command(twin)
-
-
-class _StopSignal:
-    """Remembers the signal that asks this command to end."""
-
-    def __init__(self) -> None:
-        self.number: int | None = None
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves SIGHUP
-                signal.signal(number, self._take)
-
-    def code(self, clean: int | None = None) -> int:
-        """The exit code, as a shell counts signals; 0 for the signal that is the ordinary way to end."""
-        return 0 if self.number is None or self.number == clean else 128 + self.number
-
-    def _take(self, number: int, _: FrameType | None) -> None:
-        self.number = number
-
-
-def _log(verbose: bool) -> None:
-    """To standard error; under systemd with the priority that journald understands."""
-    handler = logging.StreamHandler(sys.stderr)
-    if "JOURNAL_STREAM" in os.environ:
-        handler.setFormatter(_Journal("%(name)s: %(message)s"))
-    else:
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
-    logging.basicConfig(level=logging.WARNING, handlers=[handler])
-    logging.getLogger("otolith").setLevel(logging.DEBUG if verbose else logging.INFO)
-    logging.getLogger("otolith_drivers").setLevel(logging.DEBUG if verbose else logging.INFO)
-
-
-class _Journal(logging.Formatter):
-    PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
-
-    def format(self, record: logging.LogRecord) -> str:
-        priority = next(number for level, number in self.PRIORITIES if record.levelno >= level)
-        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
