@@ -23,8 +23,11 @@ from otolith.state import State
 
 FEWEST_RECORDS = 5
 LARGEST = 1e12  # of a value, in the unit of its signal: no sensor says that
+NEVER = "are the signals and [noise] what the machine file says, in unit and size?"
 SCATTERED = 3.0  # ratio of variances: windows disagree that much more than they say
-CONTRADICTORY = "windows disagree with each other {:.1f} times more than they should: the twin lacks something"
+CONTRADICTORY = (
+    "windows disagree with each other {:.1f} times more than they should: the twin or [noise] lacks something"
+)
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
 
 
@@ -77,7 +80,8 @@ def _learn(state: State, window: Window) -> Learned:
     if expectable:
         return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
     if refused:
-        return _learned(refuse(memory), found, Lesson.REFUSED)
+        learned = _learned(refuse(memory), found, Lesson.REFUSED)
+        return learned if warm else replace(learned, reason=f"{learned.reason}; {NEVER}")
     alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
     after, lesson = doubt(memory, expected, alone.evidence, problem)
     return _learned(after, alone, lesson)
