@@ -13,12 +13,13 @@ from otolith.adaptation.estimate import WindowEstimate, estimate
 from otolith.adaptation.fusion import carried, overall
 from otolith.adaptation.gate import REFUSED, Lesson, Memory, doubt, is_surprising, learn, refuse
 from otolith.adaptation.length import Need, next_records
+from otolith.adaptation.objective import EXPLAINED
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
 from otolith.adaptation.sensors import stuck, wrong_scale
 from otolith.adaptation.spikes import without_spikes
 from otolith.health.report import Report
-from otolith.reporting import EXPLAINED, Learned, document_of, traces_of
+from otolith.reporting import Learned, document_of, traces_of
 from otolith.state import State
 
 FEWEST_RECORDS = 5

@@ -9,6 +9,7 @@ from otolith.adaptation.advice import Situation, advise
 from otolith.adaptation.estimate import WindowEstimate
 from otolith.adaptation.fusion import carried, overall
 from otolith.adaptation.gate import Lesson, Memory
+from otolith.adaptation.objective import EXPLAINED
 from otolith.adaptation.problem import Problem
 from otolith.health.report import (
     CostDocument,
@@ -21,8 +22,6 @@ from otolith.health.report import (
 )
 from otolith.health.status import Fused, Heard, Standing, publish
 from otolith.state import State
-
-EXPLAINED = 1.5  # cost (RMSE over noise) up to which the residual counts as noise
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from otolith.adaptation.information import (
     doubt,
     information,
 )
-from otolith.adaptation.objective import Objective
+from otolith.adaptation.objective import EXPLAINED, Objective
 from otolith.adaptation.outcome import Outcome
 from otolith.adaptation.polish import Polished, polish
 from otolith.adaptation.prior import Evidence, Informed, Prior, vague
@@ -22,7 +22,6 @@ from otolith.adaptation.problem import Problem
 from otolith.adaptation.swarm import Found, scattered, search
 
 AT_BOUND = 1e-4  # of the width of the bounds
-SURPRISING = 1.5  # cost of a warm fit beyond which the swarm looks whether there is a better valley
 OTHERS, SCATTERED, GLANCE = 4, 12, 15  # starts from the swarm, all over the bounds, and their steps
 WORTH = 20_000  # steps of the integrator in a prediction, beyond which fewer starts are tried
 ALONE_STEPS = 12  # of the polish of the window alone, which begins where the window with all before it ended
@@ -80,7 +79,7 @@ class _Fit:
 
     def run(self, *, warm: bool) -> WindowEstimate:
         outcome = Outcome.CONTINUED
-        unexplained = self._cost() > SURPRISING
+        unexplained = self._cost() > EXPLAINED
         if unexplained or not (warm or self._says_nothing()):
             outcome = self._search()
         elif not warm:

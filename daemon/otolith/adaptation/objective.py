@@ -12,6 +12,7 @@ from otolith.adaptation.problem import Problem
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import Correction, Excitation, Noise, kernel_of
 
+EXPLAINED = 1.5  # cost up to which the residual counts as noise: an explanation that leaves more explains too little
 INITIAL_STATE_REACH = 10.0  # standard deviations around the first record, in which the twin may start at least
 TRUNCATION = 1e-3  # of the noise: how large the integrator's error may be
 HOPELESS = 1e30  # the cost of a guess whose prediction is not finite: worse than any other, and finite

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.objective import Objective, quantum
+from otolith.adaptation.objective import EXPLAINED, Objective, quantum
 from otolith.adaptation.polish import polish
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
@@ -21,7 +21,6 @@ SENSOR_STEPS = 30  # of the polish
 LARGEST_ERROR = 0.5  # of a gain
 KINDS = ((True, False), (False, True), (True, True))  # gain, offset, both: at constant speed one of them will do
 CLEARLY = 10.0  # in -2 log evidence: a Bayes factor of 150
-EXPLAINED = 1.5  # cost that a wrong scale may leave: an explanation that explains little is none
 
 
 def stuck(problem: Problem, window: Window, parameters: Array) -> list[str]:
