@@ -63,7 +63,7 @@ def attempts(problem: Problem, window: Window, begin: Array) -> tuple[Attempt, .
 
     alone = polished(begin)
     begun = time.perf_counter()
-    found = search(objective, problem.swarm, begin, problem.seed + window.index).values
+    found = search(objective, problem.swarm, begin, problem.seed + window.index).places[0]
     swarm = Attempt(found, time.perf_counter() - begun + made)
     after = polished(found)
     begun = time.perf_counter()

@@ -130,4 +130,7 @@ def test_windows_that_scatter_more_than_they_say_are_believed_less() -> None:
         value = SIZE + 0.03 * float(random.standard_normal())  # three times what the window thinks
         belief = updated(carried(belief, LENGTH * index), evidence(value, 0.0, 0.01, random), PROBLEM)
     assert 2.0 < belief.scatter < 30.0
-    assert replace(belief, scatter=1.0).end == belief.end
+    credulous = updated(replace(belief, scatter=1.0), evidence(SIZE, 0.0, 0.01, random), PROBLEM)
+    doubtful = updated(belief, evidence(SIZE, 0.0, 0.01, random), PROBLEM)
+    deviations = [overall(entry, PROBLEM).covariance[0, 0] ** 0.5 for entry in (credulous, doubtful)]
+    assert deviations[0] < 0.8 * deviations[1]

@@ -22,8 +22,11 @@ from otolith.adaptation.problem import Problem
 from otolith.adaptation.swarm import Found, scattered, search
 
 AT_BOUND = 1e-4  # of the width of the bounds
-OTHERS, SCATTERED, GLANCE = 4, 12, 15  # starts from the swarm, all over the bounds, and their steps
+PARTICLES = 4  # of the swarm, the best first, that the polish starts from
+SCATTERED = 12  # starts of the polish all over the bounds
+GLANCE = 15  # steps of the polish from each of these, to see which of them is worth more
 WORTH = 20_000  # steps of the integrator in a prediction, beyond which fewer starts are tried
+SILENT = 0.25  # of the width of the bounds: standard deviation from which on a window says nothing of a parameter
 ALONE_STEPS = 12  # of the polish of the window alone, which begins where the window with all before it ended
 APART = 5.0  # standard deviations between two results that are not the same
 ALIKE = 9.0  # in χ²: what two explanations of a window may differ by and be equally good
@@ -40,8 +43,8 @@ class WindowEstimate:
     outcome: Outcome
     cost: float
     """RMSE in units of the noise."""
-    chi_square: float
-    """Of the window alone."""
+    count: float
+    """Values that were measured."""
     rmse_configured: tuple[float, ...]
     rmse_estimated: tuple[float, ...]
     measured: Array
@@ -50,6 +53,11 @@ class WindowEstimate:
     """(states,) of the twin at the last record."""
     generations: int
     evaluations: int
+
+    @property
+    def chi_square(self) -> float:
+        """Of the window alone."""
+        return self.cost**2 * self.count
 
 
 def estimate(
@@ -121,7 +129,7 @@ class _Fit:
 
     def _says_nothing(self) -> bool:
         reach = self._told.sd[: self._objective.free]
-        return not bool((reach < 0.25 * (self._objective.high - self._objective.low)[: len(reach)]).any())
+        return not bool((reach < SILENT * (self._objective.high - self._objective.low)[: len(reach)]).any())
 
     def _search(self) -> Outcome:
         problem, objective, known = self._problem, self._objective, self._fit
@@ -153,28 +161,23 @@ class _Fit:
         objective, problem = self._objective, self._problem
         count = min(SCATTERED, SCATTERED * WORTH // max(objective.work, 1))
         spread = scattered(*problem.bounds, count, problem.seed + self._window.index)
-        best: Polished | None = None
-        others = searched.others[1 : OTHERS if count else 1]
-        for start in (searched.values, *others, *spread):
-            found = polish(objective, objective.guess(start), GLANCE)
-            self._evaluations += found.evaluations
-            best = found if best is None or found.chi_square < best.chi_square else best
-        if best is None:
-            raise AssertionError("a swarm has at least one particle")
+        starts = (*searched.places[: PARTICLES if count else 1], *spread)
+        polished = [polish(objective, objective.guess(start), GLANCE) for start in starts]
+        self._evaluations += sum(found.evaluations for found in polished)
+        best = min(polished, key=lambda found: found.chi_square)
         free = objective.free
         return self._polish(self._informed.guess(best.guess[:free], best.guess[free:]))
 
     def _result(self, outcome: Outcome) -> WindowEstimate:
         objective, problem = self._objective, self._problem
-        cost = self._cost()
         configured = objective.predict(objective.guess(problem.nominal)[None])[0]
         predicted, last_state = objective.followed(self._fit.guess)
         return WindowEstimate(
             parameters=self._parameters(outcome),
             evidence=self._informed.evidence(self._fit, self._doubt()),
             outcome=outcome,
-            cost=cost,
-            chi_square=cost**2 * objective.count,
+            cost=self._cost(),
+            count=objective.count,
             rmse_configured=tuple(map(float, objective.rmse(configured))),
             rmse_estimated=tuple(map(float, objective.rmse(predicted))),
             measured=objective.measured,

@@ -123,8 +123,8 @@ class _Learning:
             fit = self._likelihood.fit(levels, window, starts)
             if not fits and fit.cost > SURPRISING:
                 objective = Objective(noisy(self._problem, levels), window, self._problem.nominal)
-                searched = search(objective, self._problem.swarm, self._problem.nominal, self._problem.seed).values
-                fit = self._likelihood.fit(levels, window, [*starts, searched])
+                searched = search(objective, self._problem.swarm, self._problem.nominal, self._problem.seed)
+                fit = self._likelihood.fit(levels, window, [*starts, searched.places[0]])
             fits.append(fit)
             starts = [self._problem.nominal, fit.guess[: len(self._problem.free)]]
         return fits

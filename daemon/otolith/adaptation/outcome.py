@@ -13,4 +13,3 @@ class Outcome(StrEnum):
     AMBIGUOUS = "swarm and polish disagree: different parameters explain the window equally well"
     NOTHING_TO_FIND = "the window says too little to search in"
     UNFINISHED = "neither swarm nor polish came to rest: the result is the best so far"
-    NOT_ESTIMATED = "not estimated"

@@ -44,11 +44,6 @@ class Evidence:
     rest: Array
     """(2 free,)."""
 
-    @property
-    def information(self) -> Array:
-        """(2 free, 2 free) the Fisher information."""
-        return np.asarray(self.root.T @ self.root)
-
 
 def vague(problem: Problem) -> Prior:
     """All that is known before the first window: the machine file's values and bounds."""

@@ -19,13 +19,12 @@ WIDE = 10.0  # ratio of the bounds from which on a parameter is searched for by 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The best parameters of a swarm."""
+    """Where a swarm came to rest."""
 
-    values: Array
-    """(free parameters,)."""
-    others: Array
-    """(particles, free parameters) where the other particles came to rest, the best first."""
+    places: Array
+    """(particles, free parameters), the best first."""
     cost: float
+    """Of the best."""
     generations: int
     evaluations: int
     converged: bool
@@ -42,7 +41,7 @@ class _Bounded(PymooProblem):  # type: ignore[misc]  # pymoo has no types
 
 
 def search(objective: Objective, options: SwarmOptions, start: Array, seed: int) -> Found:
-    """The best parameters within the bounds; ``start`` (free parameters,) is one of the first particles.
+    """Where a swarm comes to rest within the bounds; ``start`` (free parameters,) is one of the first particles.
 
     The initial state is left to the polish: here every particle starts at the first record. The inertia weight adapts
     from the given one: held fixed at the paper's 0.9, the swarm does not converge.
@@ -61,10 +60,10 @@ def search(objective: Objective, options: SwarmOptions, start: Array, seed: int)
         generations += 1
         chi_square = objective.count * algorithm.pop.get("F")[:, 0] ** 2
         converged = bool(np.ptp(chi_square) <= options.tolerance * max(float(chi_square.min()), 1.0))
-    winner = algorithm.opt[0]
-    order = np.argsort(algorithm.pop.get("F")[:, 0], kind="stable")
-    rest: Array = algorithm.pop.get("X")[order].copy()
-    return Found(winner.X.copy(), rest, float(winner.F[0]), generations, algorithm.evaluator.n_eval, converged)
+    costs = algorithm.pop.get("F")[:, 0]  # pymoo's population is each particle's best so far
+    order = np.argsort(costs, kind="stable")
+    places: Array = algorithm.pop.get("X")[order].copy()
+    return Found(places, float(costs[order[0]]), generations, algorithm.evaluator.n_eval, converged)
 
 
 def scattered(low: Array, high: Array, count: int, seed: int) -> Array:
