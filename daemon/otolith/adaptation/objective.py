@@ -1,7 +1,6 @@
 """The objective of one window: how far a guess of parameters and initial state is from what was measured."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -72,17 +71,13 @@ class Objective:
             return open_loop(self.kernel, plain, self.noise)
         return predictor(self.kernel, parameters, initial, plain, self.noise)
 
-    @contextmanager
-    def reading(self, output: int, gain: float, offset: float) -> Iterator["Objective"]:
+    def reading(self, output: int, gain: float, offset: float) -> "Objective":
         """The objective as if what ``output`` measured had been ``gain`` times the truth, and ``offset`` more."""
-        measured, excitation = self.measured, self._excitation
-        self.measured = measured.copy()
-        self.measured[:, output] = (measured[:, output] - offset) / gain
-        self._excitation = replace(excitation, measured=np.where(self.present, self.measured, np.nan))
-        try:
-            yield self
-        finally:
-            self.measured, self._excitation = measured, excitation
+        changed = copy(self)
+        changed.measured = self.measured.copy()
+        changed.measured[:, output] = (self.measured[:, output] - offset) / gain
+        changed._excitation = replace(self._excitation, measured=np.where(self.present, changed.measured, np.nan))
+        return changed
 
     @property
     def work(self) -> int:

@@ -154,8 +154,7 @@ class _Scaled:
     def _at(self, guess: Array) -> tuple[Array, Array]:
         """As if the sensor had been right: its noise is divided by the gain as well."""
         gain, offset = map(float, guess[:2])
-        with self._objective.reading(self._index, gain, offset) as objective:
-            residuals, jacobian = objective.linearised(guess[2:])
+        residuals, jacobian = self._objective.reading(self._index, gain, offset).linearised(guess[2:])
         scale = np.ones(self._objective.measured.shape)
         scale[:, self._index] = gain
         return residuals * scale.ravel(), jacobian * scale.reshape(-1, 1)
