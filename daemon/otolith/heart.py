@@ -10,7 +10,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.estimate import WindowEstimate, estimate
-from otolith.adaptation.fusion import carried, overall
+from otolith.adaptation.fusion import Belief, carried, overall
 from otolith.adaptation.gate import REFUSED, Lesson, Memory, doubt, is_surprising, learn, refuse
 from otolith.adaptation.length import Need, next_records
 from otolith.adaptation.objective import EXPLAINED
@@ -29,6 +29,7 @@ SCATTERED = 3.0  # ratio of variances: windows disagree that much more than they
 CONTRADICTORY = (
     "windows disagree with each other {:.1f} times more than they should: the twin or [noise] lacks something"
 )
+UNUSED = "window not estimated from: "
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
 
 
@@ -43,15 +44,18 @@ def adapt(state: State, window: Window) -> tuple[State, Report]:
 def _judge(state: State, window: Window) -> Learned:
     """Sampling and sensors are looked at first: what lies must not teach."""
     problem, memory = state.problem, state.memory
+    expected = carried(memory.belief, window.end)
+    before = overall(expected, problem)
+    untaught = Learned(memory, before, before)
     reasons = window.quality.reasons if window.quality.verdict is Verdict.BAD else _senseless(window)
     if reasons:
-        return Learned(memory, reason="window not estimated from: " + "; ".join(reasons))
+        return replace(untaught, reason=UNUSED + "; ".join(reasons))
     window, notes, vetoes = without_spikes(window, problem.twin, problem.noise)
     if not vetoes:
-        vetoes = stuck(problem, window, _start(overall(carried(memory.belief, window.end), problem), problem))
+        vetoes = stuck(problem, window, _start(before, problem))
     if vetoes:
-        return Learned(refuse(memory), None, Lesson.SENSOR, "window not estimated from: " + "; ".join(vetoes))
-    learned = _learn(state, window)
+        return replace(untaught, memory=refuse(memory), lesson=Lesson.SENSOR, reason=UNUSED + "; ".join(vetoes))
+    learned = _learn(state, window, expected, untaught)
     return replace(learned, reason="; ".join(filter(None, (*notes, learned.reason))))
 
 
@@ -64,38 +68,39 @@ def _senseless(window: Window) -> tuple[str, ...]:
     return ()
 
 
-def _learn(state: State, window: Window) -> Learned:
-    """What the window says, weighed with what was known."""
-    problem, memory = state.problem, state.memory
-    expected = carried(memory.belief, window.end)
-    prior = overall(expected, problem)
+def _learn(state: State, window: Window, expected: Belief, untaught: Learned) -> Learned:
+    """What the window says, weighed with what was ``expected`` at its end."""
+    problem, memory, prior = state.problem, state.memory, untaught.before
     warm = any(entry.known for entry in state.standing)
     found = estimate(problem, window, _start(prior, problem), prior, warm=warm)
     refused = found.cost > REFUSED
     expectable = not refused and not is_surprising(expected, found.evidence, problem)
     if expectable and found.cost <= EXPLAINED:
-        return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
+        return _learned(untaught, problem, learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
     fault = wrong_scale(problem, window, prior, found.chi_square, memory.lying) if warm else None
     if fault is not None:
-        return Learned(refuse(memory, fault.output), found, Lesson.SENSOR, str(fault))
+        lying = refuse(memory, fault.output)
+        return replace(untaught, memory=lying, found=found, lesson=Lesson.SENSOR, reason=str(fault))
     if expectable:
-        return _learned(learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
+        return _learned(untaught, problem, learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
     if refused:
-        learned = _learned(refuse(memory), found, Lesson.REFUSED)
+        learned = _learned(untaught, problem, refuse(memory), found, Lesson.REFUSED)
         return learned if warm else replace(learned, reason=f"{learned.reason}; {NEVER}")
     alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
     after, lesson = doubt(memory, expected, alone.evidence, problem)
-    return _learned(after, alone, lesson)
+    return _learned(untaught, problem, after, alone, lesson)
 
 
-def _learned(memory: Memory, found: WindowEstimate, lesson: Lesson) -> Learned:
+def _learned(untaught: Learned, problem: Problem, memory: Memory, found: WindowEstimate, lesson: Lesson) -> Learned:
     """With what there is to say of the window as a whole."""
+    before = untaught.before
+    after = before if memory.belief is untaught.memory.belief else overall(memory.belief, problem)
     reasons = [] if lesson is Lesson.LEARNED else [lesson.value]
     if found.cost > EXPLAINED and lesson is not Lesson.REFUSED:
         reasons.append(UNEXPLAINED)
     if memory.belief.scatter > SCATTERED:
         reasons.append(CONTRADICTORY.format(memory.belief.scatter**0.5))
-    return Learned(memory, found, lesson, "; ".join(reasons))
+    return Learned(memory, before, after, found, lesson, "; ".join(reasons))
 
 
 def _start(prior: Prior, problem: Problem) -> Array:
@@ -104,11 +109,10 @@ def _start(prior: Prior, problem: Problem) -> Array:
 
 
 def _next_records(state: State, window: Window, learned: Learned) -> int:
-    problem, found = state.problem, learned.found
+    problem, found, known = state.problem, learned.found, learned.after
     if found is None:
         return state.records
     free = len(problem.free)
-    known = overall(learned.memory.belief, problem)
     trend: Array = np.sqrt(known.mean[free:] ** 2 + np.diag(known.covariance)[free:])
     need = Need(np.array([entry.sd for entry in found.parameters]), trend, found.cost <= EXPLAINED)
     return next_records(problem.window, window.records, window.sample_period, need)

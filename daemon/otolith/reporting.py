@@ -7,9 +7,9 @@ import numpy as np
 from otolith.acquisition.window import Window
 from otolith.adaptation.advice import Situation, advise
 from otolith.adaptation.estimate import WindowEstimate
-from otolith.adaptation.fusion import carried, overall
 from otolith.adaptation.gate import Lesson, Memory
 from otolith.adaptation.objective import EXPLAINED
+from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
 from otolith.health.report import (
     CostDocument,
@@ -29,6 +29,10 @@ class Learned:
     """What is known after a window, and how it came about."""
 
     memory: Memory
+    before: Prior
+    """What was known at the end of the window, but for the window."""
+    after: Prior
+    """What is known then."""
     found: WindowEstimate | None = None
     """None for a window that was not estimated from."""
     lesson: Lesson | None = None
@@ -42,7 +46,7 @@ def document_of(state: State, window: Window, learned: Learned) -> tuple[tuple[S
     parameters: dict[str, ParameterDocument] = {}
     standing: list[Standing] = []
     allowed = problem.determined_within * problem.scale
-    for index, (entry, fused) in enumerate(zip(problem.free, _fused(state, memory, window.end), strict=True)):
+    for index, (entry, fused) in enumerate(zip(problem.free, _fused(learned), strict=True)):
         said = None if found is None else found.parameters[index]
         heard = Heard(said, learned.lesson, memory.contradictions, memory.belief.scatter, learned.reason)
         now, parameters[entry.name] = publish(entry, float(allowed[index]), fused, heard, state.standing[index])
@@ -72,12 +76,11 @@ def traces_of(state: State, window: Window, learned: Learned) -> Traces:
     return Traces(names, np.column_stack(columns), None, noise)
 
 
-def _fused(state: State, memory: Memory, end: float) -> list[Fused]:
-    """Of each free parameter, what is known at ``end`` (Unix s), and what this window did to it."""
-    free = len(state.problem.free)
-    before = overall(carried(state.memory.belief, end), state.problem)
-    after = overall(carried(memory.belief, end), state.problem) if memory is not state.memory else before
-    sd, sd_before = (np.sqrt(np.diag(known.covariance)) for known in (after, before))
+def _fused(learned: Learned) -> list[Fused]:
+    """Of each free parameter, what is known at the end of the window, and what this window did to it."""
+    after = learned.after
+    free = len(after.mean) // 2
+    sd, sd_before = (np.sqrt(np.diag(known.covariance)) for known in (after, learned.before))
     return [
         Fused(
             value=float(after.mean[index]),
@@ -98,7 +101,7 @@ def _advise(problem: Problem, window: Window, learned: Learned, documents: dict[
         return
     inputs = np.array([window.column(entry.name)[-1] for entry in problem.twin.inputs])
     situation = Situation(inputs, found.last_state, window.records, window.sample_period)
-    for name, text in advise(problem, overall(learned.memory.belief, problem), situation, wanted).items():
+    for name, text in advise(problem, learned.after, situation, wanted).items():
         documents[name] = documents[name].model_copy(update={"advice": text})
 
 
