@@ -67,7 +67,7 @@ def run(scenario: Scenario, hours: float) -> dict[str, Any]:
         state, report = adapt(state, window)
         seconds.append(time.perf_counter() - begun)
         document = report.document
-        lessons["none" if document.fit is None else document.fit.lesson.name] += 1
+        lessons[document.lesson.name] += 1
         for entry in document.parameters.values():
             statuses[entry.status] += 1
         found = [(entry.value, entry.sd, entry.nominal) for entry in document.parameters.values()]

@@ -35,7 +35,7 @@ class Learned:
     """What is known then."""
     found: WindowEstimate | None = None
     """None for a window that was not estimated from."""
-    lesson: Lesson | None = None
+    lesson: Lesson = Lesson.BAD
     reason: str = ""
     """What there is to say of the window as a whole."""
 
@@ -58,11 +58,12 @@ def document_of(state: State, window: Window, learned: Learned) -> tuple[tuple[S
         twin=problem.twin.name,
         model="DT'" if any(entry.known for entry in standing) else "DT",
         window=window_document(window),
+        lesson=learned.lesson,
         parameters=parameters,
     )
-    if found is not None and learned.lesson is not None:
+    if found is not None:
         cost = CostDocument(evaluations=found.evaluations, generations=found.generations)
-        document = document.model_copy(update={"fit": _fit(problem, found, learned.lesson, memory), "cost": cost})
+        document = document.model_copy(update={"fit": _fit(problem, found, memory), "cost": cost})
     return tuple(standing), document
 
 
@@ -105,7 +106,7 @@ def _advise(problem: Problem, window: Window, learned: Learned, documents: dict[
         documents[name] = documents[name].model_copy(update={"advice": text})
 
 
-def _fit(problem: Problem, found: WindowEstimate, lesson: Lesson, memory: Memory) -> FitDocument:
+def _fit(problem: Problem, found: WindowEstimate, memory: Memory) -> FitDocument:
     outputs = tuple(entry.name for entry in problem.twin.outputs)
     return FitDocument(
         rmse_configured=_finite(outputs, found.rmse_configured),
@@ -114,7 +115,6 @@ def _fit(problem: Problem, found: WindowEstimate, lesson: Lesson, memory: Memory
         cost=found.cost,
         scatter=memory.belief.scatter,
         outcome=found.outcome,
-        lesson=lesson,
     )
 
 

@@ -8,7 +8,6 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from otolith.acquisition.window import Verdict
 from otolith.adaptation.gate import Lesson
 from otolith.console import STYLES, value_cells
 from otolith.health.report import ReportDocument, Status
@@ -23,7 +22,7 @@ class Tally:
     def __init__(self) -> None:
         self._first: ReportDocument | None = None
         self._last: ReportDocument | None = None
-        self._windows = self._good = self._fitted = self._explained = 0
+        self._windows = self._fitted = self._explained = 0
         self._lessons: Counter[Lesson] = Counter()
         self._statuses: dict[str, Counter[Status]] = {}
         self._reasons: Counter[str] = Counter()
@@ -34,13 +33,10 @@ class Tally:
         self._first = self._first or document
         self._last = document
         self._windows += 1
-        self._good += document.window.quality.verdict is Verdict.GOOD
+        self._lessons[document.lesson] += 1
         if document.fit is not None:
             self._fitted += 1
             self._explained += document.fit.explained
-            self._lessons[document.fit.lesson] += 1
-        elif document.window.quality.verdict is Verdict.GOOD:
-            self._lessons[Lesson.SENSOR] += 1
         for name, parameter in document.parameters.items():
             self._statuses.setdefault(name, Counter())[parameter.status] += 1
         for reason in document.window.quality.reasons:
@@ -76,11 +72,11 @@ class Tally:
         return table
 
     def _words(self) -> Iterator[Text]:
-        bad = self._windows - self._good
+        bad = self._lessons[Lesson.BAD]
         explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
-        yield Text(f"{self._windows} windows: {self._good} good, {bad} bad; {explained}")
+        yield Text(f"{self._windows} windows: {self._windows - bad} good, {bad} bad; {explained}")
         for lesson, count in self._lessons.items():
-            if lesson is not Lesson.LEARNED:
+            if lesson not in (Lesson.LEARNED, Lesson.BAD):
                 yield Text(f"  {count} good, but: {lesson}", style="yellow")
         for kind, count in self._reasons.most_common(MOST_REASONS):
             yield Text(f"  {count} bad like: {self._examples[kind]}", style="red")

@@ -8,6 +8,7 @@ import pytest
 
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.estimate import estimate
+from otolith.adaptation.gate import Lesson
 from otolith.adaptation.information import Identifiability
 from otolith.adaptation.objective import HOPELESS, Objective
 from otolith.adaptation.problem import Problem, SwarmOptions
@@ -88,6 +89,7 @@ def test_a_bad_window_teaches_nothing(scenario: MotorScenario, windows: Cut) -> 
     assert found.status is Status.HELD
     assert "no samples of i" in found.reason
     assert report.document.fit is None
+    assert report.document.lesson is Lesson.BAD
 
 
 def test_the_truth_outside_the_bounds_is_reported_as_invalid(scenario: MotorScenario, windows: Cut) -> None:

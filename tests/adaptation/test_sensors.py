@@ -45,10 +45,6 @@ def changed(window: Window, signal: str, change: Change) -> Window:
     return replace(window, values=values)
 
 
-def lesson(document: ReportDocument) -> Lesson | None:
-    return None if document.fit is None else document.fit.lesson
-
-
 @pytest.fixture
 def quiet(scenario: MotorScenario) -> MotorScenario:
     return scenario.model_copy(update={"faults": ()})
@@ -81,6 +77,7 @@ def test_a_lying_sensor_teaches_nothing(quiet: MotorScenario, windows: Cut, faul
     sick = changed(record[10], signal, change)  # the set-point has just doubled: everything moves
     after, documents = run(state, [sick])
     held(documents, word)
+    assert documents[0].lesson is Lesson.SENSOR
     assert after.memory.belief is state.memory.belief
 
 
@@ -102,7 +99,7 @@ def test_a_sensor_that_keeps_lying_never_becomes_a_step(
     record = [window for window, _ in windows(quiet, 55)]
     state, _ = run(begin("motor", "here", problem(*names)), record[:10])
     _, documents = run(state, [changed(window, signal, change) for window in record[10:]])
-    assert {lesson(document) for document in documents} == {Lesson.SENSOR}
+    assert {document.lesson for document in documents} == {Lesson.SENSOR}
     assert all(f"{signal} reads" in document.parameters["R_a"].reason for document in documents)
     found = documents[-1].parameters["R_a"]
     assert found.status is Status.INVALID
@@ -119,7 +116,7 @@ def test_a_step_of_the_resistance_is_followed_within_three_windows(
     _, documents = run(begin("motor", "here", problem(*names)), [window for window, _ in record])
     first = int(moment / 2.0)  # the window in which it happens
     for document in documents[10:first]:
-        assert lesson(document) is Lesson.LEARNED
+        assert document.lesson is Lesson.LEARNED
     followed = documents[first + 2].parameters["R_a"]
     assert followed.status is Status.ESTIMATED
     assert followed.low is not None
@@ -162,5 +159,5 @@ def test_noise_steps_and_kinks_are_no_spikes() -> None:
 def test_a_healthy_machine_has_honest_sensors(quiet: MotorScenario, windows: Cut) -> None:
     """Set-points up and down, rest and motion, for ten minutes."""
     state, documents = run(begin("motor", "here", problem("R_a", "D")), [window for window, _ in windows(quiet, 300)])
-    assert {lesson(document) for document in documents} == {Lesson.LEARNED}
+    assert {document.lesson for document in documents} == {Lesson.LEARNED}
     assert state.memory.contradictions == 0

@@ -21,7 +21,9 @@ RESISTANCE = Parameter("R_a", "ohm", 6.5, 3.0, 12.0, "armature resistance")
 def report(**parameters: ParameterDocument) -> ReportDocument:
     quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
     window = WindowDocument(index=0, start=1.0, end=3.0, records=200, quality=quality)
-    return ReportDocument(machine="m", site="s", twin="dc_motor", window=window, parameters=parameters)
+    return ReportDocument(
+        machine="m", site="s", twin="dc_motor", window=window, lesson=Lesson.BAD, parameters=parameters
+    )
 
 
 NUMBER = st.floats(allow_nan=True, allow_infinity=True)
@@ -33,12 +35,12 @@ ALLOWED = 0.65  # ohm
     st.builds(Fused, NUMBER, DEVIATION, NUMBER, DEVIATION, st.floats(0.0, 2.0)),
     st.none()
     | st.builds(ParameterEstimate, st.just("R_a"), NUMBER, DEVIATION, st.sampled_from(Identifiability), st.just("")),
-    st.none() | st.sampled_from(Lesson),
+    st.sampled_from(Lesson),
     st.integers(0, 5),
     st.builds(Standing, st.booleans(), st.sampled_from(Status)),
 )
 def test_nothing_but_finite_numbers_is_published(
-    fused: Fused, estimate: ParameterEstimate | None, lesson: Lesson | None, contradictions: int, before: Standing
+    fused: Fused, estimate: ParameterEstimate | None, lesson: Lesson, contradictions: int, before: Standing
 ) -> None:
     heard = Heard(estimate, lesson, contradictions, 1.0, "why")
     after, document = publish(RESISTANCE, ALLOWED, fused, heard, before)
@@ -57,6 +59,7 @@ def test_absent_is_absent_and_schema_is_named() -> None:
     assert found["schema"] == "otolith.report/1"
     assert "value" not in found["parameters"]["R_a"]
     assert found["parameters"]["R_a"]["status"] == "unestimated"
+    assert found["lesson"] == Lesson.BAD
     assert "fit" not in found
 
 

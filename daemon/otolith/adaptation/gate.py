@@ -24,6 +24,7 @@ class Lesson(StrEnum):
     SUSPECTED = "it contradicts what was known: a sudden change or a wrong window; the next one decides"
     STEPPED = "two windows agree on a sudden change"
     SENSOR = "a sensor is wrong: nothing is learned from the window"
+    BAD = "the window is not good enough: nothing is learned from it"
     REFUSED = "the twin cannot explain the window, whatever its parameters: nothing is learned from it"
 
 

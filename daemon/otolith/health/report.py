@@ -89,8 +89,6 @@ class FitDocument(Closed):
     """
     outcome: Outcome
     """How the search ended."""
-    lesson: Lesson
-    """What was made of the window."""
 
 
 class CostDocument(Closed):
@@ -132,8 +130,11 @@ class ReportDocument(Closed):
     model: str = "DT"
     """``DT`` the twin as configured, ``DT'`` with estimated parameters (the paper's names)."""
     window: WindowDocument
+    lesson: Lesson
+    """What was made of the window."""
     parameters: dict[str, ParameterDocument]
     fit: FitDocument | None = None
+    """None where nothing was estimated from the window."""
     cost: CostDocument = CostDocument()
     counters: CountersDocument | None = None
 

@@ -44,7 +44,7 @@ class Heard:
 
     estimate: ParameterEstimate | None = None
     """What it alone says; None for one that was not estimated from."""
-    lesson: Lesson | None = None
+    lesson: Lesson = Lesson.BAD
     """What was made of it."""
     contradictions: int = 0
     """Windows in a row that contradict twin or belief, this one included."""
@@ -98,7 +98,7 @@ def publish(
 
 
 def _status(known: bool, allowed: float, fused: Fused, heard: Heard, before: Standing) -> Status:
-    if not heard.taught and heard.contradictions >= INVALID_AFTER and heard.lesson is not None:
+    if not heard.taught and heard.contradictions >= INVALID_AFTER and heard.lesson is not Lesson.BAD:
         return Status.INVALID
     estimate = heard.estimate
     if heard.at_bound:
