@@ -11,7 +11,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.estimate import WindowEstimate, estimate
 from otolith.adaptation.fusion import Belief, carried, overall
-from otolith.adaptation.gate import REFUSED, Lesson, Memory, doubt, is_surprising, learn, refuse
+from otolith.adaptation.gate import REFUSED, Lesson, Memory, confirm_or_suspect, is_surprising, learn, refuse
 from otolith.adaptation.length import Need, next_records
 from otolith.adaptation.objective import EXPLAINED
 from otolith.adaptation.prior import Prior
@@ -87,7 +87,7 @@ def _learn(state: State, window: Window, expected: Belief, untaught: Learned) ->
         learned = _learned(untaught, problem, refuse(memory), found, Lesson.REFUSED)
         return learned if warm else replace(learned, reason=f"{learned.reason}; {NEVER}")
     alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
-    after, lesson = doubt(memory, expected, alone.evidence, problem)
+    after, lesson = confirm_or_suspect(memory, expected, alone.evidence, problem)
     return _learned(untaught, problem, after, alone, lesson)
 
 

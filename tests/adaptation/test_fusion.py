@@ -7,7 +7,7 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.fusion import begin_belief, carried, overall, updated
-from otolith.adaptation.gate import Lesson, Memory, begin_memory, doubt, is_surprising, learn
+from otolith.adaptation.gate import Lesson, Memory, begin_memory, confirm_or_suspect, is_surprising, learn
 from otolith.adaptation.prior import Evidence
 from otolith.adaptation.problem import Problem
 from otolith.twins import find_twin
@@ -84,7 +84,7 @@ def told(memory: Memory, value: float, end: float, seed: int, sd: float = 0.01) 
     found = evidence(value, 0.0, sd, np.random.default_rng(seed))
     expected = carried(memory.belief, end)
     if is_surprising(expected, found, PROBLEM):
-        return doubt(memory, expected, found, PROBLEM)
+        return confirm_or_suspect(memory, expected, found, PROBLEM)
     return learn(memory, expected, found, PROBLEM), Lesson.LEARNED
 
 

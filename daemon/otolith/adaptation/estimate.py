@@ -11,7 +11,7 @@ from otolith.adaptation.information import (
     ParameterEstimate,
     Wanted,
     classify,
-    doubt,
+    inflation,
     information,
 )
 from otolith.adaptation.objective import EXPLAINED, Objective
@@ -119,13 +119,13 @@ class _Fit:
     def _tell(self) -> Information:
         """What the window alone can know."""
         objective, alone = self._objective, self._alone
-        return information(alone.jacobian, objective.high - objective.low, self._doubt())
+        return information(alone.jacobian, objective.high - objective.low, self._inflation())
 
-    def _doubt(self) -> float:
+    def _inflation(self) -> float:
         """By what standard deviations grow with what is left unexplained."""
         objective, alone = self._objective, self._alone
         residuals = alone.residuals.reshape(objective.measured.shape)
-        return doubt(residuals, float(np.sqrt(alone.chi_square / objective.count)))
+        return inflation(residuals, float(np.sqrt(alone.chi_square / objective.count)))
 
     def _says_nothing(self) -> bool:
         reach = self._told.sd[: self._objective.free]
@@ -174,7 +174,7 @@ class _Fit:
         predicted, last_state = objective.followed(self._fit.guess)
         return WindowEstimate(
             parameters=self._parameters(outcome),
-            evidence=self._informed.evidence(self._fit, self._doubt()),
+            evidence=self._informed.evidence(self._fit, self._inflation()),
             outcome=outcome,
             cost=self._cost(),
             count=objective.count,

@@ -158,10 +158,10 @@ def contradicted(belief: Belief, surprise_per_degree: float) -> Belief:
 def _foretold(belief: Belief, evidence: Evidence, problem: Problem) -> tuple[Array, Array, Array]:
     """The window's root in shares, and per model its innovation's covariance and the innovation."""
     size = _size(problem)
-    doubt = np.sqrt(belief.scatter)
-    root = evidence.root * size / doubt
+    grown = np.sqrt(belief.scatter)
+    root = evidence.root * size / grown
     foretold = np.eye(len(root)) + root @ belief.covariance @ root.T
-    innovation = evidence.rest / doubt + (belief.mean - evidence.point / size) @ root.T
+    innovation = evidence.rest / grown + (belief.mean - evidence.point / size) @ root.T
     return root, foretold, innovation
 
 

@@ -67,7 +67,7 @@ def learn(memory: Memory, expected: Belief, evidence: Evidence, problem: Problem
     return Memory(updated(belief, evidence, problem))
 
 
-def doubt(memory: Memory, expected: Belief, evidence: Evidence, problem: Problem) -> tuple[Memory, Lesson]:
+def confirm_or_suspect(memory: Memory, expected: Belief, evidence: Evidence, problem: Problem) -> tuple[Memory, Lesson]:
     """After a surprising window; ``evidence`` is of that window alone."""
     end = expected.end
     if memory.suspect is not None:

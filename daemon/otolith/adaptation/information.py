@@ -54,7 +54,7 @@ def information(jacobian: Array, width: Array, grown: float) -> Information:
     """Standard deviations (guess,) from the inverse of the Fisher information ``jacobian.T @ jacobian``.
 
     ``jacobian`` (residuals, guess) is of whitened residuals; ``width`` (guess,) scales the entries. Where the residuals
-    are larger than the noise, standard deviations are ``grown`` (see :func:`doubt`).
+    are larger than the noise, standard deviations are ``grown`` (see :func:`inflation`).
     """
     scaled = jacobian * width
     norms = np.linalg.norm(scaled, axis=0)
@@ -76,7 +76,7 @@ def information(jacobian: Array, width: Array, grown: float) -> Information:
     return Information(sd, correlation)
 
 
-def doubt(residuals: Array, cost: float) -> float:
+def inflation(residuals: Array, cost: float) -> float:
     """By what standard deviations grow with what is left unexplained; ``residuals`` (records, outputs) are whitened.
 
     What is left beyond noise lasts from record to record, so it does not average out: its long-run variance counts
