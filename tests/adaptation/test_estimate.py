@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.estimate import estimate
 from otolith.adaptation.gate import Lesson
-from otolith.adaptation.information import Identifiability
+from otolith.adaptation.information import Identifiability, inflation
 from otolith.adaptation.objective import HOPELESS, Objective
 from otolith.adaptation.problem import Problem, SwarmOptions
 from otolith.health.report import Status
@@ -195,7 +195,16 @@ def test_a_residual_beyond_the_noise_widens_the_interval(scenario: MotorScenario
     told = estimate(problem_for("R_a"), window, np.array([6.5])).parameters[0]
     optimist = replace(problem_for("R_a"), noise=(0.005 / 3.0, 0.02 / 3.0))
     doubted = estimate(optimist, window, np.array([6.5])).parameters[0]
-    assert 0.85 * told.sd <= doubted.sd <= 1.4 * told.sd  # chance correlation of the residual widens it a little more
+    assert doubted.sd == pytest.approx(told.sd, rel=0.15)
+
+
+def test_only_a_residual_that_lasts_widens_the_interval_beyond_its_size() -> None:
+    random = np.random.default_rng(1)
+    white = random.standard_normal((200, 2))
+    lasting = np.cumsum(random.standard_normal((200, 2)), axis=0)
+    for residuals, low, high in ((white, 0.95, 1.1), (lasting, 3.0, 20.0)):
+        cost = float(np.sqrt(np.mean(residuals**2)))
+        assert low <= inflation(3.0 / cost * residuals, 3.0) / 3.0 <= high
 
 
 def test_a_guess_that_diverges_never_wins(scenario: MotorScenario, windows: Cut) -> None:

@@ -14,6 +14,7 @@ BLIND = 1e-4  # share in an unseen direction beyond which a parameter is not see
 FLAT = 1e-9  # a sensitivity this far under the largest is none
 PUSHED = 2.0  # times the interval asked for: a wider one does not tell on which side of a bound the value lies
 LONGEST_MEMORY = 0.25  # of a window: lags over which residuals are looked at for what they have in common
+LASTING = 2.0  # long-run variance over variance from which on correlation is no chance
 NOTICED = 1.1  # cost from which on it is looked at all: noise alone hardly gets there
 TRADED = 0.95  # correlation beyond which two parameters cannot be told apart
 
@@ -80,7 +81,8 @@ def inflation(residuals: Array, cost: float) -> float:
     """By what standard deviations grow with what is left unexplained; ``residuals`` (records, outputs) are whitened.
 
     What is left beyond noise lasts from record to record, so it does not average out: its long-run variance counts
-    (W. K. Newey, K. D. West, Econometrica 55, 1987), summed until the correlation ends.
+    (W. K. Newey, K. D. West, Econometrica 55, 1987), summed until the correlation ends. White residuals seem to be
+    correlated by chance, always to the same side: as long as it is no more than that, their variance alone counts.
     """
     if cost <= NOTICED:
         return max(cost, 1.0)
@@ -91,7 +93,8 @@ def inflation(residuals: Array, cost: float) -> float:
         variances = np.array([series[lag:] @ series[: records - lag] for lag in range(most)]) / max(records, 1)
         ends = np.flatnonzero(variances <= 0.0)
         lasting = variances[1 : int(ends[0]) if len(ends) else most]
-        long_run = max(long_run, float(variances[0] + 2.0 * lasting.sum()))
+        told = float(variances[0] + 2.0 * lasting.sum())
+        long_run = max(long_run, told if told > LASTING * variances[0] else float(variances[0]))
     return float(np.sqrt(long_run)) if np.isfinite(long_run) else float(cost)
 
 
