@@ -5,12 +5,10 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import islice
-from pathlib import Path
 
 import numpy as np
 
-from otolith.acquisition.window import Quality, Verdict, Window
+from benchmarks.motor import CONFIG, windows
 from otolith.adaptation.estimate import estimate
 from otolith.adaptation.objective import Objective
 from otolith.adaptation.problem import Problem
@@ -18,10 +16,7 @@ from otolith.adaptation.swarm import search
 from otolith.heart import adapt
 from otolith.plan import load_plan
 from otolith.state import begin
-from otolith_drivers.plant.plants import load_scenario, simulate
-
-CONFIG = Path(__file__).parents[1] / "config"
-SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
+from otolith_drivers.plant.plants import load_scenario
 
 
 def median_seconds(work: Callable[[], object], runs: int) -> float:
@@ -34,18 +29,6 @@ def median_seconds(work: Callable[[], object], runs: int) -> float:
     return float(np.median(times))
 
 
-def windows(count: int) -> list[Window]:
-    ticks = list(islice(simulate(load_scenario(CONFIG / "scenarios" / "demo.toml")), 200 * count))
-    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    found = []
-    for index in range(count):
-        part = ticks[200 * index : 200 * (index + 1)]
-        values = np.array([[tick.measured[name] for name in SIGNALS.values()] for tick in part])
-        missing = np.zeros(values.shape, dtype=np.bool_)
-        found.append(Window(index, part[0].time, 0.01, tuple(SIGNALS), values, missing, quality))
-    return found
-
-
 def of(problem: Problem, names: tuple[str, ...]) -> Problem:
     """``problem`` with these parameters free."""
     twin = problem.twin
@@ -55,7 +38,7 @@ def of(problem: Problem, names: tuple[str, ...]) -> Problem:
 
 def main() -> int:
     problem = load_plan(CONFIG / "dc-motor.toml").problem
-    record = windows(12)
+    record = list(windows(load_scenario(CONFIG / "scenarios" / "demo.toml"), 12))
     for names in (("R_a",), ("R_a", "D"), ("R_a", "D", "J")):
         free = of(problem, names)
         start = np.array([entry.nominal for entry in free.free])

@@ -11,25 +11,20 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
-from itertools import islice
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from otolith.acquisition.window import Quality, Verdict, Window
+from benchmarks.motor import CONFIG, RECORDS, windows
+from otolith.acquisition.window import Array
 from otolith.heart import adapt
 from otolith.plan import load_plan
 from otolith.state import begin
-from otolith_drivers.plant.plants import load_scenario, simulate
+from otolith_drivers.plant.plants import load_scenario
 from otolith_drivers.plant.scenario import Scenario
 
-CONFIG = Path(__file__).parents[1] / "config"
-SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 QUANTA = np.array([0.0, 0.0, 20.0 / 4096, 100.0 / 4096])  # A, rad/s
-RECORDS = 200
-GOOD = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
 
 
 def scenarios() -> dict[str, Scenario]:
@@ -39,16 +34,10 @@ def scenarios() -> dict[str, Scenario]:
     return {"excited": demo, "constant speed": demo.model_copy(update={"set_points": (first,), "repeat_every": None})}
 
 
-def windows(scenario: Scenario, count: int) -> Iterator[Window]:
-    """As the daemon would cut them."""
-    ticks = simulate(scenario)
-    for index in range(count):
-        values = np.array([[tick.measured[name] for name in SIGNALS.values()] for tick in islice(ticks, RECORDS)])
-        steps = np.where(QUANTA > 0.0, QUANTA, 1.0)
-        values = np.where(QUANTA > 0.0, np.rint(values / steps) * steps, values)
-        missing = np.zeros(values.shape, dtype=np.bool_)
-        start = index * RECORDS * scenario.sample_period
-        yield Window(index, start, scenario.sample_period, tuple(SIGNALS), values, missing, GOOD)
+def converted(values: Array) -> Array:
+    """(records, signals) as converters of 12 bit show them."""
+    steps = np.where(QUANTA > 0.0, QUANTA, 1.0)
+    return np.where(QUANTA > 0.0, np.rint(values / steps) * steps, values)
 
 
 def run(scenario: Scenario, hours: float) -> dict[str, Any]:
@@ -57,14 +46,14 @@ def run(scenario: Scenario, hours: float) -> dict[str, Any]:
     twin = plan.twin
     free = tuple(twin.parameter(name) for name in ("R_a", "D"))
     known = tuple((entry.name, entry.nominal) for entry in twin.parameters if entry not in free)
-    problem = type(plan.problem)(twin, known, free, plan.problem.noise, plan.problem.input_noise)
-    state = begin("motor", "bench", problem)
+    state = begin("motor", "bench", replace(plan.problem, known=known, free=free))
     lessons: Counter[str] = Counter()
     statuses: Counter[str] = Counter()
     errors, pulls, seconds = [], [], []
     for window in windows(scenario, round(hours * 3600.0 / (RECORDS * scenario.sample_period))):
+        seen = replace(window, values=converted(window.values))
         begun = time.perf_counter()
-        state, report = adapt(state, window)
+        state, report = adapt(state, seen)
         seconds.append(time.perf_counter() - begun)
         document = report.document
         lessons[document.lesson.name] += 1

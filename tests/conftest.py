@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.acquisition.window import Window
 from otolith.paths import examples_directory
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.plants import load_scenario, simulate
 
 EXAMPLES = examples_directory()
-GOOD = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 
 
@@ -44,8 +43,7 @@ def windows() -> Callable[..., list[tuple[Window, float]]]:
         for index in range(count):
             part = ticks[index * records : (index + 1) * records]
             values = np.array([[tick.measured[name] for name in SIGNALS.values()] for tick in part])
-            missing = np.zeros(values.shape, dtype=np.bool_)
-            window = Window(index, part[0].time, scenario.sample_period, tuple(SIGNALS), values, missing, GOOD)
+            window = Window.whole(index, part[0].time, scenario.sample_period, tuple(SIGNALS), values)
             found.append((window, float(np.mean([tick.truth["R_a"] for tick in part]))))
         return found
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.acquisition.window import Window
 from otolith.check import describe
 from otolith.errors import ConfigurationError
 from otolith.heart import adapt
@@ -60,8 +60,7 @@ def test_its_twin_estimates(folder: Path) -> None:
     truth = np.array([[0.085, 0.9, 0.00031]])
     omega = kernel_of(plan.twin).simulate(truth, np.array([[80.0]]), Excitation(torque[:, None], 0.02))[0, :, 0]
     values = np.column_stack([torque, omega + random.normal(0.0, 0.1, 500)])
-    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    window = Window(0, 0.0, 0.02, ("T_m", "omega"), values, np.zeros(values.shape, dtype=np.bool_), quality)
+    window = Window.whole(0, 0.0, 0.02, ("T_m", "omega"), values)
     _, report = adapt(begin("fan-3", "hall-2", plan.problem), window)
     found = {name: entry.value for name, entry in report.document.parameters.items()}
     assert found == pytest.approx({"T_c": 0.9, "k": 0.00031}, rel=0.02)

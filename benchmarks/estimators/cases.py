@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.estimators.data import APART, GOOD
+from benchmarks.estimators.data import APART
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.problem import Problem
 from otolith.twin.definition import Definition, Input, Parameter, Role
@@ -115,5 +115,4 @@ def _window(case: Case, random: np.random.Generator, index: int) -> tuple[Array,
     drive = replace(drive, substeps=kernel.substeps(parameters, initial, drive, EXACT * noise))
     outputs = kernel.simulate(parameters[None], initial[None], drive)[0]
     found = np.column_stack([inputs, outputs + random.normal(size=outputs.shape) * noise])[RECORDS:]
-    missing = np.zeros(found.shape, dtype=np.bool_)
-    return truth, Window(index, 0.0, case.period, twin.signals, found, missing, GOOD)
+    return truth, Window.whole(index, 0.0, case.period, twin.signals, found)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Quality, Verdict, Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.problem import Problem
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twins import find_twin
@@ -19,7 +19,6 @@ LIFE = 20  # windows of one machine that are scored
 RUN_IN = 1  # windows before them, so that who remembers has something to remember
 APART = (0.7, 1.4)  # of the nominal values, between which the truth lies: nobody may begin at it
 EXACT = 8  # substeps: the data's own error is far below any rival's
-GOOD = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,5 +89,4 @@ def _lived(truths: Array, state: Array, inputs: Array) -> Array:
 
 
 def _window(index: int, values: Array) -> Window:
-    missing = np.zeros(values.shape, dtype=np.bool_)
-    return Window(index, PERIOD * RECORDS * index, PERIOD, TWIN.signals, values, missing, GOOD)
+    return Window.whole(index, PERIOD * RECORDS * index, PERIOD, TWIN.signals, values)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.acquisition.window import Window
 from otolith.health.report import Report
 from otolith.state import State
 
@@ -60,8 +60,6 @@ def perform(task: Task) -> Result:
 def _warm_up(state: State) -> None:
     """Load and compile what the first window would have to wait for."""
     signals = state.problem.twin.signals
-    values = np.zeros((20, len(signals)))
-    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    window = Window(0, 0.0, 0.01, signals, values, np.zeros(values.shape, dtype=np.bool_), quality)
+    window = Window.whole(0, 0.0, 0.01, signals, np.zeros((20, len(signals))))
     short = replace(state.problem, swarm=replace(state.problem.swarm, generations=2))
     perform(Task(replace(state, problem=short), window))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.acquisition.window import Array, Quality, Verdict, Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.length import Need, next_records
 from otolith.adaptation.problem import Problem, WindowOptions
 from otolith.health.report import ReportDocument, Status
@@ -18,7 +18,6 @@ TWIN = find_twin("dc_motor")
 FREE = tuple(entry for entry in TWIN.parameters if entry.name in ("R_a", "J", "D"))
 KNOWN = tuple((entry.name, entry.nominal) for entry in TWIN.parameters if entry not in FREE)
 PROBLEM = Problem(TWIN, KNOWN, FREE, (0.005, 0.02))
-GOOD = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
 RECORDS, PERIOD = 200, 0.01
 PARAMETERS = np.array([[entry.nominal for entry in TWIN.parameters]])
 SPEED = 10.0  # rad/s
@@ -30,7 +29,7 @@ def window(index: int, inputs: Array, initial: Array) -> Window:
     random = np.random.default_rng(index)
     outputs = kernel_of(TWIN).simulate(PARAMETERS, initial[None], Excitation(inputs, PERIOD, 4))[0]
     values = np.column_stack([inputs, outputs + random.normal(size=outputs.shape) * [0.005, 0.02]])
-    return Window(index, 2.0 * index, PERIOD, TWIN.signals, values, np.zeros(values.shape, dtype=np.bool_), GOOD)
+    return Window.whole(index, 2.0 * index, PERIOD, TWIN.signals, values)
 
 
 def steady(count: int) -> tuple[State, ReportDocument]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from otolith.acquisition.window import Array, Quality, Verdict, Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.estimate import estimate
 from otolith.adaptation.objective import Objective
 from otolith.adaptation.problem import Problem
@@ -15,7 +15,6 @@ TRUTH = {entry.name: entry.nominal for entry in TWIN.parameters}
 NOISE = np.array([0.005, 0.02])  # A, rad/s
 QUANTUM = np.array([20.0, 100.0]) / 2**12  # of converters of 12 bit over ±10 A and ±50 rad/s
 WINDOWS, PERIOD, RECORDS = 2000, 0.01, 200
-GOOD = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
 SETS = (
     ("R_a",),
     ("D",),
@@ -38,7 +37,7 @@ def window(random: np.random.Generator, index: int) -> tuple[Window, Array]:
     outputs = kernel_of(TWIN).simulate(parameters, initial[None], Excitation(inputs, PERIOD, 4))[0]
     seen = np.rint((outputs + random.normal(size=outputs.shape) * NOISE) / QUANTUM) * QUANTUM
     values = np.column_stack([inputs, seen])
-    return Window(index, 0.0, PERIOD, TWIN.signals, values, np.zeros(values.shape, dtype=np.bool_), GOOD), initial
+    return Window.whole(index, 0.0, PERIOD, TWIN.signals, values), initial
 
 
 def bound(problem: Problem, record: Window, initial: Array) -> Array:

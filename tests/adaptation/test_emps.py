@@ -23,7 +23,6 @@ from otolith.health.report import ParameterDocument, ReportDocument, Status
 from otolith.heart import adapt
 from otolith.state import begin
 from otolith.twins import find_twin
-from tests.conftest import GOOD
 
 ROOT = Path(__file__).parents[2]
 PLACES = [*map(Path, filter(None, [os.environ.get("OTOLITH_DATA")])), ROOT.parent / "shared" / "data"]
@@ -46,8 +45,7 @@ def windows() -> tuple[Window, ...]:
     table = np.loadtxt(FILE, delimiter=",", skiprows=1)
     values = np.column_stack([FORCE * table[:, 3], table[:, 2]])
     pieces = [values[start : start + RECORDS] for start in range(0, len(values) - RECORDS + 1, RECORDS)]
-    missing = np.zeros((RECORDS, 2), dtype=np.bool_)
-    return tuple(Window(k, 2.0 * k, PERIOD, ("F", "x"), piece, missing, GOOD) for k, piece in enumerate(pieces))
+    return tuple(Window.whole(k, 2.0 * k, PERIOD, ("F", "x"), piece) for k, piece in enumerate(pieces))
 
 
 def problem(twin: str) -> Problem:

@@ -61,9 +61,7 @@ def test_the_same_seed_gives_the_same_report(scenario: MotorScenario, windows: C
 
 def test_a_motor_at_rest_says_nothing_about_its_resistance() -> None:
     values = np.zeros((200, 4))
-    missing = np.zeros(values.shape, dtype=np.bool_)
-    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    window = Window(0, 0.0, 0.01, DC_MOTOR.signals, values, missing, quality)
+    window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     _, report = adapt(state_for("R_a"), window)
     found = report.document.parameters["R_a"]
     assert (found.status, found.value) == (Status.UNESTIMATED, None)
@@ -136,8 +134,7 @@ def test_lost_first_records_do_not_bias(scenario: MotorScenario, windows: Cut, l
 @pytest.mark.parametrize("names", [("R_a",), ("R_a", "K_e"), ("R_a", "L_a", "J", "K_e", "K_t", "D")])
 def test_constant_windows_are_answered_honestly(value: float, records: int, names: tuple[str, ...]) -> None:
     values = np.full((records, 4), value)
-    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    window = Window(0, 0.0, 0.01, DC_MOTOR.signals, values, np.zeros(values.shape, dtype=np.bool_), quality)
+    window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     problem = replace(problem_for(*names), swarm=SwarmOptions(generations=3))
     _, report = adapt(begin("motor", "here", problem), window)
     text = report.document.to_json()
@@ -153,8 +150,7 @@ def test_a_constant_equilibrium_cannot_tell_resistance_from_the_electromotive_fo
     i, omega = (0.00143 + 0.006) * 10.0 / 0.038, 10.0
     row = [6.5 * i + 0.038 * omega, 0.06, i, omega]
     values = np.tile(row, (200, 1))
-    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    window = Window(0, 0.0, 0.01, DC_MOTOR.signals, values, np.zeros(values.shape, dtype=np.bool_), quality)
+    window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     found = estimate(problem_for("R_a", "K_e"), window, np.array([6.5, 0.038]))
     assert {entry.identifiability for entry in found.parameters} == {Identifiability.TRADED}
 
@@ -167,8 +163,7 @@ def test_a_fast_motor_is_integrated_finely_enough() -> None:
     inputs = np.column_stack([np.repeat(random.uniform(5.0, 20.0, 20), 10), np.full(200, 0.03)])
     outputs = kernel_of(DC_MOTOR).simulate(parameters, np.zeros((1, 2)), Excitation(inputs, 0.01, 64))[0]
     values = np.column_stack([inputs, outputs + random.normal(size=(200, 2)) * [0.005, 0.02]])
-    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    window = Window(0, 0.0, 0.01, DC_MOTOR.signals, values, np.zeros(values.shape, dtype=np.bool_), quality)
+    window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     known = tuple((name, value) for name, value in truth.items() if name != "R_a")
     entry = estimate(replace(problem_for("R_a"), known=known), window, np.array([6.0])).parameters[0]
     assert entry.value == pytest.approx(6.5, abs=4.0 * entry.sd)

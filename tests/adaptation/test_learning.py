@@ -14,7 +14,6 @@ from otolith.adaptation.learning import learn_noise
 from otolith.adaptation.problem import Problem
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twins import find_twin
-from tests.conftest import GOOD
 
 TWIN = find_twin("dc_motor")
 TRUTH = {entry.name: entry.nominal for entry in TWIN.parameters}
@@ -57,7 +56,7 @@ def window(
             state = kernel_of(TWIN).simulate(parameters, state[None], piece)[0, 1]
             state = state + np.array(strays) * np.sqrt(PERIOD) * random.normal(size=2)
     values = np.column_stack([volts, load, outputs + random.normal(size=outputs.shape) * SENSORS])
-    return Window(index, 2.0 * index, PERIOD, TWIN.signals, values, np.zeros(values.shape, dtype=np.bool_), GOOD)
+    return Window.whole(index, 2.0 * index, PERIOD, TWIN.signals, values)
 
 
 def levels(found: LearnedNoise) -> Array:
@@ -113,8 +112,8 @@ def test_one_window_is_enough_for_the_likelihood_but_agrees_with_nobody() -> Non
 
 def test_without_a_usable_window_everything_stays_as_it_was() -> None:
     bad = Quality(Verdict.BAD, 1.0, 2.0, 0.0, 0.0, ("no samples of i",))
-    spoilt = replace(window(np.random.default_rng(8), 0), quality=bad)
-    for windows in ([], [spoilt], [replace(spoilt, quality=GOOD, values=spoilt.values * np.nan)]):
+    whole = window(np.random.default_rng(8), 0)
+    for windows in ([], [replace(whole, quality=bad)], [replace(whole, values=whole.values * np.nan)]):
         found = learn_noise(PROBLEM, windows)
         assert found.applied(PROBLEM).noise == PROBLEM.noise
         assert {entry.remark for entry in (*found.outputs, *found.states)} == {say.NO_WINDOW}

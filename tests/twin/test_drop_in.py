@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.acquisition.window import Window
 from otolith.health.report import Status
 from otolith.heart import adapt
 from otolith.plan import load_plan
@@ -72,8 +72,7 @@ def test_it_estimates_what_its_roles_say(machine_file: Path) -> None:
     truth = np.array([[1.5, 95.0, 1.1]])
     theta = kernel_of(plan.twin).simulate(truth, np.array([[20.0]]), drive)[0, :, 0] + random.normal(0.0, 0.1, 300)
     values = np.column_stack([current, theta])
-    quality = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
-    window = Window(0, 0.0, 1.0, ("i", "theta"), values, np.zeros(values.shape, dtype=np.bool_), quality)
+    window = Window.whole(0, 0.0, 1.0, ("i", "theta"), values)
     _, report = adapt(begin("spindle", "site", plan.problem), window)
     for name, value in (("C", 95.0), ("R_th", 1.1)):
         found = report.document.parameters[name]

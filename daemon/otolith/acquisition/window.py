@@ -50,6 +50,12 @@ class Window:
     """(records, signals), true where a value was bridged and is no measurement."""
     quality: Quality
 
+    @classmethod
+    def whole(cls, index: int, start: float, sample_period: float, signals: tuple[str, ...], values: Array) -> "Window":
+        """Without gaps and sampled to perfection, as simulations and files on a grid are."""
+        missing = np.zeros(values.shape, dtype=np.bool_)
+        return cls(index, start, sample_period, signals, values, missing, Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0))
+
     @property
     def records(self) -> int:
         """How many."""

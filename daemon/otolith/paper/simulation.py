@@ -6,7 +6,7 @@ from itertools import islice
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Quality, Verdict, Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.problem import Problem
 from otolith.paper.rows import Row, Sensor
 from otolith.paths import examples_directory
@@ -14,7 +14,6 @@ from otolith.plan import Plan, load_plan
 from otolith_drivers.plant.plants import load_scenario, signals, simulate
 from otolith_drivers.quantities import factor
 
-GOOD = Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0)
 CHUNK = 200  # records between two calls that tell of progress
 
 
@@ -36,8 +35,7 @@ class Life:
         for index in range(len(self.values) // records):
             first = index * records
             values = self.values[first : first + records]
-            missing = np.zeros(values.shape, dtype=np.bool_)
-            yield Window(index, first * self.period, self.period, self.signals, values, missing, GOOD)
+            yield Window.whole(index, first * self.period, self.period, self.signals, values)
 
     def with_noise(self, deviations: Mapping[str, float], seed: int) -> "Life":
         """As other sensors would have seen the same life: for signals that no controller acts upon."""
