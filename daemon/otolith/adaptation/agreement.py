@@ -12,7 +12,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Mask
 from otolith.adaptation.likelihood import Fit, Likelihood
-from otolith.adaptation.prior import UNSEEN
+from otolith.adaptation.prior import without_states
 from otolith.twin.definition import Definition
 
 SEEN = 2.0  # a window sees a direction in which it knows that many times more than the bounds of the parameters say
@@ -58,14 +58,11 @@ def agreement(fits: Sequence[Fit], width: Array) -> Agreement:
 def root(fit: Fit, width: Array) -> Array:
     """(seen, free) square root of the information about the parameters, in shares of ``width``, as far as it is seen.
 
-    The initial state is eliminated, as in :class:`otolith.adaptation.prior.Evidence`; residuals beyond the noise make
-    the window say less.
+    The initial state is eliminated; residuals beyond the noise make the window say less.
     """
     free = fit.objective.free
     scaled = fit.found.jacobian * width
-    states, singular, _ = np.linalg.svd(scaled[:, free:], full_matrices=False)
-    states = states[:, singular > UNSEEN * max(singular.max(initial=0.0), 1.0)]
-    _, singular, rows = np.linalg.svd(scaled[:, :free] - states @ (states.T @ scaled[:, :free]), full_matrices=False)
+    _, singular, rows = np.linalg.svd(without_states(scaled[:, :free], scaled[:, free:]), full_matrices=False)
     singular = singular / max(fit.cost, 1.0)
     seen = singular > SEEN
     return np.asarray(singular[seen, None] * rows[seen])

@@ -52,6 +52,23 @@ def vague(problem: Problem) -> Prior:
     return Prior(np.concatenate([problem.nominal, np.zeros(len(low))]), np.diag(deviations**2))
 
 
+def whitening(covariance: Array) -> Array:
+    """(n, n) what makes deviations of this ``covariance`` (n, n) independent and of unit variance."""
+    size = np.sqrt(np.diag(covariance))
+    factor = np.linalg.cholesky(covariance / np.outer(size, size))
+    return np.asarray(np.linalg.inv(factor) / size)
+
+
+def without_states(rows: Array, slopes: Array) -> Array:
+    """``rows`` (residuals, columns) less all that the initial state could make of them.
+
+    ``slopes`` (residuals, states) are of the residuals by the initial state, in shares of what it may be.
+    """
+    states, singular, _ = np.linalg.svd(slopes, full_matrices=False)
+    seen = states[:, singular > UNSEEN * max(singular.max(initial=0.0), 1.0)]
+    return np.asarray(rows - seen @ (seen.T @ rows))
+
+
 class Informed:
     """The objective of a window together with the prior; a guess is parameters at the end, trends, initial state."""
 
@@ -62,9 +79,7 @@ class Informed:
         self.high = np.concatenate([objective.high[:free], reach, objective.high[free:]])
         self._objective = objective
         self._mean = prior.mean
-        size = np.sqrt(np.diag(prior.covariance))
-        factor = np.linalg.cholesky(prior.covariance / np.outer(size, size))
-        self._root = np.linalg.inv(factor) / size
+        self._root = whitening(prior.covariance)
 
     def guess(self, parameters: Array, initial: Array) -> Array:
         """(guess,) from (free,) and (states,), with the trends of the prior."""
@@ -88,12 +103,8 @@ class Informed:
         """What the window says around ``fit``, with standard deviations ``grown`` by what is left unexplained."""
         count = len(self._mean)
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
-        scale = (self.high - self.low)[count:]
-        states, singular, _ = np.linalg.svd(jacobian[:, count:] * scale, full_matrices=False)
-        seen = states[:, singular > UNSEEN * max(singular.max(initial=0.0), 1.0)]
-        bent = self._bends(fit)
-        both = np.column_stack([jacobian[:, :count], residuals, bent])
-        both -= seen @ (seen.T @ both)
+        both = np.column_stack([jacobian[:, :count], residuals, self._bends(fit)])
+        both = without_states(both, jacobian[:, count:] * (self.high - self.low)[count:])
         directions, triangle = np.linalg.qr(both[:, :count])
         rest = directions.T @ both[:, count:]
         root, rest = discounted(triangle / grown, rest[:, 0] / grown, rest[:, 1:])

@@ -10,7 +10,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.objective import EXPLAINED, Objective, quantum
 from otolith.adaptation.polish import polish
-from otolith.adaptation.prior import Prior
+from otolith.adaptation.prior import Prior, whitening
 from otolith.adaptation.problem import Problem
 
 SHORTEST = 5  # records of the same value that are looked at
@@ -122,7 +122,7 @@ class _Scaled:
     def __init__(self, objective: Objective, prior: Prior, index: int, freedom: tuple[bool, bool]) -> None:
         self._objective, self._index, free = objective, index, objective.free
         self._mean = prior.mean[:free]
-        self._root = np.linalg.inv(np.linalg.cholesky(prior.covariance[:free, :free]))
+        self._root = whitening(prior.covariance[:free, :free])
         reach = max(float(np.ptp(objective.measured[:, index])), 1e3 * float(objective.noise.outputs[index]))
         gain, offset = LARGEST_ERROR * freedom[0], reach * freedom[1]
         # The initial state lies where the sensor would have shown it, had it been right.
