@@ -80,7 +80,7 @@ def live(row: Row, plan: Plan, seconds: float, sensors: Sequence[Sensor], lived:
     """
     scenario = load_scenario(examples_directory() / "scenarios" / f"{row.name}.toml")
     noise = {sensor.plant: sensor.noise for sensor in sensors}
-    scenario = scenario.model_copy(update={"noise": scenario.noise.model_copy(update=noise)})  # type: ignore[attr-defined]
+    scenario = scenario.model_copy(update={"noise": scenario.noise.model_copy(update=noise)})
     sources = [str(plan.file.signals[name]["signal"]) for name in plan.twin.signals]
     records = round(seconds / scenario.sample_period)
     values, truth = np.empty((records + 1, len(sources))), np.empty(records + 1)

@@ -37,6 +37,8 @@ class Scenario(Closed):
     dbc: Path
     bus: BusOptions = BusOptions()
     parameters: Any
+    noise: Any
+    """Standard deviation of each sensor."""
     faults: tuple[Fault, ...] = ()
 
     @model_validator(mode="after")
