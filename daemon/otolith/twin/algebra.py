@@ -30,6 +30,12 @@ class Printer(PythonCodePrinter):  # type: ignore[misc]  # sympy has no types
     def _print_absolute(self, expr: Any) -> str:
         return f"abs({self._print(expr.args[0])})"
 
+    def _print_component(self, expr: Any) -> str:
+        return f"{expr.func.__name__}({', '.join(self._print(argument) for argument in expr.args)})"
+
+    # SymPy asks for a method of the very name of a function's class.
+    _print_component_x = _print_component_a = _print_component_b = _print_component_c = _print_component
+
     def _print_Heaviside(self, expr: Any) -> str:  # noqa: N802
         return f"(1.0 if {self._print(expr.args[0])} > 0.0 else 0.0)"
 

@@ -12,6 +12,8 @@ class Role(StrEnum):
     """Instrumented known: given or measured."""
     ESTIMATED = "estimated"
     """Non-instrumented known: estimated from windows."""
+    SETTING = "setting"
+    """A choice, of which no derivative is taken: what sits in a slot for components."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +27,11 @@ class Parameter:
     high: float
     meaning: str
     role: Role = Role.INSTRUMENTED
+
+    @property
+    def label(self) -> str:
+        """For people: a number of a component is called by what it means."""
+        return self.meaning if self.name.startswith("_") else self.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +116,8 @@ class Definition:
     definitions: tuple[tuple[str, str, str], ...] = ()
     """Name, expression and meaning of helper quantities, in the author's order."""
     sites: tuple[Site, ...] = field(default=())
+    plain: "Definition | None" = None
+    """Of a twin with slots for components (see :mod:`otolith.twin.slots`): the twin without them."""
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -123,6 +132,11 @@ class Definition:
         """Every named quantity and its unit."""
         groups = (self.states, self.inputs, self.outputs, self.parameters, self.constants)
         return {entry.name: entry.unit for group in groups for entry in group}
+
+    @property
+    def settings(self) -> int:
+        """How many of the parameters, the last ones, have no derivatives."""
+        return sum(entry.role is Role.SETTING for entry in self.parameters)
 
     def parameter(self, name: str) -> Parameter:
         """By its name."""

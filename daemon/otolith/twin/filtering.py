@@ -97,8 +97,8 @@ def kalman(writer: Fragments, decorator: str) -> list[str]:
         "if record + 1 == records:",
         "    break",
         *(f"w_{index} = inputs[record + 1, {index}]" for index in range(inputs)),
-        f"{unpacked(_names('n', states))} = advance_({_arguments(writer, {})})",
-        *_transition(writer),
+        f"{unpacked(names('n', states))} = advance_({arguments(writer, {})})",
+        *transition(writer, "transition[{}, {}]"),
         "spread_(covariance, transition)",
         *(f"covariance[{row}, {row}] += process[{row}] * sample_period" for row in range(states)),
         *_inputs_into_states(writer),
@@ -120,26 +120,27 @@ def kalman(writer: Fragments, decorator: str) -> list[str]:
     ]  # fmt: skip
 
 
-def _names(prefix: str, count: int) -> list[str]:
+def names(prefix: str, count: int) -> list[str]:
+    """Numbered variables."""
     return [f"{prefix}_{index}" for index in range(count)]
 
 
-def _arguments(writer: Fragments, changed: dict[str, str]) -> str:
+def arguments(writer: Fragments, changed: dict[str, str]) -> str:
     """Of ``advance_``, with some names replaced."""
-    names = [*writer.x, *writer.u, *_names("w", len(writer.u))]
-    return ", ".join(["step", "substeps", *(changed.get(name, name) for name in names), *writer.fixed])
+    given = [*writer.x, *writer.u, *names("w", len(writer.u))]
+    return ", ".join(["step", "substeps", *(changed.get(name, name) for name in given), *writer.fixed])
 
 
-def _transition(writer: Fragments) -> list[str]:
-    """The derivative of the next state by this one, by central differences."""
+def transition(writer: Fragments, place: str) -> list[str]:
+    """The derivative of the next state by this one, by central differences, into ``place`` of row and column."""
     lines = []
     for column, name in enumerate(writer.x):
-        up, down = _names("up", len(writer.x)), _names("down", len(writer.x))
+        up, down = names("up", len(writer.x)), names("down", len(writer.x))
         lines += [
             f"by = {DIFFERENCE.format(name=name)}",
-            f"{unpacked(up)} = advance_({_arguments(writer, {name: f'{name} + by'})})",
-            f"{unpacked(down)} = advance_({_arguments(writer, {name: f'{name} - by'})})",
-            *(f"transition[{row}, {column}] = (up_{row} - down_{row}) / (2.0 * by)" for row in range(len(writer.x))),
+            f"{unpacked(up)} = advance_({arguments(writer, {name: f'{name} + by'})})",
+            f"{unpacked(down)} = advance_({arguments(writer, {name: f'{name} - by'})})",
+            *(f"{place.format(row, column)} = (up_{row} - down_{row}) / (2.0 * by)" for row in range(len(writer.x))),
         ]
     return lines
 
@@ -152,7 +153,7 @@ def _inputs_into_outputs(writer: Fragments) -> list[str]:
         lines += [
             f"if driving[{index}] > 0.0:",
             *indent([
-                f"{unpacked(_names('z', writer.outputs))} = outputs_({writer.arguments(writer.x, nudged)})",
+                f"{unpacked(names('z', writer.outputs))} = outputs_({writer.arguments(writer.x, nudged)})",
                 *(f"innovation[{row}, {column}] += (z_{row} - y_{row}) * (z_{column} - y_{column})"
                   for row in range(writer.outputs) for column in range(writer.outputs)),
             ]),
@@ -168,7 +169,7 @@ def _inputs_into_states(writer: Fragments) -> list[str]:
         lines += [
             f"if driving[{index}] > 0.0:",
             *indent([
-                f"{unpacked(_names('z', len(writer.x)))} = advance_({_arguments(writer, changed)})",
+                f"{unpacked(names('z', len(writer.x)))} = advance_({arguments(writer, changed)})",
                 *(f"covariance[{row}, {column}] += (z_{row} - n_{row}) * (z_{column} - n_{column})"
                   for row in range(len(writer.x)) for column in range(len(writer.x))),
             ]),

@@ -16,10 +16,11 @@ class Fragments:
 
     def __init__(self, definition: Definition) -> None:
         system = _renamed(system_of(definition))
-        hoist = Hoist(system.parameters)
+        hoist = Hoist((*system.parameters, *system.settings))
         self.x = [symbol.name for symbol in system.states]
         self.u = [symbol.name for symbol in system.inputs]
         self.p = [symbol.name for symbol in system.parameters]
+        self.settings = [symbol.name for symbol in system.settings]
         self.linear = [entry.hold == "foh" for entry in definition.inputs]
         self.outputs = len(system.outputs)
         self.a, self.b = Entries.of(system.rates, system.states), Entries.of(system.rates, system.parameters)
@@ -29,7 +30,7 @@ class Fragments:
         self.rate_entries = [hoist(expression) for expression in (*self.a.values, *self.b.values)]
         self.output_entries = [hoist(expression) for expression in (*self.c.values, *self.d.values)]
         self.hoisted = hoist.lines
-        self.fixed = [*self.p, *hoist.names]
+        self.fixed = [*self.p, *self.settings, *hoist.names]
 
     def function(self, name: str, expressions: list[sympy.Expr]) -> list[str]:
         """A function of scalars, subexpressions shared."""
@@ -66,7 +67,7 @@ class Fragments:
     def read(self, parameter: str, state: str) -> list[str]:
         """Once per trajectory."""
         return [
-            *(f"{name} = {parameter.format(index)}" for index, name in enumerate(self.p)),
+            *(f"{name} = {parameter.format(index)}" for index, name in enumerate([*self.p, *self.settings])),
             *self.hoisted,
             *(f"{name} = {state.format(index)}" for index, name in enumerate(self.x)),
         ]
@@ -180,13 +181,18 @@ def _renamed(system: System) -> System:
     """Prefixed symbols, so that no name of a page meets one of the kernel's own."""
     new = {
         symbol: sympy.Symbol(f"{prefix}_{symbol.name}", real=True)
-        for prefix, symbols in (("x", system.states), ("u", system.inputs), ("p", system.parameters))
+        for prefix, symbols in (
+            ("x", system.states),
+            ("u", system.inputs),
+            ("p", (*system.parameters, *system.settings)),
+        )
         for symbol in symbols
     }
     return System(
         states=tuple(new[symbol] for symbol in system.states),
         inputs=tuple(new[symbol] for symbol in system.inputs),
         parameters=tuple(new[symbol] for symbol in system.parameters),
+        settings=tuple(new[symbol] for symbol in system.settings),
         rates=tuple(expression.xreplace(new) for expression in system.rates),
         outputs=tuple(expression.xreplace(new) for expression in system.outputs),
     )

@@ -12,13 +12,16 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from otolith import kernel_cache
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Mask
 from otolith.errors import ConfigurationError
 from otolith.twin.definition import Definition
 
 MOST_SUBSTEPS = 1024
+
+Numbers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +79,23 @@ class Sensitivities(NamedTuple):
     """(states, parameters + states [+ parameters])."""
 
 
+class Linear(NamedTuple):
+    """A twin with slots, linearised along a window (see :mod:`otolith.twin.responses`)."""
+
+    trajectory: Array
+    """(records, states) as predicted."""
+    moves: Array
+    """(records, states, states)."""
+    early: Array
+    """(records, states, sites)."""
+    late: Array
+    """(records, states, sites)."""
+    output: Array
+    """(records, outputs, states)."""
+    through: Array
+    """(records, outputs, sites)."""
+
+
 class Kernel:
     """The compiled kernels of one definition, loaded from the cache or compiled on first use."""
 
@@ -124,15 +144,38 @@ class Kernel:
         found = self._call("kalman", parameters, initial, inputs, period, substeps, measured, *noises)
         return Correction(*found)
 
-    def substeps(self, parameters: Array, initial: Array, excitation: Excitation, tolerance: Array) -> int:
-        """The fewest substeps (a power of two) whose truncation error stays under ``tolerance`` (outputs,).
+    def along(self, parameters: Array, initial: Array, excitation: Excitation, nudge: Array) -> Linear:
+        """The linear system along a window, by differences of ``nudge`` (sites,) in the units of the sites."""
+        return Linear(*self._call("along", parameters, initial, *self._drive(excitation), nudge))
+
+    def curves(self, families: Array, x: Array, sources: Numbers, inner: Array, phases: Array) -> Array:
+        """Shapes of components of unit amplitude: (curves,), (sources, records), (curves,), (curves,), (curves,).
+
+        ``sources`` are the rows of ``x`` that they depend on. Returns (records, curves).
+        """
+        found: Array = self._call("curves", families, x, sources, inner, phases)
+        return found
+
+    def respond(self, linear: Linear, correction: Correction, present: Mask, curves: Array, sites: Numbers) -> Array:
+        """(records * outputs, curves) whitened innovations, as each of ``curves`` (records, curves) changes them.
+
+        ``sites`` (curves,) are the numbers of the sites at which they enter.
+        """
+        rest = (linear.through, correction.gain, correction.whitening, present, curves, sites)
+        found: Array = self._call("respond", linear.moves, linear.early, linear.late, linear.output, *rest)
+        return found
+
+    def substeps(
+        self, parameters: Array, initial: Array, excitation: Excitation, tolerance: Array, most: int = MOST_SUBSTEPS
+    ) -> int:
+        """The fewest substeps (a power of two up to ``most``) with a truncation error under ``tolerance`` (outputs,).
 
         Shapes (parameters,), (states,). The error is told by halving the step (Richardson; Hairer, Norsett, Wanner,
         Solving Ordinary Differential Equations I, section II.4).
         """
         count = 1
         coarse = self.simulate(parameters[None], initial[None], replace(excitation, substeps=count))
-        while count < MOST_SUBSTEPS:
+        while count < most:
             fine = self.simulate(parameters[None], initial[None], replace(excitation, substeps=2 * count))
             with np.errstate(invalid="ignore"):
                 error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0
@@ -185,6 +228,7 @@ def identity_of(definition: Definition) -> str:
         [astuple(entry)[:3] for entry in definition.constants],
         [(name, expression) for name, expression, _ in definition.definitions],
         definition.equations,
+        None if definition.plain is None else [astuple(entry) for entry in definition.sites],
     )
     return hashlib.sha256(repr(mathematical).encode()).hexdigest()
 

@@ -9,35 +9,12 @@ from functools import lru_cache
 
 import sympy
 
-from otolith.twin.definition import Definition
+from otolith.twin.completed import entering_of
+from otolith.twin.definition import Definition, Site
 from otolith.twin.expressions import constant, parse
+from otolith.twin.functions import absolute, sign
+from otolith.twin.slots import sites
 from otolith_drivers.quantities import to_base
-
-
-class sign(sympy.Function):  # type: ignore[misc]  # noqa: N801 - printed as it is called
-    """The sign, with the slope that it has beside its step: SymPy's own asks whether its argument is real."""
-
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
-        """Zero."""
-        del argindex
-        return sympy.Integer(0)
-
-
-class absolute(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as above
-    """The absolute value of a real quantity."""
-
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
-        """The sign."""
-        del argindex
-        return sign(self.args[0])
-
-    def _pretty(self, printer: object) -> object:
-        return printer._print(sympy.Abs(self.args[0]))  # type: ignore[attr-defined]
-
-    def _latex(self, printer: object) -> str:
-        found: str = printer._print(sympy.Abs(self.args[0]))  # type: ignore[attr-defined]
-        return found
-
 
 UNARY = {name: getattr(sympy, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh",
                                                    "exp", "log", "sqrt")}  # fmt: skip
@@ -51,6 +28,8 @@ class System:
     states: tuple[sympy.Symbol, ...]
     inputs: tuple[sympy.Symbol, ...]
     parameters: tuple[sympy.Symbol, ...]
+    settings: tuple[sympy.Symbol, ...]
+    """Of which no derivative is taken."""
     rates: tuple[sympy.Expr, ...]
     outputs: tuple[sympy.Expr, ...]
 
@@ -64,23 +43,60 @@ def system_of(definition: Definition) -> System:
     values: dict[str, sympy.Expr] = {name: _scaled(symbols[name], scales[name]) for name in symbols}
     for entry in definition.constants:
         values[entry.name] = sympy.Float(entry.value * scales[entry.name])
+    entering = _Entering(definition, symbols)
+    for driven in definition.inputs:
+        values[driven.name] -= entering.sensor(driven.name)  # the twin is driven by what is true
     pending = {name: parse(text) for name, text, _ in definition.definitions}
     while pending:
         ready = [name for name in pending if not _depends(pending[name], pending)]
         for name in ready:
-            values[name] = to_sympy(pending.pop(name), values)
-    right = {left: to_sympy(parse(text), values) for left, text in definition.equations}
+            values[name] = entering.at(name, to_sympy(pending.pop(name), values), values)
     states = [entry.name for entry in definition.states]
+    right = {left: entering.at(left, to_sympy(parse(text), values), values) for left, text in definition.equations}
+    shown = {left: _scaled(side, 1.0 / scales[left]) for left, side in right.items() if left in scales}
+    shown |= {name: symbols[name] for name in states}
+    settings = len(definition.parameters) - definition.settings
     return System(
         states=tuple(symbols[name] for name in states),
         inputs=tuple(symbols[entry.name] for entry in definition.inputs),
-        parameters=tuple(symbols[entry.name] for entry in definition.parameters),
+        parameters=tuple(symbols[entry.name] for entry in definition.parameters[:settings]),
+        settings=tuple(symbols[entry.name] for entry in definition.parameters[settings:]),
         rates=tuple(_scaled(right[f"der({name})"], 1.0 / scales[name]) for name in states),
         outputs=tuple(
-            symbols[entry.name] if entry.name in states else _scaled(right[entry.name], 1.0 / scales[entry.name])
+            shown[entry.name] + _scaled(entering.sensor(entry.name), 1.0 / scales[entry.name])
             for entry in definition.outputs
         ),
     )
+
+
+class _Entering:
+    """What components add at the sites of a twin with slots; nothing at those of a plain one."""
+
+    def __init__(self, definition: Definition, symbols: dict[str, sympy.Symbol]) -> None:
+        self._sites: list[tuple[Site, sympy.Expr]] = []
+        self._sensors: dict[str, sympy.Expr] = {}
+        plain = definition.plain
+        if plain is not None:
+            outputs = [entry.name for entry in plain.outputs]
+            entering = entering_of(plain, symbols, dict(zip(outputs, system_of(plain).outputs, strict=True)))
+            own = len(plain.sites)
+            self._sites = list(zip(plain.sites, entering[:own], strict=True))
+            self._sensors = {
+                site.into: expression for site, expression in zip(sites(plain)[own:], entering[own:], strict=True)
+            }
+
+    def at(self, left: str, side: sympy.Expr, values: dict[str, sympy.Expr]) -> sympy.Expr:
+        """The right side that belongs to ``left``, with what enters there (Eq. 3 and 18)."""
+        for site, expression in self._sites:
+            if site.into == left and site.mode == "multiplicative":
+                side *= 1 + expression
+            elif site.into == left:
+                side += to_sympy(parse(site.through), values) * expression
+        return side
+
+    def sensor(self, name: str) -> sympy.Expr:
+        """What the sensor of a signal adds to the truth."""
+        return self._sensors.get(name, sympy.Integer(0))
 
 
 def to_sympy(tree: ast.expr, values: dict[str, sympy.Expr]) -> sympy.Expr:
