@@ -9,20 +9,39 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Verdict, Window
-from otolith.adaptation.estimate import WindowEstimate, estimate
-from otolith.adaptation.fusion import Belief, carried, overall
-from otolith.adaptation.gate import REFUSED, Lesson, Memory, confirm_or_suspect, is_surprising, learn, refuse
+from otolith.adaptation.case import Case, Hypothesis
+from otolith.adaptation.catalogue import FADES_AFTER, adopted, alternatives, approving, faded, slot_of, words
+from otolith.adaptation.claims import Reason
+from otolith.adaptation.completion import plain, without
+from otolith.adaptation.estimate import WindowEstimate, estimate, refine
+from otolith.adaptation.fusion import Belief, carried, overall, rebased
+from otolith.adaptation.gate import (
+    REFUSED,
+    TEACHING,
+    Lesson,
+    Memory,
+    considered,
+    decided,
+    is_sure_of_some,
+    is_surprising,
+    learn,
+    refuse,
+)
+from otolith.adaptation.glance import glance
 from otolith.adaptation.length import Need, next_records
 from otolith.adaptation.objective import EXPLAINED
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
-from otolith.adaptation.sensors import stuck, wrong_scale
+from otolith.adaptation.sensors import stuck
 from otolith.adaptation.spikes import without_spikes
+from otolith.adaptation.tracking import is_lost, moved_on, outlived, turned
 from otolith.health.report import Report
 from otolith.reporting import Learned, document_of, traces_of
 from otolith.state import State
 
 FEWEST_RECORDS = 5
+SEARCHED = 5000  # records, the last ones of a window, in which components are looked for: a search has to end
+PHASES = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad
 LARGEST = 1e12  # of a value, in the unit of its signal: no sensor says that
 NEVER = "are the signals and [noise] what the machine file says, in unit and size?"
 SCATTERED = 3.0  # ratio of variances: windows disagree that much more than they say
@@ -35,22 +54,45 @@ UNEXPLAINED = "the twin does not explain the window up to the noise: another par
 
 def adapt(state: State, window: Window) -> tuple[State, Report]:
     """Adapt the twin to ``window``; a bad window leaves what is known where it was and is reported."""
+    state = _without_outlived(state, window)
     learned = _judge(state, window)
+    learned = replace(learned, catalogue=approving(learned.catalogue, state.approved))
     standing, document = document_of(state, window, learned)
-    after = replace(state, memory=learned.memory, standing=standing, records=_next_records(state, window, learned))
+    after = replace(
+        state,
+        problem=learned.problem,
+        memory=learned.memory,
+        catalogue=learned.catalogue,
+        standing=standing,
+        records=_next_records(state, window, learned),
+    )
     return after, Report(document, traces_of(state, window, learned))
+
+
+def _without_outlived(state: State, window: Window) -> State:
+    """Without components whose time is over."""
+    for component in outlived(state.problem, window):
+        fewer = without(state.problem, component)
+        belief, turn = rebased(state.memory.belief, state.problem, fewer), state.memory.turned
+        if turn is not None:
+            keys = [entry.key for entry in state.problem.components]
+            turn = replace(turn, by=tuple(turn.by[keys.index(entry.key)] for entry in fewer.components))
+        rest = tuple(entry for entry in state.catalogue if entry.component.key != component.key)
+        memory = replace(state.memory, belief=belief, turned=turn, case=None)
+        state = replace(state, problem=fewer, memory=memory, catalogue=rest)
+    return state
 
 
 def _judge(state: State, window: Window) -> Learned:
     """Sampling and sensors are looked at first: what lies must not teach."""
     problem, memory = state.problem, state.memory
-    expected = carried(memory.belief, window.end)
+    expected = carried(moved_on(memory.belief, problem, memory.turned, window), window.end)
     before = overall(expected, problem)
-    untaught = Learned(memory, before, before)
+    untaught = Learned(memory, before, before, problem, state.catalogue)
     reasons = window.quality.reasons if window.quality.verdict is Verdict.BAD else _senseless(window)
     if reasons:
         return replace(untaught, reason=UNUSED + "; ".join(reasons))
-    window, notes, vetoes = without_spikes(window, problem.twin, problem.noise)
+    window, notes, vetoes = without_spikes(window, plain(problem), problem.noise)
     if not vetoes:
         vetoes = stuck(problem, window, _start(before, problem))
     if vetoes:
@@ -71,36 +113,100 @@ def _senseless(window: Window) -> tuple[str, ...]:
 def _learn(state: State, window: Window, expected: Belief, untaught: Learned) -> Learned:
     """What the window says, weighed with what was ``expected`` at its end."""
     problem, memory, prior = state.problem, state.memory, untaught.before
-    warm = any(entry.known for entry in state.standing)
-    found = estimate(problem, window, _start(prior, problem), prior, warm=warm)
-    refused = found.cost > REFUSED
-    expectable = not refused and not is_surprising(expected, found.evidence, problem)
-    if expectable and found.cost <= EXPLAINED:
-        return _learned(untaught, problem, learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
-    fault = wrong_scale(problem, window, prior, found.chi_square, memory.lying) if warm else None
-    if fault is not None:
-        lying = refuse(memory, fault.output)
-        return replace(untaught, memory=lying, found=found, lesson=Lesson.SENSOR, reason=str(fault))
-    if expectable:
-        return _learned(untaught, problem, learn(memory, expected, found.evidence, problem), found, Lesson.LEARNED)
-    if refused:
-        learned = _learned(untaught, problem, refuse(memory), found, Lesson.REFUSED)
-        return learned if warm else replace(learned, reason=f"{learned.reason}; {NEVER}")
-    alone = estimate(problem, window, np.array([entry.value for entry in found.parameters]), warm=True)
-    after, lesson = confirm_or_suspect(memory, expected, alone.evidence, problem)
-    return _learned(untaught, problem, after, alone, lesson)
+    warm = any(entry.known for entry in state.standing.values())
+    lost = is_lost(expected, problem)
+    found = _refined(problem, window, prior, lost) if warm else estimate(problem, window, _start(prior, problem), prior)
+    start = prior.mean if warm and not lost else np.array([entry.value for entry in found.parameters])
+    recent = window if problem.components else window.since(max(window.records - SEARCHED, 0))
+    seen = glance(problem, recent, prior, start)
+    expectable = found.cost <= REFUSED and not is_surprising(expected, found.evidence, problem)
+    if memory.case is None and expectable and found.cost <= EXPLAINED and seen.gain <= 0.0:
+        return _expected(untaught, window, expected, found)
+    considering = considered(memory, problem, recent, expected, (prior, seen))
+    case: Case | None = considering
+    lesson, best = decided(considering, problem)
+    if lesson is Lesson.LEARNED and found.cost <= REFUSED:
+        return _expected(untaught, window, expected, found)
+    if lesson is Lesson.LEARNED:  # what came is gone again within the window
+        case, lesson = None, Lesson.REFUSED
+    if case is not None and lesson in TEACHING:
+        return _changed(untaught, window, case, lesson, best)
+    if case is not None and best.reason is Reason.COMPONENT and is_sure_of_some(case):
+        # Which component it is may be open, but each of them leaves the parameters where the best one has them.
+        after = overall(rebased(best.belief, best.problem, problem), problem)
+        untaught = replace(untaught, before=after, after=after)
+    learned = _said(replace(untaught, memory=refuse(memory, case), found=found, lesson=lesson, case=case))
+    return learned if warm or lesson is not Lesson.REFUSED else replace(learned, reason=f"{learned.reason}; {NEVER}")
 
 
-def _learned(untaught: Learned, problem: Problem, memory: Memory, found: WindowEstimate, lesson: Lesson) -> Learned:
+def _refined(problem: Problem, window: Window, prior: Prior, lost: list[int]) -> WindowEstimate:
+    """In the valley that was known; of phases that nobody has followed, several are tried."""
+    start = _start(prior, problem)
+    tried = []
+    for turn in PHASES if lost else (0.0,):
+        begin = start.copy()
+        begin[lost] += turn
+        tried.append(refine(problem, window, begin, prior))
+    return min(tried, key=lambda found: found.cost)
+
+
+def _expected(untaught: Learned, window: Window, expected: Belief, found: WindowEstimate) -> Learned:
+    """After a window that healthy change explains; a component that is no longer seen leaves the twin."""
+    problem, now = untaught.problem, turned(untaught.problem, window, found.last_state)
+    memory = learn(untaught.memory, expected, found.evidence, problem, now)
+    after = overall(memory.belief, problem)
+    catalogue = faded(untaught.catalogue, problem, after)
+    gone = next((entry for entry in catalogue if entry.fading >= FADES_AFTER), None)
+    learned = replace(untaught, memory=memory, after=after, found=found, lesson=Lesson.LEARNED, catalogue=catalogue)
+    slot = None if gone is None else slot_of(problem, gone.component)
+    if gone is None or slot is None:
+        return _said(learned)
+    fewer = without(problem, problem.components[slot])
+    bare = rebased(memory.belief, problem, fewer)
+    if refine(fewer, window, _start(overall(bare, fewer), fewer), overall(bare, fewer)).cost > max(
+        EXPLAINED, found.cost
+    ):
+        return _said(learned)  # it is still needed, however little is known of it
+    rest = tuple(entry for entry in catalogue if entry is not gone)
+    return _rebased(replace(learned, lesson=Lesson.FADED, catalogue=rest), window, fewer, memory)
+
+
+def _changed(untaught: Learned, window: Window, case: Case, lesson: Lesson, best: Hypothesis) -> Learned:
+    """After windows that agree on a sudden change, or on a component."""
+    catalogue = adopted(case, best, untaught.catalogue) if lesson is Lesson.DISCOVERED else untaught.catalogue
+    memory = Memory(best.belief, best.turned)
+    learned = replace(untaught, lesson=lesson, catalogue=catalogue, case=case, adopted=best)
+    return _rebased(learned, window, replace(best.problem, excluded=untaught.problem.excluded), memory)
+
+
+def _rebased(learned: Learned, window: Window, problem: Problem, memory: Memory) -> Learned:
+    """With another twin, or knowledge begun anew."""
+    belief = memory.belief
+    if len(belief.mean[0]) != 2 * len(problem.free):
+        belief = rebased(belief, learned.problem, problem)
+    turn = memory.turned
+    if turn is not None and len(turn.by) != len(problem.components):
+        keys = [entry.key for entry in learned.problem.components]
+        turn = replace(turn, by=tuple(turn.by[keys.index(entry.key)] for entry in problem.components))
+    after = overall(belief, problem)
+    found = refine(problem, window, _start(after, problem), after)
+    memory = replace(memory, belief=belief, turned=turn)
+    return _said(replace(learned, memory=memory, before=after, after=after, problem=problem, found=found))
+
+
+def _said(learned: Learned) -> Learned:
     """With what there is to say of the window as a whole."""
-    before = untaught.before
-    after = before if memory.belief is untaught.memory.belief else overall(memory.belief, problem)
-    reasons = [] if lesson is Lesson.LEARNED else [lesson.value]
-    if found.cost > EXPLAINED and lesson is not Lesson.REFUSED:
+    reasons = [] if learned.lesson is Lesson.LEARNED else [learned.lesson.value]
+    case = learned.case
+    if case is not None and learned.lesson in (Lesson.SENSOR, Lesson.SUSPECTED):
+        others = [f"or {entry.text} ({entry.probability:.0%})" for entry in alternatives(case, case.best)[:2]]
+        reasons += ["; ".join([f"{words(case.best)} ({case.probabilities[0]:.0%})", *others])]
+    if learned.found is not None and learned.found.cost > EXPLAINED and learned.lesson is not Lesson.REFUSED:
         reasons.append(UNEXPLAINED)
-    if memory.belief.scatter > SCATTERED:
-        reasons.append(CONTRADICTORY.format(memory.belief.scatter**0.5))
-    return Learned(memory, before, after, found, lesson, "; ".join(reasons))
+    scatter = learned.memory.belief.scatter
+    if scatter > SCATTERED:
+        reasons.append(CONTRADICTORY.format(scatter**0.5))
+    return replace(learned, reason="; ".join(reasons))
 
 
 def _start(prior: Prior, problem: Problem) -> Array:
@@ -109,7 +215,7 @@ def _start(prior: Prior, problem: Problem) -> Array:
 
 
 def _next_records(state: State, window: Window, learned: Learned) -> int:
-    problem, found, known = state.problem, learned.found, learned.after
+    problem, found, known = learned.problem, learned.found, learned.after
     if found is None:
         return state.records
     free = len(problem.free)

@@ -6,11 +6,16 @@ import numpy as np
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.advice import Situation, advise
+from otolith.adaptation.case import Case, Hypothesis
+from otolith.adaptation.catalogue import Entry
+from otolith.adaptation.completion import driven
 from otolith.adaptation.estimate import WindowEstimate
+from otolith.adaptation.experiment import deciding
 from otolith.adaptation.gate import Lesson, Memory
 from otolith.adaptation.objective import EXPLAINED
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
+from otolith.health.discoveries import component_documents, explanations_of, findings_of
 from otolith.health.report import (
     CostDocument,
     FitDocument,
@@ -33,38 +38,64 @@ class Learned:
     """What was known at the end of the window, but for the window."""
     after: Prior
     """What is known then."""
+    problem: Problem
+    """With the components that are in the twin then."""
+    catalogue: tuple[Entry, ...] = ()
+    """Of these components."""
     found: WindowEstimate | None = None
     """None for a window that was not estimated from."""
     lesson: Lesson = Lesson.BAD
     reason: str = ""
     """What there is to say of the window as a whole."""
+    case: Case | None = None
+    """What could have happened, if that is a question."""
+    adopted: Hypothesis | None = None
+    """What has been found to have happened."""
 
 
-def document_of(state: State, window: Window, learned: Learned) -> tuple[tuple[Standing, ...], ReportDocument]:
+def document_of(state: State, window: Window, learned: Learned) -> tuple[dict[str, Standing], ReportDocument]:
     """The report of ``window`` after ``state``, and what it says of each parameter."""
-    problem, memory, found = state.problem, learned.memory, learned.found
+    problem, memory, found = learned.problem, learned.memory, learned.found
     parameters: dict[str, ParameterDocument] = {}
-    standing: list[Standing] = []
+    standing: dict[str, Standing] = {}
     allowed = problem.determined_within * problem.scale
+    sure = learned.case is not None and not learned.case.doubts_parameters
+    contradictions = 0 if sure else memory.contradictions
     for index, (entry, fused) in enumerate(zip(problem.free, _fused(learned), strict=True)):
         said = None if found is None else found.parameters[index]
-        heard = Heard(said, learned.lesson, memory.contradictions, memory.belief.scatter, learned.reason)
-        now, parameters[entry.name] = publish(entry, float(allowed[index]), fused, heard, state.standing[index])
-        standing.append(now)
+        heard = Heard(said, learned.lesson, contradictions, memory.belief.scatter, learned.reason)
+        before = state.standing.get(entry.label, Standing())
+        standing[entry.label], said_of_it = publish(entry, float(allowed[index]), fused, heard, before)
+        if not entry.name.startswith("_"):
+            parameters[entry.name] = said_of_it
     _advise(problem, window, learned, parameters)
+    components = component_documents(problem, learned.after, learned.catalogue)
+    undecided = learned.case if learned.lesson in (Lesson.SUSPECTED, Lesson.SENSOR, Lesson.REFUSED) else None
+    explanations = explanations_of(undecided)
+    experiment = _experiment(window, learned, undecided)
     document = ReportDocument(
         machine=state.machine,
         site=state.site,
         twin=problem.twin.name,
-        model="DT'" if any(entry.known for entry in standing) else "DT",
+        model=_model(problem, standing),
         window=window_document(window),
         lesson=learned.lesson,
         parameters=parameters,
+        components=components,
+        explanations=explanations,
+        findings=findings_of(components, explanations, learned.case, experiment),
     )
     if found is not None:
         cost = CostDocument(evaluations=found.evaluations, generations=found.generations)
         document = document.model_copy(update={"fit": _fit(problem, found, memory), "cost": cost})
-    return tuple(standing), document
+    return standing, document
+
+
+def _model(problem: Problem, standing: dict[str, Standing]) -> str:
+    """The paper's names."""
+    if problem.components:
+        return "DT''"
+    return "DT'" if any(entry.known for entry in standing.values()) else "DT"
 
 
 def traces_of(state: State, window: Window, learned: Learned) -> Traces:
@@ -100,10 +131,23 @@ def _advise(problem: Problem, window: Window, learned: Learned, documents: dict[
     wanted = [name for name, entry in documents.items() if entry.status in (Status.UNESTIMATED, Status.HELD)]
     if found is None or learned.lesson is not Lesson.LEARNED or not wanted or not np.isfinite(found.last_state).all():
         return
-    inputs = np.array([window.column(entry.name)[-1] for entry in problem.twin.inputs])
+    inputs = driven(problem.twin, window)[-1]
     situation = Situation(inputs, found.last_state, window.records, window.sample_period)
     for name, text in advise(problem, learned.after, situation, wanted).items():
         documents[name] = documents[name].model_copy(update={"advice": text})
+
+
+def _experiment(window: Window, learned: Learned, case: Case | None) -> str:
+    """What would tell the most probable explanation from the next one."""
+    found = learned.found
+    if case is None or found is None or not np.isfinite(found.last_state).all():
+        return ""
+    others = case.alternatives(case.best)
+    if not others:
+        return ""
+    inputs = driven(learned.problem.twin, window)[-1]
+    situation = Situation(inputs, found.last_state, window.records, window.sample_period)
+    return deciding(case.best, others[0][0], situation)
 
 
 def _fit(problem: Problem, found: WindowEstimate, memory: Memory) -> FitDocument:
@@ -111,6 +155,7 @@ def _fit(problem: Problem, found: WindowEstimate, memory: Memory) -> FitDocument
     return FitDocument(
         rmse_configured=_finite(outputs, found.rmse_configured),
         rmse_estimated=_finite(outputs, found.rmse_estimated),
+        rmse_completed=_finite(outputs, found.rmse_completed) if problem.components else None,
         explained=found.cost <= EXPLAINED,
         cost=found.cost,
         scatter=memory.belief.scatter,

@@ -5,6 +5,8 @@ Benchmarks, 2019.) The data is not ours: it is looked for where OTOLITH_DATA say
 """
 
 import os
+import re
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -159,3 +161,29 @@ def test_one_way_only_friction_and_offset_are_named_as_traded() -> None:
             assert entry.identifiability is Identifiability.TRADED
             assert f"traded with {other}" in entry.reason
     assert seen == 5
+
+
+def test_dry_friction_that_the_twin_lacks_is_discovered() -> None:
+    """Viscous friction is in the twin, by direction; the dry one, 20.4 N on the average of both, is not."""
+    full = find_twin("servo_axis_directional")
+    bare = replace(
+        full,
+        name="axis_without_dry_friction",
+        definitions=tuple(
+            (name, re.sub(r" \+ F_c_(up|down)\*tanh\(v/v_s\)", "", text), meaning)
+            for name, text, meaning in full.definitions
+        ),
+        parameters=tuple(entry for entry in full.parameters if entry.name.startswith(("M", "F_v"))),
+    )
+    told = learned("servo_axis_directional")
+    levels = {entry.name: entry.value for entry in told.states}
+    process = tuple(levels[entry.name] for entry in bare.states)
+    state = begin("axis", "lab", Problem(bare, (), bare.parameters, (told.outputs[0].value,), process_noise=process))
+    documents = []
+    for window in windows():
+        state, report = adapt(state, window)
+        documents.append(report.document)
+    (found,) = documents[-1].components
+    assert (found.family, found.input, found.site) == ("Coulomb", "v", "carriage")
+    assert found.values["amplitude"].value == pytest.approx(-20.4, rel=0.1)
+    assert documents[-1].parameters["M"].value == pytest.approx(MASS, rel=0.01)

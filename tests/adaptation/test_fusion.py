@@ -7,7 +7,6 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.fusion import begin_belief, carried, overall, updated
-from otolith.adaptation.gate import Lesson, Memory, begin_memory, confirm_or_suspect, is_surprising, learn
 from otolith.adaptation.prior import Evidence
 from otolith.adaptation.problem import Problem
 from otolith.twins import find_twin
@@ -78,50 +77,6 @@ def test_a_clock_that_goes_back_does_no_harm() -> None:
     belief = updated(carried(begin_belief(PROBLEM), 1e9), evidence(6.0, 0.0, 0.01, np.random.default_rng(3)), PROBLEM)
     earlier = carried(belief, 5.0)
     assert overall(earlier, PROBLEM).mean == pytest.approx(overall(carried(belief, 1e9), PROBLEM).mean)
-
-
-def told(memory: Memory, value: float, end: float, seed: int, sd: float = 0.01) -> tuple[Memory, Lesson]:
-    found = evidence(value, 0.0, sd, np.random.default_rng(seed))
-    expected = carried(memory.belief, end)
-    if is_surprising(expected, found, PROBLEM):
-        return confirm_or_suspect(memory, expected, found, PROBLEM)
-    return learn(memory, expected, found, PROBLEM), Lesson.LEARNED
-
-
-def healthy(windows: int = 30) -> Memory:
-    memory = begin_memory(PROBLEM)
-    for index in range(windows):
-        memory, lesson = told(memory, SIZE, LENGTH * index, index)
-        assert lesson is Lesson.LEARNED
-    return memory
-
-
-def test_a_step_is_believed_when_two_windows_say_so() -> None:
-    memory, lesson = told(healthy(), 0.9 * SIZE, 60.0, 100)
-    assert lesson is Lesson.SUSPECTED
-    assert overall(memory.belief, PROBLEM).mean[0] == pytest.approx(SIZE, abs=0.05)
-    memory, lesson = told(memory, 0.9 * SIZE, 62.0, 101)
-    assert lesson is Lesson.STEPPED
-    assert overall(memory.belief, PROBLEM).mean[0] == pytest.approx(0.9 * SIZE, abs=0.03)
-
-
-def test_one_wrong_window_changes_nothing_but_confidence() -> None:
-    before = healthy()
-    memory, _ = told(before, 0.5 * SIZE, 60.0, 100)
-    memory, lesson = told(memory, SIZE, 62.0, 101)
-    assert lesson is Lesson.LEARNED
-    assert memory.contradictions == 0
-    assert overall(memory.belief, PROBLEM).mean[0] == pytest.approx(SIZE, abs=0.05)
-    assert memory.belief.scatter > before.belief.scatter
-
-
-def test_windows_that_contradict_each_other_never_become_a_step() -> None:
-    memory, lessons = healthy(), []
-    for index, value in enumerate((0.7, 1.3, 0.6, 1.4, 0.8)):
-        memory, lesson = told(memory, value * SIZE, 60.0 + 2.0 * index, 200 + index)
-        lessons.append(lesson)
-    assert lessons == [Lesson.SUSPECTED] * 5
-    assert memory.contradictions == 5
 
 
 def test_windows_that_scatter_more_than_they_say_are_believed_less() -> None:

@@ -1,6 +1,6 @@
 """What adaptation works on: a window of uniformly sampled signals, and the verdict on how well they were sampled."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -65,6 +65,15 @@ class Window:
     def end(self) -> float:
         """Unix seconds at which the last record ends."""
         return self.start + self.records * self.sample_period
+
+    def since(self, record: int) -> "Window":
+        """What is left of the window from a record on."""
+        start = self.start + record * self.sample_period
+        return replace(self, start=start, values=self.values[record:], missing=self.missing[record:])
+
+    def until(self, record: int) -> "Window":
+        """The window up to a record."""
+        return replace(self, values=self.values[:record], missing=self.missing[:record])
 
     def column(self, signal: str) -> Array:
         """(records,) of one signal."""

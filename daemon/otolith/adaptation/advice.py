@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
+from otolith.adaptation.completion import plain
 from otolith.adaptation.information import QUANTILE
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
@@ -48,29 +49,29 @@ class Move:
 
 def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[str]) -> dict[str, str]:
     """A sentence for each ``wanted`` parameter that some move would pin down, given what is ``known`` of all."""
-    moves = list(_moves(problem, situation))
-    reaches = np.array([_reaches(problem, known, situation, move) for move in moves]).reshape(len(moves), -1)
+    tried = list(moves(problem, situation))
+    reaches = np.array([_reaches(problem, known, situation, move) for move in tried]).reshape(len(tried), -1)
     allowed = problem.determined_within * problem.scale
     deviations = QUANTILE * np.sqrt(np.diag(known.covariance))
     advice = {}
     for index, entry in enumerate(problem.free):
-        if entry.name not in wanted or not moves:
+        if entry.name not in wanted or not tried:
             continue
         reach = reaches[:, index]
         enough = np.flatnonzero(reach <= allowed[index])
         best = int(enough[0]) if len(enough) else int(np.argmin(reach))
         if reach[best] <= WORTH * deviations[index]:
-            advice[entry.name] = f"{moves[best].words} would pin it down to ±{reach[best]:.2g} {entry.unit}{ELSE}"
+            advice[entry.name] = f"{tried[best].words} would pin it down to ±{reach[best]:.2g} {entry.unit}{ELSE}"
     return advice
 
 
-def _moves(problem: Problem, situation: Situation) -> Iterator[Move]:
-    """The smallest first."""
+def moves(problem: Problem, situation: Situation) -> Iterator[Move]:
+    """Steps and swings of one input at a time, the smallest first."""
     records = min(situation.records, RECORDS)
     period = situation.records * situation.sample_period / records
     share = np.arange(records) / records
     for size in SHARES:
-        for column, entry in enumerate(problem.twin.inputs):
+        for column, entry in enumerate(plain(problem).inputs):
             here, there = _ends(entry, float(situation.inputs[column]), size)
             step = f"a step of {entry.name} from {here:.3g} to {there:.3g} {entry.unit}"
             swing = f"swinging {entry.name} between {here:.3g} and {there:.3g} {entry.unit}"
@@ -91,7 +92,7 @@ def _ends(entry: Input, here: float, size: float) -> tuple[float, float]:
 def _reaches(problem: Problem, known: Prior, situation: Situation, move: Move) -> Array:
     """(free,) half of the 95 % interval of each parameter after ``move``; the initial state is estimated along."""
     twin, kernel, free = problem.twin, kernel_of(problem.twin), len(problem.free)
-    order = [entry.name for entry in twin.parameters]
+    order = [entry.name for entry in twin.parameters[: len(twin.parameters) - twin.settings]]
     parameters = np.array([dict(problem.known).get(entry.name, entry.nominal) for entry in twin.parameters])
     places = [order.index(entry.name) for entry in problem.free]
     parameters[places] = np.clip(known.mean[:free], *problem.bounds)

@@ -19,6 +19,8 @@ def bends(objective: Objective, guess: Array, jacobian: Array) -> Array:
 
     ``jacobian`` (rows, guess) is of everything that holds the guess in place, the prior included.
     """
+    if not np.isfinite(jacobian).all():
+        return np.zeros((len(objective.measured.ravel()), 0))
     size = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     _, singular, directions = np.linalg.svd(jacobian / size, full_matrices=False)
     seen = singular > SLIGHT * singular[0]
@@ -34,5 +36,7 @@ def bends(objective: Objective, guess: Array, jacobian: Array) -> Array:
 
 def discounted(root: Array, rest: Array, bent: Array) -> tuple[Array, Array]:
     """``root`` (rows, columns) and ``rest`` (rows,) with ``bent`` (rows, directions) as noise beside the unit one."""
-    factor = np.linalg.cholesky(np.eye(len(rest)) + bent @ bent.T)
-    return np.linalg.solve(factor, root), np.linalg.solve(factor, rest)
+    # The inverse root of the whole covariance: whatever the size of what bends, rounding does not make it singular.
+    along, sizes, _ = np.linalg.svd(bent, full_matrices=False)
+    share = 1.0 - 1.0 / np.hypot(1.0, sizes)
+    return root - (along * share) @ (along.T @ root), rest - (along * share) @ (along.T @ rest)

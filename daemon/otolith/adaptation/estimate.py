@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
+from otolith.adaptation.completion import places
 from otolith.adaptation.information import (
     Identifiability,
     Information,
@@ -47,6 +48,8 @@ class WindowEstimate:
     """Values that were measured."""
     rmse_configured: tuple[float, ...]
     rmse_estimated: tuple[float, ...]
+    rmse_completed: tuple[float, ...]
+    """With the components; as estimated, where there are none."""
     measured: Array
     predicted: Array
     last_state: Array
@@ -72,6 +75,11 @@ def estimate(
     return _Fit(problem, window, start, prior or vague(problem)).run(warm=warm)
 
 
+def refine(problem: Problem, window: Window, start: Array, prior: Prior) -> WindowEstimate:
+    """As :func:`estimate`, but in the valley of ``start`` (free parameters,) whatever the window says."""
+    return _Fit(problem, window, start, prior).run(warm=True, near=True)
+
+
 class _Fit:
     """One window's fit, step by step."""
 
@@ -85,9 +93,9 @@ class _Fit:
         self._alone = self._window_alone()
         self._told = self._tell()
 
-    def run(self, *, warm: bool) -> WindowEstimate:
+    def run(self, *, warm: bool, near: bool = False) -> WindowEstimate:
         outcome = Outcome.CONTINUED
-        unexplained = self._cost() > EXPLAINED
+        unexplained = self._cost() > EXPLAINED and not near
         if unexplained or not (warm or self._says_nothing()):
             outcome = self._search()
         elif not warm:
@@ -170,8 +178,9 @@ class _Fit:
 
     def _result(self, outcome: Outcome) -> WindowEstimate:
         objective, problem = self._objective, self._problem
-        configured = objective.predict(objective.guess(problem.nominal)[None])[0]
+        configured = objective.predict(objective.guess(self._bare(problem.nominal))[None])[0]
         predicted, last_state = objective.followed(self._fit.guess)
+        estimated = objective.followed(self._bare(self._fit.guess))[0] if problem.components else predicted
         return WindowEstimate(
             parameters=self._parameters(outcome),
             evidence=self._informed.evidence(self._fit, self._inflation()),
@@ -179,13 +188,20 @@ class _Fit:
             cost=self._cost(),
             count=objective.count,
             rmse_configured=tuple(map(float, objective.rmse(configured))),
-            rmse_estimated=tuple(map(float, objective.rmse(predicted))),
+            rmse_estimated=tuple(map(float, objective.rmse(estimated))),
+            rmse_completed=tuple(map(float, objective.rmse(predicted))),
             measured=objective.measured,
             predicted=predicted,
             last_state=last_state,
             generations=self._generations,
             evaluations=self._evaluations,
         )
+
+    def _bare(self, guess: Array) -> Array:
+        """A guess without components: their amplitudes are zero."""
+        problem, bare = self._problem, guess.copy()
+        bare[[places(problem, slot)[0] for slot in range(len(problem.components))]] = 0.0
+        return bare
 
     def _parameters(self, outcome: Outcome) -> tuple[ParameterEstimate, ...]:
         objective, guess = self._objective, self._alone.guess

@@ -132,6 +132,40 @@ def surprise(belief: Belief, evidence: Evidence, problem: Problem) -> float:
     return float(np.einsum("mi,mij,mj->m", innovation, np.linalg.inv(foretold), innovation).min())
 
 
+def rebased(belief: Belief, problem: Problem, other: Problem) -> Belief:
+    """The belief for another choice of free parameters: what both have is kept, and nothing known of what is new."""
+    fresh, (mean, covariance) = begin_belief(other), _moments(belief)
+    order = {entry.label: index for index, entry in enumerate(problem.free)}  # slots may have changed their places
+    both = [(order[entry.label], index) for index, entry in enumerate(other.free) if entry.label in order]
+    old, new = (np.array(part, dtype=np.int64) for part in (zip(*both, strict=True) if both else ((), ())))
+    level = np.full(len(other.free), FIRST_LEVEL)
+    level[new] = belief.level[0][old]
+    level = _around(np.maximum(level, level.max() - CALMEST))
+    ratio = problem.scale[old] / other.scale[new]
+    ratio = np.concatenate([ratio, ratio])
+    old, new = (np.concatenate([part, part + count]) for part, count in ((old, len(order)), (new, len(other.free))))
+    begun_mean, begun_covariance = _moments(fresh)
+    begun_mean[new] = mean[old] * ratio
+    begun_covariance[new, :] = begun_covariance[:, new] = 0.0
+    begun_covariance[np.ix_(new, new)] = covariance[np.ix_(old, old)] * np.outer(ratio, ratio)
+    count = len(level)
+    return Belief(
+        level,
+        np.tile(begun_mean, (count, 1)),
+        np.tile(begun_covariance, (count, 1, 1)),
+        np.full(count, 1.0 / count),
+        belief.end,
+        belief.scatter,
+    )
+
+
+def with_prior(belief: Belief, prior: Prior, problem: Problem) -> Belief:
+    """The belief with ``prior`` under every model of change."""
+    size, models = _size(problem), len(belief.weight)
+    mean = np.tile(prior.mean / size, (models, 1))
+    return replace(belief, mean=mean, covariance=np.tile(prior.covariance / np.outer(size, size), (models, 1, 1)))
+
+
 def updated(belief: Belief, evidence: Evidence, problem: Problem) -> Belief:
     """The belief after a window; ``belief`` has been carried to its end."""
     root, foretold, innovation = _foretold(belief, evidence, problem)

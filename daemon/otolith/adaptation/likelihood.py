@@ -112,7 +112,7 @@ class Likelihood:
 
     def _unlikelihood(self, objective: Objective, found: Polished) -> float:
         _, log_determinant = np.linalg.slogdet(self._information(found))
-        return found.chi_square + objective.log_determinant + float(log_determinant)
+        return found.chi_square + objective.correction.log_determinant + float(log_determinant)
 
     def _information(self, found: Polished) -> Array:
         """(guess, guess) in shares of ``width``, with the bounds as what is known before: no direction is without."""

@@ -1,20 +1,21 @@
 """The objective of one window: how far a guess of parameters and initial state is from what was measured."""
 
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
+from otolith.adaptation.completion import driven, shifts
 from otolith.adaptation.disturbance import open_loop, predictor
 from otolith.adaptation.problem import Problem
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import Correction, Excitation, Noise, kernel_of
+from otolith.twin.kernel import MOST_SUBSTEPS, Correction, Excitation, Noise, kernel_of
 
 EXPLAINED = 1.5  # cost up to which the residual counts as noise: an explanation that leaves more explains too little
 INITIAL_STATE_REACH = 10.0  # standard deviations around the first record, in which the twin may start at least
 TRUNCATION = 1e-3  # of the noise: how large the integrator's error may be
 HOPELESS = 1e30  # the cost of a guess whose prediction is not finite: worse than any other, and finite
+MOST_WITH_COMPONENTS = 8  # substeps: no number of them makes the step of dry friction smooth
 WHOLE = 0.01  # of a quantum: how far the steps between values may be from whole multiples of it
 FEWEST_LEVELS = 4  # that tell a converter's steps from a signal's own
 
@@ -34,20 +35,25 @@ class Objective:
         self.measured = np.column_stack([window.column(entry.name) for entry in twin.outputs])
         self.present = ~np.column_stack([window.missing_in(entry.name) for entry in twin.outputs])
         self.count = max(float(self.present.sum()), 1.0)
-        self._inputs = np.column_stack([np.zeros((window.records, 0)), *(window.column(e.name) for e in twin.inputs)])
         self.noise = self._noise(problem)
         lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
-        self._template = np.array([dict(problem.known).get(entry.name, entry.nominal) for entry in twin.parameters])
-        order = [entry.name for entry in twin.parameters]
+        if problem.components:  # where a sensor that lies would have shown it, had it been right
+            wider = np.where(highest > lowest, np.abs(self._first) + highest - lowest, 0.0)
+            lowest, highest = lowest - wider, highest + wider
+        given = dict(problem.known) | shifts(problem, window)
+        self._template = np.array([given.get(entry.name, entry.nominal) for entry in twin.parameters])
+        order = [entry.name for entry in twin.parameters[: len(twin.parameters) - twin.settings]]
         self._places = [order.index(entry.name) for entry in problem.free]
         self.free = len(self._places)
         self._initial = [len(order) + index for index in range(len(twin.states))]
         self._drifts = [len(order) + len(twin.states) + place for place in self._places]
         low, high = problem.bounds
         self.low, self.high = np.concatenate([low, lowest]), np.concatenate([high, highest])
-        self.names = (*(entry.name for entry in problem.free), *(f"initial {state.name}" for state in twin.states))
-        self._open_loop = problem.open_loop
-        self._excitation = Excitation(self._inputs, window.sample_period)
+        self.names = (*(entry.label for entry in problem.free), *(f"initial {state.name}" for state in twin.states))
+        self._open_loop, self._states = problem.open_loop, len(twin.states)
+        self._most = MOST_SUBSTEPS if twin.plain is None else MOST_WITH_COMPONENTS
+        self._plain = twin.plain or twin
+        self._excitation = Excitation(driven(twin, window), window.sample_period)
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
         self.centre(start, self._first if initial is None else initial)
 
@@ -58,26 +64,37 @@ class Objective:
         plain = replace(self._excitation, gain=None, substeps=1)
         while True:
             made = self._correction(full, initial, plain)
-            driven = replace(plain, gain=made.gain)
-            substeps = self.kernel.substeps(full, initial, driven, allowed)
+            corrected = replace(plain, gain=made.gain)
+            substeps = self.kernel.substeps(full, initial, corrected, allowed, self._most)
             if substeps <= plain.substeps:  # else the gain was made by an integrator that is too coarse
                 break
             plain = replace(plain, substeps=substeps)
-        self.whitening, self.log_determinant = made.whitening, made.log_determinant
-        self._excitation = driven
+        self.correction = made
+        self._excitation = corrected
 
-    def _correction(self, parameters: Array, initial: Array, plain: Excitation) -> Correction:
-        if self._open_loop:
-            return open_loop(self.kernel, plain, self.noise)
-        return predictor(self.kernel, parameters, initial, plain, self.noise)
+    def _correction(self, parameters: Array, initial: Array, free: Excitation) -> Correction:
+        """Of the plain twin: what components add hardly changes by how much a prediction may be off."""
+        twin = self._plain
+        made_for = replace(free, inputs=free.inputs[:, : len(twin.inputs)])
+        parameters, initial = parameters[: len(twin.parameters)], initial[: len(twin.states)]
+        kernel = kernel_of(twin)
+        made = (
+            open_loop(kernel, made_for, self.noise)
+            if self._open_loop
+            else predictor(kernel, parameters, initial, made_for, self.noise)
+        )
+        more = self._states - len(twin.states)
+        return made._replace(gain=np.pad(made.gain, ((0, 0), (0, more), (0, 0)))) if more else made
 
-    def reading(self, output: int, gain: float, offset: float) -> "Objective":
-        """The objective as if what ``output`` measured had been ``gain`` times the truth, and ``offset`` more."""
-        changed = copy(self)
-        changed.measured = self.measured.copy()
-        changed.measured[:, output] = (self.measured[:, output] - offset) / gain
-        changed._excitation = replace(self._excitation, measured=np.where(self.present, changed.measured, np.nan))
-        return changed
+    @property
+    def excitation(self) -> Excitation:
+        """What drives the twin, and what corrects it."""
+        return self._excitation
+
+    @property
+    def whitening(self) -> Array:
+        """(records, outputs, outputs) makes each innovation's covariance the identity."""
+        return self.correction.whitening
 
     @property
     def work(self) -> int:
@@ -166,7 +183,7 @@ class Objective:
         return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
 
     def _noise(self, problem: Problem) -> Noise:
-        twin = problem.twin
+        twin = problem.twin.plain or problem.twin
         columns = zip(self.measured.T, self.present.T, strict=True)
         quanta = np.array([quantum(values[there]) for values, there in columns])
         return Noise(

@@ -99,6 +99,19 @@ class Informed:
         own = fit.residuals[: -len(self._mean)]
         return float(own @ own)
 
+    @property
+    def count(self) -> float:
+        """Measured records of all outputs."""
+        return self._objective.count
+
+    def whitened(self, fit: Polished) -> Array:
+        """(records, outputs) what is left of the window, in units of the noise."""
+        return fit.residuals[: -len(self._mean)].reshape(self._objective.measured.shape)
+
+    def last_state(self, fit: Polished) -> Array:
+        """(states,) at the last record."""
+        return self._objective.followed(fit.guess)[1]
+
     def evidence(self, fit: Polished, grown: float) -> Evidence:
         """What the window says around ``fit``, with standard deviations ``grown`` by what is left unexplained."""
         count = len(self._mean)

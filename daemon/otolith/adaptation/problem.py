@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
+from otolith.adaptation.component import Component
 from otolith.twin.definition import Definition, Parameter
 
 LEAST_SCALE = 0.01  # of the width of the bounds: what stands for the size of a parameter whose nominal value is about 0
@@ -53,6 +54,12 @@ class Problem:
     """The paper's cost: nothing corrects the twin within a window, whatever disturbs the machine."""
     determined_within: float = 0.1
     """A parameter is determined when the half of its 95 % interval is at most this share of its nominal value."""
+    components: tuple[Component, ...] = ()
+    """That complete the twin; their numbers are free as well, with names that begin with "_"."""
+    excluded: frozenset[str] = frozenset()
+    """Keys of components that are not looked for."""
+    discover: bool = True
+    """Whether components are looked for at all."""
     window: WindowOptions = WindowOptions()
     swarm: SwarmOptions = SwarmOptions()
     seed: int = 1

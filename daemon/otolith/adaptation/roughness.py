@@ -67,4 +67,4 @@ def felt_levels(problem: Problem, outputs: Array, window: Window) -> Array:
 def _uncertainty(problem: Problem, levels: Array, window: Window) -> float:
     """Mean logarithm of the innovations' variances."""
     objective = Objective(noisy(problem, levels), window, problem.nominal)
-    return objective.log_determinant / objective.count
+    return objective.correction.log_determinant / objective.count

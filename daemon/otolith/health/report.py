@@ -11,6 +11,7 @@ from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.gate import Lesson
 from otolith.adaptation.information import Identifiability
 from otolith.adaptation.outcome import Outcome
+from otolith.health.finding import AlternativeDocument, ComponentDocument, FindingDocument
 from otolith_drivers.toml_files import Closed
 
 SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"
@@ -80,6 +81,8 @@ class FitDocument(Closed):
 
     rmse_configured: dict[str, float]
     rmse_estimated: dict[str, float]
+    rmse_completed: dict[str, float] | None = None
+    """With the components."""
     explained: bool
     """Whether the estimated twin leaves nothing but noise."""
     cost: float
@@ -133,6 +136,11 @@ class ReportDocument(Closed):
     lesson: Lesson
     """What was made of the window."""
     parameters: dict[str, ParameterDocument]
+    components: tuple[ComponentDocument, ...] = ()
+    """That the twin lacked."""
+    explanations: tuple[AlternativeDocument, ...] = ()
+    """Of what has happened, while that is not decided; the most probable first."""
+    findings: tuple[FindingDocument, ...] = ()
     fit: FitDocument | None = None
     """None where nothing was estimated from the window."""
     cost: CostDocument = CostDocument()

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from otolith.adaptation.gate import Lesson
+from otolith.adaptation.gate import TEACHING, Lesson
 from otolith.adaptation.information import QUANTILE, Identifiability, ParameterEstimate
 from otolith.health.report import ParameterDocument, Status
 from otolith.twin.definition import Parameter
@@ -61,7 +61,7 @@ class Heard:
     @property
     def taught(self) -> bool:
         """Whether what is known has changed by it."""
-        return self.estimate is not None and self.lesson in (Lesson.LEARNED, Lesson.STEPPED)
+        return self.estimate is not None and self.lesson in TEACHING
 
 
 def publish(
@@ -98,7 +98,7 @@ def publish(
 
 
 def _status(known: bool, allowed: float, fused: Fused, heard: Heard, before: Standing) -> Status:
-    if not heard.taught and heard.contradictions >= INVALID_AFTER and heard.lesson is not Lesson.BAD:
+    if heard.contradictions >= INVALID_AFTER and heard.lesson in (Lesson.SUSPECTED, Lesson.REFUSED):
         return Status.INVALID
     estimate = heard.estimate
     if heard.at_bound:

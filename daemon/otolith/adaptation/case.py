@@ -1,0 +1,241 @@
+"""A case: several explanations of what was not to be expected, followed from window to window until one is right.
+
+Each explanation foretells the next window with what it has learned so far, so that evidence is gathered over windows
+that nothing was fitted to before (prequential: A. P. Dawid, Journal of the Royal Statistical Society A 147, 1984).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Window
+from otolith.adaptation.claims import Claim, Explanation, Reason, explanation
+from otolith.adaptation.completion import Mode, mode_of, places, plain, without
+from otolith.adaptation.fusion import Belief, carried, overall, rebased, updated, with_prior
+from otolith.adaptation.glance import glance
+from otolith.adaptation.information import inflation
+from otolith.adaptation.prior import Evidence
+from otolith.adaptation.problem import Problem
+from otolith.adaptation.screening import CLEARLY
+from otolith.adaptation.tracking import Turned, moved_on, turned
+
+MOST = 7  # explanations that are followed
+WORTH = 30.0  # in -2 log evidence: an explanation worse than the best by more is not followed
+MOST_OF_ONE = 20.0  # the same, of one window: none decides alone
+MOST_OF_FIRST = 15.0  # the same, of the first: if it was wrong, the second one outweighs it
+DIVERGED = 1e12  # χ² of a twin that explains nothing at all
+NOTICED = 4.0  # standard deviations of an amplitude, under which a component does not carry its weight
+LONGEST_MEMORY = 60.0  # the same: how far behind one may fall, so that it can come back when things change
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """One explanation, and what it knows. Plain: it pickles."""
+
+    claim: Claim
+    problem: Problem
+    belief: Belief
+    turned: Turned
+    deviance: float
+    """-2 log evidence of all windows so far, over that of the best."""
+    cost: float
+    """RMSE over noise that it left of the last window."""
+    silent: bool = True
+    """Whether what it left of the last window looked like noise."""
+
+    @property
+    def reason(self) -> Reason:
+        """What kind of explanation it is."""
+        return self.claim.reason
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """What could have happened. Plain: it pickles."""
+
+    hypotheses: tuple[Hypothesis, ...]
+    """The best first."""
+    onset: float
+    """Unix seconds."""
+    windows: int = 1
+    """That these hypotheses have been followed."""
+    leading: int = 1
+    """Windows in a row in which the best was the best."""
+    last: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Of the last window under what explains it best: χ², what that cost in -2 log evidence, and records."""
+    surprise: float = 1.0
+    """Of the first window under "nothing has happened", χ² per record."""
+
+    @property
+    def best(self) -> Hypothesis:
+        """The most probable one."""
+        return self.hypotheses[0]
+
+    @property
+    def probabilities(self) -> list[float]:
+        """Of each hypothesis."""
+        weights = np.exp(-0.5 * np.array([entry.deviance for entry in self.hypotheses]))
+        found: list[float] = (weights / weights.sum()).tolist()
+        return found
+
+    def probability(self, reason: Reason) -> float:
+        """Of all hypotheses of that reason."""
+        return sum(
+            share for share, entry in zip(self.probabilities, self.hypotheses, strict=True) if entry.reason is reason
+        )
+
+    @property
+    def doubts_parameters(self) -> bool:
+        """Whether parameters may have moved."""
+        near = [self.best, *(entry for entry, _ in self.alternatives(self.best))]
+        return any(entry.reason is Reason.PARAMETER for entry in near)
+
+    @property
+    def open(self) -> bool:
+        """Whether something of another kind could as well have happened."""
+        return any(entry.reason is not self.best.reason for entry, _ in self.alternatives(self.best))
+
+    def alternatives(self, to: Hypothesis) -> list[tuple[Hypothesis, float]]:
+        """The others, with their probabilities, that are hardly less likely than ``to`` (a Bayes factor of 150)."""
+        pairs = zip(self.hypotheses, self.probabilities, strict=True)
+        data = [entry.deviance - entry.claim.odds for entry in self.hypotheses]
+        own = data[self.hypotheses.index(to)]
+        return [
+            pair
+            for pair, deviance in zip(pairs, data, strict=True)
+            if pair[0] is not to and abs(deviance - own) <= CLEARLY
+        ]
+
+
+def opened(explanations: Sequence[Explanation], problem: Problem, expected: Belief, window: Window) -> Case:
+    """A case on ``window``; ``expected`` is what was known, carried to its end."""
+    explanations = [*explanations[:1], *(entry for entry in explanations[1:] if entry.chi_square < DIVERGED)]
+    records = explanations[0].informed.count
+    unexplained = _unexplained([entry.chi_square for entry in explanations], records)
+    deviances = [entry.deviance(records, unexplained) for entry in explanations]
+    order = np.argsort(deviances, kind="stable").tolist()
+    least = deviances[order[0]]
+    kept = [at for at in order if deviances[at] <= least + WORTH][:MOST]
+    kept += [at for at in order if explanations[at].reason in (Reason.NOTHING, Reason.PARAMETER) and at not in kept]
+    found = [
+        _begun(explanations[at], problem, expected, window, min(deviances[at] - least, MOST_OF_FIRST)) for at in kept
+    ]
+    surprise = explanations[0].chi_square / max(records, 1.0)
+    best = explanations[order[0]]
+    last = (best.chi_square, least - best.chi_square / unexplained, records)
+    return Case(_sorted(found), window.start, last=last, surprise=max(surprise, 1.0))
+
+
+def followed(case: Case, window: Window) -> Case:
+    """The case after one more window."""
+    fits = []
+    for entry in case.hypotheses:
+        belief = carried(moved_on(entry.belief, entry.problem, entry.turned, window), window.end)
+        prior = overall(belief, entry.problem)
+        fits.append((entry, belief, explanation(replace(entry.claim, numbers=0), entry.problem, window, prior)))
+    fits = [fit for fit in fits if fit[2].chi_square < DIVERGED] or fits[:1]
+    records = fits[0][2].informed.count
+    unexplained = _unexplained([fit.chi_square for _, _, fit in fits], records)
+    told = [_told(fit) for _, _, fit in fits]
+    deviances = [
+        fit.chi_square / unexplained + _occam(belief, evidence, entry.problem)
+        for (entry, belief, fit), (evidence, _) in zip(fits, told, strict=True)
+    ]
+    least = min(deviances)
+    best_chi = fits[int(np.argmin(deviances))][2].chi_square
+    case = replace(case, last=(best_chi, least - best_chi / unexplained, records))
+    found = []
+    for (entry, belief, fit), (evidence, last), deviance in zip(fits, told, deviances, strict=True):
+        after = updated(belief, evidence, entry.problem)
+        more = min(deviance - least, MOST_OF_ONE)
+        found.append(replace(
+            entry, belief=after, turned=turned(entry.problem, window, last), cost=_cost(fit),
+            deviance=entry.deviance + more,
+        ))  # fmt: skip
+    hypotheses = _sorted([_pruned(entry) for entry in found])
+    leading = case.leading + 1 if hypotheses[0].claim.name == case.best.claim.name else 1
+    case = replace(case, leading=leading)
+    best = next((fit for entry, _, fit in fits if entry.claim == hypotheses[0].claim), None)
+    if best is None:  # it has lost a component, and there was none of it in the window
+        return replace(case, hypotheses=hypotheses, windows=case.windows + 1)
+    left = glance(best.problem, window, best.prior, best.fit.guess).gain
+    hypotheses = (replace(hypotheses[0], silent=left <= 0.0), *hypotheses[1:])
+    return replace(case, hypotheses=hypotheses, windows=case.windows + 1)
+
+
+def joined(case: Case, fresh: Case) -> Case:
+    """A case with what a new search has found in its last window, if that is clearly better than what was followed."""
+    (followed_chi, followed_price, records), (fresh_chi, fresh_price, _) = case.last, fresh.last
+    better = (followed_chi - fresh_chi) / _unexplained([fresh_chi], records) + followed_price - fresh_price
+    if better <= CLEARLY:
+        return case
+    known = {entry.claim.name for entry in case.hypotheses}
+    new = [entry for entry in fresh.hypotheses if entry.claim.name not in known]
+    lead = min(better, MOST_OF_ONE)
+    hypotheses = _sorted([*(replace(entry, deviance=entry.deviance + lead) for entry in case.hypotheses), *new])
+    leading = case.leading if hypotheses[0].claim.name == case.best.claim.name else 1
+    return replace(case, hypotheses=hypotheses[: 2 * MOST], leading=leading)
+
+
+def _sorted(found: list[Hypothesis]) -> tuple[Hypothesis, ...]:
+    least = min(entry.deviance for entry in found)
+    ordered = sorted(found, key=lambda entry: entry.deviance)
+    return tuple(replace(entry, deviance=min(entry.deviance - least, LONGEST_MEMORY)) for entry in ordered)
+
+
+def _pruned(entry: Hypothesis) -> Hypothesis:
+    """Without components that do not carry their weight beside others (the paper's "deactivated")."""
+    problem = entry.problem
+    if len(problem.components) < 2:
+        return entry
+    known = overall(entry.belief, problem)
+    deviations = np.sqrt(np.diag(known.covariance))
+    amplitudes = [places(problem, slot)[0] for slot in range(len(problem.components))]
+    weights = [abs(float(known.mean[place])) / float(deviations[place]) for place in amplitudes]
+    weakest = int(np.argmin(weights))
+    if weights[weakest] >= NOTICED:
+        return entry
+    fewer = without(problem, problem.components[weakest])
+    by = tuple(turn for slot, turn in enumerate(entry.turned.by) if slot != weakest)
+    name = " and ".join(component.key for component in fewer.components)
+    return replace(
+        entry, claim=replace(entry.claim, name=name), problem=fewer, belief=rebased(entry.belief, problem, fewer),
+        turned=replace(entry.turned, by=by),
+    )  # fmt: skip
+
+
+def _begun(found: Explanation, problem: Problem, expected: Belief, window: Window, deviance: float) -> Hypothesis:
+    evidence, last = _told(found)
+    belief = with_prior(rebased(expected, problem, found.problem), found.prior, found.problem)
+    belief = updated(belief, evidence, found.problem)
+    after = turned(found.problem, window, last)
+    return Hypothesis(found.claim, found.problem, belief, after, deviance, _cost(found))
+
+
+def _told(found: Explanation) -> tuple[Evidence, Array]:
+    """What the window says, and the state (states,) at its last record."""
+    informed, cost = found.informed, _cost(found)
+    grown = inflation(informed.whitened(found.fit), cost)
+    return informed.evidence(found.fit, grown), informed.last_state(found.fit)
+
+
+def _cost(found: Explanation) -> float:
+    return float(np.sqrt(found.informed.chi_square(found.fit) / found.informed.count))
+
+
+def _unexplained(chi_squares: Sequence[float], records: float) -> float:
+    return max(min(chi_squares) / records, 1.0)
+
+
+def _occam(belief: Belief, evidence: Evidence, problem: Problem) -> float:
+    """How little the hypothesis said beforehand of what the window then said, as -2 log evidence."""
+    known = overall(belief, problem).covariance
+    seen = evidence.root @ known @ evidence.root.T
+    return float(np.linalg.slogdet(np.eye(len(seen)) + seen)[1])
+
+
+def is_of_machine(entry: Hypothesis) -> bool:
+    """Whether it is a component of the machine itself."""
+    twin = plain(entry.problem)
+    return any(mode_of(twin, component) is Mode.COMPONENT for component in entry.problem.components)

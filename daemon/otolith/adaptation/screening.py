@@ -1,0 +1,182 @@
+"""Candidates for components: all structures through the twin's linear response, their inner numbers by swarms."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Window
+from otolith.adaptation.completion import plain
+from otolith.adaptation.component import Component, key_of
+from otolith.adaptation.dictionary import Structure, grid, shapes, structures
+from otolith.adaptation.flight import evaluated, fly
+from otolith.adaptation.landscape import Landscape
+from otolith.adaptation.problem import Problem
+from otolith.twin.slots import SLOTS, sites, sources
+
+COARSE, FINE = 1.5, 0.5  # lines of the spectrum between two frequencies, in a glance and in a search
+CLEARLY = 10.0  # in -2 log evidence: a Bayes factor of 150
+PEAKS = 3  # of a spectrum, where a swarm begins
+FLOWN, TRIED = 16, 10  # structures whose inner numbers are searched, and those that are polished
+KEPT, RELATIVE = 23.0, 0.3  # in -2 log evidence, and as a share: what the linear picture may be wrong by
+WORTH, FEWEST = 500, 4  # steps of the integrator in a window up to which all are tried, and what is tried at least
+LARGEST = 1e9  # amplitude, in the unit of a site: nobody could read an equation with a larger one
+
+
+Guess = tuple[Structure, float]
+Settled = tuple[Guess, Array, float]
+"""A guess, its amplitudes, and its gain in -2 log evidence."""
+
+
+def screened(
+    landscape: Landscape, problem: Problem, found: list[Structure], fineness: float
+) -> tuple[list[Guess], Array, Array]:
+    """Guesses on the grid, their amplitudes (guesses, 2), and their gains in -2 log evidence (guesses,)."""
+    guesses = [(entry, float(inner)) for entry in found for inner in grid(entry, landscape.x, fineness)]
+    gains = evaluated(landscape, guesses)
+    return guesses, gains.amplitudes, scores_of(landscape, guesses, gains.gain, rivals_of(problem, found))
+
+
+@dataclass(frozen=True, slots=True)
+class Rivals:
+    """How many structures there are."""
+
+    own: int
+    """Number of the first site that is a sensor."""
+    of_machine: float
+    of_sensors: float
+
+    def of(self, structure: Structure) -> float:
+        """Of its kind."""
+        return self.of_sensors if self.lies(structure) else self.of_machine
+
+    def lies(self, structure: Structure) -> bool:
+        """Whether it is the error of a sensor."""
+        return structure.site >= self.own
+
+
+def rivals_of(problem: Problem, found: list[Structure]) -> Rivals:
+    """How many structures of each kind are among ``found``."""
+    own = len(plain(problem).sites)
+    sensors = sum(entry.site >= own for entry in found)
+    return Rivals(own, float(max(len(found) - sensors, 1)), float(max(sensors, 1)))
+
+
+def scores_of(landscape: Landscape, guesses: list[Guess], gain: Array, rivals: Rivals) -> Array:
+    """(guesses,) gains in -2 log evidence over parameters only."""
+    records = landscape.objective.count
+    counts = np.array([_numbers_of(entry) for entry, _ in guesses], dtype=np.float64)
+    others = np.array([rivals.of(entry) for entry, _ in guesses])
+    left = max((landscape.chi_square - float(gain.max(initial=0.0))) / records, 1.0)
+    return np.asarray(gain / left - counts * np.log(records) - 2.0 * np.log(3.0 * others))
+
+
+def _numbers_of(structure: Structure) -> int:
+    return len(structure.model.phases) + (structure.model.inner is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A component worth a polish."""
+
+    component: Component
+    rivals: float
+    """How many structures there are of its kind."""
+    of_sensor: bool
+
+
+def candidates(problem: Problem, landscape: Landscape, window: Window) -> list[Candidate]:
+    """The components worth a polish, the best first."""
+    known = {entry.key for entry in problem.components}
+    if len(known) >= SLOTS:
+        return []
+    excluded = known | problem.excluded
+    own = len(plain(problem).sites)
+    all_of_them = [
+        entry
+        for entry in structures(plain(problem), landscape.x)
+        if key_in(problem, entry) not in excluded and (problem.discover or entry.site >= own)
+    ]
+    rivals = rivals_of(problem, all_of_them)
+    guesses, amplitudes, scores = screened(landscape, problem, all_of_them, FINE)
+    order = np.argsort(-scores, kind="stable")
+    best: dict[Structure, list[int]] = {}
+    for index in order.tolist():
+        best.setdefault(guesses[index][0], []).append(index)
+    if not best:
+        return []
+    leaders = list(best.items())
+    flown = [(entry, places) for entry, places in leaders if entry.model.inner is not None][:FLOWN]
+    settled = [(guesses[p[0]], amplitudes[p[0]], float(scores[p[0]])) for e, p in leaders if e.model.inner is None]
+    if flown:
+        begun = [(entry, np.array([guesses[place][1] for place in places[:PEAKS]]), _step(entry, landscape.x))
+                 for entry, places in flown]  # fmt: skip
+        inner = fly(landscape, begun, problem.swarm, problem.seed + window.index)
+        arrived = [(entry, value) for (entry, _), value in zip(flown, inner, strict=True)]
+        gains = evaluated(landscape, arrived)
+        reached = scores_of(landscape, arrived, gains.gain, rivals)
+        settled += list(zip(arrived, gains.amplitudes, map(float, reached), strict=True))
+    settled.sort(key=lambda entry: -entry[2])
+    best_score = settled[0][2]
+    lies = [rivals.lies(guess[0]) for guess, _, _ in settled]
+    single = [len(guess[0].model.phases) == 1 for guess, _, _ in settled]
+    heights = np.concatenate([pair[:1] if one else pair for (_, pair, _), one in zip(settled, single, strict=True)])
+    same = landscape.is_parameter(shapes(iter(guess for guess, _, _ in settled)), heights)
+    first = np.cumsum([0, *(1 if one else 2 for one in single[:-1])])
+    settled = [entry for entry, lie, at in zip(settled, lies, first.tolist(), strict=True) if lie or not same[at]]
+    if not settled:
+        return []
+    least = max(best_score - KEPT - RELATIVE * abs(best_score), -CLEARLY)
+    kept = [entry for entry in settled if entry[2] > least][: _affordable(landscape)]
+    kept += holding(problem, settled[len(kept) :]) if kept else []
+    found = []
+    for (structure, number), pair, _ in kept:
+        if 0.0 < np.abs(pair).max() < LARGEST:
+            component = component_of(problem, window, structure, number, pair)
+            found.append(Candidate(component, rivals.of(structure), rivals.lies(structure)))
+    return found
+
+
+def _affordable(landscape: Landscape) -> int:
+    """How many candidates are polished: fewer in large windows, so that a search ends before the next one."""
+    return int(np.clip(TRIED * WORTH / max(landscape.objective.work, 1), FEWEST, TRIED))
+
+
+def holding(problem: Problem, rest: list[Settled]) -> list[Settled]:
+    """Of each site the best family that the linear picture underrates, of a state of the twin."""
+    states = {entry.name for entry in plain(problem).states}
+    found: dict[int, Settled] = {}
+    for entry in rest:
+        structure = entry[0][0]
+        if structure.model.holds and sources(plain(problem))[structure.source].name in states:
+            found.setdefault(structure.site, entry)
+    return list(found.values())
+
+
+def key_in(problem: Problem, structure: Structure) -> str:
+    """Of the component that a structure would become."""
+    twin = plain(problem)
+    source = sources(twin)[structure.source].name
+    return key_of(sites(twin)[structure.site].name, structure.model.name, source)
+
+
+def _step(structure: Structure, x: Array) -> float:
+    points = grid(structure, x, FINE)
+    return float(np.diff(points).min()) if len(points) > 1 else float(np.ptp(structure.bounds))
+
+
+def component_of(problem: Problem, window: Window, structure: Structure, inner: float, pair: Array) -> Component:
+    """The component of a structure with its inner number and the amplitudes (2,) of the linear picture."""
+    twin = plain(problem)
+    first, second = map(float, pair)
+    two = len(structure.model.phases) > 1
+    return Component(
+        site=sites(twin)[structure.site].name,
+        family=structure.model.name,
+        source=sources(twin)[structure.source].name,
+        amplitude=float(np.hypot(first, second)) if two else first,
+        inner=inner,
+        phase=float(np.arctan2(second, first)) if two else 0.0,
+        low=structure.bounds[0],
+        high=structure.bounds[1],
+        origin=window.start,
+    )
