@@ -17,6 +17,7 @@ from otolith.errors import ConfigurationError, ServiceError
 from otolith.health.report import Status
 from otolith.paper import comparison, crew, studies
 from otolith.paper.crew import Progress, perform
+from otolith.paper.discovering import Search
 from otolith.paper.document import document
 from otolith.paper.plots import draw
 from otolith.paper.rows import HIDING, NAMES, PEAK, ROWS, SENSORS, row_of
@@ -24,6 +25,7 @@ from otolith.paper.score import Spread
 from otolith.paper.simulation import live, plan_of
 from otolith.paper.studies import Job, Kind, Limit, Study, study
 from otolith.paper.tables import limit_in_words, pages
+from otolith.paper.unknowns import UNKNOWN_NAMES
 from otolith.paths import examples_directory, state_directory
 from otolith_drivers.plant.plants import load_scenario
 
@@ -83,7 +85,7 @@ def test_the_outputs_are_predicted_within_their_noise(name: str) -> None:
 
 @pytest.mark.parametrize("name", DRIFTING[:1])
 def test_plots_are_pictures_that_open(name: str, tmp_path: Path) -> None:
-    written = draw([found(name)], tmp_path / "new")
+    written = draw([found(name)], [], tmp_path / "new")
     assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(written)
     kinds = [path.stem.removeprefix(f"{name}-") for path in written]
     assert kinds == ["value-fig-7", "error-fig-8", "outputs-fig-9", "windows"]
@@ -96,7 +98,7 @@ def test_plots_are_pictures_that_open(name: str, tmp_path: Path) -> None:
 def test_a_plot_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(ServiceError, match="cannot be made"):
-        draw([found(DRIFTING[0])], tmp_path / "file" / "folder")
+        draw([found(DRIFTING[0])], [], tmp_path / "file" / "folder")
 
 
 def test_every_row_seeks_what_drifts_in_its_scenario() -> None:
@@ -156,7 +158,10 @@ def test_the_noise_that_hides_damping_is_found() -> None:
 
 def test_jobs_are_those_that_were_asked_for() -> None:
     everything = comparison.jobs_of((), noise=True, quick=False)
-    assert [job.row.name for job in everything if job.kind is Kind.IDEAL] == list(NAMES)
+    assert [job.row.name for job in everything if job.kind is Kind.IDEAL] == [*NAMES, *UNKNOWN_NAMES]
+    assert [job.row.name for job in everything if isinstance(job, Search) and job.kind is Kind.NOISY] == [
+        *UNKNOWN_NAMES
+    ]
     assert [job.row.machine for job in everything if job.kind is Kind.LIMIT] == ["hydraulic-actuator"]
     (only,) = comparison.jobs_of(("bearing-wear", "bearing-wear"), noise=False, quick=True)
     assert (only.row.name, only.kind, only.seconds) == ("bearing-wear", Kind.IDEAL, comparison.QUICK)

@@ -12,11 +12,13 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from otolith.paper import crew
+from otolith.paper.discovering import Discovery, Search
 from otolith.paper.document import document
 from otolith.paper.rows import HIDING, NAMES, row_of
 from otolith.paper.score import verdict
 from otolith.paper.studies import Job, Kind, Study
 from otolith.paper.tables import pages
+from otolith.paper.unknowns import UNKNOWNS
 from otolith.paths import state_directory, writable
 
 QUICK = 300.0  # s
@@ -40,11 +42,12 @@ def compare(names: Sequence[str], folder: Path | None, *, noise: bool, quick: bo
     with _bars() as hear:
         found = crew.perform(jobs_of(names, noise=noise, quick=quick), hear)
     studies = [entry for entry in found if isinstance(entry, Study)]
+    discoveries = [entry for entry in found if isinstance(entry, Discovery)]
     written: list[Path] = []
     if folder is not None:
         from otolith.paper.plots import draw  # noqa: PLC0415 - slow to load, and nobody else needs it
 
-        written = draw(studies, folder)
+        written = draw(studies, discoveries, folder)
     if as_json:
         click.echo(document(found, written))
     else:
@@ -53,14 +56,18 @@ def compare(names: Sequence[str], folder: Path | None, *, noise: bool, quick: bo
             console.print(page)
         if written:
             console.print(f"{len(written)} plots are in {folder}", soft_wrap=True)
-    return 0 if all(verdict(entry.job.row, entry.score) for entry in studies if entry.job.kind is Kind.IDEAL) else 1
+    met = all(verdict(entry.job.row, entry.score) for entry in studies if entry.job.kind is Kind.IDEAL)
+    return 0 if met and all(entry.met for entry in discoveries) else 1
 
 
-def jobs_of(names: Sequence[str], *, noise: bool, quick: bool) -> list[Job]:
+def jobs_of(names: Sequence[str], *, noise: bool, quick: bool) -> list[crew.Work]:
     """In the order of the rows, each once; a search for a noise once for each machine."""
     rows = [row_of(name) for name in NAMES if name in names or not names]
     seconds = {row.name: min(row.seconds, QUICK) if quick else row.seconds for row in rows}
-    jobs = [Job(row, Kind.IDEAL, seconds[row.name]) for row in rows]
+    unknown = [row for row in UNKNOWNS if row.name in names or not names]
+    jobs: list[crew.Work] = [Job(row, Kind.IDEAL, seconds[row.name]) for row in rows]
+    for kind in (Kind.IDEAL, Kind.NOISY) if noise else (Kind.IDEAL,):
+        jobs += [Search(row, kind, min(row.seconds, QUICK) if quick else row.seconds) for row in unknown]
     if noise:
         jobs += [Job(row, Kind.NOISY, seconds[row.name]) for row in rows]
         first = {row.machine: row for row in reversed(rows) if row.machine in HIDING}
@@ -74,7 +81,7 @@ def _bars() -> Iterator[Callable[[crew.Progress], None]]:
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-        tasks: dict[Job, TaskID] = {}
+        tasks: dict[crew.Work, TaskID] = {}
 
         def hear(told: crew.Progress) -> None:
             if told.job not in tasks:

@@ -8,18 +8,23 @@ from typing import Any
 
 from otolith.companion import Companion
 from otolith.errors import OtolithError, ServiceError
+from otolith.paper.discovering import Discovery, Search, discover
 from otolith.paper.studies import Job, Limit, Study, study
 
 MOST = 4  # processes: there are no more jobs that take long
 TOLD_EVERY = 20  # steps
 PATIENCE = 1.0  # s between two looks whether a process has died
 
+# What is done, and what comes of it.
+Work = Job | Search
+Found = Study | Limit | Discovery
+
 
 @dataclass(frozen=True, slots=True)
 class Progress:
     """How far a job has come."""
 
-    job: Job
+    job: Work
     steps: int
     doing: str
 
@@ -28,28 +33,28 @@ def main(connection: Any) -> None:
     """Do jobs until None comes."""
     while (job := connection.recv()) is not None:
 
-        def tell(steps: int, doing: str, job: Job = job) -> None:
+        def tell(steps: int, doing: str, job: Work = job) -> None:
             if steps % TOLD_EVERY == 1:
                 connection.send(Progress(job, steps, doing))
 
         try:
-            connection.send(study(job, tell))
+            connection.send(discover(job, tell) if isinstance(job, Search) else study(job, tell))
         except OtolithError as error:
             connection.send(error)
 
 
-def perform(jobs: Sequence[Job], hear: Callable[[Progress], None]) -> list[Study | Limit]:
+def perform(jobs: Sequence[Work], hear: Callable[[Progress], None]) -> list[Found]:
     """What the jobs find, in their order; ``hear`` is told of progress.
 
     Raises:
         OtolithError: an example file that cannot be used, or a process that died.
     """
-    waiting, found = list(jobs), dict[Job, Study | Limit]()
+    waiting, found = list(jobs), dict[Work, Found]()
     cores = len(os.sched_getaffinity(0))
     crew = [
         Companion(f"otolith-paper-{number}", f"{__name__}:main", 2) for number in range(min(cores, MOST, len(jobs)))
     ]
-    busy: dict[Companion, Job] = {}
+    busy: dict[Companion, Work] = {}
     try:
         while len(found) < len(jobs):
             for companion in crew:
@@ -75,7 +80,7 @@ def perform(jobs: Sequence[Job], hear: Callable[[Progress], None]) -> list[Study
     return [found[job] for job in jobs]
 
 
-def _hand_over(companion: Companion, job: Job) -> None:
+def _hand_over(companion: Companion, job: Work) -> None:
     if not companion.alive:
         companion.start()
     companion.offer(job)

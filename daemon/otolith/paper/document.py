@@ -5,22 +5,29 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from otolith.paper.discovering import Course, Discovery
 from otolith.paper.rows import PEAK, SENSORS
 from otolith.paper.score import Score, Spread, verdict
 from otolith.paper.studies import Kind, Limit, Study
+from otolith.paper.unknowns import NOISE
 
 SCHEMA = "otolith.paper/1"
 
 
-def document(found: Sequence[Study | Limit], plots: Sequence[Path]) -> str:
+def document(found: Sequence[Study | Limit | Discovery], plots: Sequence[Path]) -> str:
     """One line."""
     studies = [entry for entry in found if isinstance(entry, Study)]
     ideal = [entry for entry in studies if entry.job.kind is Kind.IDEAL]
+    discoveries = [entry for entry in found if isinstance(entry, Discovery)]
     whole = {
         "schema": SCHEMA,
-        "met": all(verdict(entry.job.row, entry.score) for entry in ideal),
+        "met": all(verdict(entry.job.row, entry.score) for entry in ideal) and all(entry.met for entry in discoveries),
         "scenarios": [_scenario(entry) | _targets(entry) for entry in ideal],
         "noisy": [_scenario(entry) | _sensors(entry) for entry in studies if entry.job.kind is Kind.NOISY],
+        "unknown": [_discovery(entry) for entry in discoveries if entry.job.kind is Kind.IDEAL],
+        "unknown_noisy": [_discovery(entry) for entry in discoveries if entry.job.kind is Kind.NOISY],
         "lost_in_noise": [_limit(entry) for entry in found if isinstance(entry, Limit)],
         "plots": [str(path) for path in plots],
     }
@@ -89,4 +96,47 @@ def _limit(found: Limit) -> dict[str, Any]:
         "alone": {"kept": found.alone.kept, "lost": found.alone.lost},
         "together": {"kept": found.together.kept, "lost": found.together.lost},
         "unaided": {"kept": found.unaided.kept, "lost": found.unaided.lost},
+    }
+
+
+def _discovery(entry: Discovery) -> dict[str, Any]:
+    row, noisy = entry.job.row, entry.job.kind is Kind.NOISY
+    before, after = row.paper or (None, None)
+    return {
+        "name": row.name,
+        "component": row.component,
+        "seconds": entry.job.seconds,
+        "noise_share": NOISE if noisy and not row.sensors else None,
+        "begun_s": entry.begun,
+        "suspected_s": entry.suspected,
+        "adopted_s": entry.adopted,
+        "onset_s": entry.onset,
+        "kept": entry.kept,
+        "others": list(entry.others),
+        "equation": entry.equation,
+        "numbers": {course.number.name: _course(course, noisy=noisy) for course in entry.courses},
+        "largest_error": {"before": entry.before, "after": entry.after},
+        "target": None if noisy else {row.output: row.within},
+        "paper": {"before": before, "after": after},
+        "met": entry.met,
+    }
+
+
+def _course(found: Course, *, noisy: bool) -> dict[str, Any]:
+    """The numbers of the last window, and the largest error since the discovery."""
+    known = np.isfinite(found.value)
+    if not known.any():
+        return {"truth": float(found.truth[-1])}
+    last = int(np.flatnonzero(known)[-1])
+    return {
+        "value": float(found.value[last]),
+        "low": float(found.low[last]),
+        "high": float(found.high[last]),
+        "unit": found.unit,
+        "truth": float(found.truth[last]),
+        "error": float(found.errors[last]),
+        "largest_error": float(np.nanmax(found.errors)),
+        "target": found.number.noisy if noisy else found.number.target,
+        "paper": found.number.paper,
+        "coverage": found.coverage,
     }

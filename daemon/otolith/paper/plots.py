@@ -1,6 +1,7 @@
 """A picture for each figure of the paper, and one for the study of windows."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +10,24 @@ from matplotlib.figure import Figure
 
 from otolith.acquisition.window import Array
 from otolith.errors import ServiceError
+from otolith.paper.discovering import Discovery
 from otolith.paper.rows import PEAK
 from otolith.paper.score import errors
-from otolith.paper.studies import Kind, Study
+from otolith.paper.studies import LENGTH, Kind, Study
+from otolith.paper.tracking import Curves
 from otolith.paths import writable
 
 DOTS_PER_INCH = 150
+LEAD = 5  # windows that are shown before a component begins
 SMALLEST = 1e-8  # share: what a logarithmic axis shows of an error of nothing
 ESTIMATED, ACTUAL, PAPER, TARGET = "tab:blue", "black", "tab:red", "tab:green"
 
 
-def draw(studies: Sequence[Study], folder: Path) -> list[Path]:
+Picture = tuple[str, str, Figure]
+"""Kind, the paper's number if it has one, and the figure."""
+
+
+def draw(studies: Sequence[Study], discoveries: Sequence[Discovery], folder: Path) -> list[Path]:
     """Write the pictures into ``folder``, and say what they are called.
 
     Raises:
@@ -27,24 +35,25 @@ def draw(studies: Sequence[Study], folder: Path) -> list[Path]:
     """
     writable(folder)
     written = []
-    for entry in studies:
-        for kind, number, figure in _figures(entry):
-            noisy = "noisy-" if entry.job.kind is Kind.NOISY else ""
-            path = folder / f"{noisy}{entry.job.row.name}-{kind}{f'-fig-{number}' if number else ''}.png"
-            try:
-                figure.savefig(path, dpi=DOTS_PER_INCH)
-            except OSError as error:
-                raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
-            written.append(path)
+    figures: list[tuple[Study | Discovery, Picture]] = [(made, one) for made in studies for one in _figures(made)]
+    figures += [(made, one) for made in discoveries for one in _of_discovery(made)]
+    for entry, (kind, number, figure) in figures:
+        noisy = "noisy-" if entry.job.kind is Kind.NOISY else ""
+        path = folder / f"{noisy}{entry.job.row.name}-{kind}{f'-fig-{number}' if number else ''}.png"
+        try:
+            figure.savefig(path, dpi=DOTS_PER_INCH)
+        except OSError as error:
+            raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
+        written.append(path)
     return written
 
 
-def _figures(entry: Study) -> list[tuple[str, str, Figure]]:
+def _figures(entry: Study) -> list[Picture]:
     value, error, outputs = entry.job.row.figures
     return [
         ("value", value, _figure(entry, value, _draw_value)),
         ("error", error, _figure(entry, error, _draw_error)),
-        ("outputs", outputs, _outputs(entry, outputs)),
+        ("outputs", outputs, _outputs(entry.curves, _title(entry, outputs))),
         ("windows", "", _figure(entry, "", _draw_windows)),
     ]
 
@@ -59,7 +68,46 @@ def _figure(entry: Study, number: str, draw_into: Callable[[Study, Axes], None])
     return figure
 
 
-def _title(entry: Study, number: str) -> str:
+def _of_discovery(entry: Discovery) -> list[Picture]:
+    """The outputs before and after the discovery, and the component's numbers over time."""
+    before, after = entry.job.row.figures
+    curves, end = entry.curves, entry.curves.times[-1]
+    adopted = end if entry.adopted is None else entry.adopted - LENGTH
+    lead = max(entry.begun - LEAD * LENGTH, 0.0)
+    found = [("before", before, _outputs(_between(curves, lead, adopted), _title(entry, before)))]
+    if entry.adopted is not None:
+        found.append(("after", after, _outputs(_between(curves, adopted, end), _title(entry, after))))
+        found.append(("numbers", "", _numbers(entry)))
+    return found
+
+
+def _between(curves: Curves, first: float, last: float) -> Curves:
+    inside = (curves.times >= first - 1e-9) & (curves.times < last - 1e-9)
+    return replace(
+        curves, times=curves.times[inside], measured=curves.measured[inside], predicted=curves.predicted[inside]
+    )
+
+
+def _numbers(entry: Discovery) -> Figure:
+    figure = Figure(figsize=(9.0, 2.5 * len(entry.courses)), layout="constrained")
+    grid = figure.subplots(len(entry.courses), 1, squeeze=False, sharex=True)
+    ends = LENGTH * np.arange(1, len(entry.courses[0].value) + 1)
+    for axes, course in zip(grid[:, 0], entry.courses, strict=True):
+        known = np.isfinite(course.value)
+        columns = (course.low, course.high, course.value, course.truth)
+        low, high, value, truth = (column[known] - course.truth[known] for column in columns)
+        axes.fill_between(ends[known], low, high, color=ESTIMATED, alpha=0.25, label="95 % interval")
+        axes.plot(ends[known], value, color=ESTIMATED, label="found")
+        axes.plot(ends[known], truth, color=ACTUAL, linestyle="--", linewidth=1.0, label="actual")
+        axes.set_ylabel(f"{course.number.name} - actual, {course.unit}")
+        axes.grid(visible=True, alpha=0.3)
+        axes.legend(loc="upper right")
+    grid[-1, 0].set_xlabel("time, s")
+    figure.suptitle(_title(entry, ""))
+    return figure
+
+
+def _title(entry: Study | Discovery, number: str) -> str:
     compare = f" (figure{'s' if '-' in number else ''} {number} of the paper)" if number else ""
     return f"{entry.job.row.title}, {entry.job.kind}{compare}"
 
@@ -110,9 +158,8 @@ def _draw_windows(entry: Study, axes: Axes) -> None:
     axes.set_ylabel(f"relative error of {entry.job.row.parameter}, %")
 
 
-def _outputs(entry: Study, number: str) -> Figure:
+def _outputs(curves: Curves, title: str) -> Figure:
     """Each output measured and predicted, and beside it what is left between them."""
-    curves = entry.curves
     figure = Figure(figsize=(12.0, 3.0 * len(curves.outputs)), layout="constrained")
     grid = figure.subplots(len(curves.outputs), 2, squeeze=False, sharex=True)
     for index, (name, unit) in enumerate(zip(curves.outputs, curves.units, strict=True)):
@@ -127,5 +174,5 @@ def _outputs(entry: Study, number: str) -> Figure:
             axes.grid(visible=True, alpha=0.3)
     for axes in grid[-1]:
         axes.set_xlabel("time, s")
-    figure.suptitle(_title(entry, number))
+    figure.suptitle(title)
     return figure

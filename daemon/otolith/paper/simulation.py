@@ -3,18 +3,35 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Protocol
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.problem import Problem
-from otolith.paper.rows import Row, Sensor
+from otolith.paper.rows import Sensor
 from otolith.paths import examples_directory
 from otolith.plan import Plan, load_plan
 from otolith_drivers.plant.plants import load_scenario, signals, simulate
 from otolith_drivers.quantities import factor
 
 CHUNK = 200  # records between two calls that tell of progress
+
+
+class Lived(Protocol):
+    """A row of any kind."""
+
+    @property
+    def name(self) -> str:
+        """Of the scenario file."""
+
+    @property
+    def machine(self) -> str:
+        """The machine file."""
+
+    @property
+    def parameter(self) -> str:
+        """The one that is estimated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +63,7 @@ class Life:
         return replace(self, values=values)
 
 
-def plan_of(row: Row) -> Plan:
+def plan_of(row: Lived) -> Plan:
     """What the row's machine file means.
 
     Raises:
@@ -55,7 +72,7 @@ def plan_of(row: Row) -> Plan:
     return load_plan(examples_directory() / f"{row.machine}.toml", with_driver=False)
 
 
-def problem_of(row: Row, plan: Plan, deviations: Mapping[str, float]) -> Problem:
+def problem_of(row: Lived, plan: Plan, deviations: Mapping[str, float]) -> Problem:
     """The plan's, with the row's parameter sought and all others known, told ``deviations`` of the sensors.
 
     An input that is measured by an ideal sensor is exact; outputs are weighed as the machine file says.
@@ -72,7 +89,7 @@ def problem_of(row: Row, plan: Plan, deviations: Mapping[str, float]) -> Problem
     )
 
 
-def live(row: Row, plan: Plan, seconds: float, sensors: Sequence[Sensor], lived: Callable[[], None]) -> Life:
+def live(row: Lived, plan: Plan, seconds: float, sensors: Sequence[Sensor], lived: Callable[[], None]) -> Life:
     """Simulate the row's scenario, with ideal sensors if none are given; ``lived`` is called after every 200 records.
 
     Raises:

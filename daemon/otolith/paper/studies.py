@@ -4,7 +4,7 @@ Pure of processes: a job goes in, progress is told, and what was found comes out
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cache
 
@@ -101,11 +101,11 @@ def study(job: Job, tell: Tell) -> Study | Limit:
     Raises:
         OtolithError: an example file that cannot be used.
     """
-    steps = _Steps(tell, f"{job.row.name}, {job.kind}")
+    steps = Steps(tell, f"{job.row.name}, {job.kind}")
     return _limit(job, steps) if job.kind is Kind.LIMIT else _study(job, steps)
 
 
-class _Steps:
+class Steps:
     """Counts them."""
 
     def __init__(self, tell: Tell, what: str) -> None:
@@ -113,14 +113,16 @@ class _Steps:
         self._done, self._doing = 0, ""
 
     def now(self, doing: str) -> None:
+        """From here on ``doing`` is done."""
         self._doing = doing
 
     def __call__(self) -> None:
+        """One more is done."""
         self._done += 1
         self._tell(self._done, f"{self._what}: {self._doing}")
 
 
-def _study(job: Job, steps: _Steps) -> Study:
+def _study(job: Job, steps: Steps) -> Study:
     row, plan = job.row, plan_of(job.row)
     sensors = SENSORS[row.machine] if job.kind is Kind.NOISY else ()
     steps.now("simulating")
@@ -134,7 +136,7 @@ def _study(job: Job, steps: _Steps) -> Study:
     return Study(job, problem.free[0].unit, *found[LENGTH], scores)
 
 
-def _limit(job: Job, steps: _Steps) -> Limit:
+def _limit(job: Job, steps: Steps) -> Limit:
     row, plan = job.row, plan_of(job.row)
     sensor = next(entry for entry in SENSORS[row.machine] if entry.signal == HIDING[row.machine])
     steps.now("simulating")
@@ -145,7 +147,8 @@ def _limit(job: Job, steps: _Steps) -> Limit:
     def heard(level: float, others: float = 1.0) -> Track:
         steps.now(f"{level:.3g} {sensor.unit}")
         deviations = {name: others * noise for name, noise in own.items()} | {sensor.signal: level}
-        return track(problem_of(row, plan, deviations), life.with_noise(deviations, SEED), LENGTH, steps)[0]
+        problem = replace(problem_of(row, plan, deviations), discover=False)  # the plant's own ripple is none of this
+        return track(problem, life.with_noise(deviations, SEED), LENGTH, steps)[0]
 
     alone = _edge(sensor, lambda level: not heard(level).determined.any())
     together = _edge(sensor, lambda level: bool(np.isnan(heard(level).value).all()))

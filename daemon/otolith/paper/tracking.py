@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Mask, Window
+from otolith.acquisition.window import Array, Mask
 from otolith.adaptation.information import Identifiability
 from otolith.adaptation.problem import Problem
-from otolith.health.report import ParameterDocument, Report, Status
+from otolith.health.report import Report, Status
 from otolith.heart import adapt
 from otolith.paper.simulation import Life
 from otolith.state import begin
@@ -62,29 +62,36 @@ class Curves:
     """Not a number where nothing was predicted."""
 
 
-def track(problem: Problem, life: Life, length: float, heard: Callable[[], None]) -> tuple[Track, Curves]:
-    """Let the heart hear ``life`` in windows of ``length`` s; ``heard`` is called after each."""
+def listened(problem: Problem, life: Life, records: int, heard: Callable[[], None]) -> list[Report]:
+    """What the heart says of ``life`` in windows of so many records; ``heard`` is called after each."""
     state = begin("paper", "paper", problem)
-    name, records = problem.free[0].name, round(length / life.period)
-    said: list[tuple[Window, Report, ParameterDocument]] = []
+    reports = []
     for window in life.windows(records):
         state, report = adapt(state, window)
-        said.append((window, report, report.document.parameters[name]))
+        reports.append(report)
         heard()
+    return reports
+
+
+def track(problem: Problem, life: Life, length: float, heard: Callable[[], None]) -> tuple[Track, Curves]:
+    """Let the heart hear ``life`` in windows of ``length`` s; ``heard`` is called after each."""
+    name, records = problem.free[0].name, round(length / life.period)
+    reports = listened(problem, life, records, heard)
+    said = [(report, report.document.parameters[name]) for report in reports]
     ends = np.arange(1, len(said) + 1) * records
     found = Track(
         length=length,
         ends=np.asarray(ends * life.period, dtype=np.float64),
         truth=life.truth[ends],
-        value=_column([entry.value for _, _, entry in said]),
-        low=_column([entry.low for _, _, entry in said]),
-        high=_column([entry.high for _, _, entry in said]),
-        raw=_column([entry.raw for _, _, entry in said]),
-        excited=np.array([_is_excited(report, problem) for _, report, _ in said], dtype=np.bool_),
-        determined=np.array([entry.identifiability is Identifiability.DETERMINED for _, _, entry in said]),
-        statuses=tuple(entry.status for _, _, entry in said),
+        value=_column([entry.value for _, entry in said]),
+        low=_column([entry.low for _, entry in said]),
+        high=_column([entry.high for _, entry in said]),
+        raw=_column([entry.raw for _, entry in said]),
+        excited=np.array([_is_excited(report, problem) for report in reports], dtype=np.bool_),
+        determined=np.array([entry.identifiability is Identifiability.DETERMINED for _, entry in said]),
+        statuses=tuple(entry.status for _, entry in said),
     )
-    return found, _curves(problem, life, [report for _, report, _ in said])
+    return found, curves(problem, life, reports)
 
 
 def _column(values: list[float | None]) -> Array:
@@ -96,7 +103,8 @@ def _is_excited(report: Report, problem: Problem) -> bool:
     return bool((moved > EXCITED * np.array(problem.noise)).any())
 
 
-def _curves(problem: Problem, life: Life, reports: list[Report]) -> Curves:
+def curves(problem: Problem, life: Life, reports: list[Report]) -> Curves:
+    """The outputs of all windows."""
     outputs = problem.twin.outputs
     traces = [report.traces for report in reports]
     measured = np.concatenate([trace.measured for trace in traces])
