@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[1]
-TIMINGS = {"bench_kernels": "casadi", "bench_window": ""}
+TIMINGS = {"bench_discovery": "", "bench_kernels": "casadi", "bench_window": ""}
 COMPARED = {
     "Otolith warm, published": "",
     "Otolith warm, window alone": "",

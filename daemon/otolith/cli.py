@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from otolith import __version__
+from otolith.cli_components import commission, components
 from otolith.cli_noise import noise
 from otolith.cli_paper import paper
 from otolith.cli_process import StopSignal, log_to_stderr
@@ -231,6 +232,8 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return code if stop.number is None else stop.code()
 
 
+cli.add_command(commission)
+cli.add_command(components)
 cli.add_command(noise)
 cli.add_command(paper)
 cli.add_command(twin)

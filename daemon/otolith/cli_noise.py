@@ -39,23 +39,34 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
       otolith noise my-machine.toml monday.csv
       otolith noise my-machine.toml monday.csv --windows 100 --json
     """
-    from otolith.adaptation.learning import learn_noise
-    from otolith.errors import ConfigurationError
     from otolith.plan import load_plan
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # so that the line of progress is put away
     plan = load_plan(file, with_driver=False)
-    with _progress() as told:
-        found = learn_noise(plan.problem, _windows(plan, data, windows), told=told.update)
-    if plan.problem.open_loop:
-        click.echo(f"{file}: as long as open_loop is true, process noise will not be used", err=True)
-    if not found.windows:
-        raise ConfigurationError(f"{data}: {'; '.join(found.remarks)}")
+    found = learned_noise(plan, data, windows)
     if as_json:
         click.echo(json.dumps(_document(plan, found), indent=2, ensure_ascii=False))
     else:
-        for line in _lines(plan, found):
+        for line in lines_of(plan, found):
             click.echo(line)
+
+
+def learned_noise(plan: "Plan", data: Path, windows: int) -> "LearnedNoise":
+    """From at most so many windows of the table.
+
+    Raises:
+        ConfigurationError: it has none that can be used.
+    """
+    from otolith.adaptation.learning import learn_noise
+    from otolith.errors import ConfigurationError
+
+    with _progress() as told:
+        found = learn_noise(plan.problem, _windows(plan, data, windows), told=told.update)
+    if plan.problem.open_loop:
+        click.echo(f"{plan.path}: as long as open_loop is true, process noise will not be used", err=True)
+    if not found.windows:
+        raise ConfigurationError(f"{data}: {'; '.join(found.remarks)}")
+    return found
 
 
 def _progress() -> Any:
@@ -112,7 +123,7 @@ def _spread(entries: Iterable[Entry], most: int) -> list[Entry]:
     return [kept[round(index * (len(kept) - 1) / max(count - 1, 1))] for index in range(count)]
 
 
-def _lines(plan: "Plan", found: "LearnedNoise") -> Iterator[str]:
+def lines_of(plan: "Plan", found: "LearnedNoise") -> Iterator[str]:
     """Both tables, with what there is to know of them as comments."""
     twin, problem = plan.twin, plan.problem
     yield "[noise]"

@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from datetime import datetime
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.table import Table
@@ -59,7 +60,10 @@ class Board:
             histories = {name: tuple(values) for name, values in self._histories.items()}
         if document is None:
             return Text(self._state(), style="dim")
-        parts: list[RenderableType] = [*_heading(document), _parameters(document, histories, width), *_words(document)]
+        parts: list[RenderableType] = [*_heading(document), _parameters(document, histories, width)]
+        if document.components:
+            parts.append(_components(document))
+        parts += _words(document)
         length = document.window.end - document.window.start
         if silence > SILENT_WINDOWS * length:
             parts.insert(0, Text(f"no report for {silence:.0f} s: {self._state()}", style="bold red"))
@@ -90,6 +94,18 @@ def _parameters(document: ReportDocument, histories: Mapping[str, tuple[float, .
     return table
 
 
+def _components(document: ReportDocument) -> Table:
+    table = Table(expand=False)
+    for column in ("component", "equation", "amplitude ± 95 %", "since", "status"):
+        table.add_column(column, no_wrap=True)
+    for entry in document.components:
+        amplitude = entry.values["amplitude"]
+        text = f"{amplitude.value:.4g} ± {QUANTILE * amplitude.sd:.2g} {amplitude.unit}"
+        moment = datetime.fromtimestamp(entry.onset).astimezone().strftime("%F %T")
+        table.add_row(entry.meaning, entry.equation, text, moment, f"{entry.status}, {entry.approval}")
+    return table
+
+
 def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
     """Value, half of its interval, unit and change against nominal, as a table shows them."""
     if parameter.value is None or parameter.sd is None:
@@ -110,6 +126,10 @@ def _words(document: ReportDocument) -> list[Text]:
             lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
         if parameter.advice:
             lines.append(Text(f"{name}: {parameter.advice}", style="cyan"))
+    for finding in document.findings:
+        lines.append(Text(f"{finding.severity}: {finding.text}", style="bold red"))
+        if finding.advice:
+            lines.append(Text(f"  {finding.advice}", style="cyan"))
     if document.fit is not None:
         errors = ", ".join(f"{name} {value:.3g}" for name, value in document.fit.rmse_estimated.items())
         explained = "explained up to the noise" if document.fit.explained else "more than noise is left"

@@ -9,70 +9,30 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from otolith.acquisition.window import Verdict
-from otolith.adaptation.information import QUANTILE
 from otolith.console import Board
+from otolith.demo_truth import Comparison, Shaking, compare, shaking
 from otolith.errors import ConfigurationError, OtolithError, ServiceError
-from otolith.health.report import ReportDocument, Status
+from otolith.health.report import ReportDocument
 from otolith.outlets.zenoh_session import Listener
 from otolith.paths import state_directory, writable
 from otolith.plan import load_plan
 from otolith.topics import REPORT
+from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.plants import load_scenario
 
 TOLERANCE = 0.005  # of the injected value: what every window with current must be found within
-CURRENT_FLOWS = 0.1  # A, mean over the window
+START_UP, TO_FIND = 10.0, 15.0  # s until plant and daemon listen to each other, and for a component to be adopted
 STOP_SECONDS = 2.5  # for a process to end by itself
 PAUSE = 0.1  # s
 ROWS = 15  # of the table at the end
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """One parameter in one window: injected (at its end, as reports speak of it) against found."""
-
-    window: int
-    end: float
-    parameter: str
-    injected: float
-    found: float | None
-    half_width: float | None
-    """Of the 95 % interval."""
-
-    @property
-    def error(self) -> float:
-        """Relative; infinite where nothing was found."""
-        return float("inf") if self.found is None else abs(self.found / self.injected - 1.0)
-
-
-def compare(reports: Sequence[ReportDocument], truth: Mapping[str, Sequence[float]]) -> list[Comparison]:
-    """Every parameter of every good window with current flowing; ``truth`` is columns over Unix time ``t`` (s)."""
-    times = np.asarray(truth["t"])
-    compared = []
-    for report in reports:
-        inside = (times >= report.window.start) & (times <= report.window.end)
-        if report.window.quality.verdict is not Verdict.GOOD or not inside.any():
-            continue
-        if "i" in truth and np.abs(np.asarray(truth["i"])[inside]).mean() < CURRENT_FLOWS:
-            continue
-        for name, parameter in report.parameters.items():
-            if name not in truth:  # the simulated machine has no such parameter
-                continue
-            found = parameter.value if parameter.status is Status.ESTIMATED else None
-            half = None if found is None or parameter.sd is None else QUANTILE * parameter.sd
-            injected = float(np.asarray(truth[name])[inside][-1])
-            compared.append(Comparison(report.window.index, report.window.end, name, injected, found, half))
-    return compared
 
 
 class Demo:
@@ -81,7 +41,7 @@ class Demo:
     def __init__(self, machine: Path, scenario: Path, duration: float, *, as_json: bool) -> None:
         self._machine, self._scenario, self._duration, self._as_json = machine, scenario, duration, as_json
         self._plan = load_plan(machine)
-        load_scenario(scenario)
+        self._life = load_scenario(scenario)
         stamp = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
         self._folder = writable(state_directory() / "demo" / f"{stamp}-{os.getpid()}")
         self._console = Console(stderr=as_json)
@@ -170,19 +130,33 @@ class Demo:
     def _verdict(self) -> int:
         compared = compare(self._reports, _read_columns(self._folder / "truth.csv"))
         wrong = [row for row in compared if row.error > TOLERANCE]
-        right = bool(compared) and not wrong
+        begun = [fault for fault in self._unbalances() if fault.start + TO_FIND < self._duration - START_UP]
+        shaken = [shaking(fault, self._life.parameters.J, self._reports) for fault in begun]
+        right = bool(compared) and not wrong and all(entry.right for entry in shaken)
         if self._as_json:
-            self._print_json(compared, right=right)
+            self._print_json(compared, shaken, right=right)
         else:
             self._print_table(compared, wrong)
+            for entry in shaken:
+                self._console.print(f"[{'green' if entry.right else 'red'}]{entry}[/]", highlight=False, soft_wrap=True)
         return 0 if right else 1
 
-    def _print_json(self, compared: list[Comparison], *, right: bool) -> None:
+    def _unbalances(self) -> list[Unbalance]:
+        return [fault for fault in self._life.faults if isinstance(fault, Unbalance)]
+
+    def _print_json(self, compared: list[Comparison], shaken: list[Shaking], *, right: bool) -> None:
         rows = [
             {"window": row.window, "parameter": row.parameter, "injected": row.injected, "found": row.found}
             for row in compared
         ]
-        verdict = {"right": right, "tolerance": TOLERANCE, "windows": rows, "recording": str(self.recording)}
+        components = [{"right": entry.right, "text": str(entry)} for entry in shaken]
+        verdict = {
+            "components": components,
+            "right": right,
+            "tolerance": TOLERANCE,
+            "windows": rows,
+            "recording": str(self.recording),
+        }
         sys.stdout.write(json.dumps(verdict) + "\n")
 
     def _print_table(self, compared: list[Comparison], wrong: list[Comparison]) -> None:

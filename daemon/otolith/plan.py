@@ -5,8 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from otolith.acquisition.alignment import Limits
+from otolith.adaptation.learned import LearnedNoise
 from otolith.adaptation.problem import Problem, SwarmOptions, WindowOptions
 from otolith.errors import ConfigurationError, nearest
+from otolith.restrictions import excluded
 from otolith.settings import MachineFile, ParameterTable, WindowTable, Written
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twins import find_twin, load_twin
@@ -76,6 +78,18 @@ def load_plan(path: Path, *, with_driver: bool = True) -> Plan:
     )
 
 
+def with_noise(plan: Plan, found: LearnedNoise) -> Plan:
+    """The plan with the levels of noise that were learned."""
+    outputs = {level.name: level.value for level in found.outputs}
+    states = {level.name: level.value for level in found.states}
+    problem = replace(
+        plan.problem,
+        noise=tuple(outputs[entry.name] for entry in plan.twin.outputs),
+        process_noise=tuple(states[entry.name] for entry in plan.twin.states),
+    )
+    return replace(plan, problem=problem)
+
+
 class _Context:
     """Says where in the file a fault is, when it is found after the file's own types were right."""
 
@@ -137,6 +151,8 @@ def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
         process_noise=_process_noise(file, twin, context),
         open_loop=estimation.open_loop,
         determined_within=estimation.determined_within,
+        excluded=excluded(file.discovery, twin, lambda key, fault: context.fail(("discovery", key), fault)),
+        discover=file.discovery.enabled,
         window=_window(file.window, context),
         swarm=SwarmOptions(
             file.swarm.size, file.swarm.generations, file.swarm.inertia, file.swarm.cognitive, file.swarm.social

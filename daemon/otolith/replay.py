@@ -24,7 +24,7 @@ from otolith.errors import ConfigurationError, ServiceError
 from otolith.health.report import CountersDocument, Report
 from otolith.paths import writable
 from otolith.plan import Plan, load_plan
-from otolith.state import begin
+from otolith.state import State, begin
 from otolith.tally import Tally
 from otolith.worker import Task, perform
 
@@ -137,6 +137,11 @@ class Replay:
             windows_bad=self._windows_bad,
             windows_missed=self._missed,
         )
+
+    @property
+    def state(self) -> State:
+        """After the last window."""
+        return self._state
 
     def summary(self) -> str:
         """How much was read."""

@@ -22,11 +22,13 @@ from otolith.adaptation.information import QUANTILE
 from otolith.companion import SIGNALS, Companion
 from otolith.errors import OtolithError
 from otolith.health.report import CountersDocument, Report, ReportDocument, Status
+from otolith.keeping import Keeper
 from otolith.notify import Notifier
 from otolith.outlets.places import recording_folder
 from otolith.outlets.zenoh_session import Publisher
 from otolith.paths import writable
 from otolith.plan import Plan
+from otolith.specialist import Decisions, decided, kept, restored
 from otolith.state import begin
 from otolith.supervisor import Supervisor
 
@@ -38,6 +40,7 @@ TICK = 0.1  # s; the longest wait, so how late a stop, a death or an outage can 
 RECORDER_ROOM = 32  # windows
 RECORDER_FLUSH = 1.5  # s at the end
 STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed
+KEEP_EVERY = 300.0  # s between two writes of components that are only known better
 THRIVES = 60.0  # s after which a recorder counts as healthy
 
 
@@ -51,7 +54,16 @@ class Service:
         self._rings = Rings(plan.twin.signals, RING_RATE * RING_WINDOWS * plan.problem.window.longest)
         self._windower = Windower(plan.twin.signals, plan.records, plan.file.window.sample_period, plan.limits)
         longest = plan.problem.window.longest * plan.file.window.sample_period
-        self._supervisor = Supervisor(begin(machine.name, machine.site, plan.problem), longest)
+        self._keeper = Keeper(machine.site, machine.name, plan.twin)
+        state = begin(machine.name, machine.site, plan.problem)
+        decisions = Decisions()
+        try:
+            state, decisions = restored(state, self._keeper.components()), self._keeper.decisions()
+        except OtolithError as error:  # a file that cannot be read is no reason not to watch the machine
+            log.warning("begun without components: %s", error)
+        self._said, self._kept_at = self._keeper.stamp(), 0.0
+        self._kept = tuple(entry.component.key for entry in state.catalogue)
+        self._supervisor = Supervisor(decided(state, decisions), longest)
         self._recorder = Companion("otolith-recorder", "otolith.outlets.recorder:main", RECORDER_ROOM)
         self._recording = recording if plan.file.recording.enabled else None
         self._publisher: Publisher | None = None
@@ -126,10 +138,37 @@ class Service:
         for report, seconds in self._supervisor.poll(time.monotonic()):
             self._publish(report, seconds)
             self._windower.records = self._supervisor.records
+            self._keep(time.monotonic())
         self._watch(time.monotonic())
+
+    def _keep(self, now: float) -> None:
+        """Write down components that are new, gone, or known better than a while ago."""
+        state = self._supervisor.state
+        found = tuple(entry.component.key for entry in state.catalogue)
+        if found == self._kept and (not found or now - self._kept_at < KEEP_EVERY):
+            return
+        try:
+            self._keeper.keep(kept(state))
+        except OtolithError as error:  # a full disk must not end the watching
+            log.warning("components are not kept: %s", error)
+        self._kept, self._kept_at = found, now
+
+    def _listen_to_specialist(self) -> None:
+        """What has been said about components since it was last looked at."""
+        stamp = self._keeper.stamp()
+        if stamp == self._said:
+            return
+        self._said = stamp
+        try:
+            decisions = self._keeper.decisions()
+        except OtolithError as error:
+            log.warning("%s", error)
+            return
+        self._supervisor.revise(lambda state: decided(state, decisions))
 
     def _cut(self, now: float) -> None:
         window = self._windower.cut(self._rings, time.time() - time.monotonic())
+        self._listen_to_specialist()
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
         self._supervisor.submit(window, now)
@@ -191,4 +230,5 @@ def summary(document: ReportDocument) -> str:
         else:
             held = "" if parameter.status is Status.ESTIMATED else f" ({parameter.status}: {parameter.reason})"
             parts.append(f"{name} {parameter.value:.5g} {parameter.unit} ± {QUANTILE * parameter.sd:.2g}{held}")
+    parts += [f"{finding.severity}: {finding.text}" for finding in document.findings]
     return ", ".join(parts)

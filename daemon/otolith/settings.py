@@ -71,7 +71,7 @@ class WindowTable(Closed):
     longest: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] | None = None
     """With either of these the length follows what drift and noise ask for, from ``length`` on."""
     sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-4, 10.0))] = 0.01
-    missing_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.05
+    missing_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.01
     gap_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 60.0))] = 0.05
     jitter_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 10.0))] = 0.005
 
@@ -83,6 +83,16 @@ class EstimationTable(Closed):
     """The paper's cost: nothing corrects the twin within a window; noise other than the sensors' is left out."""
     determined_within: Annotated[float, BeforeValidator(Quantity("1", 1e-6, 1.0))] = 0.1
     """A parameter counts as determined when the half of its 95 % interval is at most this share of its value."""
+
+
+class DiscoveryTable(Closed):
+    """What is looked for when the twin does not explain the machine; everything unless restricted."""
+
+    enabled: bool = True
+    families: tuple[str, ...] | None = None
+    sites: tuple[str, ...] | None = None
+    inputs: tuple[str, ...] | None = None
+    """``t``, ``angle(omega)``, or names of signals and states."""
 
 
 class SwarmTable(Closed):
@@ -128,6 +138,7 @@ class MachineFile(Closed):
     """Of the machine itself: how far a state strays, in its unit per square root of a second."""
     window: WindowTable = WindowTable()
     estimation: EstimationTable = EstimationTable()
+    discovery: DiscoveryTable = DiscoveryTable()
     swarm: SwarmTable = SwarmTable()
     zenoh: ZenohTable = ZenohTable()
     recording: RecordingTable = RecordingTable()

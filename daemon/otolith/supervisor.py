@@ -6,6 +6,7 @@ The adaptation state stays on this side of the pipe, so that a death loses no mo
 
 import logging
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 from otolith import worker
@@ -17,7 +18,8 @@ from otolith.state import State
 log = logging.getLogger(__name__)
 
 ROOM = 2  # windows that wait for a busy worker; older ones are missed
-PATIENCE = 20.0  # s for a window beyond twice its length: the first one of a new machine also compiles
+PATIENCE = 20.0  # s for a window beyond twice its length
+COMPILING = 120.0  # s more for the first one: a twin that this computer has never run is compiled before
 
 
 class Supervisor:
@@ -27,6 +29,7 @@ class Supervisor:
         self.missed = 0
         self.finished = 0
         self._state = state
+        self._changes: list[Callable[[State], State]] = []
         self._patience = PATIENCE + 2 * window_length
         self._companion = Companion("otolith-worker", "otolith.worker:main", room=1)
         self._waiting: deque[Window] = deque()
@@ -48,6 +51,15 @@ class Supervisor:
     def waitables(self) -> list[Any]:
         """See :attr:`otolith.companion.Companion.waitables`."""
         return self._companion.waitables
+
+    @property
+    def state(self) -> State:
+        """After the last window that was finished."""
+        return self._state
+
+    def revise(self, change: Callable[[State], State]) -> None:
+        """Change the state before the next window, whatever becomes of the one at hand."""
+        self._changes.append(change)
 
     def start(self) -> None:
         """Start the worker."""
@@ -105,9 +117,11 @@ class Supervisor:
     def _hand_on(self, now: float) -> None:
         if self._at_hand is not None or not self._waiting or not self._companion.alive:
             return
+        while self._changes:
+            self._state = self._changes.pop(0)(self._state)
         self._at_hand = self._waiting.popleft()
         self._companion.offer(worker.Task(self._state, self._at_hand))
-        self._deadline = now + self._patience
+        self._deadline = now + self._patience + (0.0 if self.finished else COMPILING)
 
     def _miss(self, window: Window, why: str) -> None:
         self.missed += 1

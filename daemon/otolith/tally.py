@@ -58,6 +58,13 @@ class Tally:
         for name, parameter in last.parameters.items():
             if parameter.reason:
                 yield Text(f"{name} in the last window: {parameter.reason}", style="yellow")
+        for entry in last.components:
+            yield Text(
+                f"{entry.meaning}: {entry.equation}, since {entry.onset:.12g} s ({entry.approval})", style="bold red"
+            )
+        for finding in last.findings:
+            if finding.id not in {entry.id for entry in last.components}:
+                yield Text(" ".join(filter(None, [finding.text, finding.advice])), style="red")
         yield from self._words()
 
     def _parameters(self, last: ReportDocument) -> Table:

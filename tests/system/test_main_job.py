@@ -17,7 +17,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from otolith.acquisition.window import Array, Verdict
-from otolith.demo import compare
+from otolith.demo_truth import compare
 from otolith.health.report import Status
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running

@@ -6,6 +6,7 @@ window; an entity carries a vector, measured and twin side by side.
 
 import logging
 import math
+import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -78,6 +79,10 @@ class Recording:
         for name, parameter in document.parameters.items():
             if parameter.value is not None and parameter.low is not None and parameter.high is not None:
                 self._stream.log(f"parameters/{name}", rr.Scalars([parameter.low, parameter.high, parameter.value]))
+        for entry in document.components:
+            amplitude = entry.values["amplitude"]
+            bare = re.sub(r"\W+", "_", entry.id)  # an entity's path has signs of its own
+            self._stream.log(f"components/{bare}", rr.Scalars([amplitude.low, amplitude.high, amplitude.value]))
         for text, level in _sentences(document):
             self._stream.log("log", rr.TextLog(text, level=level))
         self._stream.log("report", rr.TextDocument(_table(document), media_type=rr.MediaType.MARKDOWN))
@@ -108,6 +113,9 @@ def _sentences(document: ReportDocument) -> list[tuple[str, str]]:
     for name, parameter in document.parameters.items():
         if parameter.status is not Status.ESTIMATED and not window.quality.reasons:
             lines.append((f"window {window.index}: {name} {parameter.status}: {parameter.reason}", "INFO"))
+    for finding in document.findings:
+        advice = f" ({finding.advice})" if finding.advice else ""
+        lines.append((f"window {window.index}: {finding.text}{advice}", "WARN"))
     if document.fit is not None and not document.fit.explained:
         lines.append((f"window {window.index}: the twin does not explain the window up to the noise", "INFO"))
     return lines
@@ -121,6 +129,12 @@ def _table(document: ReportDocument) -> str:
         if parameter.value is not None and parameter.sd is not None:
             value = f"{parameter.value:.5g} {parameter.unit} ± {QUANTILE * parameter.sd:.2g}"
         rows.append(f"| {name} | {value} | {parameter.status} {parameter.reason} |")
+    if document.components:
+        rows += ["", "| component | equation | status |", "|---|---|---|"]
+        rows += [
+            f"| {entry.meaning} | {entry.equation} | {entry.status} {entry.approval} |" for entry in document.components
+        ]
+    rows += [f"\n**{finding.severity}**: {finding.text} {finding.advice}" for finding in document.findings]
     return "\n".join(rows)
 
 
@@ -137,7 +151,9 @@ def blueprint(outputs: Sequence[Output], parameters: Sequence[Parameter]) -> rrb
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                *parameter_views, rrb.TimeSeriesView(origin="/residual", name="residual in units of the noise")
+                *parameter_views,
+                rrb.TimeSeriesView(origin="/components", name="components that the twin lacked: amplitudes"),
+                rrb.TimeSeriesView(origin="/residual", name="residual in units of the noise"),
             ),
             rrb.Vertical(*signal_views),
             rrb.Vertical(

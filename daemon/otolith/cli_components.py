@@ -1,0 +1,210 @@
+"""``otolith components`` and ``otolith commission``: what the twin of a machine lacks, and what belongs to it."""
+
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from otolith.keeping import Keeper
+    from otolith.plan import Plan
+    from otolith.specialist import Kept
+    from otolith.state import State
+
+FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.group()
+def components() -> None:
+    """List the components that were found in a machine, and say what they are.
+
+    A running daemon hears what is said here with its next window, and a later one when it starts.
+
+    \b
+    Examples:
+      otolith components list my-machine.toml
+      otolith components approve my-machine.toml shaft/periodic/t
+      otolith components reject my-machine.toml shaft/Coulomb/omega
+      otolith components forget my-machine.toml shaft/periodic/t
+    """
+
+
+@components.command("list")
+@click.argument("file", type=FILE)
+@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+def list_them(file: Path, as_json: bool) -> None:
+    """List the components of the machine in FILE."""
+    import json
+
+    from pydantic import TypeAdapter
+
+    from otolith.specialist import Kept
+
+    plan, keeper = _keeper(file)
+    found, decisions = keeper.components(), keeper.decisions()
+    if as_json:
+        rows = [TypeAdapter(Kept).dump_python(entry, mode="json") for entry in found]
+        said = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
+        click.echo(json.dumps({"components": rows, **said}, ensure_ascii=False))
+        return
+    for entry in found:
+        key = entry.entry.component.key
+        word = "approved" if key in decisions.approved else "rejected" if key in decisions.rejected else "open"
+        click.echo(f"{key}  {_words(plan, entry)}  since {_moment(entry.entry.onset)}  {word}")
+    known = {entry.entry.component.key for entry in found}
+    for key in sorted(decisions.rejected - known):
+        click.echo(f"{key}  is not looked for: rejected")
+    if not found and not decisions.rejected:
+        click.echo(f"{plan.file.machine.name}: no component has been found", err=True)
+
+
+def _moment(seconds: float) -> str:
+    return time.strftime("%F %T", time.localtime(seconds))
+
+
+def _words(plan: "Plan", entry: "Kept") -> str:
+    from otolith.adaptation.completion import equation
+
+    sd = f" (amplitude ± {1.96 * entry.deviations[0]:.2g})"
+    return equation(plan.twin, entry.entry.component, entry.values) + sd
+
+
+@components.command()
+@click.argument("file", type=FILE)
+@click.argument("component")
+def approve(file: Path, component: str) -> None:
+    """COMPONENT belongs to the healthy machine: it stays in the twin and is no finding."""
+    _, keeper = _keeper(file)
+    said = keeper.decisions()
+    _known(keeper, component, said.rejected)
+    keeper.decide(replace(said, approved=said.approved | {component}, rejected=said.rejected - {component}))
+    click.echo(f"{component} is approved")
+
+
+@components.command()
+@click.argument("file", type=FILE)
+@click.argument("component")
+def reject(file: Path, component: str) -> None:
+    """COMPONENT is none: it leaves the twin and is not looked for again."""
+    _, keeper = _keeper(file)
+    said = keeper.decisions()
+    _known(keeper, component, said.approved)
+    keeper.decide(replace(said, approved=said.approved - {component}, rejected=said.rejected | {component}))
+    click.echo(f"{component} is rejected")
+
+
+@components.command()
+@click.argument("file", type=FILE)
+@click.argument("component")
+def forget(file: Path, component: str) -> None:
+    """Forget COMPONENT and what was said of it: if it is there, it will be found anew."""
+    _, keeper = _keeper(file)
+    said = keeper.decisions()
+    _known(keeper, component, said.approved | said.rejected)
+    forgotten = {**said.forgotten, component: time.time()}
+    approved, rejected = said.approved - {component}, said.rejected - {component}
+    keeper.decide(replace(said, approved=approved, rejected=rejected, forgotten=forgotten))
+    click.echo(f"{component} is forgotten")
+
+
+def _keeper(file: Path) -> "tuple[Plan, Keeper]":
+    from otolith.keeping import Keeper
+    from otolith.plan import load_plan
+
+    plan = load_plan(file, with_driver=False)
+    return plan, Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin)
+
+
+def _known(keeper: "Keeper", component: str, said: frozenset[str]) -> None:
+    """Refuse what has never been heard of.
+
+    Raises:
+        ConfigurationError: with the nearest one that has.
+    """
+    from otolith.errors import ConfigurationError, nearest
+
+    known = {entry.entry.component.key for entry in keeper.components()} | said
+    if component not in known:
+        raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
+
+
+@click.command()
+@click.argument("file", type=FILE)
+@click.argument("data", type=FILE)
+@click.option("--yes", is_flag=True, help="Every component that is found belongs to the healthy machine.")
+@click.option("--windows", type=click.IntRange(1, 1000), default=30, show_default=True, help="To learn noise from.")
+def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
+    """Learn what is normal for the machine in FILE from the table DATA, recorded while it was in good health.
+
+    Learns the levels of noise, and with them looks for components that the twin lacks. You say of each whether it
+    belongs to the machine; afterwards only change is a finding. The daemon knows what you approved when it starts.
+
+    \b
+    Examples:
+      otolith commission my-machine.toml monday.csv
+      otolith commission my-machine.toml monday.csv --yes
+    """
+    from otolith.cli_noise import learned_noise, lines_of
+    from otolith.plan import with_noise
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    plan, keeper = _keeper(file)
+    found = learned_noise(plan, data, windows)
+    for line in lines_of(plan, found):
+        click.echo(line)
+    click.echo("# put these tables into the machine file in place of its own", err=True)
+    plan = with_noise(plan, found)
+    state = _lived(plan, data)
+    _ask(plan, keeper, state, yes=yes)
+
+
+def _lived(plan: "Plan", data: Path) -> "State":
+    """The state after all windows of the table."""
+    from otolith.acquisition.table import Table
+    from otolith.replay import Replay
+
+    with Table(data, {name: plan.twin.unit_of(name) for name in plan.twin.signals}) as table:
+        run = Replay(plan, table)
+        for report in run.reports():
+            for line in _told(report.document.findings):
+                click.echo(f"window {report.document.window.index}: {line}", err=True)
+        for line in run.complaints():
+            click.echo(f"{data}: {line}", err=True)
+        return run.state
+
+
+def _told(findings: object) -> Iterator[str]:
+    for finding in findings if isinstance(findings, tuple) else ():
+        yield finding.text
+
+
+def _ask(plan: "Plan", keeper: "Keeper", state: "State", *, yes: bool) -> None:
+    from otolith.specialist import kept
+
+    said = keeper.decisions()
+    approved, rejected = set[str](), set[str]()
+    found = kept(state)
+    for entry in found:
+        key = entry.entry.component.key
+        click.echo(f"found {key}: {_words(plan, entry)}")
+        (approved if yes or click.confirm("does it belong to the healthy machine?") else rejected).add(key)
+    keeper.keep(tuple(entry for entry in found if entry.entry.component.key in approved))
+    keeper.decide(replace(said, approved=said.approved | approved, rejected=(said.rejected | rejected) - approved))
+    if not found:
+        click.echo("no component was found: the twin explains the machine up to the noise")
+    for name, parameter in _parameters(state):
+        click.echo(f"{name} = {parameter}")
+
+
+def _parameters(state: "State") -> Iterator[tuple[str, str]]:
+    from otolith.adaptation.fusion import overall
+
+    known = overall(state.memory.belief, state.problem)
+    for index, entry in enumerate(state.problem.free):
+        if not entry.name.startswith("_"):
+            sd = float(known.covariance[index, index]) ** 0.5
+            yield entry.name, f"{known.mean[index]:.5g} ± {1.96 * sd:.2g} {entry.unit}"

@@ -1,0 +1,144 @@
+"""Components on disk: what the daemon knows of them, and what the specialist has said; each file has one writer."""
+
+import contextlib
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from otolith.errors import ConfigurationError, ServiceError
+from otolith.paths import state_directory, writable
+from otolith.specialist import Decisions, Kept
+from otolith.twin.definition import Definition
+from otolith.twin.metamodels import NAMES
+from otolith.twin.slots import SLOTS, sites, sources
+from otolith_drivers.toml_files import Closed
+
+VERSION = 1
+Page = TypeVar("Page", bound=Closed)
+
+
+class _File(Closed):
+    """The daemon's file."""
+
+    version: int = VERSION
+    twin: str
+    components: tuple[Kept, ...] = ()
+
+
+class _Said(Closed):
+    """The specialist's file."""
+
+    version: int = VERSION
+    approved: tuple[str, ...] = ()
+    rejected: tuple[str, ...] = ()
+    forgotten: Annotated[dict[str, float], Field(default_factory=dict)]
+
+
+class Keeper:
+    """The two files of one machine."""
+
+    def __init__(self, site: str, machine: str, twin: Definition, folder: Path | None = None) -> None:
+        folder = folder or state_directory() / "components"
+        self._twin = twin
+        self.known = folder / f"{site}.{machine}.json"
+        self.said = folder / f"{site}.{machine}.specialist.json"
+
+    def components(self) -> tuple[Kept, ...]:
+        """Those that are kept and that this twin can have.
+
+        Raises:
+            ConfigurationError: the file is not one of ours.
+        """
+        file = _read(self.known, _File)
+        if file is None or file.twin != self._twin.name:
+            return ()
+        usable = [entry for entry in file.components if self._is_possible(entry)]
+        return tuple(usable[:SLOTS])
+
+    def _is_possible(self, kept: Kept) -> bool:
+        """Whether this version and this twin can have such a component."""
+        component = kept.entry.component
+        if component.family not in NAMES or component.amplitude == 0.0:
+            return False
+        numbers = 1 + (component.model.inner is not None) + component.repeats
+        return (
+            component.site in {entry.name for entry in sites(self._twin)}
+            and component.source in {entry.name for entry in sources(self._twin)}
+            and len(kept.values) == len(kept.deviations) == numbers
+            and all(map(math.isfinite, (*kept.values, *kept.deviations)))
+        )
+
+    def keep(self, components: tuple[Kept, ...]) -> None:
+        """Write what is known of components, all or nothing.
+
+        Raises:
+            ServiceError: the disk does not take it.
+        """
+        _write(self.known, _File(twin=self._twin.name, components=components))
+
+    def decisions(self) -> Decisions:
+        """What the specialist has said.
+
+        Raises:
+            ConfigurationError: the file is not one of ours.
+        """
+        file = _read(self.said, _Said)
+        if file is None:
+            return Decisions()
+        return Decisions(frozenset(file.approved), frozenset(file.rejected), file.forgotten)
+
+    def decide(self, decisions: Decisions) -> None:
+        """Write what the specialist says; a running daemon hears it with its next window.
+
+        Raises:
+            ServiceError: the disk does not take it.
+        """
+        _write(self.said, _Said(
+            approved=tuple(sorted(decisions.approved)), rejected=tuple(sorted(decisions.rejected)),
+            forgotten=dict(decisions.forgotten),
+        ))  # fmt: skip
+
+    def stamp(self) -> float:
+        """When the specialist last said something; 0 for never."""
+        with contextlib.suppress(OSError):
+            return self.said.stat().st_mtime
+        return 0.0
+
+
+def _read(path: Path, kind: type[Page]) -> Page | None:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error}") from error
+    try:
+        return TypeAdapter(kind).validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "file"
+        raise ConfigurationError(
+            f"{path}: {where}: {first['msg']}: move it away to begin without components"
+        ) from error
+
+
+def _write(path: Path, page: Closed) -> None:
+    try:
+        writable(path.parent)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".new")
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(page.model_dump_json(indent=2) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
+        if os.geteuid() == 0:  # the daemon has a user of its own, and must be able to read what root says
+            owner = path.parent.stat()
+            os.chown(temporary, owner.st_uid, owner.st_gid)
+        Path(temporary).replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError, UnboundLocalError):
+            Path(temporary).unlink()
+        raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error

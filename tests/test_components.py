@@ -1,0 +1,116 @@
+"""``otolith components`` and ``otolith commission``: the specialist's word, kept over restarts."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.discovery.motor import SIGNALS, Faults, live
+from click.testing import CliRunner, Result
+
+from otolith.cli import cli
+from otolith.errors import ConfigurationError
+from otolith.keeping import Keeper
+from otolith.plan import load_plan
+from otolith.specialist import Decisions, decided, restored
+from otolith.state import begin
+from tests.replays import MACHINE
+
+KEY = "shaft/periodic/angle(omega)"
+
+
+def torque(t: float, angle: float, *_: float) -> float:
+    return 0.004 * math.sin(angle)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A motor that has always been a little out of balance."""
+    told = live("sweep", 24.0, Faults(torque=torque), seed=5)
+    path = tmp_path_factory.mktemp("data") / "healthy.csv"
+    table = np.column_stack([0.01 * np.arange(len(told)), told])
+    np.savetxt(path, table, delimiter=",", header="t," + ",".join(SIGNALS), comments="", fmt="%.9g")
+    return path
+
+
+def otolith(*arguments: str | Path, said: str = "") -> Result:
+    return CliRunner().invoke(cli, list(map(str, arguments)), input=said, catch_exceptions=False, standalone_mode=False)
+
+
+def keeper() -> Keeper:
+    plan = load_plan(MACHINE, with_driver=False)
+    return Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin)
+
+
+def test_what_belongs_to_the_machine_is_learned_and_obeyed(data: Path) -> None:
+    asked = otolith("commission", MACHINE, data, "--windows", "8", said="y\n")
+    assert "[noise]" in asked.stdout
+    assert f"found {KEY}: 0.0040" in asked.stdout or f"found {KEY}: 0.0039" in asked.stdout
+    assert KEY in keeper().decisions().approved
+
+    listed = otolith("components", "list", MACHINE)
+    assert KEY in listed.stdout
+    assert "approved" in listed.stdout
+    document = json.loads(otolith("components", "list", MACHINE, "--json").stdout)
+    assert document["approved"] == [KEY]
+    assert document["components"][0]["entry"]["component"]["family"] == "periodic"
+
+    plan = load_plan(MACHINE, with_driver=False)
+    state = decided(restored(begin("m", "s", plan.problem), keeper().components()), keeper().decisions())
+    assert [entry.key for entry in state.problem.components] == [KEY]
+
+    otolith("components", "reject", MACHINE, KEY)
+    assert keeper().decisions() == Decisions(rejected=frozenset({KEY}))
+    state = decided(restored(begin("m", "s", plan.problem), keeper().components()), keeper().decisions())
+    assert state.problem.components == ()
+    assert KEY in state.problem.excluded
+
+    otolith("components", "forget", MACHINE, KEY)
+    assert not keeper().decisions().rejected
+    assert KEY in keeper().decisions().forgotten
+
+
+def test_what_nobody_has_heard_of_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="no component 'shaft/periodic'"):
+        otolith("components", "approve", MACHINE, "shaft/periodic")
+
+
+def test_a_machine_without_components_says_so() -> None:
+    assert "no component has been found" in otolith("components", "list", MACHINE).output
+
+
+def test_a_file_that_is_not_ours_is_refused_by_name() -> None:
+    one = keeper()
+    one.known.parent.mkdir(parents=True, exist_ok=True)
+    one.known.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"components.0.entry.*move it away"):
+        one.components()
+    one.said.write_text("half a fi", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=one.said.name):
+        one.decisions()
+
+
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ('families = ["periodik"]', "'periodik' is none of them"),
+        ('sites = ["shfat"]', "shaft"),
+        ('inputs = ["angle(i)"]', "angle.omega."),
+    ],
+)
+def test_a_restriction_that_cannot_be_meant_is_an_error(tmp_path: Path, line: str, word: str) -> None:
+    machine = tmp_path / "machine.toml"
+    machine.write_text(MACHINE.read_text(encoding="utf-8") + f"\n[discovery]\n{line}\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=word):
+        load_plan(machine, with_driver=False)
+
+
+def test_a_restricted_search_leaves_the_rest_out(tmp_path: Path) -> None:
+    machine = tmp_path / "machine.toml"
+    text = MACHINE.read_text(encoding="utf-8") + '\n[discovery]\nfamilies = ["periodic"]\nsites = ["shaft"]\n'
+    machine.write_text(text, encoding="utf-8")
+    excluded = load_plan(machine, with_driver=False).problem.excluded
+    assert KEY not in excluded
+    assert "shaft/linear/omega" in excluded
+    assert "winding/periodic/t" in excluded
