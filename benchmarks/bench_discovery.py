@@ -1,0 +1,53 @@
+"""What discovery costs: a window that is explained, a full search, a window of a case; all families and inputs."""
+
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.discovery.motor import Faults, J, live, windows
+from otolith.adaptation.gate import Lesson
+from otolith.adaptation.problem import Problem
+from otolith.heart import adapt
+from otolith.state import begin
+from otolith.twins import find_twin
+
+CALM, SEARCH = 0.015, 0.250  # s: what a window may take at the median
+
+
+def main() -> int:
+    twin = find_twin("dc_motor")
+    free = tuple(entry for entry in twin.parameters if entry.name in ("R_a", "D"))
+    known = tuple((entry.name, entry.nominal) for entry in twin.parameters if entry not in free)
+    problem = Problem(twin, known, free, (0.005, 0.02), input_noise=(0.0, 0.0002))
+    begun = begin("motor", "bench", problem)
+    times: dict[str, list[float]] = {"calm": [], "search": [], "followed": [], "switched off": []}
+    for seed in range(8):
+
+        def torque(t: float, *_: float) -> float:
+            return 5.0 * J * float(np.sin(10.0 * t))
+
+        state, plain = begun, replace(begun, problem=replace(problem, discover=False))
+        for window in windows(live("steps", 30.0, Faults(torque=torque, since=20.0), seed)):
+            start = time.perf_counter()
+            state, report = adapt(state, window)
+            seconds = time.perf_counter() - start
+            lesson = report.document.lesson
+            if window.index > 2 and lesson is Lesson.LEARNED and not state.problem.components:
+                times["calm"].append(seconds)
+            elif lesson is Lesson.SUSPECTED and state.memory.case is not None:
+                times["search" if state.memory.case.windows == 1 else "followed"].append(seconds)
+            if window.end <= 20.0:
+                start = time.perf_counter()
+                plain, _ = adapt(plain, window)
+                times["switched off"].append(time.perf_counter() - start)
+    medians = {name: float(np.median(values[1:])) for name, values in times.items()}
+    for name, value in medians.items():
+        ratio = value / medians["switched off"]
+        print(f"{name:14} {value * 1e3:8.1f} ms   {ratio:6.1f} x a window with discovery switched off")
+    return 0 if medians["calm"] <= CALM and medians["search"] <= SEARCH else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
