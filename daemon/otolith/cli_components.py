@@ -54,6 +54,8 @@ def list_them(file: Path, as_json: bool) -> None:
     for entry in found:
         key = entry.entry.component.key
         word = "approved" if key in decisions.approved else "rejected" if key in decisions.rejected else "open"
+        if decisions.forgotten.get(key, 0.0) > entry.entry.onset:
+            word = "forgotten: it will be found anew if it is there"
         click.echo(f"{key}  {_words(plan, entry)}  since {_moment(entry.entry.onset)}  {word}")
     known = {entry.entry.component.key for entry in found}
     for key in sorted(decisions.rejected - known):
@@ -140,7 +142,7 @@ def _known(keeper: "Keeper", component: str, said: frozenset[str]) -> None:
 def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
     """Learn what is normal for the machine in FILE from the table DATA, recorded while it was in good health.
 
-    Learns the levels of noise, and with them looks for components that the twin lacks. You say of each whether it
+    Looks for components that the twin lacks, and learns the levels of noise. You say of each component whether it
     belongs to the machine; afterwards only change is a finding. The daemon knows what you approved when it starts.
 
     \b
@@ -153,12 +155,17 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
     plan, keeper = _keeper(file)
+    state = _lived(plan, data)
     found = learned_noise(plan, data, windows)
+    if not state.catalogue:  # what the noise of the file may have hidden
+        state = _lived(with_noise(plan, found), data)
     for line in lines_of(plan, found):
         click.echo(line)
+    if state.catalogue:
+        click.echo(
+            "# process noise was learned without the components below and contains them: keep what the file says"
+        )
     click.echo("# put these tables into the machine file in place of its own", err=True)
-    plan = with_noise(plan, found)
-    state = _lived(plan, data)
     _ask(plan, keeper, state, yes=yes)
 
 
