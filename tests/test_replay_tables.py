@@ -72,7 +72,10 @@ def test_what_is_missing_is_counted_and_told(tmp_path: Path, rows: Lines, capsys
     data = written(tmp_path, rows)
     found = reports(data, capsys)
     assert len(found) == 5
-    assert all(document.parameters["R_a"].status is Status.ESTIMATED for document in found)
+    for document in found:  # two windows lack more than one record in a hundred, and are not estimated from
+        lacking = document.window.quality.missing > 0.01
+        assert document.parameters["R_a"].status is (Status.HELD if lacking else Status.ESTIMATED)
+    assert [document.window.quality.missing > 0.01 for document in found] == [False, True, True, False, False]
     assert found[-1].counters is not None
     assert (found[-1].counters.bad, found[-1].counters.lost) == (4, 0)
     text = summed_up(data, capsys)
