@@ -12,7 +12,7 @@ from otolith.restrictions import excluded
 from otolith.settings import MachineFile, ParameterTable, WindowTable, Written
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twins import find_twin, load_twin
-from otolith_drivers.base import Driver, Signal
+from otolith_drivers.base import Driver, Setup, Signal
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.registry import find
 from otolith_drivers.toml_files import Page, expect, parse, read, validate
@@ -244,9 +244,9 @@ def _driver(file: MachineFile, twin: Definition, context: _Context) -> Driver:
     sources = {
         name: validate(file.signals[name], module.Source, context.page, under=("signals", name)) for name in wanted
     }
-    signals = [Signal(name, twin.unit_of(name), source) for name, source in sources.items()]
+    signals = tuple(Signal(name, twin.unit_of(name), source) for name, source in sources.items())
     try:
-        return module.build(options, signals, context.page.path.parent)
+        return module.build(options, Setup(signals, context.page.path.parent, file.window.sample_period))
     except ConfigurationError as error:
         if error.key:
             context.fail(error.key, str(error))

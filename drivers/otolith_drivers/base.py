@@ -6,6 +6,7 @@ reconnect loop, counts what it receives and what it loses, and never lets an exc
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -32,16 +33,36 @@ class Signal:
     """Where the signal is: an instance of the driver's ``Source``."""
 
 
+class Sampling(StrEnum):
+    """What the times of a driver's samples mean, and so how they come onto the grid of a window."""
+
+    CYCLIC = "cyclic"
+    """The source samples on a grid of its own; a time is that of arrival, which may be late but never early."""
+    POLLED = "polled"
+    """A time is that at which the value was true: signals are brought to the grid by interpolation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What a driver is built for."""
+
+    signals: tuple[Signal, ...]
+    folder: Path
+    """What files named in options are relative to."""
+    sample_period: float
+    """s; how often the daemon wants each signal."""
+
+
 @dataclass(frozen=True, slots=True)
 class Counters:
     """What a driver has seen since it was opened."""
 
     received: int = 0
-    """Frames, replies or rows that held a wanted signal."""
+    """Samples delivered."""
     bad: int = 0
-    """Received but not decodable, or out of range."""
+    """Frames, replies, rows or single values that came and could not be used: not decodable, out of range, repeated."""
     lost: int = 0
-    """Known to be sent but never received, or dropped for want of room."""
+    """Samples known to be sent or asked for that never came."""
     reconnects: int = 0
 
 
@@ -52,6 +73,12 @@ class Link:
     up: bool
     reason: str = ""
     """Why it is down, in words."""
+    complaints: tuple[str, ...] = ()
+    """What is wrong now although it is up, a line each: a silent frame, a dead device, registers that are refused."""
+    plan: str = ""
+    """What is asked of the machine and what is achieved; empty where the machine sets the pace."""
+    period: float | None = None
+    """s from sample to sample as achieved; None where the machine sets the pace, or while it is not known."""
 
 
 Deliver = Callable[[Sequence[Sample]], None]
@@ -61,11 +88,15 @@ Deliver = Callable[[Sequence[Sample]], None]
 class Driver(Protocol):
     """A connection to one machine. Built from options, then opened once and closed once."""
 
+    @property
+    def sampling(self) -> Sampling:
+        """What the times of its samples mean."""
+
     def open(self, deliver: Deliver) -> None:
-        """Connect and start to deliver.
+        """Start to deliver; a device that is not there yet is waited for in a thread, as one that went away is.
 
         Raises:
-            DeviceError: the device cannot be reached at all.
+            DeviceError: this computer lacks what it takes: the interface, the permission, the file.
         """
 
     def close(self) -> None:
@@ -75,7 +106,7 @@ class Driver(Protocol):
         """What has been seen so far; from any thread."""
 
     def link(self) -> Link:
-        """Whether the connection stands; from any thread."""
+        """Whether the connection stands, and what is wrong with it; from any thread."""
 
     def describe(self) -> list[str]:
         """What will be read from where, a line per fact, for ``otolith check``."""
@@ -89,8 +120,8 @@ class DriverType(Protocol):
     Source: type[Closed]
     """The keys of each of ``[signals]``: where to find the signal."""
 
-    def build(self, options: Any, signals: Sequence[Signal], folder: Path) -> Driver:
-        """A driver ready to be opened; files in ``options`` are relative to ``folder``.
+    def build(self, options: Any, setup: Setup) -> Driver:
+        """A driver ready to be opened; ``options`` is an instance of ``Options``.
 
         Raises:
             ConfigurationError: a signal cannot be found where its source says.

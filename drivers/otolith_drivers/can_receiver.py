@@ -8,14 +8,13 @@ import math
 import random
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import can
 from cantools.database import Message
 
-from otolith_drivers.base import Counters, Deliver, Link, Sample, Signal
+from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.dbc import Source, Wanted, find_signals, load_dbc
 from otolith_drivers.errors import DeviceError
@@ -45,11 +44,12 @@ class _Frame:
     wanted: tuple[Wanted, ...]
 
 
-def build(options: Options, signals: Sequence[Signal], folder: Path) -> "CanReceiver":
-    """A receiver for ``signals``; each one's source has ``signal`` and, where that is ambiguous, ``message``."""
-    database = load_dbc(folder / options.dbc)
+def build(options: Options, setup: Setup) -> "CanReceiver":
+    """A receiver; each signal's source has ``signal`` and, where that is ambiguous, ``message``."""
+    path = setup.folder / options.dbc
+    database = load_dbc(path)
     frames: dict[tuple[int, bool], _Frame] = {}
-    for wanted in find_signals(database, signals, folder / options.dbc):
+    for wanted in find_signals(database, setup.signals, path):
         key = (wanted.message.frame_id, wanted.message.is_extended_frame)
         frame = frames.get(key, _Frame(wanted.message, ()))
         frames[key] = replace(frame, wanted=(*frame.wanted, wanted))
@@ -58,6 +58,8 @@ def build(options: Options, signals: Sequence[Signal], folder: Path) -> "CanRece
 
 class CanReceiver:
     """Implements :class:`otolith_drivers.base.Driver` over python-can, with a receive thread of its own."""
+
+    sampling = Sampling.CYCLIC
 
     def __init__(self, options: BusOptions, frames: dict[tuple[int, bool], _Frame]) -> None:
         self._options = options
@@ -160,7 +162,7 @@ class CanReceiver:
             return
         bad = any(not math.isfinite(sample.value) for sample in samples)
         self._counters = replace(
-            self._counters, received=self._counters.received + 1, bad=self._counters.bad + int(bad)
+            self._counters, received=self._counters.received + len(samples), bad=self._counters.bad + int(bad)
         )
         deliver(samples)
 

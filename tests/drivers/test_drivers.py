@@ -13,17 +13,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers import registry
-from otolith_drivers.base import Driver, Sample, Signal
+from otolith_drivers.base import Driver, Sample, Setup, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.can_receiver import CanReceiver, Options, build, monotonic_of
 from otolith_drivers.dbc import Source
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from tests.conftest import EXAMPLES, OwnMachine
 
-SIGNALS = [
+SIGNALS = (
     Signal("i", "A", Source(signal="ArmatureCurrent")),
     Signal("omega", "rpm", Source(signal="RotorSpeed")),
-]
+)
+SETUP = Setup(SIGNALS, EXAMPLES, 0.01)
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def can_rig(machine: OwnMachine) -> Iterator[Rig]:
         )
         bus.send(can.Message(arbitration_id=641, data=(1000).to_bytes(2, "little") + bytes(6), is_extended_id=False))
 
-    yield Rig(build(options, SIGNALS, EXAMPLES), say)
+    yield Rig(build(options, SETUP), say)
     bus.shutdown()
 
 
@@ -86,7 +87,7 @@ def test_it_delivers_in_the_wanted_units_and_stamps_at_the_source(rig: Rig) -> N
 def test_it_counts_what_it_receives(rig: Rig) -> None:
     """Every delivered frame, reply or row is in the counters."""
     samples = collect(rig, 10)
-    assert rig.driver.counters().received >= len(samples) / len(SIGNALS)
+    assert rig.driver.counters().received >= len(samples)
     assert rig.driver.counters().bad == 0
     assert rig.driver.link().up
 
@@ -113,9 +114,9 @@ def test_it_says_what_it_will_read(rig: Rig) -> None:
 
 
 def test_it_cannot_write(rig: Rig) -> None:
-    """The protocol has five verbs, and none of them speaks to the machine."""
+    """The protocol has five verbs and an adjective, and none of them speaks to the machine."""
     public = {name for name in dir(rig.driver) if not name.startswith("_")}
-    assert public == {"open", "close", "counters", "link", "describe"}
+    assert public == {"open", "close", "counters", "link", "describe", "sampling"}
 
 
 def test_an_unknown_driver_is_refused_with_the_known_ones() -> None:
@@ -125,7 +126,7 @@ def test_an_unknown_driver_is_refused_with_the_known_ones() -> None:
 
 def receiver(machine: OwnMachine) -> CanReceiver:
     options = Options(interface="udp_multicast", channel=machine.group, port=machine.port, dbc=Path("dc-motor.dbc"))
-    return build(options, SIGNALS, EXAMPLES)
+    return build(options, SETUP)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
@@ -144,7 +145,7 @@ def test_any_frame_is_decoded_or_counted(
     driver._take(frame, got.extend)
     counters = driver.counters()
     wanted = identifier != 7 and not remote and not error
-    assert counters.received + counters.bad == int(wanted)
+    assert (counters.received + counters.bad > 0) == wanted
     assert len(got) == counters.received
 
 
