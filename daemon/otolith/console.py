@@ -12,7 +12,7 @@ from rich.text import Text
 
 from otolith.acquisition.window import Verdict
 from otolith.adaptation.information import QUANTILE
-from otolith.health.report import ParameterDocument, ReportDocument, Status
+from otolith.health.report import DriverDocument, ParameterDocument, ReportDocument, Status
 
 HISTORY = 200  # windows that the curve can show
 WITHOUT_HISTORY = 72  # columns of the table beside the curve
@@ -134,6 +134,8 @@ def _words(document: ReportDocument) -> list[Text]:
         errors = ", ".join(f"{name} {value:.3g}" for name, value in document.fit.rmse_estimated.items())
         explained = "explained up to the noise" if document.fit.explained else "more than noise is left"
         lines.append(Text(f"residual (RMSE): {errors}: {explained}"))
+    if document.driver is not None:
+        lines += _of_driver(document.driver)
     if document.counters is not None:
         counters = document.counters
         lines += [
@@ -145,6 +147,13 @@ def _words(document: ReportDocument) -> list[Text]:
             ),
         ]
     return lines
+
+
+def _of_driver(driver: DriverDocument) -> list[Text]:
+    lines = [Text(f"driver: {complaint}", style="yellow") for complaint in driver.complaints]
+    if not driver.up:
+        return [*lines, Text(f"driver: {driver.reason}", style="bold red")]
+    return [*lines, Text(f"driver: {driver.plan}", style="dim")] if driver.plan else lines
 
 
 def sparkline(values: tuple[float, ...]) -> str:

@@ -21,7 +21,7 @@ from otolith.acquisition.windower import Windower
 from otolith.adaptation.information import QUANTILE
 from otolith.companion import SIGNALS, Companion
 from otolith.errors import OtolithError
-from otolith.health.report import CountersDocument, Report, ReportDocument, Status
+from otolith.health.report import CountersDocument, DriverDocument, Report, ReportDocument, Status
 from otolith.keeping import Keeper
 from otolith.notify import Notifier
 from otolith.outlets.places import recording_folder
@@ -29,7 +29,7 @@ from otolith.outlets.zenoh_session import Publisher
 from otolith.paths import writable
 from otolith.plan import Plan
 from otolith.specialist import Decisions, decided, kept, restored
-from otolith.state import begin
+from otolith.state import begin, regridded
 from otolith.supervisor import Supervisor
 
 log = logging.getLogger(__name__)
@@ -40,6 +40,7 @@ TICK = 0.1  # s; the longest wait, so how late a stop, a death or an outage can 
 RECORDER_ROOM = 32  # windows
 RECORDER_FLUSH = 1.5  # s at the end
 STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed
+OTHER_GRID = 0.01  # difference of two sample periods that matters
 KEEP_EVERY = 300.0  # s between two writes of components that are only known better
 THRIVES = 60.0  # s after which a recorder counts as healthy
 
@@ -52,8 +53,9 @@ class Service:
         self._plan = plan
         self._listen = plan.file.zenoh.listen if listen is None else listen
         self._rings = Rings(plan.twin.signals, RING_RATE * RING_WINDOWS * plan.problem.window.longest)
-        self._windower = Windower(plan.twin.signals, plan.records, plan.file.window.sample_period, plan.limits)
-        longest = plan.problem.window.longest * plan.file.window.sample_period
+        period, sampling = plan.file.window.sample_period, plan.driver.sampling
+        self._windower = Windower(plan.twin.signals, plan.records, period, plan.limits, sampling)
+        longest = plan.problem.window.longest * period
         self._keeper = Keeper(machine.site, machine.name, plan.twin)
         state = begin(machine.name, machine.site, plan.problem)
         decisions = Decisions()
@@ -166,8 +168,20 @@ class Service:
             return
         self._supervisor.revise(lambda state: decided(state, decisions))
 
+    def _regrid(self) -> None:
+        """Where the machine gives less than was asked, windows are made of what it gives."""
+        period, now = self._plan.driver.link().period, self._windower.sample_period
+        if period is None or abs(period / now - 1.0) < OTHER_GRID:
+            return
+        self._supervisor.revise(lambda state: regridded(state, period / now))
+        self._windower.regrid(self._supervisor.records, period)
+        found = f"the machine gives a sample every {period * 1e3:.4g} ms, not every {now * 1e3:.4g} ms"
+        size = f"{self._windower.records} records in {self._windower.length:.4g} s"
+        log.warning("%s: windows have %s from now on", found, size)
+
     def _cut(self, now: float) -> None:
         window = self._windower.cut(self._rings, time.time() - time.monotonic())
+        self._regrid()
         self._listen_to_specialist()
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
@@ -177,7 +191,9 @@ class Service:
         document = report.document
         latency = max(0.0, time.time() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
-        document = document.model_copy(update={"cost": cost, "counters": self._counters()})
+        link = self._plan.driver.link()
+        driver = DriverDocument(up=link.up, reason=link.reason, complaints=link.complaints, plan=link.plan)
+        document = document.model_copy(update={"cost": cost, "counters": self._counters(), "driver": driver})
         if self._publisher is not None:
             self._publisher.publish(document)
         if self._plan.file.recording.enabled:
@@ -231,4 +247,7 @@ def summary(document: ReportDocument) -> str:
             held = "" if parameter.status is Status.ESTIMATED else f" ({parameter.status}: {parameter.reason})"
             parts.append(f"{name} {parameter.value:.5g} {parameter.unit} ± {QUANTILE * parameter.sd:.2g}{held}")
     parts += [f"{finding.severity}: {finding.text}" for finding in document.findings]
+    if document.driver is not None:
+        parts += [] if document.driver.up else [f"no connection: {document.driver.reason}"]
+        parts += document.driver.complaints
     return ", ".join(parts)

@@ -40,7 +40,10 @@ class Supervisor:
     @property
     def records(self) -> int:
         """How many the next window should have."""
-        return self._state.records
+        state = self._state
+        for change in self._changes:
+            state = change(state)
+        return state.records
 
     @property
     def restarts(self) -> int:

@@ -12,6 +12,7 @@ ENTRY_POINT_GROUP = "otolith.drivers"
 # The module is imported only when its driver is chosen.
 DRIVERS: dict[str, str] = {
     "can": "otolith_drivers.can_receiver",
+    "modbus": "otolith_drivers.modbus_poller",
 }
 
 

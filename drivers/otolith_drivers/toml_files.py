@@ -175,7 +175,8 @@ def _keys_at(model: Any, location: Location) -> list[str]:
         return sorted({key for part in arguments for key in _keys_at(part, location)})
     if origin in (dict, tuple, list) and location:
         return _keys_at([part for part in arguments if part is not Ellipsis][-1], location[1:])
-    fields = model.model_fields if isinstance(model, type) and issubclass(model, BaseModel) else {}
+    known = model.model_fields if isinstance(model, type) and issubclass(model, BaseModel) else {}
+    fields = {field.alias or name: field for name, field in known.items()}
     if not location:
         return sorted(fields)
     if location[0] in fields:

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.acquisition.alignment import Limits, align, judge
+from otolith.acquisition.alignment import Limits, align, align_polled, judge
 from otolith.acquisition.window import Array, Verdict
+from otolith_drivers.base import Sampling
 
 PERIOD = 0.01
 
@@ -125,3 +126,25 @@ def test_the_verdict_says_why(keep: slice, sentence: str) -> None:
     quality = judge({"x": aligned}, PERIOD, Limits())
     assert quality.verdict is Verdict.BAD
     assert sentence in quality.reasons
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.004), st.floats(0.0, 0.002))
+def test_what_was_read_later_in_the_round_is_brought_back_to_the_grid(seed: int, later: float, jitter: float) -> None:
+    """The skew between registers of different requests: each time says when its value was true."""
+    times = ramp(202) * PERIOD - PERIOD + later + np.random.default_rng(seed).uniform(0.0, jitter, 202)
+    aligned = align_polled(times, np.sin(20.0 * times), 0.0, 200, PERIOD)
+    assert not aligned.missing.any()
+    assert aligned.values == pytest.approx(np.sin(20.0 * ramp(200) * PERIOD), abs=(20.0 * (PERIOD + jitter)) ** 2 / 8)
+
+
+@given(st.sets(st.integers(2, 197), max_size=40))
+def test_readings_that_never_came_are_missing(lost: set[int]) -> None:
+    kept = np.array([index for index in range(200) if index not in lost])
+    aligned = align_polled(kept * PERIOD + 0.001, kept.astype(float), 0.0, 200, PERIOD)
+    assert set(np.flatnonzero(aligned.missing).tolist()) == lost
+
+
+def test_a_round_of_requests_is_no_jitter() -> None:
+    aligned = {"x": align_polled(ramp(200) * PERIOD + 0.004, ramp(200), 0.0, 200, PERIOD)}
+    assert judge(aligned, PERIOD, Limits(jitter=0.001), Sampling.POLLED).verdict is Verdict.GOOD
+    assert judge(aligned, PERIOD, Limits(jitter=0.001), Sampling.CYCLIC).verdict is Verdict.BAD

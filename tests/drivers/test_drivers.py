@@ -1,10 +1,11 @@
 """The contract every driver keeps, parametrised over the registry: a new driver is tested by being there."""
 
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import can
@@ -12,13 +13,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith_drivers import registry
+from otolith_drivers import modbus_poller, registry
 from otolith_drivers.base import Driver, Sample, Setup, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.can_receiver import CanReceiver, Options, build, monotonic_of
 from otolith_drivers.dbc import Source
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from tests.conftest import EXAMPLES, OwnMachine
+from tests.drivers.modbus_servers import library_server
 
 SIGNALS = (
     Signal("i", "A", Source(signal="ArmatureCurrent")),
@@ -52,7 +54,27 @@ def can_rig(machine: OwnMachine) -> Iterator[Rig]:
     bus.shutdown()
 
 
-RIGS = {"can": can_rig}
+def modbus_source(register: int, unit: str) -> modbus_poller.Source:
+    return modbus_poller.Source.model_validate({"register": register, "type": "float32", "unit": unit})
+
+
+@contextmanager
+def modbus_rig(_: OwnMachine) -> Iterator[Rig]:
+    words = dict(enumerate(struct.unpack(">4H", struct.pack(">ff", 2.0, 10.0))))
+    signals = (
+        Signal("i", "A", modbus_poller.Source.model_validate({"register": 0, "type": "float32", "unit": "A"})),
+        Signal(
+            "omega", "rpm", modbus_poller.Source.model_validate({"register": 2, "type": "float32", "unit": "rad/s"})
+        ),
+    )
+    with library_server(words) as port:
+        options = modbus_poller.Options(host="127.0.0.1", port=port)
+        driver = modbus_poller.build(options, replace(SETUP, signals=signals))
+        yield Rig(driver, lambda: None)
+        driver.close()
+
+
+RIGS = {"can": can_rig, "modbus": modbus_rig}
 
 
 @pytest.fixture(params=sorted(registry.DRIVERS))

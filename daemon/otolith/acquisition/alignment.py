@@ -2,7 +2,8 @@
 
 A cyclic source samples on a grid of its own; what jitters is the arrival. So a signal that comes at about the sample
 period is not interpolated: each sample is given to the slot of the grid it was taken in, late arrivals to the slots
-before (a frame can come late, never early). Interpolation is for signals that come at another rate.
+before (a frame can come late, never early). Interpolation is for signals that come at another rate, and for those
+that were read by asking: of these every time is that at which the value was true, whatever request it came with.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array, Mask, Quality, Verdict
+from otolith_drivers.base import Sampling
 
 MOST_EXTRA = 20  # samples too many in a window that are told from a burst
 EXTRA_LIMIT = 0.02  # share of records
 IRREGULAR_LIMIT = 0.3
+POLLED_REACH = 0.75  # periods from the nearest reading, beyond which a record of a polled signal is missing
 CYCLIC_TOLERANCE = 0.3  # a source whose median period is this close to the grid's is taken to be on it
 
 
@@ -92,6 +95,21 @@ def _slots(times: Array, start: float, period: float) -> tuple[Indices, Indices]
     return kept, slots
 
 
+def align_polled(times: Array, values: Array, start: float, records: int, period: float) -> Aligned:
+    """The same of a signal whose times say when its values were true: straight lines between them, at the grid."""
+    finite = np.isfinite(values)
+    times, values = times[finite], values[finite]
+    if not len(times):
+        return Aligned(np.zeros(records), np.ones(records, dtype=np.bool_), np.zeros(0))
+    grid = start + period * np.arange(records)
+    after = np.clip(np.searchsorted(times, grid), 1, max(len(times) - 1, 1))
+    nearest = np.minimum(np.abs(grid - times[after - 1]), np.abs(grid - times[np.minimum(after, len(times) - 1)]))
+    slots = np.rint((times - start) / period)
+    inside = (slots >= 0) & (slots < records)
+    lateness = (times - (start + slots * period))[inside]
+    return Aligned(*_finite(np.interp(grid, times, values), nearest > POLLED_REACH * period), lateness)
+
+
 def _interpolated(times: Array, values: Array, start: float, records: int, period: float) -> Aligned:
     """A signal slower or faster than the grid: straight lines between samples, missing where they are too far apart."""
     grid = start + period * np.arange(records)
@@ -114,8 +132,11 @@ def _bridged(grid: Array, missing: Mask) -> Array:
     return np.interp(np.arange(len(grid)), known, grid[known])
 
 
-def _root_mean_square(lateness: Array) -> float:
-    return float(np.sqrt(np.mean(lateness**2))) if len(lateness) else 0.0
+def _jitter(lateness: Array, *, centred: bool) -> float:
+    """Root mean square (s), about the median if ``centred``."""
+    if not len(lateness):
+        return 0.0
+    return float(np.sqrt(np.mean((lateness - np.median(lateness) * centred) ** 2)))
 
 
 def _finite(values: Array, missing: Mask) -> tuple[Array, Mask]:
@@ -124,11 +145,14 @@ def _finite(values: Array, missing: Mask) -> tuple[Array, Mask]:
     return np.where(absurd, 0.0, values), missing | absurd
 
 
-def judge(aligned: Mapping[str, Aligned], period: float, limits: Limits) -> Quality:
+def judge(
+    aligned: Mapping[str, Aligned], period: float, limits: Limits, sampling: Sampling = Sampling.CYCLIC
+) -> Quality:
     """The quality of a window from its signals."""
     missing = {signal: float(found.missing.mean()) for signal, found in aligned.items()}
     gaps = {signal: _longest_run(found.missing) * period for signal, found in aligned.items()}
-    jitters = {signal: _root_mean_square(found.lateness) for signal, found in aligned.items()}
+    polled = sampling is Sampling.POLLED  # whose requests follow one another: what is the same each time is no jitter
+    jitters = {signal: _jitter(found.lateness, centred=polled) for signal, found in aligned.items()}
     offsets = [float(np.median(found.lateness)) for found in aligned.values() if len(found.lateness)]
     reasons = _silent(missing) or [
         *_over(missing, limits.missing, lambda signal, share: f"{share:.0%} of {signal} is missing"),

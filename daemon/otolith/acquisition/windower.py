@@ -1,25 +1,37 @@
 """Cutting windows out of the rings, one after the other, without a gap or an overlap between them."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
-from otolith.acquisition.alignment import Aligned, Limits, align, judge
+from otolith.acquisition.alignment import Aligned, Limits, align, align_polled, judge
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Window
+from otolith_drivers.base import Sampling
 
+ALIGN = {Sampling.CYCLIC: align, Sampling.POLLED: align_polled}
 PROMPT = 0.1  # quantile of lateness that stands for samples that nothing held up on their way
+GAP_RECORDS = 2.5  # in a row that a coarser grid may lack
 GRACE = 0.1  # s; how long after its end a window waits for late samples
 
 
 class Windower:
     """Knows where the next window begins. Times are seconds on the monotonic clock, given by the caller."""
 
-    def __init__(self, signals: tuple[str, ...], records: int, sample_period: float, limits: Limits) -> None:
+    def __init__(
+        self,
+        signals: tuple[str, ...],
+        records: int,
+        sample_period: float,
+        limits: Limits,
+        sampling: Sampling = Sampling.CYCLIC,
+    ) -> None:
         self.signals = signals
         self.records = records
         self.sample_period = sample_period
         self._limits = limits
+        self._sampling = sampling
         self._start = math.inf
         self._index = 0
 
@@ -65,7 +77,7 @@ class Windower:
             signals=self.signals,
             values=np.column_stack([aligned[signal].values for signal in self.signals]),
             missing=np.column_stack([aligned[signal].missing for signal in self.signals]),
-            quality=judge(aligned, self.sample_period, self._limits),
+            quality=judge(aligned, self.sample_period, self._limits, self._sampling),
         )
         self._index += 1
         self._start = start + self.length + self._drift(aligned)
@@ -74,8 +86,14 @@ class Windower:
     def _align(self, rings: Rings) -> dict[str, Aligned]:
         samples = rings.between(self._start - GRACE, self.next_end + GRACE)
         return {
-            signal: align(*samples[signal], self._start, self.records, self.sample_period) for signal in self.signals
+            signal: ALIGN[self._sampling](*samples[signal], self._start, self.records, self.sample_period)
+            for signal in self.signals
         }
+
+    def regrid(self, records: int, sample_period: float) -> None:
+        """From the next window on, so many records so far (s) apart; a gap is told only where records are missing."""
+        self.records, self.sample_period = records, sample_period
+        self._limits = replace(self._limits, gap=max(self._limits.gap, GAP_RECORDS * sample_period))
 
     def _drift(self, aligned: dict[str, Aligned]) -> float:
         """How far (s) to move the grid so that it meets the next window's samples in their middle.

@@ -105,12 +105,27 @@ class CostDocument(Closed):
     generations: int = 0
 
 
+class DriverDocument(Closed):
+    """How the connection to the machine fares."""
+
+    up: bool
+    reason: str = ""
+    """Why it is down."""
+    complaints: tuple[str, ...] = ()
+    """What is wrong although it is up, a line each."""
+    plan: str = ""
+    """What is asked of the machine and what is achieved, where it is asked."""
+
+
 class CountersDocument(Closed):
     """What was received and what was lost since the daemon started: nothing is lost silently."""
 
     received: int = 0
+    """Samples."""
     bad: int = 0
+    """Frames, replies or values that came and could not be used."""
     lost: int = 0
+    """Samples that were sent or asked for and never came, or that found no room."""
     reconnects: int = 0
     windows: int = 0
     """Windows cut."""
@@ -145,6 +160,8 @@ class ReportDocument(Closed):
     """None where nothing was estimated from the window."""
     cost: CostDocument = CostDocument()
     counters: CountersDocument | None = None
+    driver: DriverDocument | None = None
+    """None in a replay."""
 
     def to_json(self) -> str:
         """As published: absent where there is no content, ``schema`` first."""

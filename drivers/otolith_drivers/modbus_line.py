@@ -1,0 +1,152 @@
+"""A Modbus line that can be read and nothing else: pymodbus behind a door without a handle on the other side.
+
+Only function codes 3 (read holding registers) and 4 (read input registers) leave this file.
+"""
+
+import contextlib
+import logging
+import os
+import socket
+from typing import Final
+
+import serial
+from pymodbus import ModbusException
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+from pymodbus.exceptions import ConnectionException
+from pymodbus.framer import FramerType
+
+from otolith_drivers.modbus_options import LineOptions, Table
+
+FUNCTION_CODES: Final[dict[Table, int]] = {"holding": 3, "input": 4}
+# Modbus Application Protocol V1.1b3, section 7.
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal data address",
+    3: "illegal data value",
+    4: "server device failure",
+    5: "acknowledge, it takes longer",
+    6: "server device busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target device failed to respond",
+}
+GATEWAY_CODES = (10, 11)
+SILENT_LOG = logging.getLogger("pymodbus")
+
+
+class Refused(Exception):  # noqa: N818 - what the device has done, said in the words of the field
+    """The device answers that it does not want to.
+
+    Example scenarios: registers that it does not have, more of them than it gives at once, busy.
+    """
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
+        self.code = code
+
+
+class Silent(Exception):  # noqa: N818
+    """No answer, or none to the question, in time; the line itself stands.
+
+    Example scenarios: device switched off, wrong device number, wrong baud rate, a late answer to an earlier question.
+    """
+
+
+class Broken(Exception):  # noqa: N818
+    """The line is gone.
+
+    Example scenarios: connection refused or closed, host unreachable, serial adapter pulled out.
+    """
+
+
+class Line:
+    """One host or serial port. For one thread, but for :meth:`abort`."""
+
+    def __init__(self, options: LineOptions) -> None:
+        SILENT_LOG.setLevel(logging.CRITICAL)  # it would write the last packets to the log with every error
+        self._options = options
+        self._client = _client(options)
+
+    def connect(self) -> None:
+        """Open the line.
+
+        Raises:
+            Broken: it cannot be opened.
+        """
+        try:  # by ourselves, as the library only logs why it cannot
+            self._client.socket = self._opened()
+        except (OSError, ValueError) as error:
+            raise Broken(_cause(error)) from error
+
+    def close(self) -> None:
+        """Close it; may be called twice. What was on its way is lost, which is how a line is drained."""
+        with contextlib.suppress(OSError):
+            self._client.close()  # type: ignore[no-untyped-call]  # of a library that is typed but for this
+
+    def abort(self) -> None:
+        """From another thread: make a reading in progress end."""
+        handle = self._client.socket
+        if isinstance(handle, socket.socket):
+            with contextlib.suppress(OSError):
+                handle.shutdown(socket.SHUT_RDWR)
+
+    def read(self, device: int, table: Table, address: int, count: int) -> list[int]:
+        """The registers from ``address`` on, each 0 to 65535.
+
+        Raises:
+            Refused: the device answers with an exception.
+            Silent: no answer in time, or one to another question; the line is to be opened anew before the next one.
+            Broken: the line is gone.
+        """
+        read = self._client.read_holding_registers if table == "holding" else self._client.read_input_registers
+        try:
+            reply = read(address, count=count, device_id=device)
+        except ConnectionException as error:
+            raise Broken("the connection was closed") from error
+        except ModbusException as error:
+            raise Silent(f"no answer within {self._options.timeout:g} s") from error
+        except OSError as error:
+            raise Broken(error.strerror or str(error)) from error
+        except Exception as error:  # what hostile bytes do to the library's decoder
+            raise Silent(f"an answer that cannot be understood ({type(error).__name__})") from error
+        if reply.isError():
+            raise Refused(int(reply.exception_code))
+        if reply.function_code != FUNCTION_CODES[table] or len(reply.registers) != count:
+            raise Silent(f"an answer to another question: {len(reply.registers)} registers instead of {count}")
+        return list(reply.registers)
+
+    def _opened(self) -> socket.socket | serial.Serial:
+        options = self._options
+        if options.host is not None:
+            connection = socket.create_connection((options.host, options.port), timeout=options.timeout)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return connection
+        return serial.Serial(
+            options.serial,
+            baudrate=options.baudrate,
+            parity=options.parity,
+            stopbits=options.stop_bits,
+            timeout=options.timeout,
+            write_timeout=options.timeout,
+            exclusive=True,
+        )
+
+
+def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
+    if options.host is not None:
+        framer = FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU
+        return ModbusTcpClient(options.host, port=options.port, framer=framer, timeout=options.timeout, retries=0)
+    return ModbusSerialClient(
+        options.serial or "",
+        baudrate=options.baudrate,
+        parity=options.parity,
+        stopbits=options.stop_bits,
+        timeout=options.timeout,
+        retries=0,
+    )
+
+
+def _cause(error: OSError | ValueError) -> str:
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
+    return str(error)

@@ -1,0 +1,99 @@
+"""When the next round of requests is due, and what rate is achieved. Pure: times (s) come in as arguments.
+
+Rounds begin on a grid of absolute moments, so that a late one does not delay those after it. Where the line is slower
+than asked, the grid is made as coarse as it takes: evenly spaced samples are worth more than many.
+"""
+
+import math
+from collections import deque
+
+ROUNDS = 40  # that a decision is based on
+FULL = 0.95  # share of the period beyond which rounds leave no room for what delays them
+SLOW = 0.9  # quantile of the rounds' durations that must fit
+ROOM = 1.15  # of a longer period over what rounds take
+STEPS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # times a power of ten: periods that people use
+SELDOM, OFTEN = 0.02, 0.6  # shares of rounds that repeat the one before, between which the beat is heard
+BEAT_ROUNDS = 100
+
+
+class Pace:
+    """The grid of rounds."""
+
+    def __init__(self, asked: float) -> None:
+        self.asked = asked
+        self.period = asked
+        self.due = math.inf
+        self._starts: deque[float] = deque(maxlen=ROUNDS + 1)
+        self._durations: deque[float] = deque(maxlen=ROUNDS)
+        self._repeats = self._rounds = 0
+
+    def start(self, now: float) -> None:
+        """Lay the grid through ``now``."""
+        self.due = now
+
+    def begin(self, now: float) -> int:
+        """A round begins; how many before it were left out since the last one."""
+        behind = self._behind(now)
+        self.due += (behind + 1) * self.period
+        if behind:
+            self._starts.clear()
+        self._starts.append(now)
+        return behind
+
+    def pass_over(self, now: float) -> int:
+        """The line is away: how many rounds were due meanwhile; they are left out."""
+        missed = self._behind(now) + 1 if now >= self.due else 0
+        self.due += missed * self.period
+        self._starts.clear()
+        return missed
+
+    def _behind(self, now: float) -> int:
+        return max(0, math.floor((now - self.due) / self.period))
+
+    def end(self, duration: float, *, repeated: bool) -> bool:
+        """A round in which all answered took ``duration`` s; whether the grid was made coarser because of it.
+
+        ``repeated``: every register had the value of the round before. Where that happens now and then, the device
+        renews its registers as often as they are read, and at the same moment: reading then moves away from it.
+        """
+        self._durations.append(duration)
+        self._rounds += 1
+        self._repeats += repeated
+        if self._rounds >= BEAT_ROUNDS:
+            if SELDOM <= self._repeats / self._rounds <= OFTEN:
+                self.due += self.period / 4
+            self._rounds = self._repeats = 0
+        if len(self._durations) < ROUNDS:
+            return False
+        longest = sorted(self._durations)[int(SLOW * ROUNDS)]
+        if longest <= FULL * self.period:
+            return False
+        self.due += _even(ROOM * longest) - self.period
+        self.period = _even(ROOM * longest)
+        self._starts.clear()
+        self._durations.clear()
+        return True
+
+    @property
+    def achieved(self) -> float | None:
+        """S from round to round; None while too few have followed each other."""
+        if len(self._starts) < ROUNDS // 2:
+            return None
+        return (self._starts[-1] - self._starts[0]) / (len(self._starts) - 1)
+
+    @property
+    def known(self) -> bool:
+        """Whether enough rounds were seen to know that the period can be held."""
+        return len(self._durations) == ROUNDS
+
+    def describe(self) -> str:
+        """Asked and achieved, in words."""
+        achieved = "not known yet" if self.achieved is None else f"{1 / self.achieved:.1f} achieved"
+        coarser = f" (the grid is now {self.period * 1e3:g} ms)" if self.period > self.asked else ""
+        return f"{1 / self.asked:g} Hz asked, {achieved}{coarser}"
+
+
+def _even(period: float) -> float:
+    """The next longer period (s) that people would write."""
+    power = 10.0 ** math.floor(math.log10(period))
+    return next(step * power for step in STEPS if step * power >= period * (1 - 1e-9))

@@ -1,0 +1,125 @@
+"""Modbus servers for tests: pymodbus's own, and one that misbehaves as no well-kept library would."""
+
+import asyncio
+import socket
+import socketserver
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from tests.conftest import free_port
+
+Words = dict[int, int]
+
+
+@contextmanager
+def library_server(words: Words) -> Iterator[int]:
+    """Pymodbus serving ``words`` (by address) as device 1; the port."""
+    port = free_port(socket.SOCK_STREAM)
+    values = [words.get(address, 0) for address in range(max(words) + 1)]
+    device = SimDevice(id=1, simdata=[SimData(0, values=values, datatype=DataType.REGISTERS)])
+    loop, up = asyncio.new_event_loop(), threading.Event()
+    servers: list[ModbusTcpServer] = []
+
+    async def serve() -> None:
+        server = ModbusTcpServer(device, address=("127.0.0.1", port))
+        servers.append(server)
+        await server.serve_forever(background=True)
+        up.set()
+        await server.serving
+
+    thread = threading.Thread(target=loop.run_until_complete, args=(serve(),), name="server")
+    thread.start()
+    assert up.wait(10.0)
+    yield port
+    ending = servers[0].shutdown()  # type: ignore[no-untyped-call]
+    asyncio.run_coroutine_threadsafe(ending, loop).result(5.0)
+    thread.join(5.0)
+    loop.close()
+
+
+@dataclass
+class Behaviour:
+    """What a server says; changed by tests while it serves."""
+
+    words: Words
+    refuse: Callable[[int, int, int], int | None] = lambda device, address, count: None
+    """From device, address and count to an exception code."""
+    silent: Callable[[int], bool] = lambda device: False
+    """Whether a device does not answer."""
+    spoil: Callable[[bytes], bytes] = lambda reply: reply
+    """What happens to a whole reply on its way."""
+    functions: list[int] = field(default_factory=list)
+    """Function codes asked for."""
+    asked: list[tuple[int, int, int, int]] = field(default_factory=list)
+    """Device, function code, address and count of each request."""
+
+
+class _Handler(socketserver.BaseRequestHandler):
+    server: "_Server"
+
+    def handle(self) -> None:
+        self.server.connections.add(self.request)
+        try:
+            while header := self._exactly(7):
+                transaction, _, length, device = struct.unpack(">HHHB", header)
+                self._answer(transaction, device, self._exactly(length - 1))
+        except OSError:
+            pass
+        finally:
+            self.server.connections.discard(self.request)
+
+    def _exactly(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count:
+            part = self.request.recv(count - len(data))
+            if not part:
+                return b""
+            data += part
+        return data
+
+    def _answer(self, transaction: int, device: int, request: bytes) -> None:
+        behaviour = self.server.behaviour
+        function, address, count = struct.unpack(">BHH", request[:5])
+        behaviour.functions.append(function)
+        behaviour.asked.append((device, function, address, count))
+        if behaviour.silent(device):
+            return
+        code = behaviour.refuse(device, address, count)
+        if code is not None:
+            body = bytes([function | 0x80, code])
+        else:
+            words = [behaviour.words.get(at, 0) for at in range(address, address + count)]
+            body = bytes([function, 2 * count]) + struct.pack(f">{count}H", *words)
+        reply = struct.pack(">HHHB", transaction, 0, len(body) + 1, device) + body
+        self.request.sendall(behaviour.spoil(reply))
+
+
+class _Server(socketserver.ThreadingTCPServer):
+    allow_reuse_address = True
+    daemon_threads = True
+
+    def __init__(self, port: int, behaviour: Behaviour) -> None:
+        super().__init__(("127.0.0.1", port), _Handler)
+        self.behaviour = behaviour
+        self.connections: set[Any] = set()
+
+
+@contextmanager
+def odd_server(behaviour: Behaviour, port: int) -> Iterator[None]:
+    """A server on ``port`` that behaves so; at the end its connections are cut."""
+    server = _Server(port, behaviour)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,), name="odd-server")
+    thread.start()
+    yield
+    server.shutdown()
+    for connection in list(server.connections):
+        connection.close()
+    server.server_close()
+    thread.join(5.0)

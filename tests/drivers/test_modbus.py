@@ -1,0 +1,262 @@
+"""The Modbus driver against a real server and one that misbehaves: what is lost is counted, what is back is found."""
+
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from otolith_drivers.base import Link, Sample, Setup, Signal
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.modbus_poller import ModbusPoller, Options, Source, build
+from tests.conftest import free_port
+from tests.drivers.modbus_servers import Behaviour, odd_server
+
+PERIOD = 0.01
+
+
+def floats(*values: float) -> dict[int, int]:
+    """The registers of numbers of 32 bits, from address 0 on."""
+    return dict(enumerate(struct.unpack(f">{2 * len(values)}H", struct.pack(f">{len(values)}f", *values))))
+
+
+def source(**keys: object) -> Source:
+    return Source.model_validate({"type": "float32", "unit": "V", **keys})
+
+
+def poller(port: int, sources: Sequence[Source], period: float = PERIOD, **options: object) -> ModbusPoller:
+    signals = tuple(Signal(f"s{index}", "V", entry) for index, entry in enumerate(sources))
+    found = Options.model_validate({"host": "127.0.0.1", "port": port, "timeout": "0.1 s", **options})
+    return build(found, Setup(signals, Path(), period))
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it never came"
+        time.sleep(0.005)
+
+
+class Listener:
+    """Opens a driver, keeps what it delivers, closes it."""
+
+    def __init__(self, driver: ModbusPoller) -> None:
+        self.driver = driver
+        self.samples: list[Sample] = []
+
+    def __enter__(self) -> "Listener":
+        self.driver.open(self.samples.extend)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.driver.close()
+
+    def of(self, name: str) -> list[Sample]:
+        return [sample for sample in self.samples if sample.signal == name]
+
+    def wait(self, condition: Callable[[Link], bool]) -> None:
+        wait_for(lambda: condition(self.driver.link()))
+
+
+TWO = [source(register=0), source(register=2)]
+
+
+def test_only_function_codes_3_and_4_are_ever_sent() -> None:
+    """Looked at on the wire, through success, refusal, silence and reconnection."""
+    behaviour = Behaviour(floats(24.0, 1.5), refuse=lambda _, address, __: 2 if address == 50 else None)
+    port = free_port(socket.SOCK_STREAM)
+    sources = [source(register=0), source(register=2, table="input"), source(register=50)]
+    with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
+        listener.wait(lambda link: any("refused" in line for line in link.complaints))
+        behaviour.silent = lambda _: True
+        listener.wait(lambda link: not link.up)
+        behaviour.silent = lambda _: False
+        listener.wait(lambda link: link.up)
+    assert set(behaviour.functions) == {3, 4}
+
+
+def test_every_slot_of_the_grid_is_a_sample_or_is_counted_as_lost() -> None:
+    """However the server goes and comes back: received + lost is what was asked for."""
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+    begun = time.monotonic()
+    with Listener(poller(port, TWO)) as listener:
+        with odd_server(behaviour, port):
+            listener.wait(lambda link: link.up)
+        listener.wait(lambda link: not link.up)
+        with odd_server(behaviour, port):
+            listener.wait(lambda link: link.up)
+            count = len(listener.samples)
+            wait_for(lambda: len(listener.samples) > count + 20)
+        elapsed = time.monotonic() - begun
+    counters = listener.driver.counters()
+    assert counters.received == len(listener.samples)
+    assert counters.bad == 0
+    assert counters.reconnects == 1
+    asked = (counters.received + counters.lost) / len(TWO)
+    assert asked == pytest.approx(elapsed / PERIOD, abs=0.3 / PERIOD)  # as far as the last pause was accounted for
+    assert counters.lost > 0
+
+
+def test_a_refused_register_costs_only_itself() -> None:
+    """Read along with others it makes the device refuse them all: the request is split until it is alone."""
+    behaviour = Behaviour(floats(24.0, 1.5, 7.0), refuse=lambda _, at, count: 2 if at <= 2 < at + count else None)
+    port = free_port(socket.SOCK_STREAM)
+    with odd_server(behaviour, port), Listener(poller(port, [*TWO, source(register=4)])) as listener:
+        listener.wait(lambda link: any("s1" in line and "illegal data address" in line for line in link.complaints))
+        count = len(listener.of("s2"))
+        wait_for(lambda: len(listener.of("s2")) > count + 20)
+        assert {sample.value for sample in listener.of("s0")} == {24.0}
+        assert {sample.value for sample in listener.of("s2")} == {7.0}
+        assert not listener.of("s1")
+        behaviour.refuse = lambda *_: None
+        wait_for(lambda: bool(listener.of("s1")), 15.0)
+        listener.wait(lambda link: not link.complaints)
+
+
+def test_a_device_that_gives_fewer_registers_is_asked_for_fewer() -> None:
+    sources = [source(register=4 * index) for index in range(20)]
+    behaviour = Behaviour(floats(*([3.0] * 40)), refuse=lambda _, __, count: 3 if count > 16 else None)
+    port = free_port(socket.SOCK_STREAM)
+    with odd_server(behaviour, port), Listener(poller(port, sources, 0.02)) as listener:
+        wait_for(lambda: all(listener.of(f"s{index}") for index in range(20)))
+        listener.wait(lambda link: not link.complaints)
+
+
+def test_one_dead_device_does_not_stop_another() -> None:
+    """On the same line; it is tried again, and found when it is back."""
+    behaviour, port = Behaviour(floats(24.0, 1.5), silent=lambda device: device == 2), free_port(socket.SOCK_STREAM)
+    sources = [source(register=0, device=1), source(register=2, device=2)]
+    with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
+        listener.wait(lambda link: any("device 2 does not answer" in line for line in link.complaints))
+        assert listener.driver.link().up
+        count = len(listener.of("s0"))
+        wait_for(lambda: len(listener.of("s0")) > count + 50)
+        behaviour.silent = lambda _: False
+        wait_for(lambda: bool(listener.of("s1")), 15.0)
+        listener.wait(lambda link: not link.complaints)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda reply: reply[:-1],
+        lambda reply: reply[:9],
+        lambda reply: b"",
+        lambda reply: struct.pack(">H", struct.unpack(">H", reply[:2])[0] ^ 0x55) + reply[2:],
+        lambda reply: reply[:6] + bytes([99]) + reply[7:],
+        lambda reply: reply[:7] + bytes([4]) + reply[8:],
+        lambda reply: reply[:5] + bytes([5, 1, 3, 2, 0, 1]),
+        lambda reply: bytes(300),
+        lambda reply: reply[:8] + bytes([250]) + reply[9:],
+    ],
+    ids=["a byte short", "header only", "nothing", "other transaction", "other device", "other function", "too few",
+         "zeros", "wrong byte count"],
+)  # fmt: skip
+def test_a_spoiled_reply_is_no_reading(spoil: Callable[[bytes], bytes]) -> None:
+    """Not a single wrong value, and the next good one is taken."""
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+    with odd_server(behaviour, port), Listener(poller(port, TWO)) as listener:
+        wait_for(lambda: len(listener.samples) > 0)
+        lost = listener.driver.counters().lost
+        behaviour.spoil = spoil
+        wait_for(lambda: listener.driver.counters().lost > lost + 2)
+        behaviour.spoil = lambda reply: reply
+        count = len(listener.samples)
+        wait_for(lambda: len(listener.samples) > count, 15.0)
+    assert {sample.value for sample in listener.samples} == {24.0, 1.5}
+
+
+def test_a_late_reply_is_not_taken_for_the_next_one() -> None:
+    """The line is opened anew after a question without an answer, and so drained."""
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+
+    def slow(reply: bytes) -> bytes:
+        time.sleep(0.15)  # longer than the driver waits
+        return reply[:-4] + struct.pack(">f", 99.0)
+
+    with odd_server(behaviour, port), Listener(poller(port, TWO)) as listener:
+        wait_for(lambda: len(listener.samples) > 0)
+        behaviour.spoil = slow
+        lost = listener.driver.counters().lost
+        wait_for(lambda: listener.driver.counters().lost > lost + 2)
+        behaviour.spoil = lambda reply: reply
+        count = len(listener.samples)
+        wait_for(lambda: len(listener.samples) > count, 15.0)
+    assert {sample.value for sample in listener.samples} == {24.0, 1.5}
+
+
+def test_times_are_those_of_the_middle_of_the_round_trip() -> None:
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+    replied: list[float] = []
+
+    def slow(reply: bytes) -> bytes:
+        time.sleep(0.02)
+        replied.append(time.monotonic())
+        return reply
+
+    behaviour.spoil = slow
+    with odd_server(behaviour, port), Listener(poller(port, TWO, 0.1)) as listener:
+        wait_for(lambda: len(listener.of("s0")) >= 25)
+    behind = sorted(reply - sample.time for reply, sample in zip(replied, listener.of("s0"), strict=False))
+    assert behind[len(behind) // 2] == pytest.approx(0.01, abs=0.004)
+
+
+def test_a_line_too_slow_for_the_rate_says_what_it_achieves() -> None:
+    """And then keeps to a coarser grid, evenly."""
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+
+    def slow(reply: bytes) -> bytes:
+        time.sleep(0.02)
+        return reply
+
+    behaviour.spoil = slow
+    with odd_server(behaviour, port), Listener(poller(port, TWO)) as listener:
+        listener.wait(lambda link: link.period is not None and "not known" not in link.plan)
+        link = listener.driver.link()
+        assert link.period is not None
+        assert 0.02 < link.period < 0.04
+        assert "100 Hz asked" in link.plan
+        assert f"{1 / link.period:.0f}" in link.plan
+
+
+def test_a_swapped_word_order_is_withheld_and_named() -> None:
+    """Before a single sample of it was delivered."""
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+    state = {"reads": 0}
+
+    def moving(reply: bytes) -> bytes:
+        state["reads"] += 1
+        return reply[:-4] + struct.pack(">f", 1.5 + 0.001 * (state["reads"] % 7))
+
+    behaviour.spoil = moving
+    sources = [source(register=0), source(register=2, order="CDAB")]
+    with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
+        listener.wait(lambda link: any('set order = "ABCD"' in line for line in link.complaints))
+        wait_for(lambda: len(listener.of("s0")) > 20)
+        assert not listener.of("s1")
+        assert listener.driver.counters().bad >= 20
+
+
+def test_an_unreachable_host_is_waited_for() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    with Listener(poller(port, TWO)) as listener:
+        listener.wait(lambda link: "refused" in link.reason)
+        assert not listener.driver.link().up
+    assert not [thread for thread in threading.enumerate() if thread.name == "modbus-poll"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "sentence"),
+    [
+        ({"register": 65535, "type": "float32"}, "registers go from 0 to 65535"),
+        ({"register": 0, "unit": "A"}, "does not measure what 'V' does"),
+    ],
+)
+def test_refusals(keys: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        poller(502, [source(**keys)])
+    assert sentence in str(caught.value)
+    assert caught.value.key == ("signals", "s0")
