@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from otolith.acquisition.window import Window
 from otolith.paths import examples_directory
@@ -14,6 +15,8 @@ from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.plants import load_scenario, simulate
 
 EXAMPLES = examples_directory()
+settings.register_profile("otolith", deadline=None)  # how long an example takes depends on who else computes
+settings.load_profile("otolith")
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 
 

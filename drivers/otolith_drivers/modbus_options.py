@@ -103,7 +103,7 @@ class Source(Closed):
         return self
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Item:
     """A signal as the registers carry it."""
 

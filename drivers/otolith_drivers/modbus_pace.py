@@ -7,10 +7,12 @@ than asked, the grid is made as coarse as it takes: evenly spaced samples are wo
 import math
 from collections import deque
 
-ROUNDS = 40  # that a decision is based on
+ROUNDS = 50  # that a decision is based on
 FULL = 0.95  # share of the period beyond which rounds leave no room for what delays them
-SLOW = 0.9  # quantile of the rounds' durations that must fit
 ROOM = 1.15  # of a longer period over what rounds take
+MOST_LEFT_OUT = 0.2  # share of the grid; less is a busy computer, and passes
+MOST_AT_ONCE = 2  # left out before a round, that are laid to the line's speed; a timeout leaves out more
+EASY = 20  # decisions in a row by which a finer grid would do, before it is tried again
 STEPS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # times a power of ten: periods that people use
 SELDOM, OFTEN = 0.02, 0.6  # shares of rounds that repeat the one before, between which the beat is heard
 BEAT_ROUNDS = 100
@@ -24,8 +26,11 @@ class Pace:
         self.period = asked
         self.due = math.inf
         self._starts: deque[float] = deque(maxlen=ROUNDS + 1)
-        self._durations: deque[float] = deque(maxlen=ROUNDS)
+        self._durations: list[float] = []
+        self._left_out = self._easy = 0
         self._repeats = self._rounds = 0
+        self.known = False
+        """Whether enough rounds were seen to know that the period can be held."""
 
     def start(self, now: float) -> None:
         """Lay the grid through ``now``."""
@@ -35,8 +40,7 @@ class Pace:
         """A round begins; how many before it were left out since the last one."""
         behind = self._behind(now)
         self.due += (behind + 1) * self.period
-        if behind:
-            self._starts.clear()
+        self._left_out += min(behind, MOST_AT_ONCE)
         self._starts.append(now)
         return behind
 
@@ -51,7 +55,7 @@ class Pace:
         return max(0, math.floor((now - self.due) / self.period))
 
     def end(self, duration: float, *, repeated: bool) -> bool:
-        """A round in which all answered took ``duration`` s; whether the grid was made coarser because of it.
+        """A round in which all answered took ``duration`` s; whether the grid was changed because of it.
 
         ``repeated``: every register had the value of the round before. Where that happens now and then, the device
         renews its registers as often as they are read, and at the same moment: reading then moves away from it.
@@ -65,14 +69,29 @@ class Pace:
             self._rounds = self._repeats = 0
         if len(self._durations) < ROUNDS:
             return False
-        longest = sorted(self._durations)[int(SLOW * ROUNDS)]
-        if longest <= FULL * self.period:
-            return False
-        self.due += _even(ROOM * longest) - self.period
-        self.period = _even(ROOM * longest)
-        self._starts.clear()
+        wanted = self._wanted()
         self._durations.clear()
+        self._left_out, self.known = 0, True
+        if wanted == self.period:
+            return False
+        self.due += wanted - self.period
+        self.period = wanted
+        self._starts.clear()
         return True
+
+    def _wanted(self) -> float:
+        """The period (s) that the last rounds speak for."""
+        usual = sorted(self._durations)[ROUNDS // 2]
+        share = self._left_out / (ROUNDS + self._left_out)
+        if usual > FULL * self.period or share > MOST_LEFT_OUT:
+            self._easy = 0
+            return _even(max(ROOM * usual, self.period / (1.0 - share)))
+        finer = max(self.asked, _even(ROOM * usual))
+        self._easy = self._easy + 1 if finer < self.period else 0
+        if self._easy < EASY:
+            return self.period
+        self._easy = 0
+        return finer
 
     @property
     def achieved(self) -> float | None:
@@ -80,11 +99,6 @@ class Pace:
         if len(self._starts) < ROUNDS // 2:
             return None
         return (self._starts[-1] - self._starts[0]) / (len(self._starts) - 1)
-
-    @property
-    def known(self) -> bool:
-        """Whether enough rounds were seen to know that the period can be held."""
-        return len(self._durations) == ROUNDS
 
     def describe(self) -> str:
         """Asked and achieved, in words."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from otolith_drivers.modbus_options import Item, Table
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Request:
     """Registers of one device that are read at once."""
 

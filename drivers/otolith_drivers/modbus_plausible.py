@@ -37,12 +37,15 @@ def judge(history: Sequence[Sequence[int]], kind: TypeName, order: Order) -> Jud
     """Of the registers of one number, read again and again; what is not enough to judge counts as plausible."""
     if len(history) < FEWEST:
         return Judgement(plausible=True)
-    numbers = {other: _numbers(history, kind, other) for other in orders_of(kind)}
-    chosen = order if order in numbers else orders_of(kind)[0 if order in ("ABCD", "CDAB") else 1]
+    orders = orders_of(kind)
+    chosen = order if order in orders else orders[0 if order in ("ABCD", "CDAB") else 1]
+    if is_float(kind) and not _fault_of_floats(_numbers(history, kind, chosen)):  # seldom is more than this needed
+        return Judgement(plausible=True)
+    numbers = {other: _numbers(history, kind, other) for other in orders}
     reason = _fault(numbers, kind, chosen)
     if not reason:
         return Judgement(plausible=True)
-    others = [other for other in numbers if other != chosen and not _fault(numbers, kind, other)]
+    others = [other for other in orders if other != chosen and not _fault(numbers, kind, other)]
     better = min(others, key=lambda other: _roughness(numbers[other]), default=None)
     return Judgement(plausible=False, reason=reason, better=better)
 

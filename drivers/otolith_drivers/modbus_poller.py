@@ -93,6 +93,7 @@ class ModbusPoller:
             try:
                 if not connected:
                     self._line.connect()
+                    self._lose(self._pace.pass_over(time.monotonic()) * len(self._items))
                     connected, pause = True, BACKOFF_FIRST
                 self._wait()
                 if not self._stop.is_set():

@@ -8,11 +8,12 @@ from otolith_drivers.modbus_options import Item
 from otolith_drivers.modbus_plausible import Judgement, judge
 
 READINGS = 20  # of each number, that a judgement looks at
+AGAIN = 100  # rounds, after which a number is judged anew
 MOST_PATIENCE = 3 * READINGS  # rounds; what some registers never answer must not hold up the others
 
 
 class OrderWatch:
-    """Over all numbers that take more than one register; one is judged in each round, in turn."""
+    """Over all numbers that take more than one register; each is judged again from time to time, one in a round."""
 
     def __init__(self, items: Sequence[Item]) -> None:
         self._items = {item.name: item for item in items if item.count > 1}
@@ -37,8 +38,12 @@ class OrderWatch:
     def end_round(self) -> None:
         """Judge what is due."""
         self._rounds += 1
-        name = next(self._turn)
-        names = [name] if self.ready else list(self._items)
+        if not self.ready:
+            names = list(self._items)
+        elif self._rounds % max(1, AGAIN // max(1, len(self._items))) == 0:
+            names = [next(self._turn)]
+        else:
+            return
         for each in names:
             if len(self._history.get(each, ())) == READINGS:
                 item = self._items[each]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from otolith_drivers.base import Signal
 from otolith_drivers.modbus_line import Refused
 from otolith_drivers.modbus_options import Item, Options, Source, item_of
-from otolith_drivers.modbus_pace import ROUNDS, Pace
+from otolith_drivers.modbus_pace import EASY, ROUNDS, Pace
 from otolith_drivers.modbus_plan import plan, split
 from otolith_drivers.modbus_plausible import judge
 from otolith_drivers.modbus_requests import LONGEST_REST, Requests
@@ -141,6 +141,23 @@ def test_a_pace_that_fits_is_kept_and_one_that_does_not_is_lengthened_evenly() -
     assert pace.achieved == pytest.approx(0.025)
     assert missed > 0
     assert "100 Hz asked, 40.0 achieved" in pace.describe()
+    for _ in range(EASY * ROUNDS + 2 * ROUNDS):
+        now = max(now, pace.due)
+        pace.begin(now)
+        now += 0.004
+        pace.end(0.004, repeated=False)
+    assert pace.period == 0.01
+
+
+def test_a_computer_that_was_busy_for_a_moment_does_not_change_the_grid() -> None:
+    pace, now = Pace(0.01), 0.0
+    pace.start(now)
+    for index in range(10 * ROUNDS):
+        now = max(now, pace.due)
+        pace.begin(now)
+        duration = 0.03 if index % 20 == 0 else 0.004
+        now += duration
+        assert not pace.end(duration, repeated=False)
 
 
 @given(st.lists(st.floats(0.0, 3.0), min_size=1, max_size=50))
