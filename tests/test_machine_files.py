@@ -32,6 +32,13 @@ def test_a_wrong_file_gets_its_sentence(case: Path) -> None:
     assert fnmatchcase(said, expected.read_text(encoding="utf-8").rstrip("\n").replace("[", "[[]"))
 
 
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_machine_file_to_copy_can_be_loaded(path: Path) -> None:
+    plan = load_plan(path)
+    lines = describe(plan)
+    assert all(any(line.startswith(f"{signal} [") for line in lines) for signal in plan.twin.signals)
+
+
 def test_the_example_means_what_it_says() -> None:
     plan = load_plan(EXAMPLES / "dc-motor.toml")
     assert [entry.name for entry in plan.problem.free] == ["R_a"]

@@ -11,7 +11,8 @@ from otolith.plan import Plan, load_plan
 from otolith.topics import prefix
 from otolith_drivers.base import Sample
 
-LISTEN = 1.0  # s
+LISTEN = 1.0  # s, or as long as so many samples take:
+ENOUGH = 60
 
 
 def check_machine(path: Path, *, with_device: bool) -> Iterator[str]:
@@ -67,9 +68,16 @@ def _listen(plan: Plan) -> Iterator[str]:
         counts.update(sample.signal for sample in samples)
 
     plan.driver.open(deliver)
-    time.sleep(LISTEN)
+    listened = max(LISTEN, ENOUGH * plan.file.window.sample_period)
+    time.sleep(listened)
+    link = plan.driver.link()
     plan.driver.close()
-    wanted = LISTEN / plan.file.window.sample_period
+    wanted = listened / plan.file.window.sample_period
     for signal in plan.twin.signals:
         verdict = "" if counts[signal] >= 0.5 * wanted else ", too few" if counts[signal] else ": is the machine on?"
-        yield f"heard {signal}: {counts[signal]} samples in {LISTEN:g} s{verdict}"
+        yield f"heard {signal}: {counts[signal]} samples in {listened:g} s{verdict}"
+    if link.plan:
+        yield f"plan: {link.plan}"
+    yield from link.complaints
+    if not link.up:
+        yield f"no connection: {link.reason}"
