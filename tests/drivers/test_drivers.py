@@ -1,11 +1,7 @@
-"""The contract every driver keeps, parametrised over the registry: a new driver is tested by being there."""
+"""The CAN driver on real buses, and what it does with frames that no healthy node sends."""
 
-import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import can
@@ -13,75 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith_drivers import modbus_poller, registry
-from otolith_drivers.base import Driver, Sample, Setup, Signal
+from otolith_drivers.base import Sample
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.can_receiver import CanReceiver, Options, build, monotonic_of
-from otolith_drivers.dbc import Source
-from otolith_drivers.errors import ConfigurationError, DeviceError
-from tests.conftest import EXAMPLES, OwnMachine
-from tests.drivers.modbus_servers import library_server
-
-SIGNALS = (
-    Signal("i", "A", Source(signal="ArmatureCurrent")),
-    Signal("omega", "rpm", Source(signal="RotorSpeed")),
-)
-SETUP = Setup(SIGNALS, EXAMPLES, 0.01)
-
-
-@dataclass(frozen=True)
-class Rig:
-    """A driver and a real source that can be made to say something."""
-
-    driver: Driver
-    say: Callable[[], None]
-
-
-@contextmanager
-def can_rig(machine: OwnMachine) -> Iterator[Rig]:
-    options = Options(interface="udp_multicast", channel=machine.group, port=machine.port, dbc=Path("dc-motor.dbc"))
-    bus = open_bus(BusOptions(**options.model_dump(exclude={"dbc"})))
-
-    def say() -> None:
-        bus.send(
-            can.Message(
-                arbitration_id=385, data=bytes(2) + (2000).to_bytes(2, "little") + bytes(4), is_extended_id=False
-            )
-        )
-        bus.send(can.Message(arbitration_id=641, data=(1000).to_bytes(2, "little") + bytes(6), is_extended_id=False))
-
-    yield Rig(build(options, SETUP), say)
-    bus.shutdown()
-
-
-def modbus_source(register: int, unit: str) -> modbus_poller.Source:
-    return modbus_poller.Source.model_validate({"register": register, "type": "float32", "unit": unit})
-
-
-@contextmanager
-def modbus_rig(_: OwnMachine) -> Iterator[Rig]:
-    words = dict(enumerate(struct.unpack(">4H", struct.pack(">ff", 2.0, 10.0))))
-    signals = (
-        Signal("i", "A", modbus_poller.Source.model_validate({"register": 0, "type": "float32", "unit": "A"})),
-        Signal(
-            "omega", "rpm", modbus_poller.Source.model_validate({"register": 2, "type": "float32", "unit": "rad/s"})
-        ),
-    )
-    with library_server(words) as port:
-        options = modbus_poller.Options(host="127.0.0.1", port=port)
-        driver = modbus_poller.build(options, replace(SETUP, signals=signals))
-        yield Rig(driver, lambda: None)
-        driver.close()
-
-
-RIGS = {"can": can_rig, "modbus": modbus_rig}
-
-
-@pytest.fixture(params=sorted(registry.DRIVERS))
-def rig(request: pytest.FixtureRequest, own_machine: OwnMachine) -> Iterator[Rig]:
-    with RIGS[request.param](own_machine) as made:
-        yield made
-        made.driver.close()
+from otolith_drivers.contract import Rig
+from otolith_drivers.errors import DeviceError
+from tests.conftest import OwnMachine
+from tests.drivers.rigs import SETUP, can_rig
 
 
 def collect(rig: Rig, enough: int) -> list[Sample]:
@@ -93,57 +27,6 @@ def collect(rig: Rig, enough: int) -> list[Sample]:
         rig.say()
         time.sleep(0.01)
     return got
-
-
-def test_it_delivers_in_the_wanted_units_and_stamps_at_the_source(rig: Rig) -> None:
-    """Samples bear the daemon's names and units, and a time on the monotonic clock that has just been."""
-    begun = time.monotonic()
-    samples = collect(rig, 10)
-    assert {sample.signal for sample in samples} == {"i", "omega"}
-    values = {sample.signal: sample.value for sample in samples}
-    assert values["i"] == pytest.approx(2.0)
-    assert values["omega"] == pytest.approx(10.0 * 60 / (2 * 3.141592653589793))
-    assert all(begun - 0.1 <= sample.time <= time.monotonic() for sample in samples)
-
-
-def test_it_counts_what_it_receives(rig: Rig) -> None:
-    """Every delivered frame, reply or row is in the counters."""
-    samples = collect(rig, 10)
-    assert rig.driver.counters().received >= len(samples)
-    assert rig.driver.counters().bad == 0
-    assert rig.driver.link().up
-
-
-def test_it_stops_within_a_second_and_may_be_closed_twice(rig: Rig) -> None:
-    """After close no thread of it is left and nothing more is delivered."""
-    before = set(threading.enumerate())
-    got = collect(rig, 2)
-    begun = time.monotonic()
-    rig.driver.close()
-    rig.driver.close()
-    assert time.monotonic() - begun < 1.0
-    assert set(threading.enumerate()) <= before
-    delivered = len(got)
-    rig.say()
-    time.sleep(0.05)
-    assert len(got) == delivered
-
-
-def test_it_says_what_it_will_read(rig: Rig) -> None:
-    """Every signal is in the description."""
-    text = "\n".join(rig.driver.describe())
-    assert all(signal.name in text for signal in SIGNALS)
-
-
-def test_it_cannot_write(rig: Rig) -> None:
-    """The protocol has five verbs and an adjective, and none of them speaks to the machine."""
-    public = {name for name in dir(rig.driver) if not name.startswith("_")}
-    assert public == {"open", "close", "counters", "link", "describe", "sampling"}
-
-
-def test_an_unknown_driver_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match="did you mean 'can'"):
-        registry.find("cam")
 
 
 def receiver(machine: OwnMachine) -> CanReceiver:

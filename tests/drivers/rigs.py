@@ -1,0 +1,66 @@
+"""A rig for each driver of the registry: the driver, and a real source that it can hear."""
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import can
+
+from otolith_drivers import can_receiver, modbus_poller
+from otolith_drivers.base import Setup, Signal
+from otolith_drivers.can_bus import BusOptions, open_bus
+from otolith_drivers.contract import Rig
+from otolith_drivers.dbc import Source
+from tests.conftest import EXAMPLES, OwnMachine
+from tests.drivers.modbus_servers import library_server
+
+SIGNALS = (
+    Signal("i", "A", Source(signal="ArmatureCurrent")),
+    Signal("omega", "rpm", Source(signal="RotorSpeed")),
+)
+SETUP = Setup(SIGNALS, EXAMPLES, 0.01)
+EXPECTED = {"i": 2.0, "omega": 10.0 * 60 / (2 * 3.141592653589793)}
+
+
+@contextmanager
+def can_rig(machine: OwnMachine) -> Iterator[Rig]:
+    options = can_receiver.Options(
+        interface="udp_multicast", channel=machine.group, port=machine.port, dbc=Path("dc-motor.dbc")
+    )
+    bus = open_bus(BusOptions(**options.model_dump(exclude={"dbc"})))
+
+    def say() -> None:
+        bus.send(
+            can.Message(
+                arbitration_id=385, data=bytes(2) + (2000).to_bytes(2, "little") + bytes(4), is_extended_id=False
+            )
+        )
+        bus.send(can.Message(arbitration_id=641, data=(1000).to_bytes(2, "little") + bytes(6), is_extended_id=False))
+
+    yield Rig(can_receiver.build(options, SETUP), EXPECTED, say)
+    bus.shutdown()
+
+
+def modbus_source(register: int, unit: str) -> modbus_poller.Source:
+    return modbus_poller.Source.model_validate({"register": register, "type": "float32", "unit": unit})
+
+
+@contextmanager
+def modbus_rig(_: OwnMachine) -> Iterator[Rig]:
+    words = dict(enumerate(struct.unpack(">4H", struct.pack(">ff", 2.0, 10.0))))
+    signals = (
+        Signal("i", "A", modbus_poller.Source.model_validate({"register": 0, "type": "float32", "unit": "A"})),
+        Signal(
+            "omega", "rpm", modbus_poller.Source.model_validate({"register": 2, "type": "float32", "unit": "rad/s"})
+        ),
+    )
+    with library_server(words) as port:
+        options = modbus_poller.Options(host="127.0.0.1", port=port)
+        driver = modbus_poller.build(options, replace(SETUP, signals=signals))
+        yield Rig(driver, EXPECTED)
+        driver.close()
+
+
+RIGS: dict[str, Callable[[OwnMachine], AbstractContextManager[Rig]]] = {"can": can_rig, "modbus": modbus_rig}
