@@ -133,27 +133,41 @@ def replay(file: Path, data: Path, as_json: bool, recording: Path | None) -> int
 
 @cli.command()
 @click.argument("scenario", type=FILE)
+@click.option(
+    "--as",
+    "transport",
+    type=click.Choice(["can", "modbus-tcp", "modbus-rtu"]),
+    default="can",
+    show_default=True,
+    help="What to be: a node on the CAN bus, or a Modbus drive on a port or a serial line of its own.",
+)
 @click.option("--truth", type=FILE, help="Write the parameters as they really are into this CSV file.")
+@click.option("--summary", type=FILE, help="Write at the end what was sent, asked and withheld into this JSON file.")
 @click.option("--duration", type=click.FloatRange(0.1), default=math.inf, metavar="SECONDS", help="End by then.")
-def plant(scenario: Path, truth: Path | None, duration: float) -> int:
-    """Be the simulated machine of SCENARIO, a node on the CAN bus, in real time.
+def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | None, duration: float) -> int:
+    """Be the simulated machine of SCENARIO, a device on its bus, in real time.
 
     \b
-    Example:
+    Examples:
       otolith plant config/scenarios/demo.toml
+      otolith plant config/scenarios/bus-dropouts.toml --as modbus-tcp --summary withheld.json
     """
-    from otolith_drivers.plant.can_node import CanNode
+    from contextlib import ExitStack, closing
+
+    from otolith_drivers.plant.nodes import open_node, write_summary
     from otolith_drivers.plant.plants import load_scenario
+    from otolith_drivers.plant.truth import TruthFile
 
     loaded = load_scenario(scenario)
     stop = StopSignal()
-    node = CanNode(loaded, truth)
-    try:
-        click.echo(f"{loaded.plant} on {loaded.bus.title()}, frames of {loaded.dbc.name}; Ctrl-C ends it", err=True)
-        sent = node.run(lambda: stop.number is not None, duration)
-    finally:
-        node.close()
-    click.echo(f"{sent.frames} frames in {sent.seconds:.1f} s of simulated time, {sent.stalls} stalls", err=True)
+    with ExitStack() as stack:
+        true = stack.enter_context(closing(TruthFile(truth))) if truth is not None else None
+        node = stack.enter_context(closing(open_node(transport, loaded)))
+        click.echo(f"{node.title()}; Ctrl-C ends it", err=True)
+        done = node.run(true, lambda: stop.number is not None, duration)
+    if summary is not None:
+        write_summary(summary, loaded, transport, done)
+    click.echo(node.say(done), err=True)
     return stop.code(clean=signal.SIGTERM)
 
 

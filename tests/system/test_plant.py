@@ -1,10 +1,13 @@
 """The plant as a user meets it: one per bus, ended cleanly, errors in one line."""
 
+import json
 import signal
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
+import can
 import pytest
 
 from otolith_drivers.can_bus import BusOptions, open_bus
@@ -45,6 +48,46 @@ def test_ctrl_c(own_machine: OwnMachine) -> None:
     _, errors = process.communicate(timeout=5)
     assert process.returncode == 130
     assert "Traceback" not in errors
+
+
+FAULTS = """
+[[faults]]
+kind = "dropouts"
+share = 0.2
+start = "0 s"
+until = "1 s"
+
+[[faults]]
+kind = "gone"
+start = "0.9 s"
+until = "1.2 s"
+
+[[faults]]
+kind = "garbage"
+share = 0.1
+start = "0 s"
+"""
+
+
+def test_what_is_withheld_from_the_bus_is_counted_to_the_last_frame(own_machine: OwnMachine, tmp_path: Path) -> None:
+    """Alive counters go on, so that who listens can count as well; frames of strangers are nobody else's."""
+    own_machine.scenario.write_text(own_machine.scenario.read_text(encoding="utf-8") + FAULTS, encoding="utf-8")
+    command = [*PLANT, str(own_machine.scenario), "--duration", "2", "--summary", str(tmp_path / "summary.json")]
+    heard: list[can.Message] = []
+    with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus:
+        node = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        while (frame := bus.recv(0.2)) is not None or node.poll() is None:
+            heard += [frame] if frame is not None else []
+    assert node.wait(timeout=5) == 0
+    done = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    dropouts, gone, garbage = done["faults"]
+    assert len(heard) == done["frames"] + garbage["ticks"]
+    assert done["ticks"] == 200
+    assert done["frames"] + dropouts["withheld"] + gone["withheld"] == 2 * done["ticks"]
+    assert gone["ticks"] == 30
+    counts = [frame.data[7] for frame in heard if frame.arbitration_id == 385]
+    skipped = sum((after - before) % 256 - 1 for before, after in pairwise(counts))
+    assert skipped + counts[0] == (dropouts["withheld"] + gone["withheld"]) / 2
 
 
 @pytest.mark.parametrize(

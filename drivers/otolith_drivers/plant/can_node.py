@@ -1,159 +1,128 @@
 """The simulated machine as a CAN node: cyclic frames by a DBC, in real time, with an alive counter in each message."""
 
-import csv
 import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable
 
 import can
 from cantools.database import Message
 
 from otolith_drivers.can_bus import open_bus
 from otolith_drivers.dbc import load_dbc
-from otolith_drivers.errors import ConfigurationError, DeviceError, ServiceError
-from otolith_drivers.plant.plants import signals, simulate
+from otolith_drivers.errors import ConfigurationError, DeviceError
+from otolith_drivers.plant.pace import Turn, in_real_time
 from otolith_drivers.plant.scenario import Scenario
-from otolith_drivers.plant.tick import Tick
+from otolith_drivers.plant.summary import Summary
+from otolith_drivers.plant.truth import TruthFile
 from otolith_drivers.quantities import factor
 
 ALIVE_COUNTER = "AliveCounter"  # signals whose name ends so count the frames of their message
 LISTEN_FIRST = 0.15  # s; longer than ten periods of a node that is already there
-CATCH_UP_LIMIT = 1.0  # s; after a longer stall (suspend) the node goes on from now instead of sending a burst
-TRUTH_EVERY = 10  # ticks
-
-
-@dataclass(frozen=True, slots=True)
-class Sent:
-    """What a node has done."""
-
-    frames: int
-    seconds: float
-    """Simulated time."""
-    stalls: int
-    """How often the computer held the node up for longer than ``CATCH_UP_LIMIT``."""
+STANDARD_IDENTIFIERS = 2048
+LONGEST_FRAME = 8  # bytes
 
 
 class CanNode:
-    """A simulated machine on its bus."""
+    """Implements :class:`otolith_drivers.plant.nodes.Node` over python-can."""
 
-    def __init__(self, scenario: Scenario, truth: Path | None = None) -> None:
-        """Open the bus; ``truth`` gets what is true, as CSV over Unix time.
+    def __init__(self, scenario: Scenario) -> None:
+        """Open the bus.
 
         Raises:
             DeviceError: the bus cannot be opened, or another node already sends these frames.
             ConfigurationError: the DBC describes signals that the machine does not have.
-            ServiceError: ``truth`` cannot be written.
         """
         self._scenario = scenario
         self._messages = _messages(scenario)
         self._conversions = _conversions(self._messages, scenario)
-        self._truth = _TruthFile(truth) if truth is not None else None
+        self._ours = {message.frame_id for message in self._messages}
         self._bus = open_bus(scenario.bus)
         try:
-            _refuse_twins(self._bus, self._messages, scenario)
+            self._refuse_twins()
         except DeviceError:
             self.close()
             raise
 
-    def run(self, stopped: Callable[[], bool], duration: float = math.inf) -> Sent:
-        """Be the machine until ``stopped`` or for ``duration`` s.
+    def title(self) -> str:
+        """See :meth:`otolith_drivers.plant.nodes.Node.title`."""
+        return f"{self._scenario.plant} on {self._scenario.bus.title()}, frames of {self._scenario.dbc.name}"
 
-        Raises:
-            DeviceError: the bus went away.
-        """
-        stalls, index = 0, 0
-        for index, (tick, stalled) in enumerate(_in_real_time(self._scenario)):
-            if stopped() or tick.time >= duration:
-                break
-            stalls += stalled
-            for message in self._messages:
-                self._send(message, tick, index)
-            if self._truth is not None and index % TRUTH_EVERY == 0:
-                self._truth.note(tick)
-        return Sent(index * len(self._messages), index * self._scenario.sample_period, stalls)
+    def run(self, truth: TruthFile | None, stopped: Callable[[], bool], duration: float = math.inf) -> Summary:
+        """See :meth:`otolith_drivers.plant.nodes.Node.run`."""
+        done = Summary.of(self._scenario.faults)
+        for turn in in_real_time(self._scenario, done, stopped, duration):
+            if turn.effect.withheld is None:
+                for message in self._messages:
+                    self._send(self._frame(message, turn))
+                done.frames += len(self._messages)
+            else:
+                done.faults[turn.effect.withheld].withheld += len(self._messages)
+            for data in turn.effect.garbage:
+                self._send(self._strangers_frame(data))
+            if truth is not None:
+                truth.note(turn)
+        return done
 
     def close(self) -> None:
-        """Leave the bus."""
+        """See :meth:`otolith_drivers.plant.nodes.Node.close`."""
         self._bus.shutdown()
-        if self._truth is not None:
-            self._truth.close()
 
-    def _send(self, message: Message, tick: Tick, index: int) -> None:
+    def say(self, done: Summary) -> str:
+        """See :meth:`otolith_drivers.plant.nodes.Node.say`."""
+        withheld = f", {done.withheld} withheld" if done.faults else ""
+        return f"{done.frames} frames in {done.seconds:.1f} s of simulated time, {done.stalls} stalls{withheld}"
+
+    def _frame(self, message: Message, turn: Turn) -> can.Message:
         values: dict[str, float] = {}
         for signal in message.signals:
             if signal.name.endswith(ALIVE_COUNTER):
-                values[signal.name] = index % 2**signal.length
+                values[signal.name] = turn.index % 2**signal.length
             else:  # a sensor saturates at the ends of its range
                 scale, offset = self._conversions[signal.name]
                 low = -math.inf if signal.minimum is None else float(signal.minimum)
                 high = math.inf if signal.maximum is None else float(signal.maximum)
-                values[signal.name] = min(max(scale * tick.measured[signal.name] + offset, low), high)
+                values[signal.name] = min(max(scale * turn.tick.measured[signal.name] + offset, low), high)
         data = message.encode(values, padding=True)
-        frame = can.Message(arbitration_id=message.frame_id, data=data, is_extended_id=message.is_extended_frame)
+        return can.Message(arbitration_id=message.frame_id, data=data, is_extended_id=message.is_extended_frame)
+
+    def _strangers_frame(self, data: bytes) -> can.Message:
+        """Two bytes for its identifier, which is none of ours, and the rest as its data."""
+        identifier = int.from_bytes(data[:2], "big") % STANDARD_IDENTIFIERS
+        while identifier in self._ours:
+            identifier = (identifier + 1) % STANDARD_IDENTIFIERS
+        return can.Message(arbitration_id=identifier, data=data[2 : 2 + LONGEST_FRAME], is_extended_id=False)
+
+    def _send(self, frame: can.Message) -> None:
         try:
             self._bus.send(frame)
         except (can.CanError, OSError) as error:
             raise DeviceError(f"sending on the bus failed: {error}") from error
 
-
-def _in_real_time(scenario: Scenario) -> Iterator[tuple[Tick, bool]]:
-    """Each tick at its time, and whether the computer had held the machine up so long that time was given up."""
-    start = time.monotonic()
-    for tick in simulate(scenario):
-        late = time.monotonic() - (start + tick.time)
-        if late < 0:
-            time.sleep(-late)
-        if stalled := late > CATCH_UP_LIMIT:
-            start += late
-        yield tick, stalled
+    def _refuse_twins(self) -> None:
+        """Two nodes with the same arbitration IDs would give the listener a mixture of two machines."""
+        end = time.monotonic() + LISTEN_FIRST
+        while (left := end - time.monotonic()) > 0:
+            frame = self._bus.recv(left)
+            if frame is not None and frame.arbitration_id in self._ours:
+                raise DeviceError(
+                    f"another node already sends frame 0x{frame.arbitration_id:X} on {self._scenario.bus.title()}: "
+                    "is a second plant or demo running? Stop it, or give this scenario another bus"
+                )
 
 
 def _messages(scenario: Scenario) -> list[Message]:
     messages = load_dbc(scenario.dbc).messages
-    known = signals(scenario)
     for message in messages:
         for signal in message.signals:
-            if signal.name not in known and not signal.name.endswith(ALIVE_COUNTER):
+            if signal.name not in scenario.SIGNALS and not signal.name.endswith(ALIVE_COUNTER):
                 text = f"{scenario.dbc}: {message.name}.{signal.name} is no signal of plant {scenario.plant!r}"
-                raise ConfigurationError(f"{text}; it has {', '.join(sorted(known))}")
+                raise ConfigurationError(f"{text}; it has {', '.join(sorted(scenario.SIGNALS))}")
     return list(messages)
-
-
-def _refuse_twins(bus: can.BusABC, messages: list[Message], scenario: Scenario) -> None:
-    """Two nodes with the same arbitration IDs would give the listener a mixture of two machines."""
-    ours = {message.frame_id for message in messages}
-    end = time.monotonic() + LISTEN_FIRST
-    while (left := end - time.monotonic()) > 0:
-        frame = bus.recv(left)
-        if frame is not None and frame.arbitration_id in ours:
-            raise DeviceError(
-                f"another node already sends frame 0x{frame.arbitration_id:X} on {scenario.bus.title()}: "
-                "is a second plant or demo running? Stop it, or give this scenario another bus"
-            )
-
-
-class _TruthFile:
-    def __init__(self, path: Path) -> None:
-        try:
-            self._file = path.open("w", encoding="utf-8", newline="", buffering=1)
-        except OSError as error:
-            raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
-        self._writer = csv.writer(self._file)
-
-    def note(self, tick: Tick) -> None:
-        if tick.time == 0.0:
-            self._writer.writerow(["t", *tick.truth])
-        self._writer.writerow([f"{time.time():.4f}", *(f"{value:.9g}" for value in tick.truth.values())])
-
-    def close(self) -> None:
-        self._file.close()
 
 
 def _conversions(messages: list[Message], scenario: Scenario) -> dict[str, tuple[float, float]]:
     """Scale and offset of each signal from the plant's unit to that of the DBC."""
-    units = signals(scenario)
+    units = scenario.SIGNALS
     return {
         signal.name: factor(units[signal.name], signal.unit or units[signal.name])
         for message in messages

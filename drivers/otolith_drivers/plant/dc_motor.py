@@ -12,8 +12,9 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.plant.faults import Array, Seconds, Unbalance, shaking
+from otolith_drivers.plant.faults import Array, Unbalance, shaking
 from otolith_drivers.plant.scenario import POSITIVE, Scenario, Stretch, stretches
+from otolith_drivers.plant.spans import Seconds
 from otolith_drivers.plant.tick import Tick
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
@@ -33,6 +34,7 @@ Integrate = Callable[[State, Any, float, Steps, Shake], State]
 # From the number of a sample period in its stretch, the state at its beginning and the voltage to the state at its end.
 Advance = Callable[[int, State, float], State]
 
+SIGNALS = {"ArmatureVoltage": "V", "ArmatureCurrent": "A", "RotorSpeed": "rad/s", "LoadTorque": "N*m"}
 UNITS = {"R_a": "ohm", "L_a": "H", "J": "kg*m^2", "K_e": "V*s/rad", "K_t": "N*m/A", "D": "N*m*s/rad"}
 
 
@@ -74,6 +76,7 @@ class MotorScenario(Scenario):
     """A scenario of this motor."""
 
     UNITS: ClassVar[dict[str, str]] = UNITS
+    SIGNALS: ClassVar[dict[str, str]] = SIGNALS
     HAS_SHAFT: ClassVar[bool] = True
 
     plant: Literal["dc_motor"]
@@ -97,7 +100,6 @@ class MotorScenario(Scenario):
 
 
 SCENARIO = MotorScenario
-SIGNALS = {"ArmatureVoltage": "V", "ArmatureCurrent": "A", "RotorSpeed": "rad/s", "LoadTorque": "N*m"}
 
 
 def simulate(scenario: Any) -> Iterator[Tick]:

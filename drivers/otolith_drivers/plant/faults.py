@@ -1,5 +1,6 @@
 """What can happen to a simulated machine, each fault one row: how it is written in a scenario and what it does.
 
+What can happen to its sensors and to its bus is in ``sensor_faults`` and ``bus_faults``; the table of all is here.
 Laws of paper.txt section 5.2 and 5.3: exponential drift of a parameter, a torque or acceleration on the shaft.
 """
 
@@ -11,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
+from otolith_drivers.plant.bus_faults import BusFault
+from otolith_drivers.plant.sensor_faults import SensorFault
+from otolith_drivers.plant.spans import Seconds
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
 Array = NDArray[np.float64]
-Seconds = Annotated[float, BeforeValidator(Quantity("s", 0.0, 1e9))]
 
 
 class Drift(Closed):
@@ -72,4 +75,4 @@ def shaking(unbalances: Iterable[Unbalance]) -> Callable[[float, float], float]:
     return acceleration
 
 
-Fault = Annotated[Drift | Step | Unbalance, Field(discriminator="kind")]
+Fault = Annotated[Drift | Step | Unbalance | SensorFault | BusFault, Field(discriminator="kind")]

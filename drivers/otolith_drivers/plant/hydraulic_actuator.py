@@ -21,6 +21,7 @@ from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
 STEP = 1e-4  # s: of the integrator and, as in the paper, of the controller
+SIGNALS = {"ValveArea": "m^2", "LoadForce": "N", "PistonPosition": "m", "SystemPressure": "Pa"}
 UNITS = {
     "k_spring": "N/m",
     "D": "N*s/m",
@@ -73,6 +74,7 @@ class LiftScenario(Scenario):
     """A scenario of this lift."""
 
     UNITS: ClassVar[dict[str, str]] = UNITS
+    SIGNALS: ClassVar[dict[str, str]] = SIGNALS
 
     plant: Literal["hydraulic_actuator"]
     parameters: Parameters = Parameters()
@@ -83,7 +85,6 @@ class LiftScenario(Scenario):
 
 
 SCENARIO = LiftScenario
-SIGNALS = {"ValveArea": "m^2", "LoadForce": "N", "PistonPosition": "m", "SystemPressure": "Pa"}
 
 
 def simulate(scenario: Any) -> Iterator[Tick]:

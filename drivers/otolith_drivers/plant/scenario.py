@@ -1,4 +1,4 @@
-"""What every scenario says, whatever the machine: seed, bus, sampling, and what happens to its parameters."""
+"""What every scenario says, whatever the machine: seed, bus, sampling, and what happens to it."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -12,6 +12,9 @@ from pydantic import BeforeValidator, model_validator
 from otolith_drivers.can_bus import BusOptions
 from otolith_drivers.errors import nearest
 from otolith_drivers.plant.faults import Array, Drift, Fault, Step, Unbalance
+from otolith_drivers.plant.registers import ModbusOptions, RegisterMap
+from otolith_drivers.plant.sensor_faults import Distortion, Offset, SensorFault, Spikes
+from otolith_drivers.plant.spans import generator
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
@@ -26,6 +29,8 @@ class Scenario(Closed):
 
     UNITS: ClassVar[dict[str, str]]
     """Of each parameter that a fault may change."""
+    SIGNALS: ClassVar[dict[str, str]]
+    """What the machine measures, and the unit of each."""
     HAS_SHAFT: ClassVar[bool] = False
     """Whether an unbalance means anything."""
 
@@ -36,6 +41,7 @@ class Scenario(Closed):
     sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-3, 1.0))] = 0.01
     dbc: Path
     bus: BusOptions = BusOptions()
+    modbus: ModbusOptions = ModbusOptions()
     parameters: Any
     noise: Any
     """Standard deviation of each sensor."""
@@ -46,11 +52,17 @@ class Scenario(Closed):
         for fault in self.faults:
             if isinstance(fault, Unbalance):
                 self._check_unbalance(fault)
-            elif fault.parameter not in self.UNITS:
-                known = nearest(fault.parameter, list(self.UNITS))
-                raise ValueError(f"a fault names parameter {fault.parameter!r}: {known}")
-            else:
+            elif isinstance(fault, Drift | Step):
+                _check_name(fault.parameter, "parameter", self.UNITS)
                 self.amount(fault)
+            elif isinstance(fault, SensorFault):
+                _check_name(fault.signal, "signal", self.SIGNALS)
+                self.amount(fault)
+        return self
+
+    @model_validator(mode="after")
+    def _registers_fit(self) -> Self:
+        RegisterMap(self.modbus, self.SIGNALS)
         return self
 
     def _check_unbalance(self, fault: Unbalance) -> None:
@@ -59,9 +71,27 @@ class Scenario(Closed):
         if (fault.frequency is None) == (fault.order is None):
             raise ValueError("an unbalance has either a frequency or an order of the shaft angle")
 
-    def amount(self, fault: Drift | Step) -> float:
-        """Of a fault, in the unit of its parameter."""
-        return Quantity(self.UNITS[fault.parameter])(fault.amount)
+    def amount(self, fault: Drift | Step | SensorFault) -> float:
+        """Of a fault, in the unit of its parameter or signal; 0 of one that has none."""
+        match fault:
+            case Drift() | Step():
+                return Quantity(self.UNITS[fault.parameter])(fault.amount)
+            case Offset() | Spikes():
+                return Quantity(self.SIGNALS[fault.signal], difference=True)(fault.amount)
+        return 0.0
+
+    def distortions(self) -> list[tuple[SensorFault, Distortion]]:
+        """What its sensors do to their signals, anew from the start; each has random numbers of its own."""
+        return [
+            (fault, fault.distortion(self.amount(fault), generator(self.seed, number)))
+            for number, fault in enumerate(self.faults)
+            if isinstance(fault, SensorFault)
+        ]
+
+
+def _check_name(name: str, what: str, known: dict[str, str]) -> None:
+    if name not in known:
+        raise ValueError(f"a fault names {what} {name!r}: {nearest(name, list(known))}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +121,7 @@ def stretches(scenario: Scenario, steps: int, where: float) -> Iterator[Stretch]
     The parameters of a step are those that hold at ``where`` in it: 0 at its beginning, 0.5 in its middle.
     """
     random = np.random.default_rng(scenario.seed)
-    changes = [(fault, scenario.amount(fault)) for fault in scenario.faults if not isinstance(fault, Unbalance)]
+    changes = [(fault, scenario.amount(fault)) for fault in scenario.faults if isinstance(fault, Drift | Step)]
     size = max(1, min(STRETCH_PERIODS, STRETCH_STEPS // steps))
     step = scenario.sample_period / steps
     begins = step * np.arange(steps, dtype=np.float64)[:, np.newaxis]

@@ -1,0 +1,391 @@
+"""The simulated machine as a Modbus drive, in a process of its own, asked by a client that is not ours."""
+
+import asyncio
+import json
+import logging
+import math
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from pymodbus import FramerType, ModbusException
+from pymodbus.client import AsyncModbusTcpClient, ModbusSerialClient, ModbusTcpClient
+from pymodbus.pdu import ModbusPDU
+
+from otolith_drivers.plant.nodes import open_node
+from otolith_drivers.plant.plants import load_scenario, simulate
+from tests.conftest import EXAMPLES, free_port
+
+PLANT = [sys.executable, "-m", "otolith", "plant"]
+REGISTERS, COUNTER = 9, 8
+PATIENCE = 20.0  # s
+TIMEOUT = 0.4  # s; a request that is answered at all is so within this, on a busy computer as well
+Client = ModbusTcpClient | ModbusSerialClient
+ORDERS = {"ABCD": [0, 1, 2, 3], "DCBA": [3, 2, 1, 0], "BADC": [1, 0, 3, 2], "CDAB": [2, 3, 0, 1]}
+
+
+class Drive:
+    """A machine as a Modbus drive, and what became of it."""
+
+    def __init__(self, folder: Path, more: str = "", transport: str = "modbus-tcp", modbus: str = "") -> None:
+        self.port, self.line = free_port(socket.SOCK_STREAM), folder / "ttyDrive"
+        self.transport, self.scenario, self.summary = transport, folder / "scenario.toml", folder / "summary.json"
+        self.scenario.write_text(
+            f'plant = "dc_motor"\ndbc = "{EXAMPLES / "dc-motor.dbc"}"\nseed = 5\n'
+            'set_points = [{ at = "0 s", speed = "10 rad/s" }]\n'
+            '[noise]\ncurrent = "5 mA"\nspeed = "0.02 rad/s"\n'
+            f'[modbus]\nport = {self.port}\nline = "{self.line}"\n{modbus}\n{more}',
+            encoding="utf-8",
+        )
+        self.command = [*PLANT, str(self.scenario), "--as", transport, "--summary", str(self.summary)]
+        self.process = subprocess.Popen(self.command, stderr=subprocess.PIPE, text=True)
+        assert self.process.stderr is not None
+        self.title = self.process.stderr.readline()
+        if "Ctrl-C ends it" not in self.title:
+            _, rest = self.process.communicate(timeout=PATIENCE)
+            raise AssertionError(self.title + rest)
+
+    def client(self, timeout: float = TIMEOUT) -> Client:
+        if self.transport == "modbus-tcp":
+            return ModbusTcpClient("127.0.0.1", port=self.port, timeout=timeout, retries=0)
+        return ModbusSerialClient(str(self.line), framer=FramerType.RTU, baudrate=115200, timeout=timeout, retries=0)
+
+    def ticks(self, count: int) -> list[list[float]]:
+        return [list(tick.measured.values()) for tick in islice(simulate(load_scenario(self.scenario)), count)]
+
+    def end(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, dict[str, Any]]:
+        """Exit code and summary."""
+        self.process.send_signal(number)
+        _, self.said = self.process.communicate(timeout=PATIENCE)
+        assert "Traceback" not in self.said
+        return self.process.returncode, json.loads(self.summary.read_text(encoding="utf-8"))
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate(timeout=PATIENCE)
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Iterator[Callable[..., Drive]]:
+    started: list[Drive] = []
+
+    def start(*arguments: str) -> Drive:
+        started.append(Drive(tmp_path, *arguments))
+        return started[-1]
+
+    logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+    yield start
+    for each in started:
+        each.close()
+
+
+def floats(registers: Sequence[int], order: str = "ABCD") -> list[float]:
+    """The four signals, by another way than the drive's own."""
+    data = np.array(registers[:COUNTER], ">u2").view("u1").reshape(4, 4)[:, np.argsort(ORDERS[order])]
+    return list(np.ascontiguousarray(data).view(">f4").ravel().astype(float))
+
+
+def wait_for(client: Client, condition: Callable[[ModbusPDU], bool]) -> ModbusPDU:
+    """The first answer that fulfils ``condition``; the client connects again where it must."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        try:
+            answer = client.read_holding_registers(0, count=REGISTERS)
+            if condition(answer):
+                return answer
+        except ModbusException:
+            pass
+        time.sleep(0.01)
+    raise AssertionError("the drive never said that")
+
+
+def past(index: int) -> Callable[[ModbusPDU], bool]:
+    return lambda answer: not answer.isError() and answer.registers[COUNTER] >= index
+
+
+@pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
+def test_each_read_is_one_tick_of_the_scenario(drive: Callable[..., Drive], transport: str) -> None:
+    """Holding and input registers alike, to the last bit of a float32, and never a mixture of two ticks."""
+    node, seen = drive("", transport), []
+    with node.client() as client:
+        for number in range(200):
+            read = client.read_input_registers if number % 2 else client.read_holding_registers
+            seen.append(read(0, count=REGISTERS).registers)
+        part = client.read_holding_registers(4, count=2)
+        assert not part.isError()
+        assert client.read_holding_registers(COUNTER, count=2).exception_code == 2
+    ticks = node.ticks(seen[-1][COUNTER] + 1)
+    assert len({registers[COUNTER] for registers in seen}) > 3
+    for registers in seen:
+        assert np.array_equal(floats(registers), np.array(ticks[registers[COUNTER]], np.float32))
+    code, done = node.end()
+    assert code == 0
+    assert done["functions"] == {"3": 102, "4": 100}
+    assert done["answers"] == 202
+    assert "202 answers to 202 requests" in node.said
+    assert not node.line.is_symlink()
+
+
+def test_an_asynchronous_client_reads_the_same(drive: Callable[..., Drive]) -> None:
+    node = drive()
+
+    async def read() -> list[Sequence[int]]:
+        client = AsyncModbusTcpClient("127.0.0.1", port=node.port, timeout=PATIENCE, retries=0)
+        assert await client.connect()
+        found = [(await client.read_holding_registers(0, count=REGISTERS)).registers for _ in range(100)]
+        client.close()
+        return found
+
+    seen = asyncio.run(read())
+    ticks = node.ticks(seen[-1][COUNTER] + 1)
+    for registers in seen:
+        assert np.array_equal(floats(registers), np.array(ticks[registers[COUNTER]], np.float32))
+
+
+NO_READS: dict[int, Callable[[Client], ModbusPDU]] = {
+    1: lambda client: client.read_coils(0, count=3),
+    2: lambda client: client.read_discrete_inputs(0, count=3),
+    5: lambda client: client.write_coil(0, value=True),
+    6: lambda client: client.write_register(0, 7),
+    8: lambda client: client.diag_query_data(b"ab"),
+    15: lambda client: client.write_coils(0, [True, False]),
+    16: lambda client: client.write_registers(0, [7, 7]),
+    22: lambda client: client.mask_write_register(address=0, and_mask=0, or_mask=7),
+    23: lambda client: client.readwrite_registers(read_address=0, read_count=2, write_address=0, values=[7]),
+    43: lambda client: client.read_device_information(),
+}
+
+
+@pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
+def test_nothing_can_be_written(drive: Callable[..., Drive], transport: str) -> None:
+    """Every function that does not read registers is illegal, counted, and without any effect."""
+    node = drive("", transport)
+    with node.client() as client:
+        for function, ask in NO_READS.items():
+            answer = ask(client)
+            assert (answer.function_code, answer.exception_code) == (function | 0x80, 1)
+        registers = client.read_holding_registers(0, count=REGISTERS).registers
+    assert np.array_equal(floats(registers), np.array(node.ticks(registers[COUNTER] + 1)[-1], np.float32))
+    _, done = node.end()
+    assert done["refused"] == {str(function): 1 for function in NO_READS}
+
+
+def test_dropouts_are_counted_to_the_last_request(drive: Callable[..., Drive]) -> None:
+    node = drive('[[faults]]\nkind = "dropouts"\nshare = 0.1\nstart = "0.2 s"\n')
+    answered = silent = 0
+    with node.client() as client:
+        while answered + silent < 150:
+            try:
+                assert not client.read_holding_registers(0, count=REGISTERS).isError()
+                answered += 1
+            except ModbusException:
+                silent += 1
+            time.sleep(0.01)  # another tick, another throw of the dice
+    _, done = node.end()
+    assert silent > 0
+    assert (done["answers"], done["faults"][0]["withheld"]) == (answered, silent)
+    assert done["functions"] == {"3": answered + silent}
+
+
+def test_a_drive_that_is_gone_over_tcp_has_no_port_and_comes_back(drive: Callable[..., Drive]) -> None:
+    node = drive('[[faults]]\nkind = "gone"\nstart = "1 s"\nuntil = "2 s"\n')
+    with node.client() as client:
+        wait_for(client, past(0))
+        with socket.create_connection(("127.0.0.1", node.port)) as idle:
+            idle.settimeout(PATIENCE)
+            assert idle.recv(1) == b""  # the drive itself closes what is open
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", node.port))
+        back = wait_for(client, past(0)).registers
+    assert back[COUNTER] >= 200
+    assert np.array_equal(floats(back), np.array(node.ticks(back[COUNTER] + 1)[-1], np.float32))
+    assert node.end()[1]["faults"][0]["ticks"] == 100
+
+
+def test_a_drive_that_is_gone_from_its_line_is_silent_and_comes_back(drive: Callable[..., Drive]) -> None:
+    node, silent = drive('[[faults]]\nkind = "gone"\nstart = "1 s"\nuntil = "2 s"\n', "modbus-rtu"), 0
+    latest = 0
+    with node.client() as client:
+        while latest < 200:
+            try:
+                latest = client.read_holding_registers(0, count=REGISTERS).registers[COUNTER]
+                assert not 100 <= latest < 200
+            except ModbusException:
+                silent += 1
+            time.sleep(0.01)
+    _, done = node.end()
+    assert silent > 0
+    assert done["faults"] == [{"number": 0, "kind": "gone", "ticks": 100, "withheld": silent, "refused": 0}]
+
+
+def test_the_order_of_words_changes_when_the_scenario_says_so(drive: Callable[..., Drive]) -> None:
+    node = drive('[[faults]]\nkind = "word_order"\norder = "CDAB"\nstart = "1 s"\n', "modbus-tcp", 'order = "BADC"')
+    with node.client() as client:
+        seen = [wait_for(client, past(index)).registers for index in (0, 100)]
+    ticks = node.ticks(seen[-1][COUNTER] + 1)
+    for registers in seen:
+        order = "BADC" if registers[COUNTER] < 100 else "CDAB"
+        assert np.array_equal(floats(registers, order), np.array(ticks[registers[COUNTER]], np.float32))
+
+
+def test_some_registers_can_be_refused(drive: Callable[..., Drive]) -> None:
+    node = drive('[[faults]]\nkind = "exception"\ncode = 6\nfirst = 4\nlast = 5\nstart = "0 s"\n')
+    with node.client() as client:
+        asked = {(address, count): client.read_holding_registers(address, count=count)
+                 for address, count in ((0, 4), (0, 5), (4, 2), (5, 1), (6, 3))}  # fmt: skip
+    assert {where: answer.exception_code for where, answer in asked.items() if answer.isError()} == {
+        (0, 5): 6, (4, 2): 6, (5, 1): 6
+    }  # fmt: skip
+    assert node.end()[1]["faults"][0]["refused"] == 3
+
+
+def test_another_device_is_not_there(drive: Callable[..., Drive]) -> None:
+    node = drive("", "modbus-tcp", "device = 7")
+    with node.client() as client:
+        assert client.read_holding_registers(0, count=2, device_id=1).exception_code == 11
+        assert not client.read_holding_registers(0, count=2, device_id=7).isError()
+
+
+def test_on_a_line_only_the_device_that_is_asked_speaks(drive: Callable[..., Drive]) -> None:
+    node = drive("", "modbus-rtu", "device = 7")
+    with node.client() as client:
+        with pytest.raises(ModbusException, match="No response"):
+            client.read_holding_registers(0, count=2, device_id=1)
+        assert not client.read_holding_registers(0, count=2, device_id=7).isError()
+    assert node.end()[1]["functions"] == {"3": 1}
+
+
+REQUEST = bytes.fromhex("01 03 00 00 00 09 85 cc")  # nine registers from 0 on, with their checksum
+
+
+def line_says(line: int, enough: int) -> tuple[bytes, float]:
+    """Bytes from a line, until there are enough, and the seconds from now to the last of them."""
+    data, begun = b"", time.monotonic()
+    while len(data) < enough:
+        assert select.select([line], [], [], PATIENCE)[0], data.hex()
+        data += os.read(line, 1000)
+    return data, time.monotonic() - begun
+
+
+@pytest.mark.parametrize("baudrate", [9600, 115200])
+def test_bytes_take_their_time_on_the_line(drive: Callable[..., Drive], baudrate: int) -> None:
+    """A read takes what both frames take; 9600 baud leave time for less than 30 reads of four signals per second."""
+    node = drive("", "modbus-rtu", f"baudrate = {baudrate}")
+    line = os.open(node.line, os.O_RDWR | os.O_NOCTTY)
+    for _ in range(3):
+        os.write(line, REQUEST)
+        answer, seconds = line_says(line, 23)
+        assert answer[:3] == b"\x01\x03\x12"
+        assert seconds >= (len(REQUEST) + len(answer)) * 10 / baudrate
+    os.close(line)
+
+
+def test_noise_on_the_line_costs_no_more_than_itself(drive: Callable[..., Drive]) -> None:
+    """Half a request is forgotten after silence, as Modbus RTU says."""
+    node = drive("", "modbus-rtu")
+    line = os.open(node.line, os.O_RDWR | os.O_NOCTTY)
+    for rubbish in (REQUEST[:5], b"\xff\x00\xff", REQUEST[:-1] + b"\x00"):
+        os.write(line, rubbish)
+        assert not select.select([line], [], [], 0.2)[0]
+        os.write(line, REQUEST)
+        assert len(line_says(line, 23)[0]) == 23
+    os.close(line)
+
+
+@pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
+def test_garbage_is_on_the_line_as_the_scenario_says(drive: Callable[..., Drive], transport: str) -> None:
+    node = drive('[[faults]]\nkind = "garbage"\nshare = 1.0\nstart = "0.5 s"\nuntil = "1 s"\n', transport)
+    if transport == "modbus-tcp":
+        with socket.create_connection(("127.0.0.1", node.port)) as connection:
+            line_says(connection.fileno(), 100)
+    else:
+        line = os.open(node.line, os.O_RDWR | os.O_NOCTTY)
+        line_says(line, 100)
+        os.close(line)
+    with node.client() as client:
+        wait_for(client, past(100))
+    assert node.end()[1]["faults"][0]["ticks"] == 50
+
+
+@pytest.mark.parametrize(
+    ("transport", "message"), [("modbus-tcp", "Address already in use"), ("modbus-rtu", "is there already")]
+)
+def test_a_second_drive_in_the_same_place_is_one_line(
+    drive: Callable[..., Drive], transport: str, message: str
+) -> None:
+    node = drive("", transport)
+    second = subprocess.run(node.command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert second.returncode == 2
+    assert len(second.stderr.splitlines()) == 1
+    assert message in second.stderr
+    assert "second plant running? Stop it" in second.stderr
+    with node.client() as client:
+        wait_for(client, past(0))
+
+
+@pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
+def test_ctrl_c_leaves_nothing_behind(drive: Callable[..., Drive], transport: str) -> None:
+    node = drive("", transport)
+    with node.client() as client:
+        wait_for(client, past(0))
+        code, done = node.end(signal.SIGINT)
+    assert code == 130
+    assert done["ticks"] > 0
+    assert not node.line.is_symlink()
+
+
+def test_the_name_of_a_drive_that_was_killed_can_be_had_again(drive: Callable[..., Drive]) -> None:
+    killed = drive("", "modbus-rtu")
+    killed.close()
+    assert killed.line.is_symlink()
+    with drive("", "modbus-rtu").client() as client:
+        wait_for(client, past(0))
+
+
+@pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
+def test_a_node_ends_with_all_that_it_began(drive: Callable[..., Drive], transport: str) -> None:
+    """No thread and no descriptor is left, however often the device was gone."""
+    faults = "".join(f'[[faults]]\nkind = "gone"\nstart = "0.{n} s"\nuntil = "0.{n}5 s"\n' for n in range(5))
+    node = drive(faults, transport)
+    node.end()
+    scenario, own = load_scenario(node.scenario), psutil.Process()
+    before = None
+    for _ in range(3):
+        opened = open_node(transport, scenario)
+        done = opened.run(None, lambda: False, 0.6)
+        opened.close()
+        assert done.ticks == 60
+        assert [fault.ticks for fault in done.faults.values()] == [5] * 5
+        left = threading.active_count(), own.num_fds()
+        assert before in (None, left)
+        before = left
+
+
+def test_a_lift_says_what_it_measures_in_integers(drive: Callable[..., Drive], tmp_path: Path) -> None:
+    node = drive()
+    node.close()
+    text = (EXAMPLES / "scenarios" / "hydraulic-fluid.toml").read_text(encoding="utf-8")
+    scale = 'ValveArea = "0.01 mm^2", LoadForce = "1 N", PistonPosition = "0.01 mm", SystemPressure = "1 Pa"'
+    modbus = f'[modbus]\nport = {node.port}\ntype = "int32"\nscale = {{ {scale} }}\n\n[[faults]]'
+    text = text.replace("../hydraulic-actuator.dbc", str(EXAMPLES / "hydraulic-actuator.dbc"))
+    node.scenario.write_text(text.replace("[[faults]]", modbus), encoding="utf-8")
+    node.process = subprocess.Popen(node.command, stderr=subprocess.PIPE, text=True)
+    with node.client() as client:
+        registers = wait_for(client, past(10)).registers
+    found = np.array(registers[:COUNTER], ">u2").view(">i4") * [1e-8, 1.0, 1e-5, 1.0]
+    wanted = node.ticks(registers[COUNTER] + 1)[-1]
+    assert all(math.isclose(one, other, abs_tol=step) for one, other, step in
+               zip(found, wanted, (1e-8, 1.0, 1e-5, 1.0), strict=True))  # fmt: skip
