@@ -48,6 +48,14 @@ def test_the_example_means_what_it_says() -> None:
     assert any("MotorMechanical.RotorSpeed" in line for line in describe(plan))
 
 
+def test_the_simplest_machine_file_needs_no_bus() -> None:
+    """The machine of dc-motor.toml, simulated in the daemon; what the shorter file leaves out is as the twin says."""
+    simple, whole = load_plan(EXAMPLES / "dc-motor-in-process.toml"), load_plan(EXAMPLES / "dc-motor.toml")
+    assert [entry.name for entry in simple.problem.free] == ["R_a", "D"]
+    assert simple.problem.noise == whole.problem.noise
+    assert any("omega from RotorSpeed [rad/s]" in line for line in describe(simple))
+
+
 def test_every_commented_default_of_the_example_is_the_default(tmp_path: Path) -> None:
     """What a user gets by taking the '# ' off is what there was before."""
     text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")

@@ -13,6 +13,7 @@ ENTRY_POINT_GROUP = "otolith.drivers"
 DRIVERS: dict[str, str] = {
     "can": "otolith_drivers.can_receiver",
     "modbus": "otolith_drivers.modbus_poller",
+    "plant": "otolith_drivers.plant.in_process",
 }
 
 

@@ -13,6 +13,7 @@ from otolith_drivers.base import Setup, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.contract import Rig
 from otolith_drivers.dbc import Source
+from otolith_drivers.plant import in_process
 from tests.conftest import EXAMPLES, OwnMachine
 from tests.drivers.modbus_servers import library_server
 
@@ -63,4 +64,33 @@ def modbus_rig(_: OwnMachine) -> Iterator[Rig]:
         driver.close()
 
 
-RIGS: dict[str, Callable[[OwnMachine], AbstractContextManager[Rig]]] = {"can": can_rig, "modbus": modbus_rig}
+PLANT_SAYS = """
+[[faults]]
+kind = "{kind}"
+signal = "{signal}"
+{change}
+start = "0 s"
+"""
+
+
+@contextmanager
+def plant_rig(machine: OwnMachine) -> Iterator[Rig]:
+    """Sensors that lie say what the rig wants to hear."""
+    wanted = {"ArmatureCurrent": "2 A", "RotorSpeed": "10 rad/s"}
+    for signal, value in wanted.items():
+        with machine.scenario.open("a", encoding="utf-8") as file:
+            file.write(PLANT_SAYS.format(kind="gain", signal=signal, change="factor = 0"))
+            file.write(PLANT_SAYS.format(kind="offset", signal=signal, change=f'amount = "{value}"'))
+    signals = tuple(
+        Signal(signal.name, signal.unit, in_process.Source(signal=name))
+        for signal, name in zip(SIGNALS, wanted, strict=True)
+    )
+    options = in_process.Options(scenario=machine.scenario)
+    yield Rig(in_process.build(options, replace(SETUP, signals=signals)), EXPECTED)
+
+
+RIGS: dict[str, Callable[[OwnMachine], AbstractContextManager[Rig]]] = {
+    "can": can_rig,
+    "modbus": modbus_rig,
+    "plant": plant_rig,
+}
