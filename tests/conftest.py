@@ -66,19 +66,57 @@ def own_machine(tmp_path: Path) -> "OwnMachine":
     return OwnMachine(tmp_path)
 
 
-class OwnMachine:
-    """Writes the example files with a bus and an endpoint of their own."""
+TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu", "in-process")
 
-    def __init__(self, folder: Path) -> None:
+
+class OwnMachine:
+    """Writes the example files with a bus and an endpoint of their own; the machine is heard over ``transport``."""
+
+    def __init__(self, folder: Path, transport: str = "can", scenario: str = "demo", faults: str | None = None) -> None:
+        """``faults`` stand in for those of the scenario."""
+        folder.mkdir(exist_ok=True)
+        self.transport = transport
         self.group, self.port = "239.74.163.9", free_port(socket.SOCK_DGRAM)
+        self.tcp_port, self.line = free_port(socket.SOCK_STREAM), folder / "line"
         self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.machine, self.scenario = folder / "machine.toml", folder / "scenario.toml"
         self.dbc = EXAMPLES / "dc-motor.dbc"
-        bus = f'interface = "udp_multicast"\nchannel = "{self.group}"\nport = {self.port}\n'
-        text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
-        text = text.replace('dbc = "dc-motor.dbc"\n', f'dbc = "{self.dbc}"\n{bus}')
-        self.machine.write_text(f'{text}\n[zenoh]\nlisten = ["{self.endpoint}"]\n', encoding="utf-8")
-        text = (EXAMPLES / "scenarios" / "demo.toml").read_text(encoding="utf-8")
+        self.machine.write_text(self._machine_file(), encoding="utf-8")
+        text = (EXAMPLES / "scenarios" / f"{scenario}.toml").read_text(encoding="utf-8")
+        text = text if faults is None else text.partition("[[faults]]")[0] + faults
         text = text.replace('dbc = "../dc-motor.dbc"', f'dbc = "{self.dbc}"')
-        text = text.replace('interface = "auto"', f"{bus}#").replace('channel = "vcan0"', "")
+        if "[bus]" in text:
+            text = text.replace('interface = "auto"', f"{self._bus()}#").replace('channel = "vcan0"', "")
+        else:
+            text = text.replace("[noise]", f"[bus]\n{self._bus()}\n[noise]")
+        modbus = f'port = {self.tcp_port}\nline = "{self.line}"\n'
+        text = (
+            text.replace("[modbus]", f"[modbus]\n{modbus}")
+            if "[modbus]" in text
+            else text.replace("[noise]", f"[modbus]\n{modbus}\n[noise]")
+        )
         self.scenario.write_text(text, encoding="utf-8")
+
+    @property
+    def plays(self) -> list[str]:
+        """The arguments of ``otolith plant``; none where the daemon plays the plant itself."""
+        return [] if self.transport == "in-process" else [str(self.scenario), "--as", self.transport]
+
+    def _bus(self) -> str:
+        return f'interface = "udp_multicast"\nchannel = "{self.group}"\nport = {self.port}\n'
+
+    def _machine_file(self) -> str:
+        text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
+        text += f'\n[zenoh]\nlisten = ["{self.endpoint}"]\n'
+        can = 'type = "can"\ndbc = "dc-motor.dbc"\n'
+        if self.transport == "can":
+            return text.replace(can, f'type = "can"\ndbc = "{self.dbc}"\n{self._bus()}')
+        if self.transport == "in-process":
+            return text.replace(can, f'type = "plant"\nscenario = "{self.scenario}"\n')
+        for address, name in enumerate(("ArmatureVoltage", "ArmatureCurrent", "RotorSpeed", "LoadTorque")):
+            unit = {"ArmatureVoltage": "V", "ArmatureCurrent": "A", "RotorSpeed": "rad/s", "LoadTorque": "N*m"}[name]
+            place = f'{{ register = {2 * address}, type = "float32", unit = "{unit}" }}'
+            text = text.replace(f'{{ signal = "{name}" }}', place)
+        tcp = f'host = "127.0.0.1"\nport = {self.tcp_port}\n'
+        rtu = f'serial = "{self.line}"\nbaudrate = 115200\nparity = "N"\n'
+        return text.replace(can, f'type = "modbus"\n{tcp if self.transport == "modbus-tcp" else rtu}')

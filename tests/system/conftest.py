@@ -25,7 +25,9 @@ class Running:
     def __init__(self, machine: OwnMachine, folder: Path) -> None:
         self.machine, self.folder = machine, folder
         self.recording, self.truth, self.log = folder / "run.rrd", folder / "truth.csv", folder / "daemon.log"
-        self.plant = self._start("plant", "plant", str(machine.scenario), "--truth", str(self.truth))
+        self.summary = folder / "summary.json"
+        plays = [*machine.plays, "--truth", str(self.truth), "--summary", str(self.summary)]
+        self.plant = self._start("plant", "plant", *plays) if machine.plays else None
         self.daemon = self._start("daemon", "run", str(machine.machine), "--recording", str(self.recording))
         self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._listener = Listener([machine.endpoint], "otolith/**/report", self._heard.put)
@@ -64,7 +66,7 @@ class Running:
         """End whatever still runs."""
         self._listener.__exit__(None, None, None)
         for process in (self.daemon, self.plant):
-            if process.poll() is None:
+            if process is not None and process.poll() is None:
                 process.terminate()
                 process.wait(timeout=10)
 

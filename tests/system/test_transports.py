@@ -1,0 +1,36 @@
+"""The same machine and scenario, however its signals come: the same armature resistance within its intervals."""
+
+from pathlib import Path
+
+import pytest
+
+from otolith.acquisition.window import Verdict
+from otolith.health.report import Status
+from tests.conftest import TRANSPORTS, OwnMachine
+from tests.system.conftest import Running
+
+TRUE = 6.5  # ohm
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_the_armature_resistance_is_the_same_over_every_transport(transport: str, tmp_path: Path) -> None:
+    running = Running(OwnMachine(tmp_path / transport, transport, faults=""), tmp_path)
+    try:
+        reports = running.wait_for(
+            lambda reports: sum(report.parameters["R_a"].status is Status.ESTIMATED for report in reports) >= 5, 120.0
+        )
+        last = reports[-1]
+        found = last.parameters["R_a"]
+        assert found.low is not None
+        assert found.high is not None
+        assert found.low <= TRUE <= found.high
+        assert found.high - found.low < 0.02 * TRUE
+        assert not last.components
+        assert last.window.quality.verdict is Verdict.GOOD
+        assert last.counters is not None
+        assert last.counters.bad == 0
+        assert last.driver is not None
+        assert last.driver.up
+        assert not last.driver.complaints
+    finally:
+        running.close()
