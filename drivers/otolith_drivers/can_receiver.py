@@ -4,19 +4,18 @@ There is no path to ``bus.send`` in this file: the driver cannot disturb the mac
 """
 
 import logging
-import math
 import random
 import threading
 import time
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import can
-from cantools.database import Message
 
-from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
+from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.dbc import Source, Wanted, find_signals, load_dbc
+from otolith_drivers.can_decoder import FrameDecoder, decoder_of
+from otolith_drivers.can_options import FrameOptions
+from otolith_drivers.dbc import Source
 from otolith_drivers.errors import DeviceError
 
 __all__ = ["CanReceiver", "Options", "Source", "build"]
@@ -29,31 +28,13 @@ MOST_BAD_IN_A_ROW = 50  # unreadable frames, after which the bus is opened anew
 STAMP_TOLERANCE = 1.0  # s; a kernel stamp farther from now than this met a clock that was set
 
 
-class Options(BusOptions):
+class Options(BusOptions, FrameOptions):
     """``[driver]`` with ``type = "can"``."""
-
-    dbc: Path
-    """The CAN database that describes the frames."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Frame:
-    """What to take from the frames of one arbitration ID."""
-
-    message: Message
-    wanted: tuple[Wanted, ...]
 
 
 def build(options: Options, setup: Setup) -> "CanReceiver":
     """A receiver; each signal's source has ``signal`` and, where that is ambiguous, ``message``."""
-    path = setup.folder / options.dbc
-    database = load_dbc(path)
-    frames: dict[tuple[int, bool], _Frame] = {}
-    for wanted in find_signals(database, setup.signals, path):
-        key = (wanted.message.frame_id, wanted.message.is_extended_frame)
-        frame = frames.get(key, _Frame(wanted.message, ()))
-        frames[key] = replace(frame, wanted=(*frame.wanted, wanted))
-    return CanReceiver(options, frames)
+    return CanReceiver(options, decoder_of(options, setup))
 
 
 class CanReceiver:
@@ -61,10 +42,11 @@ class CanReceiver:
 
     sampling = Sampling.CYCLIC
 
-    def __init__(self, options: BusOptions, frames: dict[tuple[int, bool], _Frame]) -> None:
+    def __init__(self, options: BusOptions, decoder: FrameDecoder) -> None:
         self._options = options
-        self._frames = frames
-        self._counters = Counters()
+        self._decoder = decoder
+        self._reconnects = 0
+        self._unreadable = 0
         self._link = Link(up=False, reason="not opened yet")
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -84,22 +66,21 @@ class CanReceiver:
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
-        return self._counters
+        seen = self._decoder.counters
+        return replace(seen, bad=seen.bad + self._unreadable, reconnects=self._reconnects)
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
-        return self._link
+        return replace(self._link, complaints=tuple(self._decoder.complaints(time.monotonic())))
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
-        wanted = [wanted for frame in self._frames.values() for wanted in frame.wanted]
-        signals = [f"{entry.name} [{entry.target_unit}] from {entry.describe()}" for entry in wanted]
-        return [f"CAN bus {self._options.title()}, receive only", *signals]
+        return [f"CAN bus {self._options.title()}, receive only", *self._decoder.describe()]
 
     def _connect(self) -> can.BusABC:
         filters: list[can.typechecking.CanFilter] = [
             {"can_id": identifier, "can_mask": 0x1FFFFFFF if extended else 0x7FF, "extended": extended}
-            for identifier, extended in self._frames
+            for identifier, extended in self._decoder.identifiers()
         ]
         bus = open_bus(self._options, filters)
         self._link = Link(up=True)
@@ -131,7 +112,7 @@ class CanReceiver:
         if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
             return False
         self._bad_in_a_row += 1
-        self._counters = replace(self._counters, bad=self._counters.bad + 1)
+        self._unreadable += 1
         return self._bad_in_a_row <= MOST_BAD_IN_A_ROW
 
     def _reconnect(self) -> can.BusABC | None:
@@ -144,27 +125,14 @@ class CanReceiver:
                 self._link = Link(up=False, reason=str(error))
                 pause = min(2 * pause, BACKOFF_LONGEST)
             else:
-                self._counters = replace(self._counters, reconnects=self._counters.reconnects + 1)
+                self._reconnects += 1
                 return bus
         return None
 
     def _take(self, frame: can.Message, deliver: Deliver) -> None:
-        known = self._frames.get((frame.arbitration_id, frame.is_extended_id))
-        if known is None or frame.is_error_frame or frame.is_remote_frame:
-            return
         moment = monotonic_of(frame.timestamp, time.time(), time.monotonic())
-        try:
-            values = known.message.decode_simple(bytes(frame.data), decode_choices=False)
-            samples = [Sample(wanted.name, moment, wanted.read(values)) for wanted in known.wanted]
-        except Exception as error:  # noqa: BLE001 - a hostile frame must not end the thread
-            self._counters = replace(self._counters, bad=self._counters.bad + 1)
-            log.debug("frame 0x%X: %s", frame.arbitration_id, error)
-            return
-        bad = any(not math.isfinite(sample.value) for sample in samples)
-        self._counters = replace(
-            self._counters, received=self._counters.received + len(samples), bad=self._counters.bad + int(bad)
-        )
-        deliver(samples)
+        if samples := self._decoder.decode(frame, moment):
+            deliver(samples)
 
 
 def monotonic_of(stamp: float, wall: float, monotonic: float) -> float:

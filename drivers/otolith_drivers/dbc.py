@@ -8,12 +8,16 @@ from typing import Any
 
 import cantools
 from cantools.database import Message
+from cantools.database import Signal as CanSignal
 from cantools.database.can.database import Database
 
 from otolith_drivers.base import Signal
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.quantities import factor
 from otolith_drivers.toml_files import Closed
+
+LARGEST = 1e300
+ROUNDING = 1e-6  # of a bound: 0.1 in a frame of 32-bit floats is above 0.1
 
 
 class Source(Closed):
@@ -46,6 +50,16 @@ class Wanted:
         if value is None or not self.low <= float(value) <= self.high:
             return math.nan
         return self.scale * float(value) + self.offset
+
+    def raw_range(self, signal: CanSignal) -> tuple[float, float, float, float]:
+        """The lowest and highest raw number that is a reading, and scale and offset from it to the target unit."""
+        slope, zero = float(signal.conversion.scale), float(signal.conversion.offset)
+        ends = sorted((end - zero) / slope for end in (self.low, self.high))
+        scale, offset = self.scale * slope, self.scale * zero + self.offset
+        # Beyond the largest float there is no value, be it in the frame or after scaling.
+        limit = LARGEST / max(1.0, abs(scale))
+        slack = [ROUNDING * abs(end) if math.isfinite(end) else 0.0 for end in ends]
+        return max(ends[0] - slack[0], -limit), min(ends[1] + slack[1], limit), scale, offset
 
     def describe(self) -> str:
         """Where it is read, in words."""
