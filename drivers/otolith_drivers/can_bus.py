@@ -30,6 +30,12 @@ class BusOptions(Closed):
     """The kernel's network interface, or the channel as the interface of python-can names it; ``vcan0`` without it."""
     bitrate: Annotated[float, BeforeValidator(Quantity("bit/s", 1e3, 1e6))] | None = None
     """Only for interfaces that set it themselves; the kernel's is set with ``ip link``."""
+    fd: bool = False
+    """Whether frames of CAN FD are received as well."""
+    data_bitrate: Annotated[float, BeforeValidator(Quantity("bit/s", 1e3, 2e7))] | None = None
+    """Of the data of FD frames; like ``bitrate``."""
+    listen_only: bool = True
+    """Not even to acknowledge, where the interface can; ``false`` where nobody else on the bus acknowledges."""
     port: Annotated[int, Field(ge=1024, le=65535)] = 43113
     """Of ``udp_multicast``: two buses on one computer differ in it, or in their group."""
 
@@ -37,6 +43,8 @@ class BusOptions(Closed):
     def _channel_fits(self) -> Self:
         if self.interface == "udp_multicast" and self.channel is not None and not GROUP.fullmatch(self.channel):
             raise ValueError(f"channel {self.channel!r}: udp_multicast takes a group like {DEFAULT_GROUP!r}")
+        if self.data_bitrate is not None and not self.fd:
+            raise ValueError("data_bitrate is that of CAN FD: set fd = true")
         return self
 
     def resolved(self) -> tuple[str, str]:
@@ -74,8 +82,25 @@ def kernel_has(channel: str) -> bool:
     return True
 
 
-def open_bus(options: BusOptions, filters: list[can.typechecking.CanFilter] | None = None) -> can.BusABC:
-    """The bus, open.
+# How an interface of python-can is told not to acknowledge. The kernel's is set up with 'ip link ... listen-only on'.
+LISTEN_ONLY: dict[str, dict[str, Any]] = {
+    "cantact": {"monitor": True},
+    "kvaser": {"driver_mode": False},
+    "nixnet": {"listen_only": True},
+    "pcan": {"state": can.BusState.PASSIVE},
+    "seeedstudio": {"operation_mode": "silent"},
+    "slcan": {"listen_only": True},
+    "systec": {"state": can.BusState.PASSIVE},
+    "vector": {"listen_only": True},
+}
+FILTERING = {"socketcan"}
+"""Where the kernel looks at filters. Elsewhere they cost as much as they save, or hide error frames."""
+
+
+def open_bus(
+    options: BusOptions, filters: list[can.typechecking.CanFilter] | None = None, *, listen_only: bool = False
+) -> can.BusABC:
+    """The bus, open; with ``listen_only`` it does not even acknowledge, where the interface can do that.
 
     Raises:
         DeviceError: it is not there, or refuses.
@@ -84,11 +109,14 @@ def open_bus(options: BusOptions, filters: list[can.typechecking.CanFilter] | No
     arguments: dict[str, Any] = {"interface": interface, "channel": channel}
     if interface == "udp_multicast":
         # A hop limit of 0 keeps every frame on this computer; the library's own default reaches the network.
-        arguments |= {"port": options.port, "hop_limit": 0, "fd": False}
-    elif options.bitrate is not None:
-        arguments["bitrate"] = int(options.bitrate)
+        arguments |= {"port": options.port, "hop_limit": 0, "fd": options.fd}
+    else:
+        rates = {"bitrate": options.bitrate, "data_bitrate": options.data_bitrate}
+        arguments |= {key: int(rate) for key, rate in rates.items() if rate is not None}
+        arguments |= {"fd": True} if options.fd else {}
+        arguments |= LISTEN_ONLY.get(interface, {}) if listen_only and options.listen_only else {}
     try:
-        bus = can.Bus(**arguments, can_filters=filters)
+        bus = can.Bus(**arguments, can_filters=filters if interface in FILTERING else None)
         if interface == "udp_multicast":
             _hear_only_this_group(bus)
     except (can.CanError, OSError, ImportError, ValueError, TypeError, AttributeError, NotImplementedError) as error:

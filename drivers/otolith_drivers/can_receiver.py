@@ -1,6 +1,7 @@
-"""The CAN driver: listens, decodes by a DBC, stamps every frame, survives the bus going down.
+"""The CAN driver: listens, stamps every frame, survives the bus going down.
 
-There is no path to ``bus.send`` in this file: the driver cannot disturb the machine.
+There is no path to ``bus.send`` in this file: the driver cannot disturb the machine. What is in the frames is the
+business of ``can_decoder.py``.
 """
 
 import logging
@@ -15,7 +16,8 @@ from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.can_decoder import FrameDecoder, decoder_of
 from otolith_drivers.can_options import FrameOptions
-from otolith_drivers.dbc import Source
+from otolith_drivers.can_signals import Source
+from otolith_drivers.can_socket import enlarge_buffer, frames_dropped
 from otolith_drivers.errors import DeviceError
 
 __all__ = ["CanReceiver", "Options", "Source", "build"]
@@ -26,6 +28,10 @@ RECEIVE_TIMEOUT = 0.2  # s; how late a stop can be noticed
 BACKOFF_FIRST, BACKOFF_LONGEST = 0.2, 10.0  # s
 MOST_BAD_IN_A_ROW = 50  # unreadable frames, after which the bus is opened anew
 STAMP_TOLERANCE = 1.0  # s; a kernel stamp farther from now than this met a clock that was set
+LOOK_EVERY = 0.05  # s; how often the clocks are compared: 50 ms are the longest that a clock that was set can mislead
+SILENT_PERIODS, SILENT_AT_LEAST, SILENT_AT_MOST = 10.0, 2.0, 60.0  # periods; s
+NEVER_HEARD = 10.0  # s; no period is known before anything came
+RECENT = 60.0  # s for which dropped frames are told
 
 
 class Options(BusOptions, FrameOptions):
@@ -33,7 +39,7 @@ class Options(BusOptions, FrameOptions):
 
 
 def build(options: Options, setup: Setup) -> "CanReceiver":
-    """A receiver; each signal's source has ``signal`` and, where that is ambiguous, ``message``."""
+    """A receiver of the frames in which the signals are."""
     return CanReceiver(options, decoder_of(options, setup))
 
 
@@ -45,16 +51,20 @@ class CanReceiver:
     def __init__(self, options: BusOptions, decoder: FrameDecoder) -> None:
         self._options = options
         self._decoder = decoder
-        self._reconnects = 0
-        self._unreadable = 0
         self._link = Link(up=False, reason="not opened yet")
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._bad_in_a_row = 0
+        self._reconnects = self._unreadable = self._bad_in_a_row = 0
+        self._drops = _Drops()
+        self._offset = 0.0
+        self._heard = self._opened = 0.0
+        self._patience = 0.0
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         bus = self._connect()
+        self._heard = self._opened
+        self._decoder.begin(self._opened)
         self._thread = threading.Thread(target=self._receive, args=(bus, deliver), name="can-receive", daemon=True)
         self._thread.start()
 
@@ -67,11 +77,26 @@ class CanReceiver:
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
         seen = self._decoder.counters
-        return replace(seen, bad=seen.bad + self._unreadable, reconnects=self._reconnects)
+        return replace(
+            seen,
+            bad=seen.bad + self._unreadable,
+            # What the kernel dropped is missed by pace or counter as well, unless a message has neither.
+            lost=max(seen.lost, self._drops.total),
+            reconnects=self._reconnects,
+        )
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
-        return replace(self._link, complaints=tuple(self._decoder.complaints(time.monotonic())))
+        link = self._link
+        if not link.up:
+            return link
+        if self._decoder.faults.bus_off:
+            return Link(up=False, reason="bus off: the controller has left the bus after too many errors")
+        now = time.monotonic()
+        silence = now - self._heard
+        alone = [f"nothing at all has come for {silence:.1f} s"] if silence > self._silence_limit() else []
+        complaints = (*alone, *self._drops.complaints(now), *self._decoder.complaints(now))
+        return replace(link, complaints=complaints)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
@@ -82,7 +107,12 @@ class CanReceiver:
             {"can_id": identifier, "can_mask": 0x1FFFFFFF if extended else 0x7FF, "extended": extended}
             for identifier, extended in self._decoder.identifiers()
         ]
-        bus = open_bus(self._options, filters)
+        bus = open_bus(self._options, filters, listen_only=True)
+        enlarge_buffer(bus)
+        self._drops.begin()
+        self._bad_in_a_row = 0
+        self._opened = time.monotonic()
+        self._decoder.faults.healed()
         self._link = Link(up=True)
         return bus
 
@@ -90,22 +120,52 @@ class CanReceiver:
         while not self._stop.is_set():
             if bus is None:
                 bus = self._reconnect()
-                continue
-            try:
-                frame = bus.recv(RECEIVE_TIMEOUT)
-            except Exception as error:  # noqa: BLE001 - interfaces raise whatever their vendor's library does
-                if self._only_a_bad_frame(error):
-                    continue
-                self._link = Link(up=False, reason=f"{type(error).__name__}: {error}")
-                log.warning("CAN bus %s: %s; reconnecting", self._options.title(), error)
+            elif (trouble := self._take_frames(bus, deliver)) is not None:
+                self._link = Link(up=False, reason=trouble)
+                log.warning("CAN bus %s: %s; reconnecting", self._options.title(), trouble)
                 _shut(bus)
                 bus = None
-                continue
-            self._bad_in_a_row = 0
-            if frame is not None:
-                self._take(frame, deliver)
         if bus is not None:
             _shut(bus)
+
+    def _take_frames(self, bus: can.BusABC, deliver: Deliver) -> str | None:
+        """Take what comes until the clocks are to be compared again; what is wrong if the bus must be opened anew."""
+        receive, decode, clock = bus.recv, self._decoder.decode, time.monotonic
+        begun = now = clock()
+        offset = time.time() - begun
+        while now - begun < LOOK_EVERY:
+            try:
+                frame = receive(RECEIVE_TIMEOUT)
+                now = clock()
+                if frame is None:
+                    break
+                if samples := decode(frame, monotonic_of(frame.timestamp, now + offset, now)):
+                    deliver(samples)
+            except Exception as error:  # noqa: BLE001 - interfaces raise whatever their vendor's library does
+                if self._only_a_bad_frame(error):
+                    return None
+                return f"{type(error).__name__}: {error}"
+            self._heard, self._bad_in_a_row = now, 0
+        return self._look(bus, now)
+
+    def _look(self, bus: can.BusABC, now: float) -> str | None:
+        """At what no frame tells; what is wrong if the bus must be opened anew."""
+        self._drops.note(frames_dropped(bus), now)
+        if _is_off(bus):
+            self._decoder.faults.bus_off = True
+        if now - self._heard < RECEIVE_TIMEOUT:
+            self._patience = 0.0
+            return None
+        silence = now - max(self._heard, self._opened)
+        if silence < max(self._patience, self._silence_limit()):
+            return None
+        # Some interfaces never tell that their other end has gone.
+        self._patience = min(2.0 * silence, SILENT_AT_MOST)
+        return f"nothing has come for {silence:.1f} s"
+
+    def _silence_limit(self) -> float:
+        period = self._decoder.slowest_period()
+        return NEVER_HEARD if period is None else max(SILENT_AT_LEAST, SILENT_PERIODS * period)
 
     def _only_a_bad_frame(self, error: Exception) -> bool:
         """Whether what came could not be unpacked, while the bus itself stands; many in a row are no accident."""
@@ -129,10 +189,30 @@ class CanReceiver:
                 return bus
         return None
 
-    def _take(self, frame: can.Message, deliver: Deliver) -> None:
-        moment = monotonic_of(frame.timestamp, time.time(), time.monotonic())
-        if samples := self._decoder.decode(frame, moment):
-            deliver(samples)
+
+class _Drops:
+    """Frames that this computer did not read in time, over all the buses that were opened."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._of_this_bus = 0
+        self._at = 0.0
+
+    def begin(self) -> None:
+        """Another socket counts from zero."""
+        self._of_this_bus = 0
+
+    def note(self, count: int | None, now: float) -> None:
+        """What the kernel says of this bus."""
+        if count is not None and count > self._of_this_bus:
+            self.total += count - self._of_this_bus
+            self._of_this_bus, self._at = count, now
+
+    def complaints(self, now: float) -> list[str]:
+        """A line for a while after it happened."""
+        if not self.total or now - self._at > RECENT:
+            return []
+        return [f"this computer was too busy to read {self.total} frames, the last {now - self._at:.1f} s ago"]
 
 
 def monotonic_of(stamp: float, wall: float, monotonic: float) -> float:
@@ -143,6 +223,13 @@ def monotonic_of(stamp: float, wall: float, monotonic: float) -> float:
     """
     age = wall - stamp
     return monotonic - age if 0.0 <= age < STAMP_TOLERANCE else monotonic
+
+
+def _is_off(bus: can.BusABC) -> bool:
+    try:
+        return bus.state is can.BusState.ERROR
+    except Exception:  # noqa: BLE001 - many interfaces cannot tell
+        return False
 
 
 def _shut(bus: can.BusABC) -> None:

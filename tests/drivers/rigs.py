@@ -11,8 +11,8 @@ import can
 from otolith_drivers import can_receiver, modbus_poller
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
+from otolith_drivers.can_signals import Source
 from otolith_drivers.contract import Rig
-from otolith_drivers.dbc import Source
 from otolith_drivers.plant import in_process
 from tests.conftest import EXAMPLES, OwnMachine
 from tests.drivers.modbus_servers import library_server
@@ -30,7 +30,7 @@ def can_rig(machine: OwnMachine) -> Iterator[Rig]:
     options = can_receiver.Options(
         interface="udp_multicast", channel=machine.group, port=machine.port, dbc=Path("dc-motor.dbc")
     )
-    bus = open_bus(BusOptions(**options.model_dump(exclude={"dbc"})))
+    bus = open_bus(BusOptions(**options.model_dump(include=set(BusOptions.model_fields))))
 
     def say() -> None:
         bus.send(

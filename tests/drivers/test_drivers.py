@@ -47,7 +47,7 @@ def test_any_frame_is_decoded_or_counted(
         is_remote_frame=remote,
         is_error_frame=error,
     )
-    driver._take(frame, got.extend)
+    got.extend(driver._decoder.decode(frame, 0.0))
     counters = driver.counters()
     wanted = identifier != 7 and not remote and not error
     assert (counters.received + counters.bad > 0) == wanted

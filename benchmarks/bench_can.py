@@ -1,0 +1,144 @@
+"""A busy CAN bus: what a frame costs from the socket into the rings, beside a bare python-can loop on the same frames.
+
+Another process sends 8000 frames a second of ten messages, each with one signal that is wanted and a counter, on the
+virtual bus of this computer. ``python -m benchmarks.bench_can 10`` takes 10 s for each loop instead of 60.
+"""
+
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import can
+
+from otolith.acquisition.ring import Rings
+from otolith_drivers.base import Setup, Signal
+from otolith_drivers.can_bus import BusOptions, open_bus
+from otolith_drivers.can_receiver import Options, build
+from otolith_drivers.can_signals import Source
+from otolith_drivers.can_socket import enlarge_buffer
+
+RATE, MESSAGES, FIRST_ID = 8000.0, 10, 0x180  # frames/s
+SETTLE = 0.5  # s after the last frame
+GROUP, PORT = "239.74.163.88", 43188
+BUS = BusOptions(interface="udp_multicast", channel=GROUP, port=PORT)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    sent: int
+    received: int
+    seconds: float
+    cpu: float
+
+    @property
+    def share(self) -> float:
+        return self.cpu / self.seconds
+
+    def line(self, title: str) -> str:
+        lost = self.sent - self.received
+        per_frame = self.cpu / max(self.received, 1) * 1e6
+        rate = self.sent / self.seconds
+        text = f"{title:<28} {rate:6.0f} frames/s, lost {lost} of {self.sent}"
+        return f"{text}, {self.share:6.1%} of a core, {per_frame:5.1f} us a frame"
+
+
+def database() -> str:
+    lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: Drive"]
+    for index in range(MESSAGES):
+        lines.append(f"BO_ {FIRST_ID + index} Axis{index}: 8 Drive")
+        lines.append(f' SG_ Speed{index} : 0|16@1- (0.01,0) [-320|320] "rad/s" Drive')
+        lines.append(f' SG_ Axis{index}AliveCounter : 56|8@1+ (1,0) [0|255] "" Drive')
+        lines.append("")
+    return "\n".join(lines)
+
+
+def send(seconds: float) -> int:
+    """The other process: says how many frames it has sent."""
+    frames = [
+        can.Message(arbitration_id=FIRST_ID + index, data=bytes(8), is_extended_id=False) for index in range(MESSAGES)
+    ]
+    sent, total = 0, int(RATE * seconds)
+    with open_bus(BUS) as bus:
+        begun = time.monotonic()
+        while sent < total:
+            due = min(total, int((time.monotonic() - begun) * RATE) + 1)
+            while sent < due:
+                frame = frames[sent % MESSAGES]
+                turn = sent // MESSAGES
+                frame.data[0], frame.data[7] = turn % 200, turn % 256
+                bus.send(frame)
+                sent += 1
+            time.sleep(1.0 / RATE)
+    print(sent)
+    return 0
+
+
+def sender(seconds: float) -> int:
+    command = [sys.executable, "-m", "benchmarks.bench_can", "send", str(seconds)]
+    return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)  # noqa: S603 - our own
+
+
+def bare(seconds: float) -> Result:
+    received, cpu = 0, 0.0
+    stop = threading.Event()
+
+    def loop() -> None:
+        nonlocal received, cpu
+        begun = time.thread_time()
+        while not stop.is_set():
+            received += bus.recv(0.2) is not None
+        cpu = time.thread_time() - begun
+
+    with open_bus(BUS) as bus:
+        enlarge_buffer(bus)
+        thread = threading.Thread(target=loop)
+        thread.start()
+        begun = time.monotonic()
+        sent = sender(seconds)
+        time.sleep(SETTLE)
+        elapsed = time.monotonic() - begun
+        stop.set()
+        thread.join()
+    return Result(sent, received, elapsed, cpu)
+
+
+def ours(seconds: float) -> Result:
+    names = [f"omega_{index}" for index in range(MESSAGES)]
+    rings = Rings(names, int(4 * RATE / MESSAGES))
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "bench.dbc").write_text(database(), encoding="utf-8")
+        signals = tuple(Signal(name, "rad/s", Source(signal=f"Speed{index}")) for index, name in enumerate(names))
+        options = Options(dbc=Path("bench.dbc"), **BUS.model_dump(exclude_unset=True))
+        driver = build(options, Setup(signals, Path(folder), MESSAGES / RATE))
+    driver.open(rings.deliver)
+    thread = next(thread for thread in threading.enumerate() if thread.name == "can-receive")
+    clock = time.pthread_getcpuclockid(thread.ident or 0)
+    before, begun = time.clock_gettime(clock), time.monotonic()
+    sent = sender(seconds)
+    time.sleep(SETTLE)
+    cpu, elapsed = time.clock_gettime(clock) - before, time.monotonic() - begun
+    counters, link = driver.counters(), driver.link()
+    driver.close()
+    for line in link.complaints:
+        print(f"  complaint: {line}")
+    print(f"  counted: {counters}")
+    return Result(sent, rings.counters().received, elapsed, cpu)
+
+
+def main(seconds: float) -> int:
+    plain = bare(seconds)
+    print(plain.line("python-can, bus.recv alone"))
+    whole = ours(seconds)
+    print(whole.line("Otolith, into the rings"))
+    print(f"ratio {whole.cpu / whole.received * plain.received / plain.cpu:.2f}")
+    return 0
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["send"]:
+        sys.exit(send(float(sys.argv[2])))
+    sys.exit(main(float(sys.argv[1]) if len(sys.argv) > 1 else 60.0))

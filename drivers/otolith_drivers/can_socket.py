@@ -1,0 +1,50 @@
+"""What the kernel does with frames before they are read: a larger buffer for them, and how many it threw away."""
+
+import contextlib
+import os
+import socket
+import struct
+
+import can
+
+SO_RCVBUFFORCE, SO_MEMINFO = 33, 55  # of <asm-generic/socket.h>; the socket module has no names for them
+MEMORY_INFO = struct.Struct("9I")  # of <linux/sock_diag.h>
+DROPS = 8  # its last
+BUFFER = 4 << 20  # bytes; about a second of a bus at its limit
+
+
+def enlarge_buffer(bus: can.BusABC) -> None:
+    """Let the kernel keep frames for as long as this computer may be busy; above its limit where that is permitted."""
+    descriptor = _descriptor(bus)
+    if descriptor is None:
+        return
+    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as handle:
+        try:
+            handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER)
+        except PermissionError:
+            handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+
+
+def frames_dropped(bus: can.BusABC) -> int | None:
+    """Frames that the kernel had no room for since the bus was opened; None where it does not say."""
+    descriptor = _descriptor(bus)
+    if descriptor is None:
+        return None
+    try:
+        with socket.socket(fileno=os.dup(descriptor)) as handle:
+            told = handle.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMORY_INFO.size)
+    except OSError:
+        return None
+    if len(told) < MEMORY_INFO.size:
+        return None
+    drops: int = MEMORY_INFO.unpack_from(told)[DROPS]
+    return drops
+
+
+def _descriptor(bus: can.BusABC) -> int | None:
+    """Of the socket under ``bus``; other interfaces have none, or a file's."""
+    try:
+        found = bus.fileno()
+    except NotImplementedError:
+        return None
+    return found if isinstance(found, int) and found >= 0 else None

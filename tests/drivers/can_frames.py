@@ -1,0 +1,40 @@
+"""What the tests of the CAN decoder share: a decoder of a few signals, and frames for it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import can
+
+from otolith_drivers.base import Sample, Setup, Signal
+from otolith_drivers.can_decoder import FrameDecoder, decoder_of
+from otolith_drivers.can_options import FrameOptions
+from otolith_drivers.can_signals import Source
+
+Wishes = Mapping[str, tuple[str, dict[str, Any]]]
+"""Name of each signal, its unit, and its source as in a machine file."""
+
+
+def signals(wishes: Wishes) -> tuple[Signal, ...]:
+    return tuple(Signal(name, unit, Source.model_validate(source)) for name, (unit, source) in wishes.items())
+
+
+def decoder(folder: Path, wishes: Wishes, text: str = "", suffix: str = "dbc", **options: Any) -> FrameDecoder:
+    """Of the signals in ``wishes``, by the database ``text``."""
+    if text:
+        (folder / f"drive.{suffix}").write_text(text, encoding="utf-8")
+        options["dbc"] = f"drive.{suffix}"
+    return decoder_of(FrameOptions.model_validate(options), Setup(signals(wishes), folder, 0.01))
+
+
+def frame(identifier: int, data: bytes, *, extended: bool = False, fd: bool = False) -> can.Message:
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=extended, is_fd=fd)
+
+
+def values(samples: list[Sample]) -> dict[str, float]:
+    return {sample.signal: sample.value for sample in samples}
+
+
+def dbc(*messages: str, after: str = "") -> str:
+    """A database of ``messages``, each as ``BO_`` and ``SG_`` lines."""
+    return "\n\n".join(['VERSION ""', "NS_ :", "BS_:", "BU_: Drive Monitor", *messages, after, ""])
