@@ -37,11 +37,13 @@ def library_server(words: Words) -> Iterator[int]:
     thread = threading.Thread(target=loop.run_until_complete, args=(serve(),), name="server")
     thread.start()
     assert up.wait(10.0)
-    yield port
-    ending = servers[0].shutdown()  # type: ignore[no-untyped-call]
-    asyncio.run_coroutine_threadsafe(ending, loop).result(5.0)
-    thread.join(5.0)
-    loop.close()
+    try:
+        yield port
+    finally:
+        ending = servers[0].shutdown()  # type: ignore[no-untyped-call]
+        asyncio.run_coroutine_threadsafe(ending, loop).result(5.0)
+        thread.join(5.0)
+        loop.close()
 
 
 @dataclass
@@ -62,7 +64,7 @@ class Behaviour:
 
 
 class _Handler(socketserver.BaseRequestHandler):
-    server: "_Server"
+    server: "OddServer"
 
     def handle(self) -> None:
         self.server.connections.add(self.request)
@@ -101,7 +103,9 @@ class _Handler(socketserver.BaseRequestHandler):
         self.request.sendall(behaviour.spoil(reply))
 
 
-class _Server(socketserver.ThreadingTCPServer):
+class OddServer(socketserver.ThreadingTCPServer):
+    """Each connection in a thread of its own."""
+
     allow_reuse_address = True
     daemon_threads = True
 
@@ -112,14 +116,16 @@ class _Server(socketserver.ThreadingTCPServer):
 
 
 @contextmanager
-def odd_server(behaviour: Behaviour, port: int) -> Iterator[None]:
+def odd_server(behaviour: Behaviour, port: int) -> Iterator["OddServer"]:
     """A server on ``port`` that behaves so; at the end its connections are cut."""
-    server = _Server(port, behaviour)
+    server = OddServer(port, behaviour)
     thread = threading.Thread(target=server.serve_forever, args=(0.01,), name="odd-server")
     thread.start()
-    yield
-    server.shutdown()
-    for connection in list(server.connections):
-        connection.close()
-    server.server_close()
-    thread.join(5.0)
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        for connection in list(server.connections):
+            connection.close()
+        server.server_close()
+        thread.join(5.0)
