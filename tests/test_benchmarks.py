@@ -54,9 +54,15 @@ def compared() -> dict[str, Any]:
     return document
 
 
+def test_the_bus_is_listened_to_beside_a_bare_loop() -> None:
+    said = run("bench_can", "2")
+    assert "bus.recv alone" in said
+    assert "into the rings" in said
+
+
 def test_every_entry_of_make_bench_is_run_here() -> None:
     found = {path.stem for path in (ROOT / "benchmarks").glob("bench_*.py")}
-    assert found == {*TIMINGS, "bench_estimators"}
+    assert found == {*TIMINGS, "bench_can", "bench_estimators"}
 
 
 @pytest.mark.parametrize("name", TIMINGS)

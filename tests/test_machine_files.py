@@ -72,6 +72,19 @@ def test_every_commented_default_of_the_example_is_the_default(tmp_path: Path) -
     assert loaded.problem == load_plan(EXAMPLES / "dc-motor.toml").problem
 
 
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("odrive-axis", "F [N] from Axis0_Iq.Iq_Measured * 62.8 [N], frame 0x14"),
+        ("canopen-drive", "x [m] from node 5 Position actual value (0x6064:00), TPDO 2 * 1e-06 [m], frame 0x285"),
+    ],
+)
+def test_the_examples_of_drives_are_in_order(name: str, line: str) -> None:
+    said = describe(load_plan(EXAMPLES / f"{name}.toml"))
+    assert line in said
+    assert not any("warning" in text for text in said)
+
+
 def test_units_of_the_file_are_free(own_machine: OwnMachine) -> None:
     text = own_machine.machine.read_text(encoding="utf-8")
     other = text.replace('"6.5 ohm"', '"6500 mohm"').replace('"0.02 rad/s"', '"0.190985932 rpm"')

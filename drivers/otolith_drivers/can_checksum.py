@@ -32,7 +32,6 @@ CRCS: dict[str, tuple[str, int]] = {
     "crc8-sae-j1850-zero": ("Crc8GsmA", 8),
     "crc8-autosar": ("Crc8Autosar", 8),
     "crc16-ccitt-false": ("Crc16CcittFalse", 16),
-    "crc16-arc": ("Crc16", 16),
 }
 """Names in crccheck, and bits. The SAE polynomial that starts from zero is that of AUTOSAR's profile 1."""
 

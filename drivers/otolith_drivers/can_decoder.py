@@ -11,9 +11,11 @@ from cantools.database import Signal as CanSignal
 from otolith_drivers.base import Counters, Sample, Setup, Signal
 from otolith_drivers.can_checksum import checksum_of
 from otolith_drivers.can_faults import BusFaults
+from otolith_drivers.can_fields import bytes_needed
 from otolith_drivers.can_message import NOTHING, MessageReader, Rules
 from otolith_drivers.can_options import FrameOptions, MessageTable
-from otolith_drivers.can_signals import Bits, Wanted, find_in_databases, raw_signal
+from otolith_drivers.can_signals import Wanted, find_in_databases, raw_signal
+from otolith_drivers.can_source import Bits
 from otolith_drivers.can_vigilance import FrameCounter, counter_by_name
 from otolith_drivers.canopen_watch import NodeWatch, Note
 from otolith_drivers.dbc import Loaded, load_database
@@ -200,19 +202,21 @@ def _say_unused(name: str, frames: Mapping[int, _Frame], databases: Sequence[Loa
 def _rules(frame: _Frame, table: MessageTable) -> Rules:
     message = frame.messages[0]
     length = max(entry.length for entry in frame.messages)
-    counter = None
+    counter, checksum, needed = None, None, 0
     if table.counter is None:
         if (found := counter_by_name(message, {entry.signal.name for entry in frame.wanted})) is not None:
             counter = FrameCounter(found, table.modulo, declared=False)
     elif table.counter is not False:
-        counter = FrameCounter(_signal(frame, table.counter, "counter"), table.modulo, declared=True)
-    checksum = None
+        found = _signal(frame, table.counter, "counter")
+        counter, needed = FrameCounter(found, table.modulo, declared=True), bytes_needed(found)
     if table.checksum is not None:
+        found = _signal(frame, table.checksum.signal, "checksum")
+        needed = max(needed, bytes_needed(found))
         try:
-            checksum = checksum_of(_signal(frame, table.checksum.signal, "checksum"), table.checksum, length)
+            checksum = checksum_of(found, table.checksum, max(length, needed))
         except ValueError as error:
             raise ConfigurationError(str(error), ("driver", "messages", message.name, "checksum")) from error
-    return Rules(counter, checksum, table.period)
+    return Rules(counter, checksum, table.period, needed)
 
 
 def _signal(frame: _Frame, said: str | Bits, what: str) -> CanSignal:

@@ -31,6 +31,8 @@ class Rules:
     checksum: Checksum | None = None
     period: float | None = None
     """s, declared."""
+    needed: int = 0
+    """Bytes that counter and checksum need."""
 
 
 @dataclass(slots=True)
@@ -67,7 +69,7 @@ class MessageReader:
         self.received = self.bad = 0
         self._lost = 0
         self._rules, self._counter, self._checksum = rules, rules.counter, rules.checksum
-        self._length = max(message.length for message in messages)
+        self._length = max(rules.needed, *(message.length for message in messages))
         self._rows: list[Row] = []
         self._groups: dict[tuple[object, ...], _Group] = {}
         self._troubles: dict[str, _Trouble] = {}

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.can_signals import Bits, Identifier
+from otolith_drivers.can_source import Bits, Identifier
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
@@ -14,9 +14,7 @@ Period = Annotated[float, BeforeValidator(Quantity("s", 1e-4, 3600.0))]
 Hexadecimal = Annotated[str, Field(pattern=r"^(?:[0-9A-Fa-f]{2}[ :]?){0,16}$")]
 OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{1,4})(?::([0-9A-Fa-f]{1,2}))?(?:\s+(?:(bool)|([iuf])(\d{1,2})))?")
 LENGTHS = {"i": range(1, 65), "u": range(1, 65), "f": (32, 64)}
-ChecksumKind = Literal[
-    "crc8-sae-j1850", "crc8-sae-j1850-zero", "crc8-autosar", "crc16-ccitt-false", "crc16-arc", "xor", "sum8"
-]
+ChecksumKind = Literal["crc8-sae-j1850", "crc8-sae-j1850-zero", "crc8-autosar", "crc16-ccitt-false", "xor", "sum8"]
 CLASSIC_BITS = 64
 MOST_PDOS = 512
 

@@ -16,8 +16,8 @@ from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.can_decoder import FrameDecoder, decoder_of
 from otolith_drivers.can_options import FrameOptions
-from otolith_drivers.can_signals import Source
 from otolith_drivers.can_socket import enlarge_buffer, frames_dropped
+from otolith_drivers.can_source import Source
 from otolith_drivers.errors import DeviceError
 
 __all__ = ["CanReceiver", "Options", "Source", "build"]

@@ -3,150 +3,19 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
 
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
-from cantools.database.conversion import BaseConversion
-from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Signal
 from otolith_drivers.can_fields import bytes_needed
+from otolith_drivers.can_source import Source
 from otolith_drivers.dbc import Loaded
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.quantities import factor
-from otolith_drivers.toml_files import Closed
 
-CLASSIC_LENGTH, FD_LENGTH = 8, 64  # bytes
-STANDARD_LIMIT, EXTENDED_LIMIT = 0x7FF, 0x1FFFFFFF
 LARGEST = 1e300
 ROUNDING = 1e-6  # of a bound: 0.1 in a frame of 32-bit floats is above 0.1
-
-
-def whole_number(written: object) -> object:
-    """An integer, be it written as a number or as a text like ``"0x181"``."""
-    if isinstance(written, bool):
-        raise ValueError(f"{written!r} is not a whole number")  # noqa: TRY004 - a fault of a file, not a bug
-    if isinstance(written, str):
-        try:
-            return int(written, 0)
-        except ValueError:
-            raise ValueError(f'{written!r} is not a whole number: write "0x181" or the like') from None
-    return written
-
-
-Identifier = Annotated[int, BeforeValidator(whole_number), Field(ge=0, le=EXTENDED_LIMIT)]
-
-
-class Bits(Closed):
-    """Where some bits lie, in the words of a DBC."""
-
-    start: Annotated[int, Field(ge=0, lt=8 * FD_LENGTH)]
-    """As in a DBC: the number of the lowest bit, or with ``byte_order = "big"`` of the highest."""
-    length: Annotated[int, Field(ge=1, le=64)]
-    """Bits."""
-    byte_order: Literal["little", "big"] = "little"
-    signed: bool = False
-    float: bool = False
-    """An IEEE floating-point number; comes last, because it hides the type of that name."""
-
-    @model_validator(mode="after")
-    def _a_float_has_a_known_length(self) -> Self:
-        if self.float and self.length not in (16, 32, 64):
-            raise ValueError(f"a floating-point number has 16, 32 or 64 bits, not {self.length}")
-        return self
-
-    def as_signal(self, name: str) -> CanSignal:
-        """The same in the words of cantools."""
-        return CanSignal(
-            name,
-            self.start,
-            self.length,
-            byte_order="little_endian" if self.byte_order == "little" else "big_endian",
-            is_signed=self.signed,
-            conversion=BaseConversion.factory(is_float=self.float),
-        )
-
-
-BITS = tuple(Bits.model_fields)
-KINDS: dict[str, tuple[str, ...]] = {
-    "signal": ("message",),
-    "id": ("extended", "fd", *BITS),
-    "node": ("object",),
-}
-"""The key that says where a signal is, and the keys that go with it alone."""
-
-
-class Source(Closed):
-    """``signal`` of a database, bits of the frames with ``id``, or ``object`` of the CANopen ``node``."""
-
-    signal: str | None = None
-    message: str | None = None
-    """Where more than one message has a signal of this name."""
-
-    id: Identifier | None = None
-    extended: bool = False
-    fd: bool = False
-    start: int | None = None
-    length: int | None = None
-    byte_order: Literal["little", "big"] = "little"
-    signed: bool = False
-
-    node: Annotated[int, Field(ge=1, le=127)] | None = None
-    object: str | None = None
-    """``"0x6078"``, ``"0x6064:00"``, or the name in the object dictionary."""
-
-    unit: str | None = None
-    """On the bus; in place of the database's."""
-    scale: float = 1.0
-    """Of the number in the frame; for ``id`` and ``node``."""
-    offset: float = 0.0
-    """In ``unit``; for ``id`` and ``node``."""
-    range: tuple[float, float] | None = None
-    """In ``unit``: what lies beyond is no reading; in place of the database's."""
-    float: bool = False
-
-    @model_validator(mode="after")
-    def _is_of_one_kind(self) -> Self:
-        said = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if len(said) != 1:
-            ways = '{ signal = "..." } of a database, { id = "0x181", start = 0, length = 16, unit = "V" }'
-            raise ValueError(f'say where it is by one of {ways} or {{ node = 5, object = "0x6078", unit = "A" }}')
-        for kind, keys in KINDS.items():
-            if kind != said[0] and (strange := [key for key in keys if key in self.model_fields_set]):
-                raise ValueError(f"{strange[0]!r} goes with {kind!r}, not with {said[0]!r}")
-        if self.signal is not None and not self.model_fields_set.isdisjoint({"scale", "offset"}):
-            raise ValueError("'scale' and 'offset' are the database's; to say them yourself, read it by 'id'")
-        if self.node is not None and self.object is None:
-            raise ValueError("'object' is missing: write object = \"0x6078\" or the like")
-        if self.scale == 0.0:
-            raise ValueError("a scale of 0 leaves nothing of the signal")
-        if self.range is not None and not self.range[0] < self.range[1]:
-            raise ValueError(f"range: {self.range[0]:g} is not under {self.range[1]:g}")
-        if self.id is not None:
-            self.bits()
-        return self
-
-    def bits(self) -> Bits:
-        """Where the bits of ``id`` are.
-
-        Raises:
-            ValueError: they do not fit into its frames.
-        """
-        assert self.id is not None  # noqa: S101 - asked for only then
-        if self.start is None or self.length is None:
-            raise ValueError("'start' and 'length' (bits) are missing beside 'id'")
-        if self.id > STANDARD_LIMIT and not self.extended:
-            raise ValueError(f"id 0x{self.id:X} needs 29 bits: set extended = true")
-        found = Bits(
-            start=self.start, length=self.length, byte_order=self.byte_order, signed=self.signed, float=self.float
-        )
-        size = FD_LENGTH if self.fd else CLASSIC_LENGTH
-        if (needed := bytes_needed(found.as_signal(""))) > size:
-            way_out = "" if self.fd or needed > FD_LENGTH else ", or set fd = true"
-            place = f"{self.length} bits from bit {self.start}"
-            raise ValueError(f"{place} reach into byte {needed} of a frame of {size}: correct start or length{way_out}")
-        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,14 +56,16 @@ def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -
         scale, offset = factor(unit, signal.unit)
     except ValueError as error:
         raise ConfigurationError(f"{origin}: {error}", key) from error
-    if not found.conversion.scale:
-        raise ConfigurationError(f"{origin} has a scale of 0: read it by 'id', 'start' and 'length' instead", key)
-    slope = source.scale * float(found.conversion.scale)
-    zero = source.scale * float(found.conversion.offset) + source.offset
-    low, high = source.range or (found.minimum, found.maximum)
-    if low is None or high is None or not low < high:  # [0|0] in a DBC means that nobody said
-        low, high = -math.inf, math.inf
-    ends = sorted((float(end) - zero) / slope for end in (low, high))
+    inner = (float(found.conversion.scale), float(found.conversion.offset))
+    slope, zero = source.scale * inner[0], source.scale * inner[1] + source.offset
+    if slope == 0.0 or not math.isfinite(slope + zero):
+        raise ConfigurationError(f"{origin} has a scale of {inner[0]:g} and an offset of {inner[1]:g}", key)
+    ends = [-math.inf, math.inf]
+    if source.range is not None:
+        ends = sorted((float(end) - zero) / slope for end in source.range)
+    elif found.minimum is not None and found.maximum is not None and found.minimum < found.maximum:
+        # [0|0] in a DBC means that nobody said
+        ends = sorted((float(end) - inner[1]) / inner[0] for end in (found.minimum, found.maximum))
     slack = [ROUNDING * abs(end) if math.isfinite(end) else 0.0 for end in ends]
     limit = LARGEST / max(1.0, abs(scale * slope))  # beyond the largest float there is no value, in a frame or scaled
     return Wanted(
@@ -203,12 +74,17 @@ def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -
         message=message,
         signal=found,
         source_unit=unit,
-        origin=f"{origin} [{unit}], frame 0x{message.frame_id:X}",
+        origin=f"{origin}{_times(source)} [{unit}], frame 0x{message.frame_id:X}",
         raw_low=max(ends[0] - slack[0], -limit),
         raw_high=min(ends[1] + slack[1], limit),
         scale=scale * slope,
         offset=scale * zero + offset,
     )
+
+
+def _times(source: Source) -> str:
+    scale = "" if source.scale == 1.0 else f" * {source.scale:g}"
+    return scale if source.offset == 0.0 else f"{scale} {source.offset:+g}"
 
 
 def find_in_databases(signal: Signal, databases: Sequence[Loaded]) -> Wanted:
@@ -222,27 +98,9 @@ def find_in_databases(signal: Signal, databases: Sequence[Loaded]) -> Wanted:
     if not databases:
         raise ConfigurationError('no database that describes the frames: set dbc = "..." in [driver]', key)
     where = ", ".join(str(loaded.path) for loaded in databases)
-    messages = [(loaded, message) for loaded in databases for message in loaded.messages]
-    messages = [(loaded, message) for loaded, message in messages if source.message in (None, message.name)]
-    if not messages:
-        for loaded in databases:
-            if why := loaded.unread.get(str(source.message)):
-                raise ConfigurationError(f"{loaded.path}: message {source.message!r} cannot be read: {why}", key)
-        known = nearest(str(source.message), [message.name for loaded in databases for message in loaded.messages])
-        raise ConfigurationError(f"{where}: no message {source.message!r}: {known}", key)
-    holders = [
-        (loaded, message, entry)
-        for loaded, message in messages
-        for entry in message.signals
-        if entry.name == source.signal
-    ]
+    holders = _holders(source, databases)
     if not holders:
-        known = nearest(
-            str(source.signal), sorted({entry.name for _, message in messages for entry in message.signals})
-        )
-        unread = [name for loaded in databases for name in loaded.unread]
-        more = f"; {len(unread)} messages cannot be read: {', '.join(unread[:3])}" if unread else ""
-        raise ConfigurationError(f"{where}: no signal {source.signal!r}: {known}{more}", key)
+        raise ConfigurationError(f"{where}: {_why_not(source, databases)}", key)
     if len(holders) > 1:
         _refuse_ambiguous(signal, holders, where)
     loaded, message, found = holders[0]
@@ -253,6 +111,33 @@ def find_in_databases(signal: Signal, databases: Sequence[Loaded]) -> Wanted:
         return wanted_of(signal, message, found, f"{message.name}.{found.name}")
     except ConfigurationError as error:
         raise ConfigurationError(f"{loaded.path}: {error}", error.key) from error
+
+
+def _holders(source: Source, databases: Sequence[Loaded]) -> list[tuple[Loaded, Message, CanSignal]]:
+    return [
+        (loaded, message, entry)
+        for loaded in databases
+        for message in loaded.messages
+        if source.message in (None, message.name)
+        for entry in message.signals
+        if entry.name == source.signal
+    ]
+
+
+def _why_not(source: Source, databases: Sequence[Loaded]) -> str:
+    """Why there is no such signal, and what there is."""
+    unread = {name: why for loaded in databases for name, why in loaded.unread.items()}
+    messages = [message for loaded in databases for message in loaded.messages]
+    if source.message is not None:
+        if source.message in unread:
+            return f"message {source.message!r} cannot be read: {unread[source.message]}"
+        messages = [message for message in messages if message.name == source.message]
+        if not messages:
+            names = [message.name for loaded in databases for message in loaded.messages]
+            return f"no message {source.message!r}: {nearest(source.message, names)}"
+    names = sorted({entry.name for message in messages for entry in message.signals})
+    more = f"; {len(unread)} messages cannot be read: {', '.join(list(unread)[:3])}" if unread else ""
+    return f"no signal {source.signal!r}: {nearest(str(source.signal), names)}{more}"
 
 
 def _refuse_ambiguous(signal: Signal, holders: list[tuple[Loaded, Message, CanSignal]], where: str) -> None:

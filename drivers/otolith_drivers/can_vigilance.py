@@ -27,7 +27,7 @@ COUNTER_NAMES = re.compile(
 )
 """How vendors name the counter of a message; BZ is the German ``Botschaftszähler``."""
 NOT_OF_MESSAGES = re.compile(
-    r"err|fault|puls|enc|rev|rot|turn|start|hour|time|step|edge|tooth|batch|piece|part|lost|fail|bus_?off",
+    r"err|fault|puls|encod|revol|rotat|turn|start|hour|time|step|edge|tooth|batch|piece|part|lost|fail|bus_?off",
     re.IGNORECASE,
 )
 
@@ -44,6 +44,7 @@ class Pace:
         self._intervals: list[float] = []
         self._odd = 0
         self._missing = 0
+        self._held_up = 0
 
     def note(self, time: float) -> int:
         """One has come at ``time``; how many are now known to be missing before it.
@@ -62,16 +63,16 @@ class Pace:
             self._follow(elapsed)
             missing, self._missing = self._missing, 0
             return missing
-        if self._oddity():
+        if ratio < SOON and self._missing:
+            self._missing -= 1
             return 0
-        if ratio < SOON:
-            self._missing -= min(self._missing, 1)
+        if self._oddity() or ratio < SOON:
             return 0
         missing, self._missing = self._missing, round(ratio) - 1 if elapsed < LONGEST_OUTAGE else 0
         return missing
 
     def counted(self, time: float, step: int, modulo: int) -> int:
-        """The same for one that is counted, ``step`` after the last, modulo ``modulo``: how many it is ahead of the last.
+        """The same for one that is counted ``step`` after the last, modulo ``modulo``: how many frames it is ahead.
 
         An outage may be longer than the counter's cycle: it is then the number nearest to what the clock says. Whole
         cycles count once the next interval is a regular one, with that one.
@@ -91,20 +92,25 @@ class Pace:
         if not step:
             return 0
         missing, self._missing = self._missing, cycles * modulo
-        interval = elapsed / (step + cycles * modulo)
-        if SOON <= interval / self.period <= LATE:
-            self._follow(interval)
+        ratio = elapsed / self.period / (step + cycles * modulo)
+        if SOON <= ratio <= LATE:
+            self._follow(ratio * self.period)
             return step + missing
+        if ratio > LATE:
+            self._held_up = int(expected) - step
+        elif self._held_up > 0:
+            self._held_up -= step
+            return step
         self._oddity()
-        return step if interval < self.period else step + missing
+        return step + missing if ratio > LATE else step
 
     def silent_for(self, now: float) -> float | None:
         """S without one, where that is longer than it ever should be."""
-        if self.last is None or self.period is None:
+        if self.last is None:
             return None
         least = SILENT_AT_LEAST if self.regular else IRREGULAR_SILENT_AT_LEAST
         silence = now - self.last
-        return silence if silence > max(least, SILENT_AFTER * self.period) else None
+        return silence if silence > max(least, SILENT_AFTER * (self.period or 0.0)) else None
 
     def pace(self) -> str:
         """In words."""
@@ -132,9 +138,9 @@ class Pace:
         if count < LEARNED_FROM or (span < LEARNED_OVER and count < MOST_INTERVALS):
             return
         middle, mean = statistics.median(self._intervals), span / count
-        inside = sum(SOON * middle <= entry <= LATE * middle for entry in self._intervals)
-        self.regular = inside >= MOSTLY * count and middle > 0.0 and abs(mean / middle - 1.0) < LATE - 1.0
-        self.period = middle if self.regular else mean
+        inside = [entry for entry in self._intervals if SOON * middle <= entry <= LATE * middle]
+        self.regular = len(inside) >= MOSTLY * count and middle > 0.0 and abs(mean / middle - 1.0) < LATE - 1.0
+        self.period = statistics.fmean(inside) if self.regular else mean
         self._intervals.clear()
 
 

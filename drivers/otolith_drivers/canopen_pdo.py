@@ -15,7 +15,8 @@ from cantools.database.conversion import BaseConversion
 
 from otolith_drivers.base import Signal
 from otolith_drivers.can_options import CLASSIC_BITS, MOST_PDOS, OBJECT, MappedObject, PdoTable
-from otolith_drivers.can_signals import EXTENDED_LIMIT, STANDARD_LIMIT, Source, Wanted, wanted_of
+from otolith_drivers.can_signals import Wanted, wanted_of
+from otolith_drivers.can_source import EXTENDED_LIMIT, STANDARD_LIMIT, Source
 from otolith_drivers.canopen_sheet import usable_sections, written
 from otolith_drivers.errors import ConfigurationError, nearest
 

@@ -40,20 +40,19 @@ def usable_sections(text: str) -> tuple[Sections, list[str]]:
 
 def written(sections: Sections) -> str:
     """The same as a sheet."""
-    lines = []
+    lines = ["[DeviceInfo]", ""]  # of which the library misses the name alone
     for name, entries in sections.items():
         lines += [f"[{name}]", *(f"{key}={value}" for key, value in entries.items()), ""]
     return "\n".join(lines)
 
 
 def _sections(lines: Iterable[str]) -> Sections:
-    """The first of each name, with the first of each key."""
+    """By name; of keys that stand twice the first holds."""
     found: Sections = {}
     current: dict[str, str] = {}
     for line in lines:
         if match := re.match(r"\s*\[([^\]]*)\]", line):
-            name = match[1].strip()
-            current = {} if name in found else found.setdefault(name, {})
+            current = found.setdefault(match[1].strip(), {})
         elif "=" in line and not line.lstrip().startswith((";", "#")):
             key, _, value = line.partition("=")
             current.setdefault(_canonical(key), value.split(";")[0].strip()[:LONGEST_VALUE])

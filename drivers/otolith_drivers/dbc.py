@@ -17,7 +17,7 @@ from cantools.database.can.database import Database
 
 from otolith_drivers.errors import ConfigurationError
 
-SIZE_LIMIT = 8 << 20  # bytes; large vehicles have databases of 2 MB
+SIZE_LIMIT = 4 << 20  # bytes; large vehicles have databases of 2 MB, and each takes some seconds
 LONGEST_FRAME = 4096  # bytes; CAN FD has 64, the transport protocol of SAE J1939 1785
 MOST_MULTIPLEXERS = 1 << 16  # values of one multiplexer, and arbitration IDs of one message
 FORMATS = {".dbc": "dbc", ".kcd": "kcd", ".sym": "sym", ".arxml": "arxml"}
@@ -58,7 +58,7 @@ class Loaded:
 
     def warnings(self) -> list[str]:
         """What is wrong with the file, a line each."""
-        return [f"{self.path.name}: {fault.text}" for fault in self.faults]
+        return list(dict.fromkeys(f"{self.path.name}: {fault.text}" for fault in self.faults))
 
     def faults_of(self, message: Message, signal: str) -> list[Fault]:
         """What is wrong with one signal."""
@@ -97,8 +97,13 @@ def load_database(path: Path) -> Loaded:
                 ) from error
             faults.append(Fault(f"only its messages could be read: {_cause(error)}"))
             faults += [Fault(f"message {name} cannot be read: {why}", name) for name, why in unread.items()]
-    for message in messages:
-        faults += _faults_of_layout(message)
+    for message in list(messages):
+        if why := _without_sense(message):
+            messages.remove(message)
+            unread[str(message.name)] = why
+            faults.append(Fault(f"message {message.name} cannot be used: {why}"))
+        else:
+            faults += _faults_of_layout(message)
     return Loaded(path, tuple(messages), (*faults, *_duplicates(messages)), unread)
 
 
@@ -171,12 +176,17 @@ def _message_by_message(text: str) -> tuple[list[Message], dict[str, str]]:
         try:
             read += _parse(alone, "dbc", strict=False)
         except Exception as error:  # noqa: BLE001 - parsers raise what they like
-            unread[name] = _cause(error)
+            unread[name] = re.sub(
+                r"at line \d+, column \d+", "at '>>!<<'", _cause(error)
+            )  # its lines are not the file's
     return read, unread
 
 
 def _cause(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    text = " ".join(str(error).split())
+    if single := re.fullmatch(r'(?:DBC|KCD|SYM|ARXML): "(.*)"', text):
+        text = single[1]
+    return text[:200] or type(error).__name__
 
 
 def bits_of(signal: CanSignal) -> int:
@@ -188,6 +198,15 @@ def bits_of(signal: CanSignal) -> int:
         mask |= 1 << place
         place = place - 1 if place % 8 else place + 15
     return mask
+
+
+def _without_sense(message: Message) -> str:
+    """What formats allow to be left out, and the rest of this code does not."""
+    if not isinstance(message.name, str) or not isinstance(message.frame_id, int) or message.frame_id < 0:
+        return "it has no name or no arbitration ID"
+    if any(not isinstance(signal.name, str) or signal.start < 0 for signal in message.signals):
+        return "one of its signals has no name or no place"
+    return ""
 
 
 def _faults_of_layout(message: Message) -> list[Fault]:

@@ -9,7 +9,7 @@ import can
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.can_decoder import FrameDecoder, decoder_of
 from otolith_drivers.can_options import FrameOptions
-from otolith_drivers.can_signals import Source
+from otolith_drivers.can_source import Source
 
 Wishes = Mapping[str, tuple[str, dict[str, Any]]]
 """Name of each signal, its unit, and its source as in a machine file."""

@@ -15,7 +15,7 @@ import can
 from otolith_drivers import can_receiver, modbus_poller
 from otolith_drivers.base import Driver, Setup, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.can_signals import Source
+from otolith_drivers.can_source import Source
 from tests.conftest import EXAMPLES, free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
 

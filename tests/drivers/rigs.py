@@ -11,7 +11,7 @@ import can
 from otolith_drivers import can_receiver, modbus_poller
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.can_signals import Source
+from otolith_drivers.can_source import Source
 from otolith_drivers.contract import Rig
 from otolith_drivers.plant import in_process
 from tests.conftest import EXAMPLES, OwnMachine

@@ -2,6 +2,7 @@
 
 import math
 import struct
+from typing import Literal
 
 import pytest
 from cantools.database import Message
@@ -17,7 +18,8 @@ from otolith_drivers.can_fields import bytes_needed, field
 def layouts(draw: st.DrawFn) -> CanSignal:
     is_float = draw(st.booleans())
     length = draw(st.sampled_from([16, 32, 64]) if is_float else st.integers(1, 64))
-    order = draw(st.sampled_from(["little_endian", "big_endian"]))
+    orders: tuple[Literal["little_endian", "big_endian"], ...] = ("little_endian", "big_endian")
+    order = draw(st.sampled_from(orders))
     first = draw(st.integers(0, 512 - length))
     start = first if order == "little_endian" else 8 * (first // 8) + 7 - first % 8
     return CanSignal(

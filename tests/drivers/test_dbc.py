@@ -8,7 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
-from otolith_drivers.can_signals import Source, find_in_databases
+from otolith_drivers.can_signals import find_in_databases
+from otolith_drivers.can_source import Source
 from otolith_drivers.dbc import Loaded, load_database, load_dbc
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
@@ -88,7 +89,7 @@ def test_a_huge_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     with (tmp_path / "huge.dbc").open("wb") as file:
         file.truncate(1 << 30)
     for path in (tmp_path / "huge.dbc", tmp_path, Path("/dev/zero")):
-        with pytest.raises(ConfigurationError, match="larger than|not a file"):
+        with pytest.raises(ConfigurationError, match=r"larger than|not a file"):
             load_database(path)
 
 
