@@ -1,6 +1,5 @@
 """From frames to samples, without any clock: serves a bus and a recording of one alike."""
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -21,8 +20,6 @@ from otolith_drivers.canopen_watch import NodeWatch, Note
 from otolith_drivers.dbc import Loaded, load_database
 from otolith_drivers.errors import ConfigurationError, nearest
 
-log = logging.getLogger(__name__)
-
 EXTENDED = 1 << 29  # added to an extended arbitration ID, to tell it from a standard one of the same number
 MOST_WARNINGS = 20  # lines; a file of which everything is wrong says no more by more of them
 
@@ -41,8 +38,6 @@ def decoder_of(options: FrameOptions, setup: Setup) -> "FrameDecoder":
     readers = _readers(wanted, options.messages, databases, warnings)
     if len(warnings) > MOST_WARNINGS:
         warnings = [*warnings[:MOST_WARNINGS], f"... and {len(warnings) - MOST_WARNINGS} more"]
-    for line in warnings:
-        log.warning("%s", line)
     return FrameDecoder(readers, drives.watches(), warnings)
 
 
@@ -57,7 +52,8 @@ class FrameDecoder:
         self._readers = dict(readers)
         self._watches = tuple(watches)
         self._notes: dict[int, Note] = {key: note for watch in watches for key, note in watch.frames().items()}
-        self._warnings = tuple(warnings)
+        self.warnings = tuple(warnings)
+        """What is wrong with the files that say what is in the frames, a line each."""
         self._unreadable = 0
         self._begun: float | None = None
 
@@ -119,7 +115,7 @@ class FrameDecoder:
     def describe(self) -> list[str]:
         """What will be read from where, and what is wrong with the files that say so, a line each."""
         lines = [line for reader in self._readers.values() for line in reader.describe()]
-        return [*lines, *(f"warning: {line}" for line in self._warnings)]
+        return [*lines, *(f"warning: {line}" for line in self.warnings)]
 
 
 class _Drives:

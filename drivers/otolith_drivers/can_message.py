@@ -113,7 +113,7 @@ class MessageReader:
             return [f"{self.title} has not come once in {waited:.1f} s"] if waited > _patience(declared) else []
         lines = [
             f"{self.title}: {trouble.text}; {trouble.count} in all, the last {max(now - trouble.at, 0.0):.1f} s ago"
-            for trouble in self._troubles.values()
+            for trouble in list(self._troubles.values())  # the receiving thread may add one
             if now - trouble.at < RECENT
         ]
         if self._counter is not None and self._counter.standing >= STANDS_STILL:

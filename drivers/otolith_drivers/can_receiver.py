@@ -63,6 +63,8 @@ class CanReceiver:
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         bus = self._connect()
+        for line in self._decoder.warnings:
+            log.warning("%s", line)
         self._heard = self._opened
         self._decoder.begin(self._opened)
         self._thread = threading.Thread(target=self._receive, args=(bus, deliver), name="can-receive", daemon=True)
@@ -181,8 +183,9 @@ class CanReceiver:
         while not self._stop.wait(pause * random.uniform(0.5, 1.0)):  # noqa: S311 - jitter, not a secret
             try:
                 bus = self._connect()
-            except DeviceError as error:
-                self._link = Link(up=False, reason=str(error))
+            except Exception as error:  # noqa: BLE001 - as above; a DeviceError has a sentence of its own
+                known = isinstance(error, DeviceError)
+                self._link = Link(up=False, reason=str(error) if known else f"{type(error).__name__}: {error}")
                 pause = min(2 * pause, BACKOFF_LONGEST)
             else:
                 self._reconnects += 1

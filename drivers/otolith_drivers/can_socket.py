@@ -3,6 +3,7 @@
 import contextlib
 import os
 import socket
+import stat
 import struct
 
 import can
@@ -32,6 +33,8 @@ def frames_dropped(bus: can.BusABC) -> int | None:
         return None
     try:
         with socket.socket(fileno=os.dup(descriptor)) as handle:
+            if handle.type == socket.SOCK_STREAM:  # what is dropped there is sent again
+                return None
             told = handle.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMORY_INFO.size)
     except OSError:
         return None
@@ -42,9 +45,10 @@ def frames_dropped(bus: can.BusABC) -> int | None:
 
 
 def _descriptor(bus: can.BusABC) -> int | None:
-    """Of the socket under ``bus``; other interfaces have none, or a file's."""
+    """Of the socket under ``bus``; other interfaces have none, or that of a serial line."""
     try:
         found = bus.fileno()
-    except NotImplementedError:
+        is_socket = isinstance(found, int) and found >= 0 and stat.S_ISSOCK(os.fstat(found).st_mode)
+    except (NotImplementedError, OSError):
         return None
-    return found if isinstance(found, int) and found >= 0 else None
+    return found if is_socket else None

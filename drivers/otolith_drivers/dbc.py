@@ -29,7 +29,7 @@ LENGTHS = re.compile(
     re.MULTILINE,
 )
 RANGES = re.compile(r"\b(\d+)\s*-\s*(\d+)\s*[,;]")
-HEX_RANGES = re.compile(r"\b([0-9A-Fa-f]+)h\s*-\s*([0-9A-Fa-f]+)h")
+IDENTIFIERS = re.compile(r"^\s*ID\s*=\s*([0-9A-Fa-f]+)h\s*-\s*([0-9A-Fa-f]+)h", re.MULTILINE)
 # All that a DBC needs to say of frames; comments, attributes and tables of values may be broken.
 DBC_MESSAGE = re.compile(r"^[ \t]*BO_ .*(?:\r?\n[ \t]*(?:\r?\n[ \t]*)*SG_ .*)*", re.MULTILINE)
 DBC_EXTRA = re.compile(r"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s[^;]*;", re.MULTILINE)
@@ -131,13 +131,13 @@ def _refuse_excess(text: str, path: Path) -> None:
     what = None
     if "\0" in text:
         what = "it has zero bytes in it"
-    elif re.search(r"<!(?:DOCTYPE|ENTITY)", text):
+    elif text.lstrip().startswith("<") and re.search(r"<!(?:DOCTYPE|ENTITY)", text):
         what = "it defines XML entities, which no database needs"
     elif any(len(match[1]) > 5 or int(match[1]) > 8 * LONGEST_FRAME for match in LENGTHS.finditer(text)):
         what = f"it has a length or a start beyond {LONGEST_FRAME} bytes"
     elif any(_excessive(match, 10) for line in _multiplexings(text) for match in RANGES.finditer(line)):
         what = f"it has a multiplexer of more than {MOST_MULTIPLEXERS} values"
-    elif any(_excessive(match, 16) for match in HEX_RANGES.finditer(text)):
+    elif any(_excessive(match, 16) for match in IDENTIFIERS.finditer(text)):
         what = f"it has a message of more than {MOST_MULTIPLEXERS} arbitration IDs"
     if what is not None:
         raise ConfigurationError(f"{path}: not a CAN database: {what}", ("driver", "dbc"))

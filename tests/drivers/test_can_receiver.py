@@ -222,6 +222,10 @@ def test_an_adapter_is_told_to_listen_only() -> None:
         said = b""
         while command not in said:
             said += os.read(master, 100)
+        before = len(list(Path("/proc/self/fd").iterdir()))
+        enlarge_buffer(bus)
+        assert frames_dropped(bus) is None
+        assert len(list(Path("/proc/self/fd").iterdir())) == before
         bus.shutdown()
         os.close(master)
         os.close(slave)
