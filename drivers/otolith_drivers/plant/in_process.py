@@ -5,7 +5,6 @@ The scenario's faults happen as they do on a bus; those that a bus alone can hav
 
 import logging
 import threading
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -76,7 +75,10 @@ def _find(signal: Signal, scenario: Scenario) -> _Wanted:
 
 
 class PlantDriver:
-    """Implements :class:`otolith_drivers.base.Driver` over a simulated machine, which lives in a thread of its own."""
+    """Implements :class:`otolith_drivers.base.Driver` over a simulated machine, which lives in a thread of its own.
+
+    A sample bears the time at which a bus would have brought it, however busy this computer is.
+    """
 
     sampling = Sampling.CYCLIC
 
@@ -133,6 +135,7 @@ class PlantDriver:
             self._counters = replace(counters, lost=counters.lost + count)
             return
         self._counters = replace(counters, received=counters.received + count)
-        now = time.monotonic()
         measured = turn.tick.measured
-        deliver([Sample(each.name, now, each.scale * measured[each.signal] + each.offset) for each in self._wanted])
+        deliver(
+            [Sample(each.name, turn.due, each.scale * measured[each.signal] + each.offset) for each in self._wanted]
+        )

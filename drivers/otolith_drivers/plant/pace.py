@@ -24,6 +24,8 @@ class Turn:
     tick: Tick
     lived: float
     """When the machine was so, in s on this computer's monotonic clock; a delay of its bus does not change that."""
+    due: float
+    """When its bus carries it, on the same clock; the computer may be later."""
     effect: Effect
 
 
@@ -59,7 +61,7 @@ def in_real_time(
             summary.stalls += 1
             start, latest = start + late, latest + late
         summary.note(effect, scenario.sample_period)
-        yield Turn(index, tick, start + tick.time, effect)
+        yield Turn(index, tick, start + tick.time, latest, effect)
 
 
 def _wait_until(moment: float, stopped: Callable[[], bool]) -> bool:
