@@ -157,8 +157,11 @@ def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | No
     from otolith_drivers.plant.nodes import open_node, write_summary
     from otolith_drivers.plant.plants import load_scenario
     from otolith_drivers.plant.truth import TruthFile
+    from otolith_drivers.private import complain_unless_writable
 
     loaded = load_scenario(scenario)
+    if summary is not None:
+        complain_unless_writable(summary.absolute().parent)
     stop = StopSignal()
     with ExitStack() as stack:
         true = stack.enter_context(closing(TruthFile(truth))) if truth is not None else None

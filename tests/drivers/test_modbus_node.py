@@ -305,6 +305,19 @@ def test_noise_on_the_line_costs_no_more_than_itself(drive: Callable[..., Drive]
     os.close(line)
 
 
+def test_no_bytes_of_a_client_bring_the_drive_down(drive: Callable[..., Drive]) -> None:
+    """What a stranger sends costs its own connection at most, and nothing of it is believed."""
+    node, random = drive(), np.random.default_rng(7)
+    for _ in range(100):
+        header = b"\0\1\0\0\0" + random.bytes(1) if random.random() < 0.5 else b""
+        with socket.create_connection(("127.0.0.1", node.port)) as stranger:
+            stranger.sendall(header + random.bytes(int(random.integers(1, 300))))
+    with node.client() as client:
+        registers = wait_for(client, past(0)).registers
+    assert np.array_equal(floats(registers), np.array(node.ticks(registers[COUNTER] + 1)[-1], np.float32))
+    assert node.end()[0] == 0
+
+
 @pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
 def test_garbage_is_on_the_line_as_the_scenario_says(drive: Callable[..., Drive], transport: str) -> None:
     node = drive('[[faults]]\nkind = "garbage"\nshare = 1.0\nstart = "0.5 s"\nuntil = "1 s"\n', transport)

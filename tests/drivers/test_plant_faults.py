@@ -1,8 +1,10 @@
 """What happens to sensors and bus of the simulated machine: the bus lies, the machine does not, and seeds decide."""
 
+import tomllib
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -140,6 +142,19 @@ def test_a_fault_that_cannot_happen_on_a_bus_is_refused_there() -> None:
             refuse_unfit(found, transport)
     refuse_unfit(found, "modbus-tcp")
     assert set(NODES) == {"can", "modbus-tcp", "modbus-rtu"}
+
+
+def test_every_fault_and_every_default_is_in_the_docs() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "simulated-machines.md").read_text(encoding="utf-8")
+    rows = {line.split("`")[1]: line for line in page.splitlines() if line.startswith("| `")}
+    classes = {get_args(each.model_fields["kind"].annotation)[0]: each for each in get_args(get_args(Fault)[0])}
+    assert rows.keys() == classes.keys()
+    for kind, each in classes.items():
+        said = set(each.model_fields) - {"kind", "start", "until"}
+        assert {name for name in said if f"`{name}`" not in rows[kind]} == set()
+    written = tomllib.loads(page.split("```toml")[1].split("```")[0])["modbus"]
+    assert ModbusOptions.model_validate(written) == ModbusOptions()
+    assert {"scale", "line", *written} == set(ModbusOptions.model_fields)
 
 
 @pytest.mark.parametrize(

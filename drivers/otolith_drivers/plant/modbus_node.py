@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
+import errno
 import logging
 import math
+import os
 import socket
 import sys
 import threading
@@ -23,7 +25,7 @@ from otolith_drivers.plant.summary import Summary
 from otolith_drivers.plant.truth import TruthFile
 
 SWITCH_INTERVAL = 2e-4  # s; how long the machine's equations may keep a request waiting
-PATIENCE = 5.0  # s; with the server's thread
+PATIENCE = 30.0  # s; with the server's thread
 
 
 class _ModbusNode(ABC):
@@ -159,9 +161,11 @@ class TcpNode(_ModbusNode):
         try:
             return socket.create_server((host, port), family=family)
         except (OSError, UnicodeError) as error:
+            number = error.errno if isinstance(error, OSError) else None
+            cause = os.strerror(number) if number is not None and number in errno.errorcode else str(error)
             raise DeviceError(
-                f"{self._where()} cannot be listened on: {getattr(error, 'strerror', None) or error}; "
-                "is a second plant running? Stop it, or set modbus.port (and modbus.host) in the scenario"
+                f"{self._where()} cannot be listened on: {cause}; is a second plant running? Stop it, "
+                "or set modbus.port (and modbus.host) in the scenario"
             ) from error
 
 
