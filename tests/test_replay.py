@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from otolith.acquisition import table
 from otolith.errors import ConfigurationError, OtolithError
 from otolith.health.report import ReportDocument
 from otolith.heart import adapt
@@ -22,6 +21,7 @@ from otolith.outlets.recorder import LEAST_FREE
 from otolith.plan import load_plan
 from otolith.replay import Replay, replay
 from otolith.state import begin
+from otolith_drivers.logs import table
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.conftest import SIGNALS
 from tests.replays import GOLDEN, HEADING, MACHINE, PERIOD, RECORDS, Lines, recorded, reports, summed_up, written

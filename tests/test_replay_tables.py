@@ -8,11 +8,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith.acquisition import table
 from otolith.errors import OtolithError
 from otolith.health.report import ReportDocument, Status
 from otolith.plan import load_plan
 from otolith.replay import Replay
+from otolith_drivers.logs import table
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.conftest import SIGNALS
 from tests.replays import HEADING, MACHINE, PERIOD, Lines, recorded, reports, summed_up, values, written

@@ -171,8 +171,8 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
 def _lived(plan: "Plan", data: Path) -> "State":
     """The state after all windows of the table."""
-    from otolith.acquisition.table import Table
     from otolith.replay import Replay
+    from otolith_drivers.logs.table import Table
 
     with Table(data, {name: plan.twin.unit_of(name) for name in plan.twin.signals}) as table:
         run = Replay(plan, table)

@@ -84,9 +84,9 @@ def _windows(plan: "Plan", data: Path, most: int) -> list["Window"]:
     Raises:
         ConfigurationError: there is none; with the reason of the last one, if it has one.
     """
-    from otolith.acquisition.table import Table
     from otolith.errors import ConfigurationError
     from otolith.replay import Replay
+    from otolith_drivers.logs.table import Table
 
     reasons: tuple[str, ...] = ()
 

@@ -18,7 +18,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from otolith.acquisition.playback import OUTAGE, Playback, usual_step
-from otolith.acquisition.table import Table
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.errors import ConfigurationError, ServiceError
 from otolith.health.report import CountersDocument, Report
@@ -27,6 +26,7 @@ from otolith.plan import Plan, load_plan
 from otolith.state import State, begin
 from otolith.tally import Tally
 from otolith.worker import Task, perform
+from otolith_drivers.logs.table import Table
 
 if TYPE_CHECKING:
     from otolith.outlets.recorder import Recording

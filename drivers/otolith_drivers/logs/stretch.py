@@ -5,29 +5,10 @@ from dataclasses import dataclass
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
-from otolith.acquisition.cells import decimal_sign, is_blank, numbers, split_lines
-from otolith.acquisition.heading import TIME, Heading
-from otolith.acquisition.window import Array, Mask
-
-LATEST = 1e11  # s; a time beyond is in another unit
-
-Integers = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class Rows:
-    """A stretch of a table, in the order of the file."""
-
-    times: Array
-    """(rows,) s, finite."""
-    columns: dict[str, Array]
-    """(rows,) of each signal in its unit, not a number where there is no reading."""
-    lines: Integers
-    """(rows,) numbers of their lines, from 1."""
-    bad: Integers
-    """(rows,) how much of the table was bad up to and with each row."""
+from otolith_drivers.logs.cells import decimal_sign, is_blank, numbers, split_lines
+from otolith_drivers.logs.heading import TIME, Heading
+from otolith_drivers.logs.rows import LATEST, Array, Integers, Mask, Rows
 
 
 @dataclass(slots=True)

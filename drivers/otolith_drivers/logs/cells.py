@@ -9,7 +9,7 @@ from operator import methodcaller
 
 import numpy as np
 
-from otolith.acquisition.window import Array
+from otolith_drivers.logs.rows import Array
 
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 BLANK = re.compile(r"^[ \t]*(?:[+-]?nan|n/?a|null|none)?[ \t]*$", re.IGNORECASE | re.MULTILINE)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
-from otolith.acquisition.cells import NUMBER, split_line
-from otolith.errors import ConfigurationError, nearest
+from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.logs.cells import NUMBER, split_line
 from otolith_drivers.quantities import factor
 
 TIME, SECONDS = "t", "s"

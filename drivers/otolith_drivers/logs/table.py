@@ -8,9 +8,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 
-from otolith.acquisition.heading import LONGEST_LINE, open_table, read_heading
-from otolith.acquisition.stretch import Rows, TableCounts, read_stretch
-from otolith.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.logs.heading import LONGEST_LINE, open_table, read_heading
+from otolith_drivers.logs.rows import Rows
+from otolith_drivers.logs.stretch import TableCounts, read_stretch
 
 CHUNK = 1 << 20  # characters read at once
 
