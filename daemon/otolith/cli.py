@@ -112,22 +112,25 @@ def check(file: Path, no_device: bool) -> None:
 @click.argument("data", type=FILE)
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a summary.")
 @click.option("--recording", type=FILE, callback=_rrd, help="Record into this file, as the daemon does.")
-def replay(file: Path, data: Path, as_json: bool, recording: Path | None) -> int:
-    """Let the daemon of the machine in FILE hear the table DATA, as fast as it can, and sum up what it says.
+@click.option("--real-time", is_flag=True, help="Let every window come when it would have ended.")
+def replay(file: Path, data: Path, as_json: bool, recording: Path | None, real_time: bool) -> int:
+    """Let the daemon of the machine in FILE hear the recorded DATA, as fast as it can, and sum up what it says.
 
-    DATA is CSV: a column 't' (seconds) and one for each signal of the twin, in its unit or the one in brackets.
-    FILE needs no [driver] and no [signals].
+    DATA is a table (CSV: a column 't' in seconds and one for each signal of the twin, in its unit or the one in
+    brackets), a recording of ours (.rrd) or a log of a CAN bus (.log of candump, .asc, .blf, .trc, also with .gz).
+    FILE needs [driver] and [signals] only for a log of a bus: they say what is in its frames.
 
     \b
     Examples:
       otolith replay my-machine.toml monday.csv
+      otolith replay my-machine.toml monday.blf --real-time
       otolith replay my-machine.toml monday.csv --json | jq .parameters.R_a.value
       otolith replay my-machine.toml monday.csv --recording monday.rrd
     """
     from otolith.replay import replay
 
     stop = StopSignal()
-    replay(file, data, recording, as_json=as_json, stopped=lambda: stop.number is not None)
+    replay(file, data, recording, as_json=as_json, stopped=lambda: stop.number is not None, real_time=real_time)
     return stop.code()
 
 

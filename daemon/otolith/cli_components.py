@@ -171,11 +171,11 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
 def _lived(plan: "Plan", data: Path) -> "State":
     """The state after all windows of the table."""
+    from otolith.recorded import open_recorded
     from otolith.replay import Replay
-    from otolith_drivers.logs.table import Table
 
-    with Table(data, {name: plan.twin.unit_of(name) for name in plan.twin.signals}) as table:
-        run = Replay(plan, table)
+    with open_recorded(plan, data) as recorded:
+        run = Replay(plan, recorded)
         for report in run.reports():
             for line in _told(report.document.findings):
                 click.echo(f"window {report.document.window.index}: {line}", err=True)

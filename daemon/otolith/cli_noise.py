@@ -85,8 +85,8 @@ def _windows(plan: "Plan", data: Path, most: int) -> list["Window"]:
         ConfigurationError: there is none; with the reason of the last one, if it has one.
     """
     from otolith.errors import ConfigurationError
+    from otolith.recorded import open_recorded
     from otolith.replay import Replay
-    from otolith_drivers.logs.table import Table
 
     reasons: tuple[str, ...] = ()
 
@@ -98,8 +98,8 @@ def _windows(plan: "Plan", data: Path, most: int) -> list["Window"]:
             else:
                 yield window
 
-    with Table(data, {name: plan.twin.unit_of(name) for name in plan.twin.signals}) as table:
-        run = Replay(plan, table)
+    with open_recorded(plan, data) as recorded:
+        run = Replay(plan, recorded)
         found = _spread(good(run.windows()), most)
         complaints = run.complaints()
     for line in complaints:

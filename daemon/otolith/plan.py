@@ -1,8 +1,10 @@
 """What a machine file means: its twin, its estimation problem, its driver. Faults are told with file, line and key."""
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from otolith.acquisition.alignment import Limits
 from otolith.adaptation.learned import LearnedNoise
@@ -12,7 +14,7 @@ from otolith.restrictions import excluded
 from otolith.settings import MachineFile, ParameterTable, WindowTable, Written
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twins import find_twin, load_twin
-from otolith_drivers.base import Driver, Setup, Signal
+from otolith_drivers.base import Driver, DriverType, Setup, Signal
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.registry import find
 from otolith_drivers.toml_files import Page, expect, parse, read, validate
@@ -74,7 +76,7 @@ def load_plan(path: Path, *, with_driver: bool = True) -> Plan:
         problem=problem,
         records=problem.window.records,
         limits=Limits(table.missing_limit, table.gap_limit, table.jitter_limit),
-        source=_driver(file, twin, context) if with_driver else None,
+        source=_driver(file, twin, page) if with_driver else None,
     )
 
 
@@ -223,7 +225,34 @@ def _process_noise(file: MachineFile, twin: Definition, context: _Context) -> tu
     return tuple(_levels("process_noise", file.process_noise, states, context).values())
 
 
-def _driver(file: MachineFile, twin: Definition, context: _Context) -> Driver:
+@dataclass(frozen=True, slots=True)
+class NamedDriver:
+    """The driver of a machine file, and what the file says to it."""
+
+    name: str
+    module: DriverType
+    options: Any
+    setup: Setup
+    page: Page
+
+    @contextlib.contextmanager
+    def faults_placed(self) -> Iterator[None]:
+        """What a driver finds wrong is told with file and line."""
+        try:
+            yield
+        except ConfigurationError as error:
+            if error.key:
+                _Context(self.page).fail(error.key, str(error))
+            raise
+
+
+def named_driver(file: MachineFile, twin: Definition, page: Page) -> NamedDriver:
+    """What ``[driver]`` and ``[signals]`` say.
+
+    Raises:
+        ConfigurationError: they are missing, or say something that cannot be meant.
+    """
+    context = _Context(page)
     if not file.driver:
         way_out = "[driver] with type = \"can\" and the like, and [signals]; only 'otolith replay' does without"
         context.fail(("driver",), f"missing: say where the signals come from by {way_out}")
@@ -240,14 +269,14 @@ def _driver(file: MachineFile, twin: Definition, context: _Context) -> Driver:
             raise ValueError('missing: write type = "can" or another driver')  # noqa: TRY004 - a user's slip, not a bug
         module = find(kind)
     rest = {key: value for key, value in file.driver.items() if key != "type"}
-    options = validate(rest, module.Options, context.page, under=("driver",))
-    sources = {
-        name: validate(file.signals[name], module.Source, context.page, under=("signals", name)) for name in wanted
-    }
+    options = validate(rest, module.Options, page, under=("driver",))
+    sources = {name: validate(file.signals[name], module.Source, page, under=("signals", name)) for name in wanted}
     signals = tuple(Signal(name, twin.unit_of(name), source) for name, source in sources.items())
-    try:
-        return module.build(options, Setup(signals, context.page.path.parent, file.window.sample_period))
-    except ConfigurationError as error:
-        if error.key:
-            context.fail(error.key, str(error))
-        raise
+    setup = Setup(signals, page.path.parent, file.window.sample_period)
+    return NamedDriver(kind, module, options, setup, page)
+
+
+def _driver(file: MachineFile, twin: Definition, page: Page) -> Driver:
+    named = named_driver(file, twin, page)
+    with named.faults_placed():
+        return named.module.build(named.options, named.setup)

@@ -1,6 +1,6 @@
-"""``otolith replay``: a table of samples through the very code of the daemon, as fast as the computer can.
+"""``otolith replay``: recorded data through the very code of the daemon, as fast as the computer can or in real time.
 
-    table -> rings -> windower -> heart -> report
+    file -> rings -> windower -> heart -> report
 
 The clock is the data's own, so two runs over the same files say the same, byte for byte.
 """
@@ -21,11 +21,14 @@ from otolith.acquisition.playback import OUTAGE, Playback, usual_step
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.errors import ConfigurationError, ServiceError
 from otolith.health.report import CountersDocument, Report
+from otolith.pace import Pace
 from otolith.paths import writable
 from otolith.plan import Plan, load_plan
+from otolith.recorded import open_recorded
 from otolith.state import State, begin
 from otolith.tally import Tally
 from otolith.worker import Task, perform
+from otolith_drivers.logs.rows import Reader
 from otolith_drivers.logs.table import Table
 
 if TYPE_CHECKING:
@@ -36,7 +39,9 @@ WIDTH = 110  # columns of a summary that goes into a file
 Stopped = Callable[[], bool]
 
 
-def replay(machine: Path, data: Path, recording: Path | None, *, as_json: bool, stopped: Stopped) -> None:
+def replay(  # noqa: PLR0913 - the command has an option for each
+    machine: Path, data: Path, recording: Path | None, *, as_json: bool, stopped: Stopped, real_time: bool = False
+) -> None:
     """Print what the daemon of ``machine`` would have said of ``data``: its reports as JSON Lines, or a summary.
 
     Raises:
@@ -44,16 +49,16 @@ def replay(machine: Path, data: Path, recording: Path | None, *, as_json: bool, 
     """
     plan = load_plan(machine, with_driver=False)
     tally = Tally()
-    with Table(data, {name: plan.twin.unit_of(name) for name in plan.twin.signals}) as table:
-        if table.ignored:
-            click.echo(f"{data}: columns not used: {', '.join(table.ignored)}", err=True)
-        run = Replay(plan, table, stopped)
+    with open_recorded(plan, data) as recorded:
+        if recorded.ignored:
+            click.echo(f"{data}: columns not used: {', '.join(recorded.ignored)}", err=True)
+        run = Replay(plan, recorded, stopped, Pace(stopped).wait if real_time else None)
         with _Recorder(recording, plan) as recorder, _bar(as_json=as_json) as bar:
             task = bar.add_task("", total=1.0)
             for report in run.reports():
                 tally.add(report.document)
                 recorder.add(report)
-                bar.update(task, completed=table.progress, description=f"window {report.document.window.index}")
+                bar.update(task, completed=recorded.progress, description=f"window {report.document.window.index}")
                 if as_json:
                     click.echo(report.document.to_json())
     if as_json:
@@ -67,12 +72,19 @@ def replay(machine: Path, data: Path, recording: Path | None, *, as_json: bool, 
 
 
 class Replay:
-    """One table through rings, windower and heart; ``stopped`` ends it early."""
+    """One file through rings, windower and heart; ``stopped`` ends it early, ``wait`` holds each window up."""
 
-    def __init__(self, plan: Plan, table: Table, stopped: Stopped = lambda: False) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        data: Reader,
+        stopped: Stopped = lambda: False,
+        wait: Callable[[Window], None] | None = None,
+    ) -> None:
         machine, window = plan.file.machine, plan.file.window
-        self._table = table
+        self._data = data
         self._stopped = stopped
+        self._wait = wait
         self._length = window.length
         self._playback = Playback(plan.twin.signals, plan.records, window.sample_period, plan.limits)
         self._state = begin(machine.name, machine.site, plan.problem)
@@ -82,28 +94,32 @@ class Replay:
         """Of every window, in order, with the counters of the daemon as they were at its end.
 
         Raises:
-            ConfigurationError: the table has no row that can be used, runs backwards, or makes no window.
+            ConfigurationError: the file has no row that can be used, runs backwards, or makes no window.
         """
         for window in self.windows():
+            if self._wait is not None:
+                self._wait(window)
+                if self._stopped():
+                    return
             report = self._adapt(window)
             if report is not None:
                 yield report
             if self._stopped():
                 return
         if not self._windows and not self._stopped():
-            raise ConfigurationError(f"{self._table.path}: {self._why_none()}")
+            raise ConfigurationError(f"{self._data.path}: {self._why_none()}")
 
     def windows(self) -> Iterator[Window]:
-        """The windows of the table as the daemon would cut them; see :meth:`reports`."""
-        for rows in self._table.stretches():
+        """The windows of the file as the daemon would cut them; see :meth:`reports`."""
+        for rows in self._data.stretches():
             if self._stopped():
                 return
-            if not self._playback.counts.rows:
+            if isinstance(self._data, Table) and not self._playback.counts.rows:
                 self._check_pace(rows.times)
             yield from self._playback.windows(rows)
         counts = self._playback.counts
         if counts.rows > 2 and counts.reordered == counts.rows - 1:
-            raise ConfigurationError(f"{self._table.path}: time runs backwards, from row to row: sort the rows by t")
+            raise ConfigurationError(f"{self._data.path}: time runs backwards, from row to row: sort the rows by t")
         yield from self._playback.rest()
 
     def _check_pace(self, times: Array) -> None:
@@ -111,7 +127,7 @@ class Replay:
         if math.isfinite(step) and step * FEWEST_ROWS > self._length:
             pace = f"a row every {step:.6g} s, but windows of {self._length:g} s"
             raise ConfigurationError(
-                f"{self._table.path}: {pace}: if t is no second, name the column 't [ms]' or the like"
+                f"{self._data.path}: {pace}: if t is no second, name the column 't [ms]' or the like"
             )
 
     def _adapt(self, window: Window) -> Report | None:
@@ -132,7 +148,7 @@ class Replay:
         return CountersDocument(
             received=counts.received,
             bad=counts.bad,
-            lost=counts.lost,
+            lost=counts.lost + self._data.lost,
             windows=self._windows,
             windows_bad=self._windows_bad,
             windows_missed=self._missed,
@@ -145,23 +161,21 @@ class Replay:
 
     def summary(self) -> str:
         """How much was read."""
-        counts, table = self._playback.counts, self._table.counts
-        parts = [f"{table.rows} rows read", f"{counts.reordered} reordered"]
-        parts += [f"{table.bad_rows} bad rows", f"{table.bad_cells} bad cells", f"{table.blank} cells blank"]
-        return ", ".join(parts) + f"; {counts.received} samples, {counts.lost} lost"
+        counts = self._playback.counts
+        first, *rest = self._data.found()
+        parts = ", ".join([first, f"{counts.reordered} reordered", *rest])
+        return f"{parts}; {counts.received} samples, {counts.lost + self._data.lost} lost"
 
     def complaints(self) -> list[str]:
-        """What a user should know of the table before trusting the reports, a line each."""
-        counts, table = self._playback.counts, self._table.counts
+        """What a user should know of the file before trusting the reports, a line each."""
+        counts, place = self._playback.counts, self._data.place
         lines = []
         if self._stopped():
-            lines.append(f"interrupted after {self._table.progress:.0%} of the file")
-        if table.first_bad is not None:
-            line, cause = table.first_bad
-            lines.append(f"bad cells: {table.bad_cells}, bad rows: {table.bad_rows}, the first in line {line}: {cause}")
+            lines.append(f"interrupted after {self._data.progress:.0%} of the file")
+        lines += self._data.complaints()
         if counts.first_late is not None:
             line, time, latest = counts.first_late
-            first = f"the first in line {line}, with t = {time:.12g} after t = {latest:.12g} above"
+            first = f"the first in {place} {line}, with t = {time:.12g} after t = {latest:.12g} above"
             lines.append(f"rows that came after their window was closed: {counts.late}, {first}")
         if counts.outages:
             lines.append(f"silences of more than {OUTAGE} windows, passed over: {counts.outages}")
@@ -209,7 +223,7 @@ class _Recorder:
         if self._recording is None:
             plan, machine = self._plan, self._plan.file.machine
             title = f"{machine.name} at {machine.site}"
-            self._recording = Recording(self._path, title, plan.twin.outputs, plan.problem.free)
+            self._recording = Recording(self._path, title, plan.twin, plan.problem.free)
         self._recording.add(report)
 
 

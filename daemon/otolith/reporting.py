@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.advice import Situation, advise
 from otolith.adaptation.case import Case, Hypothesis
 from otolith.adaptation.catalogue import Entry
@@ -99,13 +99,17 @@ def _model(problem: Problem, standing: dict[str, Standing]) -> str:
 
 
 def traces_of(state: State, window: Window, learned: Learned) -> Traces:
-    """The curves behind the report."""
-    found, noise = learned.found, state.problem.noise
-    names = tuple(entry.name for entry in state.problem.twin.outputs)
-    if found is not None:
-        return Traces(names, found.measured, found.predicted, noise)
+    """The curves behind the report; of the window as it came, with its spikes, so that it can be replayed from them."""
+    found, twin = learned.found, state.problem.twin
+    outputs, inputs = tuple(entry.name for entry in twin.outputs), tuple(entry.name for entry in twin.inputs)
+    predicted = None if found is None else found.predicted
+    return Traces(outputs, _present(window, outputs), predicted, state.problem.noise, inputs, _present(window, inputs))
+
+
+def _present(window: Window, names: tuple[str, ...]) -> Array:
+    """(records, names): not a number where nothing was measured."""
     columns = [np.where(window.missing_in(name), np.nan, window.column(name)) for name in names]
-    return Traces(names, np.column_stack(columns), None, noise)
+    return np.column_stack(columns) if columns else np.zeros((window.records, 0))
 
 
 def _fused(learned: Learned) -> list[Fused]:

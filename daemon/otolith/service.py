@@ -126,7 +126,7 @@ class Service:
             self._recording = folder / f"{plan.file.machine.name}-{stamp}-{os.getpid()}.rrd"
         writable(self._recording.parent)
         title = f"{plan.file.machine.name} at {plan.file.machine.site}"
-        self._recorder.start(self._recording, title, plan.twin.outputs, plan.problem.free)
+        self._recorder.start(self._recording, title, plan.twin, plan.problem.free)
         log.info("recording to %s", self._recording)
 
     def _turn(self) -> None:

@@ -14,6 +14,7 @@ DRIVERS: dict[str, str] = {
     "can": "otolith_drivers.can_receiver",
     "modbus": "otolith_drivers.modbus_poller",
     "plant": "otolith_drivers.plant.in_process",
+    "replay": "otolith_drivers.replayer",
 }
 
 

@@ -103,6 +103,20 @@ def validate(data: Any, model: type[Model], page: Page, under: Location = ()) ->
         raise ConfigurationError("\n".join(dict.fromkeys(lines))) from error
 
 
+def fitted(data: Any, model: type[Model], under: tuple[str, ...]) -> Model:
+    """``data`` as ``model``, for who does not know the file in which it stands at ``under``.
+
+    Raises:
+        ConfigurationError: with the first fault and the key of it.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        at = _written(data, fault["loc"])
+        raise ConfigurationError(_sentence(dict(fault), at, model), (*under, *map(str, at))) from error
+
+
 def dotted(location: Location) -> str:
     """``("setpoints", 2, "speed")`` as ``setpoints[2].speed``."""
     return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".") or "the file"

@@ -108,7 +108,7 @@ def test_a_full_disk_ends_the_recorder_before_it_ends_in_silence(
     usage = namedtuple("usage", ["total", "used", "free"])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(1 << 40, 1 << 40, 1 << 20))
     twin = find_twin("dc_motor")
-    recorder.main(Pipe(), tmp_path / "full.rrd", "full", twin.outputs, twin.parameters[:1])
+    recorder.main(Pipe(), tmp_path / "full.rrd", "full", twin, twin.parameters[:1])
     assert not (tmp_path / "full.rrd").exists()
 
 

@@ -50,7 +50,6 @@ class WindowEstimate:
     rmse_estimated: tuple[float, ...]
     rmse_completed: tuple[float, ...]
     """With the components; as estimated, where there are none."""
-    measured: Array
     predicted: Array
     last_state: Array
     """(states,) of the twin at the last record."""
@@ -190,7 +189,6 @@ class _Fit:
             rmse_configured=tuple(map(float, objective.rmse(configured))),
             rmse_estimated=tuple(map(float, objective.rmse(estimated))),
             rmse_completed=tuple(map(float, objective.rmse(predicted))),
-            measured=objective.measured,
             predicted=predicted,
             last_state=last_state,
             generations=self._generations,

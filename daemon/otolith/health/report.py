@@ -179,13 +179,17 @@ class ReportDocument(Closed):
 
 @dataclass(frozen=True, slots=True)
 class Traces:
-    """The curves behind a report, (records, outputs) in the units of the twin."""
+    """The curves behind a report, in the units of the twin; not a number where a record was missing."""
 
     outputs: tuple[str, ...]
     measured: Array
+    """(records, outputs)."""
     predicted: Array | None
-    """None where nothing was estimated."""
+    """(records, outputs); None where nothing was estimated."""
     noise: tuple[float, ...]
+    inputs: tuple[str, ...]
+    driving: Array
+    """(records, inputs), as measured."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """The recorder process: writes reports and their curves into a Rerun recording.
 
 It runs beside the daemon, so that no disk and no viewer can hold acquisition up. One ``send_columns`` per entity and
-window; an entity carries a vector, measured and twin side by side.
+window; an entity carries a vector, measured and twin side by side. All signals are in it, so that it can be replayed.
 """
 
 import logging
@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 from otolith.acquisition.window import Array
 from otolith.adaptation.information import QUANTILE
 from otolith.health.report import Report, ReportDocument, Status, Traces
-from otolith.twin.definition import Output, Parameter
+from otolith.twin.definition import Definition, Parameter
 
 log = logging.getLogger(__name__)
 
@@ -29,11 +29,11 @@ LEAST_FREE = 100 << 20  # bytes
 MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]
 
 
-def main(connection: Any, path: Path, title: str, outputs: Sequence[Output], parameters: Sequence[Parameter]) -> None:
+def main(connection: Any, path: Path, title: str, twin: Definition, parameters: Sequence[Parameter]) -> None:
     """Record what comes until None comes or the connection closes."""
     if not has_room(path):
         return
-    recording = Recording(path, title, outputs, parameters)
+    recording = Recording(path, title, twin, parameters)
     try:
         while (report := connection.recv()) is not None and has_room(path):
             recording.add(report)
@@ -52,15 +52,17 @@ def has_room(path: Path) -> bool:
 class Recording:
     """One ``.rrd`` file."""
 
-    def __init__(self, path: Path, title: str, outputs: Sequence[Output], parameters: Sequence[Parameter]) -> None:
+    def __init__(self, path: Path, title: str, twin: Definition, parameters: Sequence[Parameter]) -> None:
         self._stream = rr.RecordingStream(APPLICATION, recording_id=path.stem)
         self._stream.set_log_time_enabled(False)
-        self._stream.save(path, default_blueprint=blueprint(outputs, parameters))
+        self._stream.save(path, default_blueprint=blueprint(twin, parameters))
         self._stream.send_recording_name(title)
-        for output in outputs:
+        for driving in twin.inputs:
+            self._style(f"signals/{driving.name}", [f"{driving.name} measured [{driving.unit}]"], [MEASURED])
+        for output in twin.outputs:
             names = [f"{output.name} measured [{output.unit}]", f"{output.name} twin [{output.unit}]"]
             self._style(f"signals/{output.name}", names, [MEASURED, TWIN])
-        self._style("residual", [f"{output.name} / noise" for output in outputs], None)
+        self._style("residual", [f"{output.name} / noise" for output in twin.outputs], None)
         for parameter in parameters:
             names = ["95 % low", "95 % high", f"{parameter.name} [{parameter.unit}]"]  # the last is drawn on top
             self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, TWIN])
@@ -69,8 +71,11 @@ class Recording:
         """Append a window."""
         document, traces = report.document, report.traces
         window = document.window
-        moments = window.start + (window.end - window.start) * np.arange(window.records) / window.records
-        when = [rr.TimeColumn(TIMELINE, timestamp=(moments * 1e9).astype("datetime64[ns]"))]
+        offsets = (window.end - window.start) * np.arange(window.records) / window.records
+        moments = round(window.start * 1e9) + np.rint(offsets * 1e9).astype(np.int64)
+        when = [rr.TimeColumn(TIMELINE, timestamp=moments.astype("datetime64[ns]"))]
+        for index, name in enumerate(traces.inputs):
+            self._columns(f"signals/{name}", when, traces.driving[:, index : index + 1])
         for index, name in enumerate(traces.outputs):
             self._columns(f"signals/{name}", when, _side_by_side(traces, index))
         if traces.predicted is not None:
@@ -138,7 +143,7 @@ def _table(document: ReportDocument) -> str:
     return "\n".join(rows)
 
 
-def blueprint(outputs: Sequence[Output], parameters: Sequence[Parameter]) -> rrb.Blueprint:
+def blueprint(twin: Definition, parameters: Sequence[Parameter]) -> rrb.Blueprint:
     """What an operator sees: parameters first, then measured against twin, what is left, and the words."""
     parameter_views = [
         rrb.TimeSeriesView(origin=f"/parameters/{entry.name}", name=f"{entry.meaning} {entry.name} [{entry.unit}]")
@@ -146,7 +151,11 @@ def blueprint(outputs: Sequence[Output], parameters: Sequence[Parameter]) -> rrb
     ]
     signal_views = [
         rrb.TimeSeriesView(origin=f"/signals/{entry.name}", name=f"{entry.meaning} [{entry.unit}]: measured and twin")
-        for entry in outputs
+        for entry in twin.outputs
+    ]
+    input_views = [
+        rrb.TimeSeriesView(origin=f"/signals/{entry.name}", name=f"{entry.meaning} [{entry.unit}]")
+        for entry in twin.inputs
     ]
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -155,7 +164,7 @@ def blueprint(outputs: Sequence[Output], parameters: Sequence[Parameter]) -> rrb
                 rrb.TimeSeriesView(origin="/components", name="components that the twin lacked: amplitudes"),
                 rrb.TimeSeriesView(origin="/residual", name="residual in units of the noise"),
             ),
-            rrb.Vertical(*signal_views),
+            rrb.Vertical(*signal_views, *input_views),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/report", name="report"), rrb.TextLogView(origin="/log", name="log")
             ),

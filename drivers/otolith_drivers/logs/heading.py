@@ -1,6 +1,7 @@
 """The first lines of a table: how it is written, and which column is which signal in which unit."""
 
 import codecs
+import io
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,12 +10,12 @@ from typing import NamedTuple, TextIO
 
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.logs.cells import NUMBER, split_line
+from otolith_drivers.logs.files import Opened
 from otolith_drivers.quantities import factor
 
 TIME, SECONDS = "t", "s"
 SEPARATORS = (";", "\t", ",")
 LONGEST_LINE = 100_000  # characters
-HEAD = 1 << 16  # bytes by which the encoding is told
 CELL = re.compile(r"(.*?)\s*(?:\[(.*)\])?")
 EXCEL = re.compile(r"sep=(.)")  # a line by which Excel tells itself the separator
 
@@ -25,6 +26,14 @@ class Column(NamedTuple):
     place: int
     scale: float = 1.0
     offset: float = 0.0
+
+
+class Wanted(NamedTuple):
+    """A signal that is to be found: its column, its unit, and the one of the column if somebody else said it."""
+
+    column: str
+    unit: str
+    written: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,22 +51,16 @@ class Heading:
     """Columns that nobody asked for."""
 
 
-def open_table(path: Path) -> TextIO:
+def as_text(path: Path, file: Opened) -> TextIO:
     """The text of a table, whatever its line ends: UTF-8, or what older exports write.
 
     Raises:
-        ConfigurationError: no such file, not to be read, or no text.
+        ConfigurationError: no text.
     """
-    try:
-        if path.exists() and not path.is_file():
-            raise ConfigurationError(f"{path}: is a directory or a device, not a file")
-        with path.open("rb") as file:
-            head = file.read(HEAD)
-        if b"\0" in head:
-            raise ConfigurationError(f"{path}: is no text (packed, a spreadsheet or UTF-16): save it as CSV in UTF-8")
-        return path.open(encoding=_encoding(head), errors="replace")
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
+    head = file.stream.peek()
+    if b"\0" in head:
+        raise ConfigurationError(f"{path}: is no text (packed, a spreadsheet or UTF-16): save it as CSV in UTF-8")
+    return io.TextIOWrapper(file.stream, encoding=_encoding(head), errors="replace")
 
 
 def _encoding(head: bytes) -> str:
@@ -68,8 +71,8 @@ def _encoding(head: bytes) -> str:
     return "utf-8-sig"
 
 
-def read_heading(path: Path, file: TextIO, units: Mapping[str, str]) -> Heading:
-    """The heading of ``file``, read up to the end of that line; ``units`` has the unit of each signal.
+def read_heading(path: Path, file: TextIO, wanted: Mapping[str, Wanted]) -> Heading:
+    """The heading of ``file``, read up to the end of that line.
 
     Raises:
         ConfigurationError: no heading, a column that is missing or twice there, a unit that does not fit.
@@ -77,22 +80,27 @@ def read_heading(path: Path, file: TextIO, units: Mapping[str, str]) -> Heading:
     number, line, separator = _heading_line(path, file)
     cells = [cell.strip() for cell in split_line(line, separator)]
     place = f"{path}:{number}"
-    wanted = {TIME: SECONDS, **units}
+    wanted = {TIME: Wanted(TIME, SECONDS), **wanted}
+    known = list(dict.fromkeys(entry.column for entry in wanted.values()))
     if any(cells) and all(NUMBER.fullmatch(cell.replace(",", ".")) for cell in cells if cell):
-        raise ConfigurationError(f"{place}: numbers, where the names of the columns must stand: {', '.join(wanted)}")
-    columns: dict[str, Column] = {}
+        raise ConfigurationError(f"{place}: numbers, where the names of the columns must stand: {', '.join(known)}")
+    places: dict[str, tuple[int, str | None]] = {}
     others = []
     for index, cell in enumerate(cells):
         name, written = _name_and_unit(cell)
-        if name not in wanted:
+        if name not in known:
             others += [name] if name else []
-        elif name in columns:
+        elif name in places:
             raise ConfigurationError(f"{place}: column {index + 1} ({cell!r}): {name} is there twice: leave one out")
         else:
-            columns[name] = _column(index, written, wanted[name], f"{place}: column {index + 1} ({cell!r})")
-    for name, unit in wanted.items():
-        if name not in columns:
-            raise ConfigurationError(f"{place}: {_missing(name, unit, others, cells)}")
+            places[name] = (index, written)
+    columns: dict[str, Column] = {}
+    for signal, entry in wanted.items():
+        if entry.column not in places:
+            raise ConfigurationError(f"{place}: {_missing(entry, others, cells)}")
+        index, written = places[entry.column]
+        where = f"{place}: column {index + 1} ({cells[index]!r})"
+        columns[signal] = _column(index, entry.written or written, entry.unit, where)
     named = max(index for index, cell in enumerate(cells) if cell) + 1
     return Heading(number, separator, (named, len(cells)), columns, tuple(others))
 
@@ -126,8 +134,8 @@ def _column(index: int, unit: str | None, target: str, place: str) -> Column:
         raise ConfigurationError(f"{place}: {error}") from error
 
 
-def _missing(name: str, unit: str, others: list[str], cells: list[str]) -> str:
-    what = f"no column {name!r} ({'seconds' if name == TIME else unit})"
+def _missing(entry: Wanted, others: list[str], cells: list[str]) -> str:
+    what = f"no column {entry.column!r} ({'seconds' if entry.column == TIME else entry.unit})"
     if len(cells) < 2:
         return f"{what}, and no ',', ';' or tab between columns"
-    return f"{what}: {nearest(name, others) if others else 'add it'}"
+    return f"{what}: {nearest(entry.column, others) if others else 'add it'}"

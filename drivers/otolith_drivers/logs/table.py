@@ -8,39 +8,61 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 
+from otolith_drivers.base import Setup
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.logs.heading import LONGEST_LINE, open_table, read_heading
+from otolith_drivers.logs.files import Opened
+from otolith_drivers.logs.heading import LONGEST_LINE, Wanted, as_text, read_heading
 from otolith_drivers.logs.rows import Rows
 from otolith_drivers.logs.stretch import TableCounts, read_stretch
+from otolith_drivers.toml_files import Closed
 
 CHUNK = 1 << 20  # characters read at once
 
 
-class Table:
-    """One file, open."""
+class Source(Closed):
+    """Which column a signal is."""
 
-    def __init__(self, path: Path, units: Mapping[str, str]) -> None:
-        """``units`` has the unit of each signal that must be there.
+    column: str | None = None
+    """Its name; without it, that of the signal."""
+    unit: str | None = None
+    """Of the numbers in it, where the name of the column does not say it."""
+
+
+def open_log(path: Path, setup: Setup, _: object = None) -> "Table":
+    """See :meth:`otolith_drivers.logs.readers.Format.open_log`."""
+    units = {signal.name: signal.unit for signal in setup.signals}
+    return Table(path, units, {signal.name: signal.source for signal in setup.signals})
+
+
+class Table:
+    """Implements :class:`otolith_drivers.logs.rows.Reader`."""
+
+    place = "line"
+    lost = 0
+
+    def __init__(self, path: Path, units: Mapping[str, str], sources: Mapping[str, Source] | None = None) -> None:
+        """``units`` has the unit of each signal that must be there, ``sources`` where it is if not under its name.
 
         Raises:
             ConfigurationError: no file, no text, or not the columns that are needed.
         """
         self.path = path
         self.counts = TableCounts()
-        self._file = open_table(path)
-        self._read = 0
+        self._opened = Opened(path)
+        found = {name: (sources or {}).get(name, Source()) for name in units}
+        self._wanted = {name: Wanted(source.column or name, units[name], source.unit) for name, source in found.items()}
         try:
-            self._size = path.stat().st_size
-            self._heading = read_heading(path, self._file, units)
+            self._file = as_text(path, self._opened)
+            self._heading = read_heading(path, self._file, self._wanted)
         except BaseException:
-            self._file.close()
+            self._opened.close()
             raise
 
     def __enter__(self) -> "Table":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self._file.close()
+        self._opened.close()
 
     @property
     def ignored(self) -> tuple[str, ...]:
@@ -50,7 +72,32 @@ class Table:
     @property
     def progress(self) -> float:
         """Share of the file that was read, 0 to 1."""
-        return min(1.0, self._read / max(self._size, 1))
+        return self._opened.progress
+
+    @property
+    def bad(self) -> int:
+        """Rows and cells."""
+        return self.counts.bad_rows + self.counts.bad_cells
+
+    def describe(self) -> list[str]:
+        """See :meth:`otolith_drivers.logs.rows.Reader.describe`."""
+        return [f"{name} [{entry.unit}] from column {entry.column!r}" for name, entry in self._wanted.items()]
+
+    def found(self) -> list[str]:
+        """See :meth:`otolith_drivers.logs.rows.Reader.found`."""
+        counts = self.counts
+        parts = [f"{counts.rows} rows read", f"{counts.bad_rows} bad rows", f"{counts.bad_cells} bad cells"]
+        return [*parts, f"{counts.blank} cells blank"]
+
+    def complaints(self) -> list[str]:
+        """See :meth:`otolith_drivers.logs.rows.Reader.complaints`."""
+        counts, lines = self.counts, []
+        if counts.first_bad is not None:
+            line, cause = counts.first_bad
+            lines.append(
+                f"bad cells: {counts.bad_cells}, bad rows: {counts.bad_rows}, the first in line {line}: {cause}"
+            )
+        return lines + ([f"cut off: {self._opened.torn}"] if self._opened.torn else [])
 
     def stretches(self) -> Iterator[Rows]:
         """All rows, some ten thousand at a time.
@@ -60,7 +107,6 @@ class Table:
         """
         number, rest = self._heading.line + 1, ""
         while text := self._file.read(CHUNK):
-            self._read = self._file.buffer.tell()
             text, end, rest = (rest + text).rpartition("\n")
             self._check_length(text, number)
             if end:

@@ -1,0 +1,226 @@
+"""Frames out of the log of a CAN bus, by python-can, whatever state the file is in.
+
+A reader of python-can ends with the first line that it cannot read. Here it is started again behind that line, which is
+counted. What is read from a binary log is checked before python-can sees it: some garbage would keep it busy for ever.
+"""
+
+import io
+import logging
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, Protocol, TextIO, cast
+
+import can
+from can.io.blf import BLFParseError
+
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.logs.files import Opened
+
+LONGEST_LINE = 4096  # characters; of a frame with 64 bytes of data some 300
+LARGEST_BLOCK = 1 << 24  # bytes, packed; Vector's own are of some 100 kB
+OBJECT = struct.Struct("<4sHHLL")  # of a BLF file: signature, size of header, version of header, size, type
+
+logging.getLogger("can.io").setLevel(logging.ERROR)  # what it would say of single lines is counted here
+
+
+class Fault(NamedTuple):
+    """Where a frame should have been, and what was there."""
+
+    place: int
+    cause: str
+
+
+class FrameSource(Protocol):
+    """Frames with the numbers of their places, and what was there instead of some."""
+
+    place: str
+    notes: list[str]
+    """What is to be said of the whole file once it was read."""
+
+    @property
+    def passed(self) -> int:
+        """Lines that are no frames, and no faults either, like comments."""
+
+    def frames(self) -> Iterator[tuple[int, can.Message | Fault]]:
+        """All of them, in the order of the file; once."""
+
+
+@dataclass(frozen=True, slots=True)
+class TextFormat:
+    """How python-can reads a format of lines."""
+
+    reader: type[Any]
+    title: str
+    prelude: str = ""
+    """A line that its reader swallows when it is started behind a line that it could not read."""
+
+
+class _Trc(can.TRCReader):
+    """Says of a line that is cut short that it is, instead of passing over it."""
+
+    def _parse_line(self, line: str) -> can.Message | None:
+        return self._parse_cols(tuple(line.split(maxsplit=self._num_columns)))
+
+
+TEXTS = {
+    ".log": TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
+    ".asc": TextFormat(can.ASCReader, "Vector ASC", prelude="\n"),
+    ".trc": TextFormat(_Trc, "PEAK TRC"),
+}
+
+
+def source_of(path: Path, suffix: str, opened: Opened) -> FrameSource:
+    """The frames of ``opened``, a file at ``path`` that is written as its ``suffix`` says.
+
+    Raises:
+        ConfigurationError: no such log, or one that was never finished.
+    """
+    if suffix in TEXTS:
+        return TextFrames(TEXTS[suffix], io.TextIOWrapper(opened.stream, encoding="utf-8", errors="replace"))
+    return BinaryFrames(path, opened.stream)
+
+
+class _Lines:
+    """What python-can takes for its file: one line after the other, numbered."""
+
+    def __init__(self, text: TextIO) -> None:
+        self.number = 0
+        self.line = self.prelude = ""
+        self._text = text
+        self._next = text.readline(LONGEST_LINE)
+
+    def __iter__(self) -> "_Lines":
+        return self
+
+    def __next__(self) -> str:
+        if self.prelude:
+            prelude, self.prelude = self.prelude, ""
+            return prelude
+        if not self._next:
+            raise StopIteration
+        self.line, self._next = self._next, self._text.readline(LONGEST_LINE)
+        self.number += 1
+        return self.line
+
+    @property
+    def is_torn(self) -> bool:
+        """Whether the line at hand breaks off: every program that writes one ends it."""
+        return not self.line.endswith("\n") and not self._next
+
+    @property
+    def is_last(self) -> bool:
+        """Whether nothing comes after the line at hand."""
+        return not self._next
+
+    def close(self) -> None:
+        """The file is closed by who opened it."""
+
+
+class TextFrames:
+    """A log with a frame per line."""
+
+    place = "line"
+
+    def __init__(self, kind: TextFormat, text: TextIO) -> None:
+        self.notes: list[str] = []
+        self._kind = kind
+        self._lines = _Lines(text)
+        self._taken = 0
+
+    @property
+    def passed(self) -> int:
+        """See :class:`FrameSource`."""
+        return self._lines.number - self._taken
+
+    def frames(self) -> Iterator[tuple[int, can.Message | Fault]]:
+        """See :class:`FrameSource`."""
+        lines = self._lines
+        reader = self._kind.reader(lines)
+        while True:
+            try:
+                for frame in reader:
+                    self._taken += 1
+                    torn = lines.is_torn
+                    yield lines.number, self._fault("breaks off") if torn else frame
+                break
+            except Exception as error:  # noqa: BLE001 - a torn line can make it raise anything
+                self._taken += 1
+                yield lines.number, self._fault(f"is no frame of {self._kind.title} ({error})")
+            if lines.is_last:
+                break
+            lines.prelude = self._kind.prelude
+        if getattr(reader, "timestamps_format", None) == "relative":
+            self.notes.append("its times count from frame to frame, but are read from the start: export it as absolute")
+
+    def _fault(self, what: str) -> Fault:
+        text = self._lines.line.strip()
+        return Fault(self._lines.number, f"{text[:60] + '...' if len(text) > 60 else text!r} {what}")
+
+
+class BinaryFrames:
+    """A BLF file."""
+
+    place = "frame"
+    passed = 0
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.notes: list[str] = []
+        self._blocks = _Blocks(file)
+        try:
+            self._reader = _Blf(cast("BinaryIO", self._blocks))
+        except (BLFParseError, struct.error) as error:
+            raise ConfigurationError(
+                f"{path}: no BLF file, or one whose writer was killed before it wrote the head of it: "
+                "nothing can be read; a candump (.log) does not lose what was written"
+            ) from error
+
+    def frames(self) -> Iterator[tuple[int, can.Message | Fault]]:
+        """See :class:`FrameSource`."""
+        number = 0
+        try:
+            for frame in self._reader:
+                number += 1
+                yield number, frame
+        except Exception as error:  # noqa: BLE001 - what is damaged can make it raise anything
+            place = number + 1
+            yield place, Fault(place, f"the file is damaged or cut off here, and not read any further ({error})")
+            return
+        said, read = self._reader.file_size, self._blocks.read_so_far
+        if said > read:
+            self.notes.append(f"cut off: {read} of {said} bytes are there")
+        elif said < read:
+            self.notes.append(
+                "never closed by who wrote it: its last frames are missing, its times count from the start"
+            )
+
+
+class _Blocks:
+    """The bytes of a BLF file, as far as what is asked for makes sense."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.read_so_far = 0
+
+    def read(self, size: int) -> bytes:
+        if not 0 <= size <= LARGEST_BLOCK:
+            raise BLFParseError(f"a block of {size} bytes")
+        found = self._file.read(size)
+        self.read_so_far += len(found)
+        return found
+
+    def close(self) -> None:
+        """The file is closed by who opened it."""
+
+
+class _Blf(can.BLFReader):
+    def _parse_data(self, data: bytes) -> Iterator[can.Message]:
+        """Refuse objects that are smaller than their own header: python-can would read them again and again."""
+        at = 0
+        while (at := data.find(b"LOBJ", at, at + 8)) >= 0 and at + OBJECT.size <= len(data):
+            size = OBJECT.unpack_from(data, at)[3]
+            if size < OBJECT.size:
+                raise BLFParseError(f"an object of {size} bytes")
+            at += size
+        yield from super()._parse_data(data)

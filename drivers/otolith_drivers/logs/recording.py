@@ -1,0 +1,214 @@
+"""Our own recordings, ``.rrd``: what was measured, record for record, as the windows had it.
+
+Where a record was missing when it was recorded, the file has not a number, and the replay has no reading either. What
+the windows were cut from is not in it: a record stands on the grid, whenever its sample came.
+"""
+
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
+
+from otolith_drivers.base import Setup
+from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.logs.rows import Array, Integers, Rows
+from otolith_drivers.quantities import factor
+from otolith_drivers.toml_files import Closed
+
+APPLICATION, TIMELINE = "otolith", "time"
+VALUES, NAMES = "Scalars:scalars", "SeriesLines:names"
+FOLDER = "/signals/"
+NAME = re.compile(r".* measured \[(.*)\]")
+
+
+class Source(Closed):
+    """Signals are found under their own names."""
+
+
+def open_log(path: Path, setup: Setup, _: object = None) -> "Recorded":
+    """See :meth:`otolith_drivers.logs.readers.Format.open_log`."""
+    return Recorded(path, {signal.name: signal.unit for signal in setup.signals})
+
+
+class Recorded:
+    """Implements :class:`otolith_drivers.logs.rows.Reader`."""
+
+    place = "record"
+    ignored = ()
+    lost = 0
+
+    def __init__(self, path: Path, units: dict[str, str]) -> None:
+        """Look through the file for what is in it; ``units`` has the unit of each signal that must be there.
+
+        Raises:
+            ConfigurationError: no such file, no whole one, not ours, or without a signal that is needed.
+        """
+        self.path = path
+        self.bad = 0
+        self.progress = 0.0
+        self._records = 0
+        if not path.is_file():
+            raise ConfigurationError(f"{path}: cannot be read: {'is no file' if path.exists() else 'No such file'}")
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", RerunWarning)
+            self._file = self._guarded(RrdReader, path)
+        self._closed = not said
+        self._units, self._chunks = units, dict.fromkeys(units, 0)
+        written = self._look_through()
+        self._scales = {name: self._scale(name, unit, written) for name, unit in units.items()}
+
+    def __enter__(self) -> "Recorded":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        """The library keeps no file open."""
+
+    def _guarded(self, step: Any, *arguments: Any) -> Any:
+        try:
+            return step(*arguments)
+        except (RuntimeError, ValueError, OSError) as error:
+            cause = str(error).rpartition(": ")[2] or str(error)
+            way_out = f"'rerun rrd optimize --continue-on-error {self.path} -o whole.rrd' saves what is whole"
+            raise ConfigurationError(f"{self.path}: torn, or no recording ({cause}); {way_out}") from error
+
+    def _stream(self) -> Iterator[Any]:
+        chunks = iter(self._guarded(self._file.stream))
+        while (chunk := self._guarded(next, chunks, None)) is not None:
+            yield chunk
+
+    def _look_through(self) -> dict[str, str]:
+        """Count the chunks of each wanted signal; the unit of every signal there is."""
+        found = self._guarded(self._file.recordings)
+        if len(found) != 1 or found[0].application_id != APPLICATION:
+            what = (
+                f"{len(found)} recordings in it" if len(found) != 1 else f"of application {found[0].application_id!r}"
+            )
+            raise ConfigurationError(f"{self.path}: {what}: one of Otolith is needed")
+        units: dict[str, str] = {}
+        for chunk in self._stream():
+            name = _signal_of(chunk)
+            if name and chunk.is_static:
+                written = NAME.fullmatch(_first_name(chunk.to_record_batch()))
+                units[name] = written[1] if written else ""
+            elif name in self._chunks:
+                self._chunks[name] += 1
+        return units
+
+    def _scale(self, name: str, unit: str, written: dict[str, str]) -> tuple[float, float]:
+        if name not in written or not self._chunks[name]:
+            others = [entry for entry in written if entry not in self._chunks]
+            known = nearest(name, others) if others else f"it has {', '.join(sorted(written)) or 'none'}"
+            raise ConfigurationError(f"{self.path}: no signal {name!r} ({unit}) was recorded: {known}")
+        try:
+            return factor(written[name], unit)
+        except ValueError as error:
+            raise ConfigurationError(f"{self.path}: signal {name!r}: {error}") from error
+
+    def stretches(self) -> Iterator[Rows]:
+        """See :meth:`otolith_drivers.logs.rows.Reader.stretches`."""
+        waiting = {name: _Waiting(count) for name, count in self._chunks.items()}
+        total, read = sum(self._chunks.values()), 0
+        for chunk in self._stream():
+            name = _signal_of(chunk)
+            if name not in waiting or chunk.is_static:
+                continue
+            read += 1
+            self.progress = read / total
+            waiting[name].add(*self._values(name, chunk))
+            if all(entry.is_begun for entry in waiting.values()):
+                yield from self._rows(waiting, min(entry.known_until for entry in waiting.values()))
+        yield from self._rows(waiting, np.iinfo(np.int64).max)
+        if not self._records:
+            raise ConfigurationError(f"{self.path}: no records")
+
+    def _values(self, name: str, chunk: Any) -> tuple[Integers, Array]:
+        batch = chunk.to_record_batch()
+        times = batch.column(TIMELINE).cast(pa.int64()).to_numpy()
+        lists = batch.column(VALUES)
+        numbers = lists.flatten().to_numpy(zero_copy_only=False)
+        width = len(numbers) // len(times)
+        if not width or len(numbers) % len(times):
+            self.bad += len(times)
+            return times[:0], numbers[:0]
+        scale, offset = self._scales[name]
+        return times, scale * numbers.reshape(len(times), width)[:, 0] + offset
+
+    def _rows(self, waiting: dict[str, "_Waiting"], until: int) -> Iterator[Rows]:
+        parts = {name: entry.take(until) for name, entry in waiting.items()}
+        moments = np.unique(np.concatenate([times for times, _ in parts.values()]))
+        if not len(moments):
+            return
+        columns = {}
+        for name, (times, values) in parts.items():
+            columns[name] = np.full(len(moments), np.nan)
+            columns[name][np.searchsorted(moments, times)] = values
+        first = self._records + 1
+        self._records += len(moments)
+        yield Rows(
+            moments / 1e9, columns, np.arange(first, self._records + 1), np.full(len(moments), self.bad, dtype=np.int64)
+        )
+
+    def describe(self) -> list[str]:
+        """See :meth:`otolith_drivers.logs.rows.Reader.describe`."""
+        return [f"{name} [{unit}] from {FOLDER}{name}" for name, unit in self._units.items()]
+
+    def found(self) -> list[str]:
+        """See :meth:`otolith_drivers.logs.rows.Reader.found`."""
+        return [f"{self._records} records read", f"{self.bad} bad"]
+
+    def complaints(self) -> list[str]:
+        """See :meth:`otolith_drivers.logs.rows.Reader.complaints`."""
+        return [] if self._closed else ["never closed by the recorder: its last moments may be missing"]
+
+
+class _Waiting:
+    """What has come of one signal and cannot be handed on before the others are as far."""
+
+    def __init__(self, chunks: int) -> None:
+        self._left = chunks
+        self._times: list[Integers] = []
+        self._values: list[Array] = []
+        self._latest = np.iinfo(np.int64).min
+
+    def add(self, times: Integers, values: Array) -> None:
+        self._left -= 1
+        if len(times):
+            self._times.append(times)
+            self._values.append(values)
+            self._latest = max(self._latest, int(times.max()))
+
+    @property
+    def known_until(self) -> int:
+        """Nanoseconds up to which all of it is here, if it comes in order."""
+        return np.iinfo(np.int64).max if not self._left else self._latest
+
+    @property
+    def is_begun(self) -> bool:
+        return bool(self._times) or not self._left
+
+    def take(self, until: int) -> tuple[Integers, Array]:
+        if not self._times:
+            return np.zeros(0, dtype=np.int64), np.zeros(0)
+        times, values = np.concatenate(self._times), np.concatenate(self._values)
+        ready = times <= until
+        self._times, self._values = [times[~ready]], [values[~ready]]
+        return times[ready], values[ready]
+
+
+def _signal_of(chunk: Any) -> str:
+    path = str(chunk.entity_path)
+    return path.removeprefix(FOLDER) if path.startswith(FOLDER) else ""
+
+
+def _first_name(batch: Any) -> str:
+    if NAMES not in batch.schema.names:
+        return ""
+    names = batch.column(NAMES).to_pylist()
+    return str(names[0][0]) if names and names[0] else ""
