@@ -1,6 +1,7 @@
 """Replay: recorded data says what the daemon would have said, to the last byte, whatever state the file is in.
 
-A golden case is a folder with ``data.csv`` and ``error.txt``, where ``{file}`` stands for the data.
+A golden case is a folder with ``data.*`` and ``error.txt``, where ``{file}`` stands for the data and ``{machine}`` for
+the machine file: its own, or the one that all cases without share.
 ``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the sentences anew: read the difference.
 """
 
@@ -9,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +25,25 @@ from otolith.replay import Replay, replay
 from otolith.state import begin
 from otolith_drivers.logs import table
 from otolith_drivers.plant.dc_motor import MotorScenario
-from tests.conftest import SIGNALS
-from tests.replays import GOLDEN, HEADING, MACHINE, PERIOD, RECORDS, Lines, recorded, reports, summed_up, written
+from tests.conftest import EXAMPLES, SIGNALS
+from tests.drivers.logs import frames_of, live
+from tests.drivers.logs import written as written_log
+from tests.replays import (
+    GOLDEN,
+    HEADING,
+    MACHINE,
+    PERIOD,
+    RECORDS,
+    Lines,
+    recorded,
+    reports,
+    summed_up,
+    values,
+    written,
+)
 from tests.test_machine_files import GOLDEN as MACHINE_FILES
 
-CASES = sorted(path.parent for path in GOLDEN.glob("*/data.csv"))
+CASES = sorted(path.parent for path in GOLDEN.glob("*/data.*"))
 
 
 @pytest.fixture
@@ -37,9 +53,11 @@ def rows(scenario: MotorScenario) -> Lines:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_file_that_cannot_be_used_gets_its_sentence(case: Path) -> None:
+    (data,) = case.glob("data.*")
+    machine = case / "machine.toml" if (case / "machine.toml").exists() else MACHINE
     with pytest.raises(ConfigurationError) as caught:
-        replay(MACHINE, case / "data.csv", None, as_json=True, stopped=lambda: False)
-    said = str(caught.value).replace(str(case / "data.csv"), "{file}") + "\n"
+        replay(machine, data, None, as_json=True, stopped=lambda: False)
+    said = str(caught.value).replace(str(data), "{file}").replace(str(machine), "{machine}") + "\n"
     if os.environ.get("OTOLITH_UPDATE_GOLDEN"):
         (case / "error.txt").write_text(said, encoding="utf-8")
     assert said == (case / "error.txt").read_text(encoding="utf-8")
@@ -166,3 +184,61 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path, rows: Lines) -> None
     assert "1000 windows: 0 good" in printed
     small, large = (int(line.split()[1]) for line in printed.splitlines() if line.startswith("peak"))
     assert large - small < 20_000  # kB
+
+
+def test_a_log_of_the_bus_says_what_the_table_says(
+    tmp_path: Path, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Values of the bus have the resolution of its frames, and the table has those."""
+    frames = frames_of(scenario, 600)
+    heard: dict[float, dict[str, float]] = {}
+    for sample in live(frames):
+        heard.setdefault(round(sample.time, 2), {})[sample.signal] = sample.value
+    rows = [[f"{time:.2f}", *(repr(row[name]) for name in SIGNALS)] for time, row in heard.items()]
+    table_path = written(tmp_path, rows)
+    machine = tmp_path / "machine.toml"
+    text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
+    machine.write_text(text.replace('"dc-motor.dbc"', f'"{EXAMPLES / "dc-motor.dbc"}"'), encoding="utf-8")
+    found = {}
+    for path in (
+        table_path,
+        *(written_log(tmp_path, frames, suffix) for suffix in (".log", ".asc", ".blf", ".trc.gz")),
+    ):
+        replay(machine, path, None, as_json=True, stopped=lambda: False)
+        lines = capsys.readouterr().out.splitlines()
+        found[path.suffix] = values([ReportDocument.from_json(line) for line in lines])
+    assert len(found[".csv"]) == 3
+    for printed in found.values():
+        assert printed == pytest.approx(found[".csv"], rel=1e-6)
+
+
+def test_in_real_time_a_window_comes_when_it_would_have_ended(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    machine = tmp_path / "machine.toml"
+    machine.write_text(MACHINE.read_text(encoding="utf-8") + '[window]\nlength = "0.5 s"\n', encoding="utf-8")
+    later = [[f"{float(row[0]) + 1000.0 * (index >= 100):.3f}", *row[1:]] for index, row in enumerate(rows[:200])]
+    data = written(tmp_path, later)
+    printed = []
+    for real_time in (False, True):
+        begun = time.monotonic()
+        replay(machine, data, None, as_json=True, stopped=lambda: False, real_time=real_time)
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1]
+    assert len(printed[0].splitlines()) == 4
+    assert 2.0 <= time.monotonic() - begun < 20.0  # the silence in the middle is passed over
+
+
+def test_the_columns_of_a_replayed_machine_are_found_where_it_says(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = values(reports(written(tmp_path, rows), capsys))
+    in_rpm = [[*row[:4], repr(float(row[4]) * 30 / np.pi)] for row in rows]
+    data = written(tmp_path, in_rpm, heading=("t", "U", "T_load", "i", "RotorSpeed"))
+    machine = tmp_path / "machine.toml"
+    signals = 'V_a = { column = "U" }\nT_load = {}\ni = {}\nomega = { column = "RotorSpeed", unit = "rpm" }\n'
+    driver = f'[driver]\ntype = "replay"\nfile = "{data.name}"\n\n[signals]\n{signals}\n'
+    machine.write_text(MACHINE.read_text(encoding="utf-8").replace("[twin]", driver + "[twin]"), encoding="utf-8")
+    replay(machine, data, None, as_json=True, stopped=lambda: False)
+    found = [ReportDocument.from_json(line) for line in capsys.readouterr().out.splitlines()]
+    assert values(found) == pytest.approx(plain, rel=1e-6)

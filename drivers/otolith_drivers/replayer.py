@@ -83,7 +83,16 @@ def opener(path: Path, options: Options, setup: Setup) -> Callable[[], Reader]:
         for entry in setup.signals
     )
     wanted = Setup(signals, setup.folder, setup.sample_period)
-    return lambda: kind.open_log(path, wanted, can)
+
+    def open_file() -> Reader:
+        try:
+            return kind.open_log(path, wanted, can)
+        except ConfigurationError as error:
+            if error.key[:1] != ("driver",):
+                raise
+            raise ConfigurationError(str(error), ("driver", "can", *error.key[1:])) from error
+
+    return open_file
 
 
 class Replayer:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import can
 
-from otolith_drivers import can_receiver, modbus_poller
+from otolith_drivers import can_receiver, modbus_poller, replayer
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.can_source import Source
@@ -89,8 +89,23 @@ def plant_rig(machine: OwnMachine) -> Iterator[Rig]:
     yield Rig(in_process.build(options, replace(SETUP, signals=signals)), EXPECTED)
 
 
+@contextmanager
+def replay_rig(machine: OwnMachine) -> Iterator[Rig]:
+    """A file speaks by itself."""
+    path = machine.machine.with_name("drive.csv")
+    lines = ["t,ArmatureCurrent [A],RotorSpeed", *(f"{0.01 * index:.2f},2.0,10.0" for index in range(10_000))]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    sources = ({"column": "ArmatureCurrent"}, {"column": "RotorSpeed", "unit": "rad/s"})
+    signals = tuple(
+        replace(signal, source=replayer.Source.model_validate(source))
+        for signal, source in zip(SIGNALS, sources, strict=True)
+    )
+    yield Rig(replayer.build(replayer.Options(file=path), replace(SETUP, signals=signals)), EXPECTED)
+
+
 RIGS: dict[str, Callable[[OwnMachine], AbstractContextManager[Rig]]] = {
     "can": can_rig,
     "modbus": modbus_rig,
     "plant": plant_rig,
+    "replay": replay_rig,
 }

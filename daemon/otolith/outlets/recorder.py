@@ -16,7 +16,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Verdict
 from otolith.adaptation.information import QUANTILE
 from otolith.health.report import Report, ReportDocument, Status, Traces
 from otolith.twin.definition import Definition, Parameter
@@ -66,6 +66,7 @@ class Recording:
         for parameter in parameters:
             names = ["95 % low", "95 % high", f"{parameter.name} [{parameter.unit}]"]  # the last is drawn on top
             self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, TWIN])
+        self._style("windows", ["is good", "start [s]", "end [s]", "records"], None)
 
     def add(self, report: Report) -> None:
         """Append a window."""
@@ -81,6 +82,8 @@ class Recording:
         if traces.predicted is not None:
             self._columns("residual", when, (traces.measured - traces.predicted) / np.asarray(traces.noise))
         self._stream.set_time(TIMELINE, timestamp=window.end)
+        good = window.quality.verdict is Verdict.GOOD
+        self._stream.log("windows", rr.Scalars([float(good), window.start, window.end, float(window.records)]))
         for name, parameter in document.parameters.items():
             if parameter.value is not None and parameter.low is not None and parameter.high is not None:
                 self._stream.log(f"parameters/{name}", rr.Scalars([parameter.low, parameter.high, parameter.value]))

@@ -78,7 +78,7 @@ def source_of(path: Path, suffix: str, opened: Opened) -> FrameSource:
         ConfigurationError: no such log, or one that was never finished.
     """
     if suffix in TEXTS:
-        return TextFrames(TEXTS[suffix], io.TextIOWrapper(opened.stream, encoding="utf-8", errors="replace"))
+        return TextFrames(path, TEXTS[suffix], io.TextIOWrapper(opened.stream, encoding="utf-8", errors="replace"))
     return BinaryFrames(path, opened.stream)
 
 
@@ -123,7 +123,8 @@ class TextFrames:
 
     place = "line"
 
-    def __init__(self, kind: TextFormat, text: TextIO) -> None:
+    def __init__(self, path: Path, kind: TextFormat, text: TextIO) -> None:
+        self._path = path
         self.notes: list[str] = []
         self._kind = kind
         self._lines = _Lines(text)
@@ -141,18 +142,28 @@ class TextFrames:
         while True:
             try:
                 for frame in reader:
+                    if not self._taken:
+                        self._refuse_differences(reader)
                     self._taken += 1
                     torn = lines.is_torn
                     yield lines.number, self._fault("breaks off") if torn else frame
                 break
-            except Exception as error:  # noqa: BLE001 - a torn line can make it raise anything
-                self._taken += 1
-                yield lines.number, self._fault(f"is no frame of {self._kind.title} ({error})")
+            except ConfigurationError:
+                raise
+            except Exception:  # noqa: BLE001 - a torn line can make it raise anything
+                if lines.number:
+                    self._taken += 1
+                    yield lines.number, self._fault(f"is no frame of {self._kind.title}")
             if lines.is_last:
                 break
             lines.prelude = self._kind.prelude
+
+    def _refuse_differences(self, reader: Any) -> None:
+        """Which only ASC has; python-can would take them for times."""
         if getattr(reader, "timestamps_format", None) == "relative":
-            self.notes.append("its times count from frame to frame, but are read from the start: export it as absolute")
+            raise ConfigurationError(
+                f"{self._path}: its times count from frame to frame ('timestamps relative'): export them absolute"
+            )
 
     def _fault(self, what: str) -> Fault:
         text = self._lines.line.strip()
@@ -185,7 +196,13 @@ class BinaryFrames:
                 yield number, frame
         except Exception as error:  # noqa: BLE001 - what is damaged can make it raise anything
             place = number + 1
-            yield place, Fault(place, f"the file is damaged or cut off here, and not read any further ({error})")
+            yield (
+                place,
+                Fault(
+                    place,
+                    f"the file is damaged or cut off here, and not read any further ({error or type(error).__name__})",
+                ),
+            )
             return
         said, read = self._reader.file_size, self._blocks.read_so_far
         if said > read:

@@ -1,7 +1,8 @@
 """Our own recordings, ``.rrd``: what was measured, record for record, as the windows had it.
 
-Where a record was missing when it was recorded, the file has not a number, and the replay has no reading either. What
-the windows were cut from is not in it: a record stands on the grid, whenever its sample came.
+Where a record was missing when it was recorded, the file has not a number, and the replay has no reading either. A
+record stands on the grid, whenever its sample came. So a window that was bad then, perhaps for when its samples came,
+is left out: nothing was estimated from it.
 """
 
 import re
@@ -18,13 +19,13 @@ from rerun.error_utils import RerunWarning
 
 from otolith_drivers.base import Setup
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.logs.rows import Array, Integers, Rows
+from otolith_drivers.logs.rows import Array, Integers, Mask, Rows
 from otolith_drivers.quantities import factor
 from otolith_drivers.toml_files import Closed
 
 APPLICATION, TIMELINE = "otolith", "time"
 VALUES, NAMES = "Scalars:scalars", "SeriesLines:names"
-FOLDER = "/signals/"
+FOLDER, WINDOWS = "/signals/", "/windows"
 NAME = re.compile(r".* measured \[(.*)\]")
 
 
@@ -60,6 +61,7 @@ class Recorded:
             warnings.simplefilter("always", RerunWarning)
             self._file = self._guarded(RrdReader, path)
         self._closed = not said
+        self._bad_windows: list[tuple[float, float]] = []  # ns; from the first record to before the next window
         self._units, self._chunks = units, dict.fromkeys(units, 0)
         written = self._look_through()
         self._scales = {name: self._scale(name, unit, written) for name, unit in units.items()}
@@ -99,7 +101,16 @@ class Recorded:
                 units[name] = written[1] if written else ""
             elif name in self._chunks:
                 self._chunks[name] += 1
+            elif str(chunk.entity_path) == WINDOWS and not chunk.is_static:
+                self._note_windows(chunk.to_record_batch().column(VALUES).to_pylist())
         return units
+
+    def _note_windows(self, windows: list[Any]) -> None:
+        for entry in windows:
+            good, start, end, records = entry if len(entry) == 4 else (1.0, 0.0, 0.0, 1.0)
+            if not good:
+                early = 0.5 * (end - start) / records
+                self._bad_windows.append((1e9 * (start - early), 1e9 * (end - early)))
 
     def _scale(self, name: str, unit: str, written: dict[str, str]) -> tuple[float, float]:
         if name not in written or not self._chunks[name]:
@@ -145,15 +156,25 @@ class Recorded:
         moments = np.unique(np.concatenate([times for times, _ in parts.values()]))
         if not len(moments):
             return
+        left_out = self._left_out(moments)
         columns = {}
         for name, (times, values) in parts.items():
-            columns[name] = np.full(len(moments), np.nan)
-            columns[name][np.searchsorted(moments, times)] = values
+            column = np.full(len(moments), np.nan)
+            column[np.searchsorted(moments, times)] = values
+            columns[name] = np.where(left_out, np.nan, column)
         first = self._records + 1
         self._records += len(moments)
         yield Rows(
             moments / 1e9, columns, np.arange(first, self._records + 1), np.full(len(moments), self.bad, dtype=np.int64)
         )
+
+    def _left_out(self, moments: Integers) -> Mask:
+        first, last = float(moments[0]), float(moments[-1])
+        outside: Mask = np.zeros(len(moments), dtype=np.bool_)
+        for begin, end in self._bad_windows:
+            if begin <= last and end > first:
+                outside |= (moments >= begin) & (moments < end)
+        return outside
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.logs.rows.Reader.describe`."""
@@ -165,7 +186,10 @@ class Recorded:
 
     def complaints(self) -> list[str]:
         """See :meth:`otolith_drivers.logs.rows.Reader.complaints`."""
-        return [] if self._closed else ["never closed by the recorder: its last moments may be missing"]
+        lines = [] if self._closed else ["never closed by the recorder: its last moments may be missing"]
+        if self._bad_windows:
+            lines.append(f"windows that were bad when they were recorded, left out: {len(self._bad_windows)}")
+        return lines
 
 
 class _Waiting:
