@@ -1,5 +1,6 @@
 """Tables as they are found: other ways to write one, rows and cells missing, out of order, senseless."""
 
+import gzip
 from itertools import pairwise
 from pathlib import Path
 
@@ -46,13 +47,16 @@ def test_a_european_export_says_the_same(tmp_path: Path, rows: Lines, capsys: py
     assert values(reports(path, capsys)) == pytest.approx(plain, rel=1e-6)
 
 
-@pytest.mark.parametrize("style", ["tab", "quotes", "quoted decimal comma", "sep="])
+@pytest.mark.parametrize("style", ["tab", "quotes", "quoted decimal comma", "sep=", "gzip"])
 def test_other_ways_to_write_a_table(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str], style: str
 ) -> None:
     plain = values(reports(written(tmp_path, rows), capsys))
     if style == "tab":
         path = written(tmp_path, rows, separator="\t")
+    elif style == "gzip":
+        path = tmp_path / "data.csv.gz"
+        path.write_bytes(gzip.compress(written(tmp_path, rows).read_bytes()))
     elif style == "sep=":
         path = written(tmp_path, rows, separator="|")
         path.write_text("sep=|\n" + path.read_text(encoding="utf-8"), encoding="utf-8")
@@ -61,6 +65,16 @@ def test_other_ways_to_write_a_table(
         quoted = [[f'"{cell.replace(".", sign)}"' for cell in row] for row in rows]
         path = written(tmp_path, quoted, heading=tuple(f'"{name}"' for name in HEADING))
     assert values(reports(path, capsys)) == plain
+
+
+def test_a_packed_table_that_is_cut_off_is_read_as_far_as_it_goes(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "data.csv.gz"
+    path.write_bytes(gzip.compress(written(tmp_path, rows).read_bytes())[:-3000])
+    text = summed_up(path, capsys)
+    assert "4 windows: 4 good, 0 bad" in text
+    assert "cut off: Compressed file ended" in text
 
 
 def test_what_is_missing_is_counted_and_told(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:

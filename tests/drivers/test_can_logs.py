@@ -244,6 +244,10 @@ def test_an_object_without_a_size_does_not_keep_the_reader_for_ever(
     content[at + 8 : at + 12] = size.to_bytes(4, "little")
     path.write_bytes(content)
     done = threading.Event()
-    thread = threading.Thread(target=lambda: (check_any(path), done.set()), daemon=True)
-    thread.start()
+
+    def check() -> None:
+        check_any(path)
+        done.set()
+
+    threading.Thread(target=check, daemon=True).start()
     assert done.wait(10.0)

@@ -66,7 +66,7 @@ class _Unpacked(io.RawIOBase):
     def readinto(self, room: "WriteableBuffer") -> int:
         view = memoryview(room)
         try:
-            found = self._file.read(len(view))
+            found = self._file.read1(len(view))  # more at once would be lost where the packing breaks off
         except (EOFError, OSError, zlib.error) as error:
             self.torn = str(error)
             return 0
