@@ -12,7 +12,8 @@ from otolith.health.report import ReportDocument
 from otolith.outlets.zenoh_session import Listener
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.conftest import OwnMachine
-from tests.replays import MACHINE, recorded, written
+from tests.replays import MACHINE, PERIOD, recorded, written
+from tests.system.conftest import Running
 
 DRIVER = """
 [driver]
@@ -30,6 +31,31 @@ enabled = false
 """
 
 
+def replayed(*arguments: object) -> list[ReportDocument]:
+    """What ``otolith replay`` says."""
+    command = [sys.executable, "-m", "otolith", "replay", *map(str, arguments), "--json"]
+    printed = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    return [ReportDocument.from_json(line) for line in printed.splitlines()]
+
+
+def test_what_the_daemon_has_recorded_says_the_same_again(running: Running) -> None:
+    """Whatever was bad or missed while it ran."""
+    reports = list(running.wait_for(lambda reports: len(reports) >= 7))
+    assert running.stop()[0] == 0
+    again = replayed(running.machine.machine, running.recording)
+    compared = 0
+    for report in reports:
+        other = min(again, key=lambda found: abs(found.window.start - report.window.start))
+        found, expected = other.parameters["R_a"], report.parameters["R_a"]
+        assert other.window.start == pytest.approx(report.window.start, abs=PERIOD / 2)
+        assert other.window.quality.verdict is report.window.quality.verdict
+        assert found.status is expected.status
+        if expected.value is not None:
+            compared += 1
+            assert found.value == pytest.approx(expected.value, rel=1e-6)
+    assert compared >= 3
+
+
 def test_a_recording_in_real_time_says_what_its_replay_says(
     tmp_path: Path, scenario: MotorScenario, own_machine: OwnMachine
 ) -> None:
@@ -37,15 +63,13 @@ def test_a_recording_in_real_time_says_what_its_replay_says(
     machine = tmp_path / "replayed.toml"
     text = MACHINE.read_text(encoding="utf-8") + DRIVER + f'\n[zenoh]\nlisten = ["{own_machine.endpoint}"]\n'
     machine.write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "otolith"]
-    printed = subprocess.run(
-        [*command, "replay", machine, data, "--json"], capture_output=True, text=True, check=True
-    ).stdout
-    replayed = [ReportDocument.from_json(line) for line in printed.splitlines()]
+    expected = replayed(machine, data)
     heard: queue.SimpleQueue[str] = queue.SimpleQueue()
     reports: list[ReportDocument] = []
     with (
-        subprocess.Popen([*command, "run", machine], stderr=subprocess.PIPE, text=True) as daemon,
+        subprocess.Popen(
+            [sys.executable, "-m", "otolith", "run", machine], stderr=subprocess.PIPE, text=True
+        ) as daemon,
         Listener([own_machine.endpoint], "otolith/**/report", heard.put),
     ):
         deadline = time.monotonic() + 60.0
@@ -57,7 +81,7 @@ def test_a_recording_in_real_time_says_what_its_replay_says(
     good = [report for report in reports if report.window.quality.verdict == "good"]
     assert len(good) >= 2
     for report in good:
-        again = replayed[report.window.index].parameters["R_a"]
+        again = expected[report.window.index].parameters["R_a"]
         found = report.parameters["R_a"]
         assert again.low is not None
         assert again.high is not None
