@@ -53,6 +53,6 @@ def test_a_day_of_flapping_leaves_nothing_behind(name: str) -> None:
     first, *_, last = found["seen"][1:]  # the first tenth of the day fills what is kept
     assert last[0] <= 1.05 * first[0]
     assert last[1:] == first[1:]
-    assert found["reconnects"] >= FLAPS
+    assert found["reconnects"] >= 0.95 * FLAPS  # a cut while it connects is none
     if name == "modbus":
         assert found["lost"] > 0
