@@ -122,6 +122,7 @@ def _learn(state: State, window: Window, expected: Belief, untaught: Learned) ->
     expectable = found.cost <= REFUSED and not is_surprising(expected, found.evidence, problem)
     if memory.case is None and expectable and found.cost <= EXPLAINED and seen.gain <= 0.0:
         return _expected(untaught, window, expected, found)
+    untaught = replace(untaught, searched=True)
     considering = considered(memory, problem, recent, expected, (prior, seen))
     case: Case | None = considering
     lesson, best = decided(considering, problem)

@@ -51,6 +51,8 @@ class Learned:
     """What could have happened, if that is a question."""
     adopted: Hypothesis | None = None
     """What has been found to have happened."""
+    searched: bool = False
+    """Whether it was asked what else could have happened."""
 
 
 def document_of(state: State, window: Window, learned: Learned) -> tuple[dict[str, Standing], ReportDocument]:
@@ -86,7 +88,7 @@ def document_of(state: State, window: Window, learned: Learned) -> tuple[dict[st
         findings=findings_of(components, explanations, learned.case, experiment),
     )
     if found is not None:
-        cost = CostDocument(evaluations=found.evaluations, generations=found.generations)
+        cost = CostDocument(evaluations=found.evaluations, generations=found.generations, searched=learned.searched)
         document = document.model_copy(update={"fit": _fit(problem, found, memory), "cost": cost})
     return standing, document
 

@@ -18,6 +18,7 @@ from otolith.health.report import ReportDocument, Status
 from otolith.heart import adapt
 from otolith.specialist import Decisions, decided, kept, restored
 from otolith.state import State, begin
+from otolith.twin.slots import sites, sources
 from otolith.twins import find_twin
 
 TWIN = find_twin("dc_motor")
@@ -162,6 +163,26 @@ def test_discovery_can_be_switched_off() -> None:
     _, documents = run(quiet, lived("steps", 14, Faults(torque=torque, since=4.0)))
     assert not any(document.components for document in documents)
     assert documents[-1].lesson is not Lesson.LEARNED
+
+
+@pytest.mark.parametrize(("operation", "order", "amplitude"), [("steps", 3.0, 0.001), ("sweep", 1.0, 0.0003)])
+def test_what_is_not_to_be_looked_for_starts_no_search(operation: str, order: float, amplitude: float) -> None:
+    def torque(t: float, angle: float, *_: float) -> float:
+        return amplitude * math.sin(order * angle + 1.0)
+
+    record = lived(operation, 20, Faults(torque=torque, since=4.0))
+    _, free = run(begun("R_a", "D"), record)
+    assert any(document.cost.searched for document in free)
+    periodic = frozenset(
+        f"{site.name}/periodic/{source.name}" for site in sites(TWIN) for source in sources(TWIN) if source.name
+    )
+    for state in (
+        decided(begun("R_a", "D"), Decisions(rejected=periodic)),
+        begin("motor", "here", replace(problem("R_a", "D"), excluded=periodic)),
+    ):
+        _, documents = run(state, record)
+        assert not any(document.cost.searched for document in documents)
+        assert not any(document.components for document in documents)
 
 
 def patched(*resistances: float) -> list[Window]:

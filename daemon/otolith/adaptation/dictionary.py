@@ -44,10 +44,10 @@ class Shapes:
     """(curves,)."""
 
 
-def structures(twin: Definition, x: Array, allowed: frozenset[str] = frozenset()) -> list[Structure]:
+def structures(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[Structure]:
     """All that can be told from each other where the sources are ``x`` (sources, records); ``twin`` is the author's.
 
-    ``allowed`` has keys ``site``, ``family`` and ``source`` joined by a slash; empty for all.
+    Those whose keys are ``taken`` are left out.
     """
     known = [
         (model, number, source, _bounds(model, x[number]))
@@ -61,7 +61,7 @@ def structures(twin: Definition, x: Array, allowed: frozenset[str] = frozenset()
         for index, site in enumerate(sites(twin))
         for model, number, source, bounds in known
         if (index < own or _lies_so(model, source, site.into))
-        and (not allowed or key_of(site.name, model.name, source.name) in allowed)
+        and key_of(site.name, model.name, source.name) not in taken
     ]
 
 

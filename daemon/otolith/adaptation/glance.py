@@ -7,7 +7,6 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.claims import with_candidate
 from otolith.adaptation.completion import plain
-from otolith.adaptation.dictionary import structures
 from otolith.adaptation.flight import evaluated
 from otolith.adaptation.landscape import Landscape
 from otolith.adaptation.prior import Prior, vague
@@ -19,12 +18,12 @@ from otolith.adaptation.screening import (
     Candidate,
     component_of,
     holding,
-    key_in,
     rivals_of,
     screened,
+    sought,
 )
 from otolith.twin.metamodels import Kind
-from otolith.twin.slots import SLOTS, sources
+from otolith.twin.slots import sources
 
 LOOKED_AT = 4  # windows, in one of which families are tried that the linear picture underrates
 
@@ -47,10 +46,8 @@ def glance(problem: Problem, window: Window, prior: Prior, start: Array) -> Glan
     turn = (Kind.TIME, Kind.PLACE)[window.index % 2]
     found = [
         entry
-        for entry in structures(plain(problem), landscape.x)
-        if problem.discover
-        and len(problem.components) < SLOTS
-        and (len(entry.model.phases) == 1 or sources(plain(problem))[entry.source].kind is turn)
+        for entry in sought(problem, landscape.x)
+        if problem.discover and (len(entry.model.phases) == 1 or sources(plain(problem))[entry.source].kind is turn)
     ]
     _, _, scores = screened(landscape, problem, found, COARSE)
     gain = float(scores.max(initial=-np.inf)) - CLEARLY
@@ -62,17 +59,14 @@ def glance(problem: Problem, window: Window, prior: Prior, start: Array) -> Glan
 
 def _held(problem: Problem, window: Window, landscape: Landscape) -> float:
     """What a family would gain that the linear picture underrates, whatever was known of the parameters."""
-    if len(problem.components) >= SLOTS:
-        return -np.inf
-    found = structures(plain(problem), landscape.x)
+    found = sought(problem, landscape.x)
     rivals = rivals_of(problem, found)
     guesses = [(entry, entry.bounds[0]) for entry in found if entry.model.holds and not rivals.lies(entry)]
-    taken = {entry.key for entry in problem.components} | problem.excluded
     gains = evaluated(landscape, guesses)
     settled = [
         (guess, pair, 0.0)
         for guess, pair in zip(guesses, gains.amplitudes, strict=True)
-        if key_in(problem, guess[0]) not in taken and 0.0 < np.abs(pair).max() < LARGEST
+        if 0.0 < np.abs(pair).max() < LARGEST
     ]
     fresh, best = vague(problem), -np.inf
     for (structure, inner), pair, _ in holding(problem, settled):

@@ -6,7 +6,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.completion import plain
-from otolith.adaptation.component import Component, key_of
+from otolith.adaptation.component import Component
 from otolith.adaptation.dictionary import Structure, grid, shapes, structures
 from otolith.adaptation.flight import evaluated, fly
 from otolith.adaptation.landscape import Landscape
@@ -25,6 +25,20 @@ LARGEST = 1e9  # amplitude, in the unit of a site: nobody could read an equation
 Guess = tuple[Structure, float]
 Settled = tuple[Guess, Array, float]
 """A guess, its amplitudes, and its gain in -2 log evidence."""
+
+
+def sought(problem: Problem, x: Array) -> list[Structure]:
+    """All that may be looked for where the sources are ``x`` (sources, records), while the twin has room for it.
+
+    What is in the twin and what the specialist or the machine file excludes is left out. Where components are not
+    looked for, the errors of sensors are.
+    """
+    twin = plain(problem)
+    if len(problem.components) >= SLOTS:
+        return []
+    taken = problem.excluded | {entry.key for entry in problem.components}
+    own = len(twin.sites)
+    return [entry for entry in structures(twin, x, taken) if problem.discover or entry.site >= own]
 
 
 def screened(
@@ -86,16 +100,7 @@ class Candidate:
 
 def candidates(problem: Problem, landscape: Landscape, window: Window) -> list[Candidate]:
     """The components worth a polish, the best first."""
-    known = {entry.key for entry in problem.components}
-    if len(known) >= SLOTS:
-        return []
-    excluded = known | problem.excluded
-    own = len(plain(problem).sites)
-    all_of_them = [
-        entry
-        for entry in structures(plain(problem), landscape.x)
-        if key_in(problem, entry) not in excluded and (problem.discover or entry.site >= own)
-    ]
+    all_of_them = sought(problem, landscape.x)
     rivals = rivals_of(problem, all_of_them)
     guesses, amplitudes, scores = screened(landscape, problem, all_of_them, FINE)
     order = np.argsort(-scores, kind="stable")
@@ -150,13 +155,6 @@ def holding(problem: Problem, rest: list[Settled]) -> list[Settled]:
         if structure.model.holds and sources(plain(problem))[structure.source].name in states:
             found.setdefault(structure.site, entry)
     return list(found.values())
-
-
-def key_in(problem: Problem, structure: Structure) -> str:
-    """Of the component that a structure would become."""
-    twin = plain(problem)
-    source = sources(twin)[structure.source].name
-    return key_of(sites(twin)[structure.site].name, structure.model.name, source)
 
 
 def _step(structure: Structure, x: Array) -> float:

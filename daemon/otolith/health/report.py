@@ -103,6 +103,8 @@ class CostDocument(Closed):
     """From the end of the window to the publication of this report."""
     evaluations: int = 0
     generations: int = 0
+    searched: bool = False
+    """Whether it was asked what else could have happened: components, moved parameters, lying sensors."""
 
 
 class DriverDocument(Closed):
