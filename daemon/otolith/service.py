@@ -2,11 +2,13 @@
 
     driver thread -> rings -> [this thread] window -> worker process -> [this thread] report -> Zenoh, recorder process
 
-This thread never waits for a machine, a worker, a disk or a subscriber; only for a process that it has killed.
+This thread never waits for a machine, a worker, a disk or a subscriber; only for a process that it has killed, and at
+the end half a second for the disk.
 """
 
 import contextlib
 import logging
+import math
 import os
 import signal
 import time
@@ -22,6 +24,7 @@ from otolith.adaptation.information import QUANTILE
 from otolith.companion import SIGNALS, Companion
 from otolith.errors import OtolithError
 from otolith.health.report import CountersDocument, DriverDocument, Report, ReportDocument, Status
+from otolith.housekeeper import Housekeeper
 from otolith.keeping import Keeper
 from otolith.notify import Notifier
 from otolith.outlets.places import recording_folder
@@ -38,7 +41,7 @@ RING_WINDOWS = 8  # windows that the rings hold: how long this thread may be hel
 RING_RATE = 4  # how much faster than the grid a source may send for that to be true
 TICK = 0.1  # s; the longest wait, so how late a stop, a death or an outage can be noticed
 RECORDER_ROOM = 32  # windows
-RECORDER_FLUSH = 1.5  # s at the end
+RECORDER_FLUSH, KEEPER_FLUSH = 1.5, 0.5  # s at the end
 STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed
 OTHER_GRID = 0.01  # difference of two sample periods that matters
 KEEP_EVERY = 300.0  # s between two writes of components that are only known better
@@ -56,15 +59,15 @@ class Service:
         period, sampling = plan.file.window.sample_period, plan.driver.sampling
         self._windower = Windower(plan.twin.signals, plan.records, period, plan.limits, sampling)
         longest = plan.problem.window.longest * period
-        self._keeper = Keeper(machine.site, machine.name, plan.twin)
+        keeper = Keeper(machine.site, machine.name, plan.twin)
+        self._housekeeper = Housekeeper(keeper, keeper.stamp())
         state = begin(machine.name, machine.site, plan.problem)
         decisions = Decisions()
         try:
-            state, decisions = restored(state, self._keeper.components()), self._keeper.decisions()
+            state, decisions = restored(state, keeper.components()), keeper.decisions()
         except OtolithError as error:  # a file that cannot be read is no reason not to watch the machine
             log.warning("begun without components: %s", error)
-        self._said, self._kept_at = self._keeper.stamp(), 0.0
-        self._kept = tuple(entry.component.key for entry in state.catalogue)
+        self._kept, self._kept_at = tuple(entry.component.key for entry in state.catalogue), 0.0
         self._supervisor = Supervisor(decided(state, decisions), longest)
         self._recorder = Companion("otolith-recorder", "otolith.outlets.recorder:main", RECORDER_ROOM)
         self._recording = recording if plan.file.recording.enabled else None
@@ -99,6 +102,7 @@ class Service:
         machine, driver = self._plan.file.machine, self._plan.driver
         self._publisher = Publisher(machine.site, machine.name, self._listen, self._plan.file.zenoh.connect)
         driver.open(self._rings.deliver)
+        self._housekeeper.start()
         self._supervisor.start()
         self._start_recorder()
         self._started = self._progress = time.monotonic()
@@ -111,9 +115,11 @@ class Service:
             steps.callback(self._notifier.close)
             if self._publisher is not None:
                 steps.callback(self._publisher.close)
+            steps.callback(self._housekeeper.stop, KEEPER_FLUSH)
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
             steps.callback(self._supervisor.stop)
             steps.callback(self._plan.driver.close)
+            self._keep(math.inf)
             self._notifier.stopping()
 
     def _start_recorder(self) -> None:
@@ -144,29 +150,18 @@ class Service:
         self._watch(time.monotonic())
 
     def _keep(self, now: float) -> None:
-        """Write down components that are new, gone, or known better than a while ago."""
+        """Have components written down that are new, gone, or known better than a while ago."""
         state = self._supervisor.state
         found = tuple(entry.component.key for entry in state.catalogue)
-        if found == self._kept and (not found or now - self._kept_at < KEEP_EVERY):
-            return
-        try:
-            self._keeper.keep(kept(state))
-        except OtolithError as error:  # a full disk must not end the watching
-            log.warning("components are not kept: %s", error)
-        self._kept, self._kept_at = found, now
+        if found != self._kept or (found and now - self._kept_at >= KEEP_EVERY):
+            self._housekeeper.keep(kept(state))
+            self._kept, self._kept_at = found, now
 
     def _listen_to_specialist(self) -> None:
         """What has been said about components since it was last looked at."""
-        stamp = self._keeper.stamp()
-        if stamp == self._said:
-            return
-        self._said = stamp
-        try:
-            decisions = self._keeper.decisions()
-        except OtolithError as error:
-            log.warning("%s", error)
-            return
-        self._supervisor.revise(lambda state: decided(state, decisions))
+        decisions = self._housekeeper.heard()
+        if decisions is not None:
+            self._supervisor.revise(lambda state: decided(state, decisions))
 
     def _regrid(self) -> None:
         """Where the machine gives less than was asked, windows are made of what it gives."""

@@ -8,14 +8,34 @@ import subprocess
 import sys
 import time
 from collections import namedtuple
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from otolith.adaptation.catalogue import Approval, Entry
+from otolith.adaptation.component import Component
+from otolith.keeping import Keeper
 from otolith.outlets import recorder
+from otolith.plan import load_plan
+from otolith.specialist import Decisions, Kept
 from otolith.twins import find_twin
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
+
+# Seen only while the shaft all but stands, so that nothing makes it fade.
+DRY = Component("shaft", "Stribeck", "omega", -0.004, inner=0.01, low=0.005, high=0.02)
+
+
+@pytest.fixture
+def running_with_component(own_machine: OwnMachine, tmp_path: Path) -> Iterator[tuple[Running, Keeper]]:
+    """A daemon that knows of friction at rest."""
+    plan = load_plan(own_machine.machine, with_driver=False)
+    keeper = Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin)
+    keeper.keep((Kept(Entry(DRY, 5.0), (-0.004, 0.01), (1e-3, 1e-3)),))
+    running = Running(own_machine, tmp_path)
+    yield running, keeper
+    running.close()
 
 
 def test_it_tells_systemd_when_it_is_ready_and_of_every_progress(own_machine: OwnMachine, tmp_path: Path) -> None:
@@ -47,7 +67,6 @@ def test_a_stopped_worker_starves_the_watchdog(
 ) -> None:
     """Fed by finished windows only: the rule itself, without waiting for half a minute."""
     from otolith import service as module  # noqa: PLC0415
-    from otolith.plan import load_plan  # noqa: PLC0415
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
@@ -93,6 +112,20 @@ def test_windows_without_a_recorder_are_counted(running: Running) -> None:
     code, seconds = running.stop()
     assert code == 0
     assert seconds < 3.0
+
+
+def test_components_are_kept_and_the_specialist_is_heard_while_it_runs(
+    running_with_component: tuple[Running, Keeper],
+) -> None:
+    running, keeper = running_with_component
+    first = running.wait_for(lambda reports: len(reports) >= 1)
+    assert [entry.id for entry in first[0].components] == [DRY.key]
+    keeper.known.unlink()
+    keeper.decide(Decisions(approved=frozenset({DRY.key})))
+    running.wait_for(lambda reports: reports[-1].components[0].approval is Approval.APPROVED)
+    code, seconds = running.stop()
+    assert (code, seconds < 3.0) == (0, True)
+    assert [entry.entry.component.key for entry in keeper.components()] == [DRY.key]  # known better now
 
 
 class Pipe:
