@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from otolith.companion import Companion
 from otolith.console import Board
 from otolith.demo_truth import Comparison, Shaking, compare, shaking
 from otolith.errors import ConfigurationError, OtolithError, ServiceError
@@ -24,6 +25,7 @@ from otolith.health.report import ReportDocument
 from otolith.outlets.zenoh_session import Listener
 from otolith.paths import state_directory, writable
 from otolith.plan import load_plan
+from otolith.state import begin
 from otolith.topics import REPORT
 from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.plants import load_scenario
@@ -64,6 +66,9 @@ class Demo:
         say(f"machine {self._machine}, scenario {self._scenario}, {self._duration:.0f} s", soft_wrap=True)
         say(f"frames on {self._plan.driver.describe()[0]}; reports on {connect[0]}, key {key}", soft_wrap=True)
         _refuse_busy(connect)
+        self._compile(stopped)
+        if stopped():
+            return 130
         try:
             self._start("daemon", "run", str(self._machine), "--recording", str(self.recording))
             self._start("plant", "plant", str(self._scenario), "--truth", str(self._folder / "truth.csv"))
@@ -71,6 +76,25 @@ class Demo:
         finally:
             self._end()
         return 130 if stopped() else self._verdict()
+
+    def _compile(self, stopped: Callable[[], bool]) -> None:
+        """Before the clocks of plant and daemon start: a daemon whose twin is not compiled yet misses windows."""
+        identity, begun = self._plan.file.machine, time.monotonic()
+        compiler = Companion("otolith-compiler", "otolith.worker:main", room=1)
+        compiler.start(begin(identity.name, identity.site, self._plan.problem))
+        compiler.offer(None)  # to end as soon as it could begin
+        text = "compiling the twin, which takes a minute or two the first time ..."
+        if self._console.is_terminal:
+            shown: contextlib.AbstractContextManager[object] = self._console.status(text)
+        else:
+            self._console.print(text)
+            shown = contextlib.nullcontext()
+        with shown:
+            while compiler.alive and not stopped():
+                time.sleep(PAUSE)
+        compiler.kill()
+        if not stopped():
+            self._console.print(f"the twin is compiled, after {time.monotonic() - begun:.0f} s: now the clock runs")
 
     def _start(self, name: str, *arguments: str) -> None:
         """In a session of its own: Ctrl-C is for this process, which ends the others in order."""

@@ -170,6 +170,7 @@ def test_demo_names_what_was_injected(tmp_path: Path, own_machine: OwnMachine) -
     command += ["--machine", str(own_machine.machine), "--scenario", str(own_machine.scenario)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
+    assert "the twin is compiled" in done.stderr
     verdict = json.loads(done.stdout)
     assert verdict["right"]
     assert len(verdict["windows"]) >= 2
