@@ -51,6 +51,7 @@ def _document(
         equation=equation(twin, component, [number.value for number in numbers.values()]),
         values=dict(numbers),
         conditions=component.model.conditions,
+        domain=component.model.domain,
         status=ComponentStatus.FADING if entry.fading else ComponentStatus.ADOPTED,
         approval=entry.approval,
         probability=entry.probability,

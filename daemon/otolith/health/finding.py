@@ -52,6 +52,8 @@ class ComponentDocument(Closed):
     values: dict[str, NumberDocument]
     conditions: str
     """Working conditions under which machines show such a thing (Table 1 of the paper)."""
+    domain: str
+    """Inputs for which such an equation is valid, in words."""
     status: ComponentStatus
     approval: Approval
     probability: float
