@@ -173,8 +173,10 @@ def _expected(untaught: Learned, window: Window, expected: Belief, found: Window
 
 
 def _changed(untaught: Learned, window: Window, case: Case, lesson: Lesson, best: Hypothesis) -> Learned:
-    """After windows that agree on a sudden change, or on a component."""
+    """After windows that agree on a sudden change, on a component, or that one is gone."""
     catalogue = adopted(case, best, untaught.catalogue) if lesson is Lesson.DISCOVERED else untaught.catalogue
+    if lesson is Lesson.FADED:
+        catalogue = tuple(entry for entry in catalogue if slot_of(best.problem, entry.component) is not None)
     memory = Memory(best.belief, best.turned)
     learned = replace(untaught, lesson=lesson, catalogue=catalogue, case=case, adopted=best)
     return _rebased(learned, window, replace(best.problem, excluded=untaught.problem.excluded), memory)

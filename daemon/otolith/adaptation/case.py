@@ -198,9 +198,11 @@ def _pruned(entry: Hypothesis) -> Hypothesis:
         return entry
     fewer = without(problem, problem.components[weakest])
     by = tuple(turn for slot, turn in enumerate(entry.turned.by) if slot != weakest)
-    name = " and ".join(component.key for component in fewer.components)
+    claim = entry.claim
+    if claim.reason in (Reason.COMPONENT, Reason.SENSOR):  # the others are not about what is in the twin
+        claim = replace(claim, name=" and ".join(component.key for component in fewer.components))
     return replace(
-        entry, claim=replace(entry.claim, name=name), problem=fewer, belief=rebased(entry.belief, problem, fewer),
+        entry, claim=claim, problem=fewer, belief=rebased(entry.belief, problem, fewer),
         turned=replace(entry.turned, by=by),
     )  # fmt: skip
 

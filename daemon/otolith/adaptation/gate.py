@@ -132,14 +132,10 @@ def decided(case: Case, problem: Problem) -> tuple[Lesson, Hypothesis]:
         return Lesson.LEARNED, best
     if best.cost > REFUSED:
         return Lesson.REFUSED, best
-    own = {entry.label for entry in best.problem.free} == {entry.label for entry in problem.free}
-    if (
-        best.reason is Reason.PARAMETER
-        and own
-        and case.leading >= STEP_AFTER
-        and case.probability(best.reason) >= STEP_SURE
-    ):
-        return Lesson.STEPPED, best
+    own, known = ({entry.label for entry in each.free} for each in (best.problem, problem))
+    agreed = case.leading >= STEP_AFTER and case.probability(best.reason) >= STEP_SURE
+    if best.reason is Reason.PARAMETER and agreed and own <= known:  # fewer if a component has moved down to nothing
+        return Lesson.STEPPED if own == known else Lesson.FADED, best
     if case.probability(Reason.SENSOR) >= (SENSOR_SURE if case.open else SENSOR_LIKELY):
         return Lesson.SENSOR, next(entry for entry in case.hypotheses if entry.reason is Reason.SENSOR)
     sure = case.leading >= COMPONENT_AFTER and case.probability(Reason.COMPONENT) >= COMPONENT_SURE
