@@ -12,7 +12,7 @@ import click
 if TYPE_CHECKING:
     from otolith.keeping import Keeper
     from otolith.plan import Plan
-    from otolith.specialist import Kept
+    from otolith.specialist import Decisions, Kept
     from otolith.state import State
 
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -81,9 +81,8 @@ def _words(plan: "Plan", entry: "Kept") -> str:
 def approve(file: Path, component: str) -> None:
     """COMPONENT belongs to the healthy machine: it stays in the twin and is no finding."""
     _, keeper = _keeper(file)
-    said = keeper.decisions()
-    _known(keeper, component, said.rejected)
-    keeper.decide(replace(said, approved=said.approved | {component}, rejected=said.rejected - {component}))
+    said = _unsaid(keeper, component)
+    keeper.decide(replace(said, approved=said.approved | {component}))
     click.echo(f"{component} is approved")
 
 
@@ -93,9 +92,8 @@ def approve(file: Path, component: str) -> None:
 def reject(file: Path, component: str) -> None:
     """COMPONENT is none: it leaves the twin and is not looked for again."""
     _, keeper = _keeper(file)
-    said = keeper.decisions()
-    _known(keeper, component, said.approved)
-    keeper.decide(replace(said, approved=said.approved - {component}, rejected=said.rejected | {component}))
+    said = _unsaid(keeper, component)
+    keeper.decide(replace(said, rejected=said.rejected | {component}))
     click.echo(f"{component} is rejected")
 
 
@@ -105,11 +103,8 @@ def reject(file: Path, component: str) -> None:
 def forget(file: Path, component: str) -> None:
     """Forget COMPONENT and what was said of it: if it is there, it will be found anew."""
     _, keeper = _keeper(file)
-    said = keeper.decisions()
-    _known(keeper, component, said.approved | said.rejected)
-    forgotten = {**said.forgotten, component: time.time()}
-    approved, rejected = said.approved - {component}, said.rejected - {component}
-    keeper.decide(replace(said, approved=approved, rejected=rejected, forgotten=forgotten))
+    said = _unsaid(keeper, component)
+    keeper.decide(replace(said, forgotten={**said.forgotten, component: time.time()}))
     click.echo(f"{component} is forgotten")
 
 
@@ -121,17 +116,19 @@ def _keeper(file: Path) -> "tuple[Plan, Keeper]":
     return plan, Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin)
 
 
-def _known(keeper: "Keeper", component: str, said: frozenset[str]) -> None:
-    """Refuse what has never been heard of.
+def _unsaid(keeper: "Keeper", component: str) -> "Decisions":
+    """What has been said, but for what was said of ``component``.
 
     Raises:
-        ConfigurationError: with the nearest one that has.
+        ConfigurationError: it has never been heard of; with the nearest one that has.
     """
     from otolith.errors import ConfigurationError, nearest
 
-    known = {entry.entry.component.key for entry in keeper.components()} | said
+    said = keeper.decisions()
+    known = {entry.entry.component.key for entry in keeper.components()} | said.approved | said.rejected
     if component not in known:
         raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
+    return replace(said, approved=said.approved - {component}, rejected=said.rejected - {component})
 
 
 @click.command()
@@ -197,14 +194,22 @@ def _ask(plan: "Plan", keeper: "Keeper", state: "State", *, yes: bool) -> None:
     found = kept(state)
     for entry in found:
         key = entry.entry.component.key
-        click.echo(f"found {key}: {_words(plan, entry)}")
-        (approved if yes or click.confirm("does it belong to the healthy machine?") else rejected).add(key)
+        click.echo(f"found {key}: {_words(plan, entry)}", err=True)
+        (approved if yes or _belongs() else rejected).add(key)
     keeper.keep(tuple(entry for entry in found if entry.entry.component.key in approved))
     keeper.decide(replace(said, approved=said.approved | approved, rejected=(said.rejected | rejected) - approved))
     if not found:
-        click.echo("no component was found: the twin explains the machine up to the noise")
+        click.echo("no component was found: the twin explains the machine up to the noise", err=True)
     for name, parameter in _parameters(state):
-        click.echo(f"{name} = {parameter}")
+        click.echo(f"{name} = {parameter}", err=True)
+
+
+def _belongs() -> bool:
+    try:
+        return click.confirm("does it belong to the healthy machine?", err=True)
+    except click.Abort:
+        click.echo("\nnot answered: nothing is kept; answer y or n, or give --yes", err=True)
+        raise
 
 
 def _parameters(state: "State") -> Iterator[tuple[str, str]]:
