@@ -78,7 +78,16 @@ def pages(rows: Sequence[Found]) -> Iterator[RenderableType]:
         whole.add_column(f"{100 * noise:g} % noise", justify="right")
     for name in names:
         whole.add_row(name, *(_whole([r.answers[name] for r in rows if r.noise == noise]) for noise in NOISES))
+    for variant in sorted({name.partition(" ")[0] for name in names[1:]}):
+        best = (_whole([_best(row, variant) for row in rows if row.noise == noise]) for noise in NOISES)
+        whole.add_row(f"{variant}, the best setting for each window", *best)
     yield whole
+
+
+def _best(row: Found, variant: str) -> Answer:
+    """Of all settings the one that somebody who knew the truth would choose for this window."""
+    own = [answer for name, answer in row.answers.items() if name.partition(" ")[0] == variant]
+    return max(own, key=lambda entry: (entry.right and not entry.spurious, entry.right, -entry.spurious))
 
 
 def document(rows: Sequence[Found]) -> list[dict[str, Any]]:
