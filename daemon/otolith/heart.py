@@ -12,7 +12,7 @@ from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.case import Case, Hypothesis
 from otolith.adaptation.catalogue import FADES_AFTER, adopted, alternatives, approving, faded, slot_of, words
 from otolith.adaptation.claims import Reason
-from otolith.adaptation.completion import plain, without
+from otolith.adaptation.completion import plain
 from otolith.adaptation.estimate import WindowEstimate, estimate, refine
 from otolith.adaptation.fusion import Belief, carried, overall, rebased
 from otolith.adaptation.gate import (
@@ -34,10 +34,10 @@ from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
 from otolith.adaptation.sensors import stuck
 from otolith.adaptation.spikes import without_spikes
-from otolith.adaptation.tracking import is_lost, moved_on, outlived, turned
+from otolith.adaptation.tracking import is_lost, left_out, moved_on, outlived, turned
 from otolith.health.report import Report
 from otolith.reporting import Learned, document_of, traces_of
-from otolith.state import State
+from otolith.state import State, without_component
 
 FEWEST_RECORDS = 5
 SEARCHED = 5000  # records, the last ones of a window, in which components are looked for: a search has to end
@@ -54,7 +54,8 @@ UNEXPLAINED = "the twin does not explain the window up to the noise: another par
 
 def adapt(state: State, window: Window) -> tuple[State, Report]:
     """Adapt the twin to ``window``; a bad window leaves what is known where it was and is reported."""
-    state = _without_outlived(state, window)
+    for component in outlived(state.problem, window):
+        state = without_component(state, component)
     learned = _judge(state, window)
     learned = replace(learned, catalogue=approving(learned.catalogue, state.approved))
     standing, document = document_of(state, window, learned)
@@ -67,20 +68,6 @@ def adapt(state: State, window: Window) -> tuple[State, Report]:
         records=_next_records(state, window, learned),
     )
     return after, Report(document, traces_of(state, window, learned))
-
-
-def _without_outlived(state: State, window: Window) -> State:
-    """Without components whose time is over."""
-    for component in outlived(state.problem, window):
-        fewer = without(state.problem, component)
-        belief, turn = rebased(state.memory.belief, state.problem, fewer), state.memory.turned
-        if turn is not None:
-            keys = [entry.key for entry in state.problem.components]
-            turn = replace(turn, by=tuple(turn.by[keys.index(entry.key)] for entry in fewer.components))
-        rest = tuple(entry for entry in state.catalogue if entry.component.key != component.key)
-        memory = replace(state.memory, belief=belief, turned=turn, case=None)
-        state = replace(state, problem=fewer, memory=memory, catalogue=rest)
-    return state
 
 
 def _judge(state: State, window: Window) -> Learned:
@@ -162,14 +149,14 @@ def _expected(untaught: Learned, window: Window, expected: Belief, found: Window
     slot = None if gone is None else slot_of(problem, gone.component)
     if gone is None or slot is None:
         return _said(learned)
-    fewer = without(problem, problem.components[slot])
-    bare = rebased(memory.belief, problem, fewer)
+    fewer, bare, turn = left_out(problem, memory.belief, memory.turned, slot)
     if refine(fewer, window, _start(overall(bare, fewer), fewer), overall(bare, fewer)).cost > max(
         EXPLAINED, found.cost
     ):
         return _said(learned)  # it is still needed, however little is known of it
     rest = tuple(entry for entry in catalogue if entry is not gone)
-    return _rebased(replace(learned, lesson=Lesson.FADED, catalogue=rest), window, fewer, memory)
+    learned = replace(learned, lesson=Lesson.FADED, catalogue=rest)
+    return _rebased(learned, window, fewer, replace(memory, belief=bare, turned=turn))
 
 
 def _changed(untaught: Learned, window: Window, case: Case, lesson: Lesson, best: Hypothesis) -> Learned:
@@ -178,22 +165,14 @@ def _changed(untaught: Learned, window: Window, case: Case, lesson: Lesson, best
     if lesson is Lesson.FADED:
         catalogue = tuple(entry for entry in catalogue if slot_of(best.problem, entry.component) is not None)
     memory = Memory(best.belief, best.turned)
-    learned = replace(untaught, lesson=lesson, catalogue=catalogue, case=case, adopted=best)
+    learned = replace(untaught, lesson=lesson, catalogue=catalogue, case=case)
     return _rebased(learned, window, replace(best.problem, excluded=untaught.problem.excluded), memory)
 
 
 def _rebased(learned: Learned, window: Window, problem: Problem, memory: Memory) -> Learned:
-    """With another twin, or knowledge begun anew."""
-    belief = memory.belief
-    if len(belief.mean[0]) != 2 * len(problem.free):
-        belief = rebased(belief, learned.problem, problem)
-    turn = memory.turned
-    if turn is not None and len(turn.by) != len(problem.components):
-        keys = [entry.key for entry in learned.problem.components]
-        turn = replace(turn, by=tuple(turn.by[keys.index(entry.key)] for entry in problem.components))
-    after = overall(belief, problem)
+    """With another twin, of which ``memory`` is, or knowledge begun anew."""
+    after = overall(memory.belief, problem)
     found = refine(problem, window, _start(after, problem), after)
-    memory = replace(memory, belief=belief, turned=turn)
     return _said(replace(learned, memory=memory, before=after, after=after, problem=problem, found=found))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.advice import Situation, advise
-from otolith.adaptation.case import Case, Hypothesis
+from otolith.adaptation.case import Case
 from otolith.adaptation.catalogue import Entry
 from otolith.adaptation.completion import driven
 from otolith.adaptation.estimate import WindowEstimate
@@ -49,8 +49,6 @@ class Learned:
     """What there is to say of the window as a whole."""
     case: Case | None = None
     """What could have happened, if that is a question."""
-    adopted: Hypothesis | None = None
-    """What has been found to have happened."""
     searched: bool = False
     """Whether it was asked what else could have happened."""
 

@@ -168,7 +168,9 @@ class Service:
         period, now = self._plan.driver.link().period, self._windower.sample_period
         if period is None or abs(period / now - 1.0) < OTHER_GRID:
             return
-        self._supervisor.revise(lambda state: regridded(state, period / now))
+        plan = self._plan
+        ratio = period / plan.file.window.sample_period
+        self._supervisor.revise(lambda state: regridded(state, plan.problem.window, ratio))
         self._windower.regrid(self._supervisor.records, period)
         found = f"the machine gives a sample every {period * 1e3:.4g} ms, not every {now * 1e3:.4g} ms"
         size = f"{self._windower.records} records in {self._windower.length:.4g} s"

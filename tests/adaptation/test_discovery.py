@@ -280,6 +280,7 @@ def test_a_twin_that_is_full_goes_on() -> None:
         assert document.lesson.value in document.parameters["R_a"].reason
         names = [entry.text for entry in document.explanations if entry.reason is Reason.PARAMETER]
         assert not any(component in name.split(" and ") for name in names for component in three)
-    assert {document.lesson for document in documents[4:]} <= {Lesson.LEARNED, Lesson.FADED}
+    assert Lesson.REFUSED not in {document.lesson for document in documents[4:]}
+    assert {document.lesson for document in documents[-3:]} == {Lesson.LEARNED}
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
     assert len(documents[-1].components) == 2  # the third one was never there

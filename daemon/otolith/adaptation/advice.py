@@ -89,18 +89,25 @@ def _ends(entry: Input, here: float, size: float) -> tuple[float, float]:
     return here, min(max(there, entry.low), entry.high)
 
 
+def numbers_at(problem: Problem, mean: Array) -> tuple[Array, list[int]]:
+    """All parameters of the twin (parameters,), the free ones as in ``mean`` (free, ...), and where those are."""
+    order, given = [entry.name for entry in problem.twin.parameters], dict(problem.known)
+    parameters = np.array([given.get(entry.name, entry.nominal) for entry in problem.twin.parameters])
+    places = [order.index(entry.name) for entry in problem.free]
+    parameters[places] = np.clip(mean[: len(places)], *problem.bounds)
+    return parameters, places
+
+
 def _reaches(problem: Problem, known: Prior, situation: Situation, move: Move) -> Array:
     """(free,) half of the 95 % interval of each parameter after ``move``; the initial state is estimated along."""
     twin, kernel, free = problem.twin, kernel_of(problem.twin), len(problem.free)
-    order = [entry.name for entry in twin.parameters[: len(twin.parameters) - twin.settings]]
-    parameters = np.array([dict(problem.known).get(entry.name, entry.nominal) for entry in twin.parameters])
-    places = [order.index(entry.name) for entry in problem.free]
-    parameters[places] = np.clip(known.mean[:free], *problem.bounds)
+    parameters, columns = numbers_at(problem, known.mean)
     records = len(move.inputs)
     period = situation.records * situation.sample_period / records
     with np.errstate(over="ignore", invalid="ignore"):
         slopes = kernel.sensitivities(parameters, situation.state, Excitation(move.inputs, period, SUBSTEPS)).slopes
-        columns = [*places, *range(len(order), len(order) + len(twin.states))]
+        base = len(twin.parameters) - twin.settings
+        columns += range(base, base + len(twin.states))
         jacobian = (slopes[:, :, columns] / np.array(problem.noise)[None, :, None]).reshape(-1, len(columns))
         information = jacobian.T @ jacobian
     deviations = np.sqrt(np.diag(known.covariance)[:free])

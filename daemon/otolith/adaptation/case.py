@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.claims import Claim, Explanation, Reason, explanation
-from otolith.adaptation.completion import Mode, mode_of, places, plain, without
+from otolith.adaptation.claims import Claim, Explanation, Reason, explanation, unexplained
+from otolith.adaptation.completion import places
 from otolith.adaptation.fusion import Belief, carried, overall, rebased, updated, with_prior
 from otolith.adaptation.glance import glance
 from otolith.adaptation.information import inflation
 from otolith.adaptation.prior import Evidence
 from otolith.adaptation.problem import Problem
 from otolith.adaptation.screening import CLEARLY
-from otolith.adaptation.tracking import Turned, moved_on, turned
+from otolith.adaptation.tracking import Turned, left_out, moved_on, turned
 
 MOST = 7  # explanations that are followed
 WORTH = 30.0  # in -2 log evidence: an explanation worse than the best by more is not followed
@@ -50,6 +50,16 @@ class Hypothesis:
         return self.claim.reason
 
 
+@dataclass(frozen=True, slots=True)
+class Told:
+    """How well a window is explained by what explains it best."""
+
+    chi_square: float = 0.0
+    price: float = 0.0
+    """Of the explanation, in -2 log evidence."""
+    records: float = 1.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
     """What could have happened. Plain: it pickles."""
@@ -62,8 +72,8 @@ class Case:
     """That these hypotheses have been followed."""
     leading: int = 1
     """Windows in a row in which the best was the best."""
-    last: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Of the last window under what explains it best: χ², what that cost in -2 log evidence, and records."""
+    last: Told = Told()
+    """Of the last window."""
     surprise: float = 1.0
     """Of the first window under "nothing has happened", χ² per record."""
 
@@ -112,8 +122,8 @@ def opened(explanations: Sequence[Explanation], problem: Problem, expected: Beli
     """A case on ``window``; ``expected`` is what was known, carried to its end."""
     explanations = [*explanations[:1], *(entry for entry in explanations[1:] if entry.chi_square < DIVERGED)]
     records = explanations[0].informed.count
-    unexplained = _unexplained([entry.chi_square for entry in explanations], records)
-    deviances = [entry.deviance(records, unexplained) for entry in explanations]
+    left = unexplained([entry.chi_square for entry in explanations], records)
+    deviances = [entry.deviance(records, left) for entry in explanations]
     order = np.argsort(deviances, kind="stable").tolist()
     least = deviances[order[0]]
     kept = [at for at in order if deviances[at] <= least + WORTH][:MOST]
@@ -123,7 +133,7 @@ def opened(explanations: Sequence[Explanation], problem: Problem, expected: Beli
     ]
     surprise = explanations[0].chi_square / max(records, 1.0)
     best = explanations[order[0]]
-    last = (best.chi_square, least - best.chi_square / unexplained, records)
+    last = Told(best.chi_square, least - best.chi_square / left, records)
     return Case(_sorted(found), window.start, last=last, surprise=max(surprise, 1.0))
 
 
@@ -136,15 +146,15 @@ def followed(case: Case, window: Window) -> Case:
         fits.append((entry, belief, explanation(replace(entry.claim, numbers=0), entry.problem, window, prior)))
     fits = [fit for fit in fits if fit[2].chi_square < DIVERGED] or fits[:1]
     records = fits[0][2].informed.count
-    unexplained = _unexplained([fit.chi_square for _, _, fit in fits], records)
+    left = unexplained([fit.chi_square for _, _, fit in fits], records)
     told = [_told(fit) for _, _, fit in fits]
     deviances = [
-        fit.chi_square / unexplained + _occam(belief, evidence, entry.problem)
+        fit.chi_square / left + _occam(belief, evidence, entry.problem)
         for (entry, belief, fit), (evidence, _) in zip(fits, told, strict=True)
     ]
     least = min(deviances)
     best_chi = fits[int(np.argmin(deviances))][2].chi_square
-    case = replace(case, last=(best_chi, least - best_chi / unexplained, records))
+    case = replace(case, last=Told(best_chi, least - best_chi / left, records))
     found = []
     for (entry, belief, fit), (evidence, last), deviance in zip(fits, told, deviances, strict=True):
         after = updated(belief, evidence, entry.problem)
@@ -159,21 +169,21 @@ def followed(case: Case, window: Window) -> Case:
     best = next((fit for entry, _, fit in fits if entry.claim == hypotheses[0].claim), None)
     if best is None:  # it has lost a component, and there was none of it in the window
         return replace(case, hypotheses=hypotheses, windows=case.windows + 1)
-    left = glance(best.problem, window, best.prior, best.fit.guess).gain
-    hypotheses = (replace(hypotheses[0], silent=left <= 0.0), *hypotheses[1:])
+    gain = glance(best.problem, window, best.prior, best.fit.guess).gain
+    hypotheses = (replace(hypotheses[0], silent=gain <= 0.0), *hypotheses[1:])
     return replace(case, hypotheses=hypotheses, windows=case.windows + 1)
 
 
 def joined(case: Case, fresh: Case) -> Case:
     """A case with what a new search has found in its last window, if that is clearly better than what was followed."""
-    (followed_chi, followed_price, records), (fresh_chi, fresh_price, _) = case.last, fresh.last
-    better = (followed_chi - fresh_chi) / _unexplained([fresh_chi], records) + followed_price - fresh_price
+    old, new = case.last, fresh.last
+    better = (old.chi_square - new.chi_square) / unexplained([new.chi_square], old.records) + old.price - new.price
     if better <= CLEARLY:
         return case
     known = {entry.claim.name for entry in case.hypotheses}
-    new = [entry for entry in fresh.hypotheses if entry.claim.name not in known]
+    more = [entry for entry in fresh.hypotheses if entry.claim.name not in known]
     lead = min(better, MOST_OF_ONE)
-    hypotheses = _sorted([*(replace(entry, deviance=entry.deviance + lead) for entry in case.hypotheses), *new])
+    hypotheses = _sorted([*(replace(entry, deviance=entry.deviance + lead) for entry in case.hypotheses), *more])
     leading = case.leading if hypotheses[0].claim.name == case.best.claim.name else 1
     return replace(case, hypotheses=hypotheses[: 2 * MOST], leading=leading)
 
@@ -196,15 +206,11 @@ def _pruned(entry: Hypothesis) -> Hypothesis:
     weakest = int(np.argmin(weights))
     if weights[weakest] >= NOTICED:
         return entry
-    fewer = without(problem, problem.components[weakest])
-    by = tuple(turn for slot, turn in enumerate(entry.turned.by) if slot != weakest)
+    problem, belief, turn = left_out(problem, entry.belief, entry.turned, weakest)
     claim = entry.claim
     if claim.reason in (Reason.COMPONENT, Reason.SENSOR):  # the others are not about what is in the twin
-        claim = replace(claim, name=" and ".join(component.key for component in fewer.components))
-    return replace(
-        entry, claim=claim, problem=fewer, belief=rebased(entry.belief, problem, fewer),
-        turned=replace(entry.turned, by=by),
-    )  # fmt: skip
+        claim = replace(claim, name=" and ".join(component.key for component in problem.components))
+    return replace(entry, claim=claim, problem=problem, belief=belief, turned=turn)
 
 
 def _begun(found: Explanation, problem: Problem, expected: Belief, window: Window, deviance: float) -> Hypothesis:
@@ -226,18 +232,8 @@ def _cost(found: Explanation) -> float:
     return float(np.sqrt(found.informed.chi_square(found.fit) / found.informed.count))
 
 
-def _unexplained(chi_squares: Sequence[float], records: float) -> float:
-    return max(min(chi_squares) / records, 1.0)
-
-
 def _occam(belief: Belief, evidence: Evidence, problem: Problem) -> float:
     """How little the hypothesis said beforehand of what the window then said, as -2 log evidence."""
     known = overall(belief, problem).covariance
     seen = evidence.root @ known @ evidence.root.T
     return float(np.linalg.slogdet(np.eye(len(seen)) + seen)[1])
-
-
-def is_of_machine(entry: Hypothesis) -> bool:
-    """Whether it is a component of the machine itself."""
-    twin = plain(entry.problem)
-    return any(mode_of(twin, component) is Mode.COMPONENT for component in entry.problem.components)

@@ -9,6 +9,7 @@ from otolith.adaptation.case import Case, Hypothesis
 from otolith.adaptation.claims import Reason
 from otolith.adaptation.completion import equation, places, plain, site_of
 from otolith.adaptation.component import Component
+from otolith.adaptation.fusion import overall
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
 
@@ -23,8 +24,6 @@ class Approval(StrEnum):
     OPEN = "open"
     APPROVED = "approved"
     """It belongs to the healthy machine."""
-    REJECTED = "rejected"
-    """It is not to be looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +79,7 @@ def words(found: Hypothesis) -> str:
     twin, problem = plain(found.problem), found.problem
     if found.reason is Reason.SENSOR and problem.components:
         return _of_sensor(found)
-    mean = found.belief.weight @ found.belief.mean
-    values = mean[: len(problem.free)] * problem.scale
+    values = overall(found.belief, problem).mean
     return "; ".join(
         f"{entry.site}: {equation(twin, entry, values[places(problem, slot)].tolist())}"
         for slot, entry in enumerate(problem.components)
@@ -94,9 +92,7 @@ def _of_sensor(found: Hypothesis) -> str:
     slot = len(problem.components) - 1
     component = problem.components[slot]
     site = site_of(plain(problem), component.site)
-    value = float(
-        (found.belief.weight @ found.belief.mean)[places(problem, slot)[0]] * problem.scale[places(problem, slot)[0]]
-    )
+    value = float(overall(found.belief, problem).mean[places(problem, slot)[0]])
     off = f"{value:+.1%}" if component.family == "linear" else f"{value:+.2g} {site.unit}"
     return f"{site.into} reads {off} off: look at the sensor and its scale"
 

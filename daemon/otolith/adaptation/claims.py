@@ -3,6 +3,7 @@
 What explains better is told by evidence (G. Schwarz, Annals of Statistics 6, 1978).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -77,6 +78,11 @@ class Explanation:
         """-2 log evidence, where even the best leaves ``unexplained`` times the noise (variance)."""
         claim = self.claim
         return float(self.chi_square / unexplained + claim.numbers * np.log(records) + claim.odds)
+
+
+def unexplained(chi_squares: Iterable[float], records: float) -> float:
+    """How many times the noise (variance) even the best explanation leaves; at least one."""
+    return max(min(chi_squares) / records, 1.0)
 
 
 def extended(prior: Prior, problem: Problem, wider: Problem) -> Prior:

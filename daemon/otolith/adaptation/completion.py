@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from enum import StrEnum
 
 import numpy as np
 
@@ -30,13 +29,6 @@ STRETCH = 3.0  # times what was found: how far an inner number may move
 TURNS = 4.0 * np.pi  # rad: bounds of a phase, which is brought back between -pi and pi after every window
 
 
-class Mode(StrEnum):
-    """What a component is an explanation by."""
-
-    COMPONENT = "component"
-    SENSOR = "sensor"
-
-
 def site_of(twin: Definition, name: str) -> Site:
     """By its name; ``twin`` is the author's."""
     return next(entry for entry in sites(twin) if entry.name == name)
@@ -45,12 +37,6 @@ def site_of(twin: Definition, name: str) -> Site:
 def source_of(twin: Definition, name: str) -> Source:
     """By its name; ``twin`` is the author's."""
     return next(entry for entry in sources(twin) if entry.name == name)
-
-
-def mode_of(twin: Definition, component: Component) -> Mode:
-    """Whether it is of the machine or of a sensor."""
-    own = {entry.name for entry in twin.sites}
-    return Mode.COMPONENT if component.site in own else Mode.SENSOR
 
 
 def plain(problem: Problem) -> Definition:

@@ -12,7 +12,7 @@ from otolith.twin.kernel import Numbers
 from otolith.twin.metamodels import METAMODELS, Kind, MetaModel, code_of
 from otolith.twin.slots import Source, sites, sources
 
-SENSOR_FAMILIES = {"constant": "", "linear": "itself"}  # an offset and a gain
+SENSOR_FAMILIES = frozenset({"constant", "linear"})  # an offset and a gain
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,15 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.claims import Claim, Explanation, Reason, explanation, extended, with_candidate
+from otolith.adaptation.claims import (
+    Claim,
+    Explanation,
+    Reason,
+    explanation,
+    extended,
+    unexplained,
+    with_candidate,
+)
 from otolith.adaptation.completion import plain
 from otolith.adaptation.glance import Glance, glance
 from otolith.adaptation.landscape import Landscape
@@ -50,9 +58,9 @@ def search(problem: Problem, window: Window, prior: Prior, seen: Glance) -> list
 def _convinces(found: list[Explanation]) -> bool:
     """Whether one of them explains the window, by one component at most, and clearly better than nothing does."""
     records = found[0].informed.count
-    unexplained = max(min(entry.chi_square for entry in found) / records, 1.0)
-    best = min(found, key=lambda entry: entry.deviance(records, unexplained))
-    gained = found[0].deviance(records, unexplained) - best.deviance(records, unexplained)
+    left = unexplained((entry.chi_square for entry in found), records)
+    best = min(found, key=lambda entry: entry.deviance(records, left))
+    gained = found[0].deviance(records, left) - best.deviance(records, left)
     more = len(best.problem.components) - len(found[0].problem.components)
     return gained > CLEARLY and more <= 1 and best.chi_square <= EXPLAINED**2 * records
 
@@ -86,7 +94,7 @@ def _one_moved(problem: Problem, window: Window, prior: Prior, landscape: Landsc
         entry = all_of_them[index]
         claim = Claim(Reason.PARAMETER, entry.label, 1, float(len(all_of_them)))
         if index < len(problem.free):
-            found.append(explanation(claim, problem, window, opened_at(prior, problem, index), prior.mean))
+            found.append(explanation(claim, problem, window, _but_for(prior, problem, index), prior.mean))
         else:
             rest = tuple(pair for pair in problem.known if pair[0] != entry.name)
             wider = replace(problem, free=(*problem.free, entry), known=rest)
@@ -94,7 +102,7 @@ def _one_moved(problem: Problem, window: Window, prior: Prior, landscape: Landsc
     return found
 
 
-def opened_at(prior: Prior, problem: Problem, index: int) -> Prior:
+def _but_for(prior: Prior, problem: Problem, index: int) -> Prior:
     """What is known, but nothing of one parameter."""
     mean, covariance, fresh = prior.mean.copy(), prior.covariance.copy(), vague(problem)
     for at in (index, index + len(problem.free)):
@@ -145,4 +153,4 @@ def _further(best: Explanation, window: Window) -> Explanation | None:
         return None
     records = best.informed.count
     gained = best.deviance(records, 1.0) - found.deviance(records, 1.0)
-    return found if gained / max(found.chi_square / records, 1.0) > CLEARLY else None
+    return found if gained / unexplained([found.chi_square], records) > CLEARLY else None

@@ -7,9 +7,10 @@ could still explain of the other's answer is taken out first.
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.adaptation.advice import ELSE, SUBSTEPS, Move, Situation, moves
+from otolith.adaptation.advice import ELSE, SUBSTEPS, Move, Situation, moves, numbers_at
 from otolith.adaptation.case import Hypothesis
 from otolith.adaptation.completion import plain
+from otolith.adaptation.fusion import overall
 from otolith.adaptation.screening import CLEARLY
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twin.slots import ELAPSED
@@ -35,7 +36,8 @@ def _distance(first: Hypothesis, second: Hypothesis, situation: Situation, move:
     if not (np.isfinite(difference).all() and np.isfinite(weighted).all()):
         return 0.0
     free, states = len(first.problem.free), len(plain(first.problem).states)
-    allowed = np.sqrt(np.maximum(np.diag(_covariance(first))[:free], 0.0))
+    known = overall(first.belief, first.problem).covariance
+    allowed = np.sqrt(np.maximum(np.diag(known)[:free], 0.0))
     rows = np.vstack([weighted, np.diag(np.concatenate([1.0 / np.maximum(allowed, 1e-30), np.zeros(states)]))])
     wanted = np.concatenate([difference, np.zeros(free + states)])
     size = np.maximum(np.linalg.norm(rows, axis=0), 1e-30)
@@ -44,22 +46,11 @@ def _distance(first: Hypothesis, second: Hypothesis, situation: Situation, move:
     return float(left @ left)
 
 
-def _covariance(hypothesis: Hypothesis) -> Array:
-    """(2 free, 2 free) in the units of the numbers."""
-    belief, size = hypothesis.belief, np.tile(hypothesis.problem.scale, 2)
-    return np.asarray(np.einsum("m,mij->ij", belief.weight, belief.covariance) * np.outer(size, size))
-
-
 def _answer(hypothesis: Hypothesis, situation: Situation, move: Move) -> tuple[Array, Array]:
     """(records, outputs), and its derivatives (records, outputs, free + states)."""
     problem, author = hypothesis.problem, plain(hypothesis.problem)
     twin = problem.twin
-    order = [entry.name for entry in twin.parameters]
-    parameters = np.array([dict(problem.known).get(entry.name, entry.nominal) for entry in twin.parameters])
-    places = [order.index(entry.name) for entry in problem.free]
-    belief = hypothesis.belief
-    values = (belief.weight @ belief.mean)[: len(places)] * problem.scale
-    parameters[places] = np.clip(values, *problem.bounds)
+    parameters, places = numbers_at(problem, overall(hypothesis.belief, problem).mean)
     records, own = len(move.inputs), len(author.inputs)
     period = situation.records * situation.sample_period / records
     inputs = np.zeros((records, len(twin.inputs)))

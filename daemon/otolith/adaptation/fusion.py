@@ -159,6 +159,16 @@ def rebased(belief: Belief, problem: Problem, other: Problem) -> Belief:
     )
 
 
+def pinned(belief: Belief, at: int, sd: float, value: float | None = None) -> Belief:
+    """The belief where of number ``at`` (in shares) no more is known than ``sd``, nor of what goes with it."""
+    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+    if value is not None:
+        mean[:, at] = value
+    covariance[:, at, :] = covariance[:, :, at] = 0.0
+    covariance[:, at, at] = sd**2
+    return replace(belief, mean=mean, covariance=covariance)
+
+
 def with_prior(belief: Belief, prior: Prior, problem: Problem) -> Belief:
     """The belief with ``prior`` under every model of change."""
     size, models = _size(problem), len(belief.weight)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.claims import with_candidate
+from otolith.adaptation.claims import unexplained, with_candidate
 from otolith.adaptation.completion import plain
 from otolith.adaptation.flight import evaluated
 from otolith.adaptation.landscape import Landscape
@@ -74,7 +74,7 @@ def _held(problem: Problem, window: Window, landscape: Landscape) -> float:
             component_of(problem, window, structure, inner, pair), rivals.of(structure), of_sensor=False
         )
         tried = with_candidate(problem, window, fresh, candidate)
-        left = max(tried.chi_square / tried.informed.count, 1.0)
+        left = unexplained([tried.chi_square], tried.informed.count)
         price = tried.deviance(tried.informed.count, 1.0) - tried.chi_square
         price += len(problem.free) * np.log(tried.informed.count)
         best = max(best, (landscape.chi_square - tried.chi_square) / left - price)

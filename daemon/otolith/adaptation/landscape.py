@@ -45,7 +45,7 @@ class Landscape:
         informed = Informed(self.objective, problem, prior)
         guess = informed.guess(begin, self.objective.guess(begin)[len(begin) :])
         residuals, jacobian = informed.linearised(guess)
-        self.records = len(residuals) - len(prior.mean)
+        own = len(residuals) - len(prior.mean)  # the rest is what the prior says
         size = np.linalg.norm(jacobian, axis=0)
         alive = size > 0.0
         basis, singular, _ = np.linalg.svd(jacobian[:, alive] / size[alive], full_matrices=False)
@@ -53,7 +53,7 @@ class Landscape:
         left = residuals - basis @ (basis.T @ residuals)
         self.chi_square = float(left @ left)
         """Of parameters only, with what their prior says."""
-        self._left, self._basis = left[: self.records], basis[: self.records]
+        self._left, self._basis = left[:own], basis[:own]
         self._problem, self._window, self._guess = problem, window, guess
         self._linear, self._correction = self._linearise(guess)
 

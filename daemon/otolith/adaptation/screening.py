@@ -100,18 +100,34 @@ class Candidate:
 
 def candidates(problem: Problem, landscape: Landscape, window: Window) -> list[Candidate]:
     """The components worth a polish, the best first."""
-    all_of_them = sought(problem, landscape.x)
-    rivals = rivals_of(problem, all_of_them)
-    guesses, amplitudes, scores = screened(landscape, problem, all_of_them, FINE)
-    order = np.argsort(-scores, kind="stable")
-    best: dict[Structure, list[int]] = {}
-    for index in order.tolist():
-        best.setdefault(guesses[index][0], []).append(index)
-    if not best:
+    found = sought(problem, landscape.x)
+    rivals = rivals_of(problem, found)
+    settled = _settled(problem, landscape, window, found, rivals)
+    if not settled:
         return []
-    leaders = list(best.items())
-    flown = [(entry, places) for entry, places in leaders if entry.model.inner is not None][:FLOWN]
-    settled = [(guesses[p[0]], amplitudes[p[0]], float(scores[p[0]])) for e, p in leaders if e.model.inner is None]
+    best_score = settled[0][2]
+    settled = _no_parameters(landscape, settled, rivals)
+    least = max(best_score - KEPT - RELATIVE * abs(best_score), -CLEARLY)
+    kept = [entry for entry in settled if entry[2] > least][: _affordable(landscape)]
+    kept += holding(problem, settled[len(kept) :]) if kept else []
+    return [
+        Candidate(component_of(problem, window, *guess, pair), rivals.of(guess[0]), rivals.lies(guess[0]))
+        for guess, pair, _ in kept
+        if 0.0 < np.abs(pair).max() < LARGEST
+    ]
+
+
+def _settled(
+    problem: Problem, landscape: Landscape, window: Window, found: list[Structure], rivals: Rivals
+) -> list[Settled]:
+    """The structures with the best inner numbers that swarms find, the best first; swarms fly for the leaders only."""
+    guesses, amplitudes, scores = screened(landscape, problem, found, FINE)
+    leaders: dict[Structure, list[int]] = {}
+    for index in np.argsort(-scores, kind="stable").tolist():
+        leaders.setdefault(guesses[index][0], []).append(index)
+    still = [places[0] for entry, places in leaders.items() if entry.model.inner is None]
+    settled = [(guesses[place], amplitudes[place], float(scores[place])) for place in still]
+    flown = [(entry, places) for entry, places in leaders.items() if entry.model.inner is not None][:FLOWN]
     if flown:
         begun = [(entry, np.array([guesses[place][1] for place in places[:PEAKS]]), _step(entry, landscape.x))
                  for entry, places in flown]  # fmt: skip
@@ -119,26 +135,17 @@ def candidates(problem: Problem, landscape: Landscape, window: Window) -> list[C
         arrived = [(entry, value) for (entry, _), value in zip(flown, inner, strict=True)]
         gains = evaluated(landscape, arrived)
         reached = scores_of(landscape, arrived, gains.gain, rivals)
-        settled += list(zip(arrived, gains.amplitudes, map(float, reached), strict=True))
-    settled.sort(key=lambda entry: -entry[2])
-    best_score = settled[0][2]
-    lies = [rivals.lies(guess[0]) for guess, _, _ in settled]
+        settled += zip(arrived, gains.amplitudes, map(float, reached), strict=True)
+    return sorted(settled, key=lambda entry: -entry[2])
+
+
+def _no_parameters(landscape: Landscape, settled: list[Settled], rivals: Rivals) -> list[Settled]:
+    """Without components that do what a parameter would do; a sensor that lies may."""
     single = [len(guess[0].model.phases) == 1 for guess, _, _ in settled]
     heights = np.concatenate([pair[:1] if one else pair for (_, pair, _), one in zip(settled, single, strict=True)])
     same = landscape.is_parameter(shapes(iter(guess for guess, _, _ in settled)), heights)
-    first = np.cumsum([0, *(1 if one else 2 for one in single[:-1])])
-    settled = [entry for entry, lie, at in zip(settled, lies, first.tolist(), strict=True) if lie or not same[at]]
-    if not settled:
-        return []
-    least = max(best_score - KEPT - RELATIVE * abs(best_score), -CLEARLY)
-    kept = [entry for entry in settled if entry[2] > least][: _affordable(landscape)]
-    kept += holding(problem, settled[len(kept) :]) if kept else []
-    found = []
-    for (structure, number), pair, _ in kept:
-        if 0.0 < np.abs(pair).max() < LARGEST:
-            component = component_of(problem, window, structure, number, pair)
-            found.append(Candidate(component, rivals.of(structure), rivals.lies(structure)))
-    return found
+    first = np.cumsum([0, *(1 if one else 2 for one in single[:-1])]).tolist()
+    return [entry for entry, at in zip(settled, first, strict=True) if rivals.lies(entry[0][0]) or not same[at]]
 
 
 def _affordable(landscape: Landscape) -> int:

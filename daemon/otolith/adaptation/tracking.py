@@ -5,13 +5,14 @@ angle, so that a component that is tracked stays coherent and its frequency is k
 """
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.completion import places, plain, source_of
+from otolith.adaptation.completion import places, plain, source_of, without
 from otolith.adaptation.component import Component
-from otolith.adaptation.fusion import Belief
+from otolith.adaptation.fusion import Belief, pinned, rebased
 from otolith.adaptation.problem import Problem
 
 HALF = 0.5  # of a sampling period: what a window may begin late or early and follow its predecessor
@@ -30,6 +31,9 @@ class Turned:
     """Unix seconds of the next window's first record, if none is left out."""
     by: tuple[float, ...]
     """Of each slot, in the unit of its source."""
+
+
+Turn = TypeVar("Turn", Turned, Turned | None)
 
 
 def turned(problem: Problem, window: Window, last_state: Array) -> Turned:
@@ -59,11 +63,11 @@ def moved_on(belief: Belief, problem: Problem, before: Turned | None, window: Wi
         if component.source == "t" and _is_known(belief, problem, places(problem, slot), window.start - before.start):
             belief = _turned_by(belief, problem, places(problem, slot), window.start - before.start)
         elif component.source == "t":
-            belief = _lost(belief, problem, places(problem, slot)[-1])
+            belief = lost(belief, problem, places(problem, slot)[-1])
         elif follows:
             belief = _turned_by(belief, problem, places(problem, slot), by)
         elif source_of(plain(problem), component.source).symbol.startswith("_"):
-            belief = _lost(belief, problem, places(problem, slot)[-1])
+            belief = lost(belief, problem, places(problem, slot)[-1])
     return belief
 
 
@@ -92,6 +96,20 @@ def is_lost(belief: Belief, problem: Problem) -> list[int]:
     return [phase for phase in phases if known[phase] > HARDLY]
 
 
+def lost(belief: Belief, problem: Problem, phase: int) -> Belief:
+    """The belief where nothing is known of a phase any more."""
+    return pinned(belief, phase, UNKNOWN / problem.scale[phase])
+
+
+def left_out(problem: Problem, belief: Belief, turn: Turn, slot: int) -> tuple[Problem, Belief, Turn]:
+    """Twin, knowledge and turns without the component of a slot; what stays keeps its numbers."""
+    fewer = without(problem, problem.components[slot])
+    rest = rebased(belief, problem, fewer)
+    if turn is not None:
+        turn = replace(turn, by=tuple(by for index, by in enumerate(turn.by) if index != slot))
+    return fewer, rest, turn
+
+
 def outlived(problem: Problem, window: Window) -> list[Component]:
     """Components that ran away with time: what goes on for longer is a trend of a parameter, and a clock may be set."""
     return [
@@ -99,10 +117,3 @@ def outlived(problem: Problem, window: Window) -> list[Component]:
         for entry in problem.components
         if entry.source == "t" and not entry.repeats and not 0.0 <= window.start - entry.origin <= LONGEST_RUN
     ]
-
-
-def _lost(belief: Belief, problem: Problem, phase: int) -> Belief:
-    covariance = belief.covariance.copy()
-    covariance[:, phase, :] = covariance[:, :, phase] = 0.0
-    covariance[:, phase, phase] = (UNKNOWN / problem.scale[phase]) ** 2
-    return replace(belief, covariance=covariance)
