@@ -8,7 +8,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.adaptation.advice import Situation, advise
 from otolith.adaptation.case import Case
 from otolith.adaptation.catalogue import Entry
-from otolith.adaptation.completion import driven
+from otolith.adaptation.completion import driven, plain
 from otolith.adaptation.estimate import WindowEstimate
 from otolith.adaptation.experiment import deciding
 from otolith.adaptation.gate import Lesson, Memory
@@ -100,7 +100,7 @@ def _model(problem: Problem, standing: dict[str, Standing]) -> str:
 
 def traces_of(state: State, window: Window, learned: Learned) -> Traces:
     """The curves behind the report; of the window as it came, with its spikes, so that it can be replayed from them."""
-    found, twin = learned.found, state.problem.twin
+    found, twin = learned.found, plain(state.problem)
     outputs, inputs = tuple(entry.name for entry in twin.outputs), tuple(entry.name for entry in twin.inputs)
     predicted = None if found is None else found.predicted
     return Traces(outputs, _present(window, outputs), predicted, state.problem.noise, inputs, _present(window, inputs))

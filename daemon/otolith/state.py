@@ -33,7 +33,7 @@ class State:
 
 
 def regridded(state: State, configured: WindowOptions, ratio: float) -> State:
-    """The state for windows with a sample period ``ratio`` times the configured: as long in seconds, never too short."""
+    """The state for windows with ``ratio`` times the configured sample period: as long in seconds, never too short."""
 
     def scaled(records: int) -> int:
         return max(round(records / ratio), min(records, FEWEST_ON_A_COARSE_GRID))

@@ -1,0 +1,139 @@
+"""Every fault of bus and sensor while the daemon runs: it recovers without a restart, and counts exactly what it lost.
+
+One life of a healthy motor over CAN and one over Modbus TCP, side by side, in which one fault follows another.
+``pytest tests/system/test_faults.py -rP`` prints how long each took to be overcome.
+"""
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+
+from otolith.acquisition.window import Verdict
+from otolith.health.report import ReportDocument, Status
+from tests.conftest import OwnMachine
+from tests.system.conftest import Running
+
+TRUE = 6.5  # ohm
+PERIOD, WINDOW = 0.01, 2.0  # s
+BOTH, CAN, MODBUS = ("can", "modbus-tcp"), ("can",), ("modbus-tcp",)
+
+
+@dataclass(frozen=True)
+class Injected:
+    """A fault, and until when (s of the plant's time) it acts."""
+
+    kind: str
+    start: float
+    until: float
+    keys: str = ""
+    on: tuple[str, ...] = BOTH
+    within: float = 3 * WINDOW
+    """s, from its end to the beginning of the next window that is estimated from."""
+
+    def __str__(self) -> str:
+        """As a scenario has it."""
+        until = "" if self.kind == "clock_step" else f'until = "{self.until} s"\n'
+        return f'\n[[faults]]\nkind = "{self.kind}"\nstart = "{self.start} s"\n{until}{self.keys}\n'
+
+
+FAULTS = [
+    Injected("dropouts", 14.0, 15.0, "share = 0.3"),
+    Injected("gone", 22.0, 25.0),
+    Injected("garbage", 33.0, 35.0, "share = 0.5"),
+    Injected("jitter", 41.0, 43.0, 'deviation = "20 ms"'),
+    Injected("clock_step", 49.0, 49.0, 'by = "0.7 s"'),
+    Injected("exception", 56.0, 57.0, "code = 6", MODBUS, 12.0),
+    Injected("word_order", 66.0, 68.0, 'order = "CDAB"', MODBUS),
+    Injected("frozen", 76.0, 79.0, 'signal = "RotorSpeed"'),
+]
+END = 92.0
+
+
+@pytest.fixture(scope="module")
+def lives(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Running]]:
+    """Both machines, at the end of their lives."""
+    running = {}
+    for transport in BOTH:
+        folder = tmp_path_factory.mktemp(transport)
+        faults = "".join(str(fault) for fault in FAULTS if transport in fault.on)
+        running[transport] = Running(OwnMachine(folder / "machine", transport, faults=faults), folder)
+    try:
+        for one in running.values():
+            one.wait_for(lambda reports, one=one: reports and reports[-1].window.end > began(one) + END, 180.0)  # type: ignore[misc]
+        yield running
+    finally:
+        for one in running.values():
+            one.close()
+
+
+def began(one: Running) -> float:
+    """Unix seconds of the plant's first tick."""
+    with one.truth.open(encoding="utf-8") as file:
+        return float(next(csv.DictReader(file))["t"])
+
+
+def is_sound(report: ReportDocument) -> bool:
+    parameter = report.parameters["R_a"]
+    return report.window.quality.verdict is Verdict.GOOD and parameter.status is Status.ESTIMATED
+
+
+@pytest.mark.parametrize(("transport", "fault"), [(t, fault) for t in BOTH for fault in FAULTS if t in fault.on],
+                         ids=lambda value: getattr(value, "kind", value))  # fmt: skip
+def test_it_recovers_without_a_restart(lives: dict[str, Running], transport: str, fault: Injected) -> None:
+    one = lives[transport]
+    start = began(one)
+    assert any(is_sound(report) for report in one.reports if report.window.end < start + fault.start)
+    after = [report for report in one.reports if report.window.start >= start + fault.until]
+    sound = next(report for report in after if is_sound(report))
+    waited = sound.window.start - (start + fault.until)
+    print(f"{transport}, {fault.kind}: estimated again from the window that begins {waited:.1f} s after its end")  # noqa: T201 - for -rP
+    assert waited <= fault.within
+    low, high = sound.parameters["R_a"].low, sound.parameters["R_a"].high
+    assert low is not None
+    assert high is not None
+    assert low <= TRUE <= high
+
+
+@pytest.mark.parametrize("transport", BOTH)
+def test_nothing_is_estimated_from_what_was_spoiled(lives: dict[str, Running], transport: str) -> None:
+    """Whatever happened, no report claimed a resistance that was wrong, and the machine grew no component."""
+    for report in lives[transport].reports:
+        found = report.parameters["R_a"]
+        if found.value is not None and found.sd is not None:
+            assert abs(found.value - TRUE) <= max(4.0 * found.sd, 0.005 * TRUE), report.window
+        assert not report.components
+    last = lives[transport].reports[-1].counters
+    assert last is not None
+    assert last.worker_restarts == 0
+
+
+def test_lost_samples_are_counted_exactly_on_can(lives: dict[str, Running]) -> None:
+    """By the messages' alive counters, over an outage longer than their cycle too: two signals in each frame."""
+    one = lives["can"]
+    counters = one.reports[-1].counters
+    assert one.plant is not None
+    one.plant.terminate()
+    one.plant.wait(timeout=10)
+    summary = json.loads(one.summary.read_text(encoding="utf-8"))
+    assert counters is not None
+    withheld = sum(fault["withheld"] for fault in summary["faults"])
+    print(f"{withheld} frames withheld, {counters.lost} samples lost")  # noqa: T201 - for -rP
+    assert counters.lost == 2 * withheld
+
+
+def test_every_slot_is_a_sample_or_lost_on_modbus(lives: dict[str, Running]) -> None:
+    one = lives["modbus-tcp"]
+    first, last = (
+        next(report for report in one.reports if report.window.quality.verdict is Verdict.GOOD),
+        one.reports[-1],
+    )
+    assert first.counters is not None
+    assert last.counters is not None
+    asked = [report.counters.received + report.counters.lost + report.counters.bad for report in (first, last)
+             if report.counters is not None]  # fmt: skip
+    slots = (asked[1] - asked[0]) / 4
+    assert slots == pytest.approx((last.window.end - first.window.end) / PERIOD, rel=0.02)
+    assert last.counters.reconnects >= 1
