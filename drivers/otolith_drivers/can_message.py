@@ -70,6 +70,7 @@ class MessageReader:
         self._lost = 0
         self._rules, self._counter, self._checksum = rules, rules.counter, rules.checksum
         self._length = max(rules.needed, *(message.length for message in messages))
+        self._cycle = max((message.cycle_time or 0) * 1e-3 for message in messages)
         self._rows: list[Row] = []
         self._groups: dict[tuple[object, ...], _Group] = {}
         self._troubles: dict[str, _Trouble] = {}
@@ -108,7 +109,7 @@ class MessageReader:
     def complaints(self, now: float, begun: float) -> list[str]:
         """What is wrong at ``now``, a line each; listening began at ``begun`` (s)."""
         if self.pace.last is None and not self._troubles:
-            declared = self._rules.period or 0.0
+            declared = self._rules.period or self._cycle
             waited = now - begun
             return [f"{self.title} has not come once in {waited:.1f} s"] if waited > _patience(declared) else []
         lines = [

@@ -29,6 +29,7 @@ BACKOFF_FIRST, BACKOFF_LONGEST = 0.2, 10.0  # s
 MOST_BAD_IN_A_ROW = 50  # unreadable frames, after which the bus is opened anew
 STAMP_TOLERANCE = 1.0  # s; a kernel stamp farther from now than this met a clock that was set
 LOOK_EVERY = 0.05  # s; how often the clocks are compared: 50 ms are the longest that a clock that was set can mislead
+CLOCK_TRIES, CLOCK_SPAN = 5, 2e-5  # s
 SILENT_PERIODS, SILENT_AT_LEAST, SILENT_AT_MOST = 10.0, 2.0, 60.0  # periods; s
 NEVER_HEARD = 10.0  # s; no period is known before anything came
 RECENT = 60.0  # s for which dropped frames are told
@@ -56,7 +57,6 @@ class CanReceiver:
         self._thread: threading.Thread | None = None
         self._reconnects = self._unreadable = self._bad_in_a_row = 0
         self._drops = _Drops()
-        self._offset = 0.0
         self._heard = self._opened = 0.0
         self._patience = 0.0
 
@@ -134,7 +134,7 @@ class CanReceiver:
         """Take what comes until the clocks are to be compared again; what is wrong if the bus must be opened anew."""
         receive, decode, clock = bus.recv, self._decoder.decode, time.monotonic
         begun = now = clock()
-        offset = time.time() - begun
+        offset = wall_ahead()
         while now - begun < LOOK_EVERY:
             try:
                 frame = receive(RECEIVE_TIMEOUT)
@@ -216,6 +216,18 @@ class _Drops:
         if not self.total or now - self._at > RECENT:
             return []
         return [f"this computer was too busy to read {self.total} frames, the last {now - self._at:.1f} s ago"]
+
+
+def wall_ahead() -> float:
+    """How far the wall clock is ahead of the monotonic one (s), though this thread may be held up between the two."""
+    best, span = 0.0, float("inf")
+    for _ in range(CLOCK_TRIES):
+        before, wall, after = time.monotonic(), time.time(), time.monotonic()
+        if after - before < span:
+            best, span = wall - 0.5 * (before + after), after - before
+        if span < CLOCK_SPAN:
+            break
+    return best
 
 
 def monotonic_of(stamp: float, wall: float, monotonic: float) -> float:

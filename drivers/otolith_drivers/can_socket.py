@@ -11,7 +11,7 @@ import can
 SO_RCVBUFFORCE, SO_MEMINFO = 33, 55  # of <asm-generic/socket.h>; the socket module has no names for them
 MEMORY_INFO = struct.Struct("9I")  # of <linux/sock_diag.h>
 DROPS = 8  # its last
-BUFFER = 4 << 20  # bytes; about a second of a bus at its limit
+BUFFER = 8 << 20  # bytes; a second or two of a bus at its limit
 
 
 def enlarge_buffer(bus: can.BusABC) -> None:

@@ -85,6 +85,10 @@ class Pace:
             if step:
                 self._learn(elapsed / step)
             return step
+        if step == 1 and SOON <= elapsed / self.period <= LATE:  # as nearly always
+            self._follow(elapsed)
+            missing, self._missing = self._missing, 0
+            return 1 + missing
         expected = elapsed / self.period if elapsed < LONGEST_OUTAGE else 0.0
         cycles = max(0, round((expected - step) / modulo))
         if cycles and not step:  # the count of the last frame, but not that frame
@@ -176,7 +180,7 @@ class FrameCounter:
         step = (count - last) % self.modulo if last is not None else 1
         if not self._trusted:
             self._run = self._run + 1 if step == 1 else 0
-            self._trusted = self._run > PROOF
+            self._trusted, self._spoiled = self._run > PROOF, 0
             return pace.note(time)
         before = pace.last
         ahead = pace.counted(time, step, self.modulo)

@@ -76,6 +76,27 @@ def test_jitter_and_many_gaps_leave_the_count_exact(gaps: list[int], jitter: flo
     assert lost == sum(gaps)
 
 
+@settings(deadline=None)
+@given(
+    frames=st.lists(st.tuples(st.floats(0, 3), st.integers(0, 255), st.integers(0, 8)), max_size=200),
+    options=st.sampled_from([UNCOUNTED, COUNTED, {}]),
+)
+def test_whatever_comes_every_frame_is_delivered_or_bad(
+    tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[float, int, int]], options: dict[str, Any]
+) -> None:
+    found, time, delivered = motor(tmp_path_factory.mktemp("any"), **options), 0.0, 0
+    for pause, count, length in frames:
+        time += pause
+        before = found.counters
+        samples = found.decode(frame(385, (bytes(7) + bytes([count]))[:length]), time)
+        after = found.counters
+        delivered += len(samples)
+        assert after.bad - before.bad == (0 if samples else 1)
+        assert after.lost >= before.lost
+        assert all("\n" not in line for line in found.complaints(time))
+    assert found.counters.received == delivered
+
+
 def test_a_counter_of_fifteen_counts_is_said_by_its_modulo(tmp_path: Path) -> None:
     found = motor(tmp_path, messages={"Motor": {"counter": "Tick", "modulo": 15}})
     send_all(found, range(100), range(140, 200))
@@ -258,6 +279,9 @@ def test_what_never_came_is_told_after_a_few_seconds(tmp_path: Path) -> None:
     found = motor(tmp_path)
     assert found.complaints(2.0) == []
     assert found.complaints(4.0) == ["Motor (0x181) has not come once in 4.0 s"]
+    cycle = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_ "GenMsgCycleTime" BO_ 385 900;'
+    seldom = decoder(tmp_path, WISHES, MOTOR + cycle)
+    assert (seldom.complaints(0.0), seldom.complaints(8.9), len(seldom.complaints(9.1))) == ([], [], 1)
     slow = motor(tmp_path, messages={"Motor": {"period": "2 s"}})
     assert slow.complaints(19.0) == []
     assert slow.complaints(21.0) == ["Motor (0x181) has not come once in 21.0 s"]
