@@ -147,6 +147,6 @@ def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
 
 
 def _cause(error: OSError | ValueError) -> str:
-    if isinstance(error, OSError) and error.errno:
+    if isinstance(error, OSError) and error.errno and error.errno > 0:
         return os.strerror(error.errno)
-    return str(error)
+    return (isinstance(error, OSError) and error.strerror) or str(error)

@@ -57,10 +57,11 @@ def _numbers(history: Sequence[Sequence[int]], kind: TypeName, order: Order) -> 
 
 def _fault(numbers: dict[Order, Array], kind: TypeName, order: Order) -> str:
     """What is wrong with the numbers in this order; nothing if they will do."""
-    return _fault_of_floats(numbers[order]) if is_float(kind) else _fault_of_integers(numbers, kind, order)
+    return fault_of_floats(numbers[order]) if is_float(kind) else _fault_of_integers(numbers, kind, order)
 
 
-def _fault_of_floats(numbers: Array) -> str:
+def fault_of_floats(numbers: Array) -> str:
+    """What is wrong with ``numbers`` as readings of a machine, in words; nothing if they will do."""
     finite = np.isfinite(numbers)
     if finite.mean() < 0.9:
         return f"{np.mean(~finite):.0%} of the readings are no numbers"

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import count, groupby
 from typing import Any
 
 from pymodbus.server import ModbusTcpServer
@@ -19,11 +20,22 @@ Words = dict[int, int]
 
 
 @contextmanager
-def library_server(words: Words) -> Iterator[int]:
-    """Pymodbus serving ``words`` (by address) as device 1; the port."""
+def library_server(words: Words, moving: Callable[[int], Words] | None = None) -> Iterator[int]:
+    """Pymodbus serving ``words`` (by address) as device 1; the port.
+
+    Only those registers are there: a request that touches another one is refused. ``moving`` gives new words for each
+    request, of which it is told the first address.
+    """
     port = free_port(socket.SOCK_STREAM)
-    values = [words.get(address, 0) for address in range(max(words) + 1)]
-    device = SimDevice(id=1, simdata=[SimData(0, values=values, datatype=DataType.REGISTERS)])
+
+    async def before(_: int, start: int, *others: Any) -> None:
+        held = others[2]  # what is at ``start`` and behind it; after the address and length of the request
+        for at, word in moving(start).items() if moving else ():
+            held[at - start] = word
+
+    blocks = [list(run) for _, run in groupby(sorted(words), key=_place_less_rank())]
+    data = [SimData(run[0], values=[words[at] for at in run], datatype=DataType.REGISTERS) for run in blocks]
+    device = SimDevice(id=1, simdata=data, action=before)
     loop, up = asyncio.new_event_loop(), threading.Event()
     servers: list[ModbusTcpServer] = []
 
@@ -44,6 +56,12 @@ def library_server(words: Words) -> Iterator[int]:
         asyncio.run_coroutine_threadsafe(ending, loop).result(5.0)
         thread.join(5.0)
         loop.close()
+
+
+def _place_less_rank() -> Callable[[int], int]:
+    """The same for addresses that follow each other, when called for all of them in order."""
+    rank = count()
+    return lambda address: address - next(rank)
 
 
 @dataclass
