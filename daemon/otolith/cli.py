@@ -11,6 +11,7 @@ from otolith import __version__
 from otolith.cli_components import commission, components
 from otolith.cli_noise import noise
 from otolith.cli_paper import paper
+from otolith.cli_probe import probe
 from otolith.cli_process import StopSignal, log_to_stderr
 from otolith.cli_twin import twin
 
@@ -19,7 +20,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 EXIT_CODES = """\b
 Exit codes:
   0    done; run and plant also when stopped by SIGTERM
-  1    the demo's estimate was wrong, or a target of paper was missed
+  1    the demo's estimate was wrong, a target of paper was missed, or probe has found nothing
   2    a file, option, bus or port cannot be used; the message says which and what to do
   130  interrupted by Ctrl-C (128 + the number of any other signal)"""
 
@@ -256,4 +257,5 @@ cli.add_command(commission)
 cli.add_command(components)
 cli.add_command(noise)
 cli.add_command(paper)
+cli.add_command(probe)
 cli.add_command(twin)
