@@ -39,7 +39,7 @@ def judge(history: Sequence[Sequence[int]], kind: TypeName, order: Order) -> Jud
         return Judgement(plausible=True)
     orders = orders_of(kind)
     chosen = order if order in orders else orders[0 if order in ("ABCD", "CDAB") else 1]
-    if is_float(kind) and not _fault_of_floats(_numbers(history, kind, chosen)):  # seldom is more than this needed
+    if is_float(kind) and not fault_of_floats(_numbers(history, kind, chosen)):  # seldom is more than this needed
         return Judgement(plausible=True)
     numbers = {other: _numbers(history, kind, other) for other in orders}
     reason = _fault(numbers, kind, chosen)
