@@ -11,6 +11,7 @@ import logging
 import math
 import os
 import signal
+import sys
 import time
 from datetime import UTC, datetime
 from multiprocessing.connection import wait
@@ -40,6 +41,7 @@ log = logging.getLogger(__name__)
 RING_WINDOWS = 8  # windows that the rings hold: how long this thread may be held up without losing a sample
 RING_RATE = 4  # how much faster than the grid a source may send for that to be true
 TICK = 0.1  # s; the longest wait, so how late a stop, a death or an outage can be noticed
+SWITCH = 5e-4  # s that a thread of Python may keep the others waiting: what arrives is to be stamped at once
 RECORDER_ROOM = 32  # windows
 RECORDER_FLUSH, KEEPER_FLUSH = 1.5, 0.5  # s at the end
 STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed
@@ -99,6 +101,7 @@ class Service:
         self._stop_signal = number
 
     def _start(self) -> None:
+        sys.setswitchinterval(SWITCH)
         machine, driver = self._plan.file.machine, self._plan.driver
         self._publisher = Publisher(machine.site, machine.name, self._listen, self._plan.file.zenoh.connect)
         driver.open(self._rings.deliver)

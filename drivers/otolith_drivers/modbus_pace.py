@@ -12,6 +12,7 @@ FULL = 0.95  # share of the period beyond which rounds leave no room for what de
 ROOM = 1.15  # of a longer period over what rounds take
 MOST_LEFT_OUT = 0.2  # share of the grid; less is a busy computer, and passes
 MOST_AT_ONCE = 2  # left out before a round, that are laid to the line's speed; a timeout leaves out more
+SLOW_IN_A_ROW = 2  # decisions by which a coarser grid is needed, before it is made
 EASY = 20  # decisions in a row by which a finer grid would do, before it is tried again
 STEPS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # times a power of ten: periods that people use
 SELDOM, OFTEN = 0.02, 0.6  # shares of rounds that repeat the one before, between which the beat is heard
@@ -27,7 +28,7 @@ class Pace:
         self.due = math.inf
         self._starts: deque[float] = deque(maxlen=ROUNDS + 1)
         self._durations: list[float] = []
-        self._left_out = self._easy = 0
+        self._left_out = self._slow = self._easy = 0
         self._repeats = self._rounds = 0
         self.known = False
         """Whether enough rounds were seen to know that the period can be held."""
@@ -71,7 +72,7 @@ class Pace:
             return False
         wanted = self._wanted()
         self._durations.clear()
-        self._left_out, self.known = 0, True
+        self._left_out, self.known = 0, self._slow == 0
         if wanted == self.period:
             return False
         self.due += wanted - self.period
@@ -84,8 +85,11 @@ class Pace:
         usual = sorted(self._durations)[ROUNDS // 2]
         share = self._left_out / (ROUNDS + self._left_out)
         if usual > FULL * self.period or share > MOST_LEFT_OUT:
-            self._easy = 0
-            return _even(max(ROOM * usual, self.period / (1.0 - share)))
+            self._slow, self._easy = self._slow + 1, 0
+            if self._slow < SLOW_IN_A_ROW:
+                return self.period
+            return _even(ROOM * usual if usual > FULL * self.period else self.period / (1.0 - share))
+        self._slow = 0
         finer = max(self.asked, _even(ROOM * usual))
         self._easy = self._easy + 1 if finer < self.period else 0
         if self._easy < EASY:

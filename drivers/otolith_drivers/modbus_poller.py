@@ -11,6 +11,7 @@ import time
 from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
+from otolith_drivers.modbus_freshness import Freshness
 from otolith_drivers.modbus_line import Broken, Line, Refused, Silent
 from otolith_drivers.modbus_options import Item, Options, Source, item_of
 from otolith_drivers.modbus_pace import Pace
@@ -44,7 +45,7 @@ class ModbusPoller:
         self._pace = Pace(period)
         self._watch = OrderWatch(items)
         self._held_back: list[list[Sample]] = []
-        self._image: dict[Request, list[int]] = {}
+        self._freshness = Freshness()
         self._received = self._bad = self._lost = self._reconnects = 0
         self._up, self._was_up, self._reason = False, False, "not opened yet"
         self._stop = threading.Event()
@@ -69,10 +70,11 @@ class ModbusPoller:
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
-        complaints = (*self._requests.complaints(time.monotonic()), *self._watch.complaints())
+        complaints = [*self._requests.complaints(time.monotonic()), *self._watch.complaints()]
+        complaints += self._freshness.complaints(self._pace.period)
         described = f"{summary(self._requests.requests)}, {self._pace.describe()}"
         period = self._pace.period if self._pace.known or self._pace.period > self._pace.asked else None
-        return Link(self._up, self._reason, complaints, described, period)
+        return Link(self._up, self._reason, tuple(complaints), described, period)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
@@ -146,6 +148,10 @@ class ModbusPoller:
         registers = self._line.read(request.device, request.table, request.address, request.count)
         moment = 0.5 * (asked + time.monotonic())
         self._requests.answered(request)
+        repeated, stale = self._freshness.take(request, registers)
+        if stale:
+            self._bad += len(request.items)
+            return repeated
         samples = []
         for item in request.items:
             part = registers[item.address - request.address : item.end - request.address]
@@ -155,8 +161,6 @@ class ModbusPoller:
             self._hand_on(samples, deliver)
         else:
             self._held_back.append(samples)
-        repeated = self._image.get(request) == registers
-        self._image[request] = registers
         return repeated
 
     def _settle(self, deliver: Deliver) -> None:

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
+from otolith_drivers.modbus_freshness import Freshness
 from otolith_drivers.modbus_line import Refused
 from otolith_drivers.modbus_options import Item, Options, Source, item_of
 from otolith_drivers.modbus_pace import EASY, ROUNDS, Pace
@@ -132,7 +133,7 @@ def test_a_pace_that_fits_is_kept_and_one_that_does_not_is_lengthened_evenly() -
         assert not pace.end(0.004, repeated=False)
     assert pace.achieved == pytest.approx(0.01)
     missed = 0
-    for _ in range(3 * ROUNDS):
+    for _ in range(5 * ROUNDS):
         now = max(now, pace.due)
         missed += pace.begin(now)
         now += 0.021
@@ -257,3 +258,19 @@ def test_the_lines_least_time_is_that_of_its_characters() -> None:
     line = Options(serial="/dev/ttyUSB0", baudrate=9600)
     assert line.least_time(10) == pytest.approx((8 + 5 + 20 + 7) * 11 / 9600)
     assert Path(line.serial or "").name in line.title()
+
+
+def test_an_old_image_among_new_ones_is_none() -> None:
+    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    for index in range(500):
+        assert freshness.take(request, [index, 0]) == (False, False)
+    assert freshness.take(request, [499, 0]) == (True, True)
+    assert freshness.take(request, [500, 0]) == (False, False)
+
+
+def test_registers_that_often_say_the_same_are_believed_and_told() -> None:
+    """A machine that stands still is no fault; nor is a coarse register."""
+    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    stale = [freshness.take(request, [index // 5, 0])[1] for index in range(1000)]
+    assert not any(stale)
+    assert "80% of the readings" in freshness.complaints(0.01)[0]
