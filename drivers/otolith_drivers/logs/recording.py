@@ -24,6 +24,7 @@ from otolith_drivers.quantities import factor
 from otolith_drivers.toml_files import Closed
 
 APPLICATION, TIMELINE = "otolith", "time"
+BATCH = 50_000  # readings, of all signals together
 VALUES, NAMES = "Scalars:scalars", "SeriesLines:names"
 FOLDER, WINDOWS = "/signals/", "/windows"
 NAME = re.compile(r".* measured \[(.*)\]")
@@ -125,15 +126,18 @@ class Recorded:
     def stretches(self) -> Iterator[Rows]:
         """See :meth:`otolith_drivers.logs.rows.Reader.stretches`."""
         waiting = {name: _Waiting(count) for name, count in self._chunks.items()}
-        total, read = sum(self._chunks.values()), 0
+        total, read, fresh = sum(self._chunks.values()), 0, 0
         for chunk in self._stream():
             name = _signal_of(chunk)
             if name not in waiting or chunk.is_static:
                 continue
             read += 1
             self.progress = read / total
-            waiting[name].add(*self._values(name, chunk))
-            if all(entry.is_begun for entry in waiting.values()):
+            times, values = self._values(name, chunk)
+            waiting[name].add(times, values)
+            fresh += len(times)
+            if fresh >= BATCH and all(entry.is_begun for entry in waiting.values()):
+                fresh = 0
                 yield from self._rows(waiting, min(entry.known_until for entry in waiting.values()))
         yield from self._rows(waiting, np.iinfo(np.int64).max)
         if not self._records:
@@ -144,8 +148,8 @@ class Recorded:
         times = batch.column(TIMELINE).cast(pa.int64()).to_numpy()
         lists = batch.column(VALUES)
         numbers = lists.flatten().to_numpy(zero_copy_only=False)
-        width = len(numbers) // len(times)
-        if not width or len(numbers) % len(times):
+        width = len(numbers) // max(len(times), 1)
+        if lists.null_count or not width or len(numbers) % len(times):
             self.bad += len(times)
             return times[:0], numbers[:0]
         scale, offset = self._scales[name]
