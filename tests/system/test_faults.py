@@ -126,6 +126,17 @@ def test_lost_samples_are_counted_exactly_on_can(lives: dict[str, Running]) -> N
     assert counters.lost == 2 * withheld
 
 
+def test_the_drive_was_only_ever_read(lives: dict[str, Running]) -> None:
+    """By its own count of function codes, through all that has happened."""
+    one = lives["modbus-tcp"]
+    assert one.plant is not None
+    one.plant.terminate()
+    one.plant.wait(timeout=10)
+    summary = json.loads(one.summary.read_text(encoding="utf-8"))
+    assert set(summary["functions"]) == {"3"}
+    assert not summary["refused"]
+
+
 def test_what_was_not_read_over_modbus_is_counted(lives: dict[str, Running]) -> None:
     """At least what was asked for while the drive was gone; and its way back is told."""
     counters = lives["modbus-tcp"].reports[-1].counters
