@@ -16,7 +16,7 @@ from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.can_bus import BusOptions, open_bus
 from otolith_drivers.can_decoder import FrameDecoder, decoder_of
 from otolith_drivers.can_options import FrameOptions
-from otolith_drivers.can_socket import enlarge_buffer, frames_dropped
+from otolith_drivers.can_socket import enlarge_buffer, frames_dropped, refusal
 from otolith_drivers.can_source import Source
 from otolith_drivers.errors import DeviceError
 
@@ -184,12 +184,15 @@ class CanReceiver:
             try:
                 bus = self._connect()
             except Exception as error:  # noqa: BLE001 - as above; a DeviceError has a sentence of its own
-                known = isinstance(error, DeviceError)
-                self._link = Link(up=False, reason=str(error) if known else f"{type(error).__name__}: {error}")
-                pause = min(2 * pause, BACKOFF_LONGEST)
+                trouble = str(error) if isinstance(error, DeviceError) else f"{type(error).__name__}: {error}"
             else:
-                self._reconnects += 1
-                return bus
+                if (against := refusal(bus)) is None:
+                    self._reconnects += 1
+                    return bus
+                _shut(bus)
+                trouble = f"CAN bus {self._options.title()}: {against}"
+            self._link = Link(up=False, reason=trouble)
+            pause = min(2 * pause, BACKOFF_LONGEST)
         return None
 
 

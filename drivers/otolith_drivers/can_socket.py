@@ -1,4 +1,4 @@
-"""What the kernel does with frames before they are read: a larger buffer for them, and how many it threw away."""
+"""What python-can does not ask of the kernel: room for frames, how many were thrown away, and whether the bus is up."""
 
 import contextlib
 import os
@@ -42,6 +42,22 @@ def frames_dropped(bus: can.BusABC) -> int | None:
         return None
     drops: int = MEMORY_INFO.unpack_from(told)[DROPS]
     return drops
+
+
+def refusal(bus: can.BusABC) -> str | None:
+    """What the kernel has against a bus that was just opened: it opens one that is down, too, and then refuses to read.
+
+    The error is taken off the bus by asking, so that it is to be shut.
+    """
+    descriptor = _descriptor(bus)
+    if descriptor is None:
+        return None
+    try:
+        with socket.socket(fileno=os.dup(descriptor)) as handle:
+            code = handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    except OSError:
+        return None
+    return os.strerror(code) if code else None
 
 
 def _descriptor(bus: can.BusABC) -> int | None:
