@@ -8,11 +8,13 @@ DEV := .venv/.dev-$(HERE)
 BENCH := .venv/.bench-$(HERE)
 PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: help demo test check bench clean
+.PHONY: help demo test system-test check bench clean
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
 	@echo "make test    run all tests"
+	@echo "make system-test"
+	@echo "             as root on Debian: drivers against can-utils, systemd and libmodbus, in a guest that is booted"
 	@echo "make check   ruff, mypy --strict, import rules"
 	@echo "make bench   print the benchmarks"
 	@echo "make clean   remove .venv and caches"
@@ -22,6 +24,9 @@ demo: $(RUNTIME)
 
 test: $(DEV)
 	$(BIN)/python -m pytest
+
+system-test: $(DEV)
+	@PYTHON=$(BIN)/python tests/vm/all.sh
 
 check: $(DEV)
 	$(BIN)/ruff check

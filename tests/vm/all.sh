@@ -1,0 +1,27 @@
+#!/bin/bash
+# What 'make system-test' runs: our drivers against foreign parts. README.md beside this file says more.
+set -euo pipefail
+cd "$(dirname "$(realpath "$0")")/../.."
+python=${PYTHON:-.venv/bin/python}
+share=${XDG_CACHE_HOME:-$HOME/.cache}/otolith-vm/share
+
+[ "$(id -u)" = 0 ] || { echo "system-test needs root, as it makes a guest: sudo make system-test" >&2; exit 2; }
+missing=()
+command -v linux.uml >/dev/null || missing+=(user-mode-linux)
+command -v mmdebstrap >/dev/null || missing+=(mmdebstrap)
+command -v mkfs.ext4 >/dev/null || missing+=(e2fsprogs)
+command -v gcc >/dev/null || missing+=(gcc libc6-dev)
+[ -e /usr/include/modbus/modbus.h ] || missing+=(libmodbus-dev)
+[ ${#missing[@]} = 0 ] || { echo "missing on this computer: apt install ${missing[*]}" >&2; exit 2; }
+
+begun=$SECONDS
+PYTHON=$python tests/vm/image.sh >/dev/null
+echo "guest ready after $((SECONDS - begun)) s"
+begun=$SECONDS code=0
+"$python" -m pytest -v -s tests/vm/test_modbus.py || code=1
+mkdir -p "$share"
+rm -f "$share"/*.whl
+"$python" -m pip --disable-pip-version-check wheel --quiet --no-deps --wheel-dir "$share" .
+SHARE=$share tests/vm/run.sh tests/vm/in_guest.sh -v -s tests/vm/test_can.py tests/vm/test_unit.py || code=1
+echo "system tests took $((SECONDS - begun)) s"
+exit $code

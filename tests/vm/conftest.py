@@ -1,0 +1,211 @@
+"""The kernel's CAN, and plant and daemon as processes on it: what the tests inside the guest share."""
+
+import os
+import queue
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from otolith.acquisition.window import Verdict
+from otolith.health.report import CountersDocument, ParameterDocument, ReportDocument
+from otolith.outlets.zenoh_session import Listener
+from tests.conftest import EXAMPLES, free_port
+
+CHANNEL = "vcan0"
+STATISTICS = Path(f"/sys/class/net/{CHANNEL}/statistics")
+RESISTANCE = 6.1  # ohm, of the plant; the machine file says 6.5
+OTOLITH = [sys.executable, "-m", "otolith"]
+BUS = 'interface = "socketcan"\nchannel = "vcan0"\n'
+# Short windows for short tests; the guest's only processor keeps the plant waiting for milliseconds.
+WINDOW = '[window]\nlength = "1 s"\njitter_limit = "25 ms"\n'
+SCENARIO = f"""
+plant = "dc_motor"
+seed = 7
+dbc = "dc-motor.dbc"
+set_points = [{{ at = "0 s", speed = "10 rad/s" }}, {{ at = "5 s", speed = "20 rad/s" }}]
+repeat_every = "10 s"
+parameters = {{ R_a = "{RESISTANCE} ohm" }}
+noise = {{ current = "5 mA", speed = "0.02 rad/s", load_torque = "0.2 mN*m" }}
+[bus]
+{BUS}
+"""
+
+Reports = list[ReportDocument]
+
+
+def run(*command: str, seconds: float = 60.0) -> str:
+    """Standard output of a program that must succeed."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    return done.stdout
+
+
+def transmitted() -> int:
+    """Frames that anybody has put on the bus since it was made."""
+    return int((STATISTICS / "tx_packets").read_text(encoding="ascii"))
+
+
+def resistance(reports: Reports) -> ParameterDocument:
+    """What the newest report says of R_a."""
+    return reports[-1].parameters["R_a"]
+
+
+def counters(reports: Reports) -> CountersDocument:
+    """The newest."""
+    found = reports[-1].counters
+    assert found is not None
+    return found
+
+
+def good(reports: Reports) -> Reports:
+    """Those of windows that could be estimated from."""
+    return [report for report in reports if report.window.quality.verdict is Verdict.GOOD]
+
+
+@dataclass
+class Program:
+    """A process and what it has said."""
+
+    process: "subprocess.Popen[bytes]"
+    log: Path
+
+    def text(self) -> str:
+        """All that it has said."""
+        return self.log.read_text(encoding="utf-8", errors="replace")
+
+    def says(self, words: str, seconds: float = 60.0) -> None:
+        """Wait until it has said so."""
+        deadline = time.monotonic() + seconds
+        while words not in self.text():
+            assert self.process.poll() is None, self.text()
+            assert time.monotonic() < deadline, f"no {words!r} within {seconds:g} s: {self.text()}"
+            time.sleep(0.05)
+
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """Its exit code."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.wait(timeout=20)
+
+
+class Ears:
+    """Hears the reports of a daemon over Zenoh."""
+
+    def __init__(self, endpoint: str, alive: Callable[[], str]) -> None:
+        """``alive`` says why a daemon that should run does not; nothing if it does."""
+        self.reports: Reports = []
+        self._alive = alive
+        self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._listener = Listener([endpoint], "otolith/**/report", self._heard.put)
+
+    def wait_for(self, enough: Callable[[Reports], bool], seconds: float = 60.0) -> Reports:
+        """The reports, once there are enough of them."""
+        deadline = time.monotonic() + seconds
+        while not enough(self.reports):
+            assert not (why := self._alive()), why
+            said = [f"{report.window.index} {report.window.quality}" for report in self.reports]
+            assert time.monotonic() < deadline, f"not enough in {seconds:g} s: {said}"
+            try:
+                self.reports.append(ReportDocument.from_json(self._heard.get(timeout=0.5)))
+            except queue.Empty:
+                continue
+        return self.reports
+
+    def wait_for_good(self, count: int) -> Reports:
+        """The reports, once ``count`` more good windows have come."""
+        before = len(good(self.reports))
+        return self.wait_for(lambda reports: len(good(reports)) >= before + count)
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._listener.__exit__(None, None, None)
+
+
+class Machine:
+    """A machine file and a scenario for the kernel's bus, and programs in the background, whose logs are kept."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        self.file, self.scenario = folder / "machine.toml", folder / "scenario.toml"
+        self.dbc = Path(shutil.copy(EXAMPLES / "dc-motor.dbc", folder))
+        example = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
+        text = example.replace('type = "can"\n', f'type = "can"\n{BUS}')
+        self.file.write_text(f'{text}\n{WINDOW}[zenoh]\nlisten = ["{self.endpoint}"]\n', encoding="utf-8")
+        self.scenario.write_text(SCENARIO, encoding="utf-8")
+        self._programs: list[Program] = []
+        self._ears: list[Ears] = []
+
+    def start(self, *command: str) -> Program:
+        """A program in the background."""
+        log = self.folder / f"{len(self._programs)}-{Path(command[0]).name}.log"
+        with log.open("wb") as stream:
+            environment = {**os.environ, "XDG_STATE_HOME": str(self.folder / "state")}
+            process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT, env=environment)
+        self._programs.append(Program(process, log))
+        return self._programs[-1]
+
+    def plant(self) -> Program:
+        """The simulated machine, once it is on the bus."""
+        program = self.start(*OTOLITH, "plant", str(self.scenario))
+        program.says("Ctrl-C ends it")
+        return program
+
+    def daemon(self, seconds: float = 60.0) -> tuple[Program, Ears]:
+        """The daemon, once it has said that the bus is silent, and what it says."""
+        program = self.start(*OTOLITH, "run", str(self.file))
+        program.says("reports on")
+        ears = self.ears(lambda: "" if program.process.poll() is None else program.text())
+        ears.wait_for(lambda reports: len(reports) >= 1, seconds)
+        return program, ears
+
+    def ears(self, alive: Callable[[], str]) -> Ears:
+        """What the daemon of this machine says."""
+        self._ears.append(Ears(self.endpoint, alive))
+        return self._ears[-1]
+
+    def close(self) -> None:
+        """End what still runs."""
+        for ears in self._ears:
+            ears.close()
+        for program in reversed(self._programs):
+            program.stop()
+
+
+@contextmanager
+def machine_on_a_bus(folder: Path) -> Iterator[Machine]:
+    """A bus of the kernel, with its counters at zero, and nobody on it yet."""
+    run("ip", "link", "add", CHANNEL, "type", "vcan")
+    machine = Machine(folder)
+    try:
+        run("ip", "link", "set", CHANNEL, "up")
+        yield machine
+    finally:
+        machine.close()
+        if STATISTICS.exists():
+            run("ip", "link", "delete", CHANNEL)
+
+
+@pytest.fixture(scope="session")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Kernels in the cache, so that no daemon of a test is behind for having to compile them."""
+    begun = time.monotonic()
+    with machine_on_a_bus(tmp_path_factory.mktemp("compiled")) as machine:
+        machine.daemon(seconds=400.0)
+    print(f"kernels compiled, or found, in {time.monotonic() - begun:.1f} s")
+
+
+@pytest.fixture
+def machine(compiled: None, tmp_path: Path) -> Iterator[Machine]:
+    """Plant and daemon to be started on a bus of their own."""
+    with machine_on_a_bus(tmp_path) as made:
+        yield made

@@ -1,0 +1,204 @@
+"""Our daemon on a bus of the Linux kernel, with can-utils as the others on it. Runs in the guest, as root."""
+
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from otolith.acquisition.window import Verdict
+from otolith.health.report import CountersDocument, ParameterDocument, ReportDocument, Status
+from tests.vm.conftest import (
+    CHANNEL,
+    RESISTANCE,
+    Ears,
+    Machine,
+    Program,
+    Reports,
+    counters,
+    good,
+    machine_on_a_bus,
+    resistance,
+    run,
+    transmitted,
+)
+
+FRAMES = 200  # per second, of the plant
+OURS = ("181", "281")
+
+
+@dataclass(frozen=True)
+class Live:
+    """What a daemon found out while candump wrote down what was on the bus."""
+
+    silent: ReportDocument
+    transmitted_before: int
+    reports: Reports
+    dump: Path
+    frames: int
+    """That the plant says it has sent."""
+    transmitted: int
+    """That were on the bus."""
+
+
+@pytest.fixture(scope="module")
+def live(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Live:
+    with machine_on_a_bus(tmp_path_factory.mktemp("live")) as machine:
+        _, ears = machine.daemon()
+        before = transmitted()
+        dump = machine.start("candump", "-L", CHANNEL)
+        plant = machine.plant()
+        reports = ears.wait_for_good(10)
+        plant.stop()
+        frames = int(re.findall(r"(\d+) frames in", plant.text())[0])
+        deadline = time.monotonic() + 10.0
+        while len(dump.text().splitlines()) < frames and time.monotonic() < deadline:
+            time.sleep(0.1)
+        return Live(reports[0], before, list(reports), dump.log, frames, transmitted())
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A machine whose daemon runs, on a bus that is silent between the tests."""
+
+    machine: Machine
+    daemon: Program
+    ears: Ears
+
+    def now(self) -> CountersDocument:
+        """What has been counted up to the end of a window that ends after this call."""
+        moment = time.time()
+        return counters(self.ears.wait_for(lambda reports: reports[-1].window.end >= moment))
+
+
+@pytest.fixture(scope="module")
+def watched(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
+    with machine_on_a_bus(tmp_path_factory.mktemp("watched")) as machine:
+        yield Watched(machine, *machine.daemon())
+
+
+@pytest.fixture
+def plant(watched: Watched) -> Iterator[Program]:
+    plant = watched.machine.plant()
+    watched.ears.wait_for_good(2)
+    yield plant
+    plant.stop()
+
+
+def check(found: ParameterDocument) -> None:
+    assert found.status is Status.ESTIMATED
+    assert found.value is not None
+    assert found.sd is not None
+    assert found.value == pytest.approx(RESISTANCE, rel=0.005)
+    assert abs(found.value - RESISTANCE) <= 3.0 * found.sd
+
+
+def test_it_estimates_what_the_bus_brings(live: Live) -> None:
+    check(resistance(live.reports))
+    first, last = counters(good(live.reports)[:1]), counters(live.reports)
+    assert (last.bad, last.lost, last.windows_missed) == (0, 0, first.windows_missed)
+    assert last.reconnects == first.reconnects  # a bus that is silent for long is opened anew
+
+
+def test_it_never_sends(live: Live) -> None:
+    """Every frame that the kernel has seen on this bus is one of the plant, and another's dump has just those."""
+    assert live.silent.window.quality.verdict is Verdict.BAD
+    assert live.transmitted_before == 0
+    assert live.transmitted == live.frames > 0
+    lines = live.dump.read_text(encoding="ascii").splitlines()
+    assert len(lines) == live.frames
+    assert {line.split()[2].split("#")[0] for line in lines} == set(OURS)
+
+
+def test_a_replayed_dump_says_what_the_live_bus_said(
+    compiled: None, live: Live, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    with machine_on_a_bus(tmp_path_factory.mktemp("replayed")) as machine:
+        _, ears = machine.daemon()
+        player = machine.start("canplayer", "-I", str(live.dump))
+        reports = ears.wait_for_good(7)
+        assert player.process.wait(timeout=30) == 0
+        assert transmitted() == live.frames
+    found, then = resistance(reports), resistance(live.reports)
+    check(found)
+    assert found.low is not None
+    assert found.high is not None
+    assert then.value is not None
+    assert found.low <= then.value <= found.high
+
+
+def test_a_flood_of_other_frames_changes_nothing(watched: Watched, plant: Program) -> None:
+    """Extended, FD and remote frames, also with our identifiers, and error frames."""
+    machine, ears = watched.machine, watched.ears
+    before, sent = watched.now(), transmitted()
+    kinds = [
+        ["-e", "-I", "r"],
+        ["-e", "-I", OURS[0]],
+        ["-f", "-I", OURS[0]],
+        ["-f", "-b", "-E", "-I", OURS[1]],
+        ["-R", "-I", OURS[0]],
+        ["-m", "-I", "7FF"],
+    ]
+    begun = time.monotonic()
+    flood = [machine.start("cangen", CHANNEL, "-g", "5", "-i", *kind) for kind in kinds]
+    for error_class in ("20000004", "20000040", "20000080"):
+        run("cansend", CHANNEL, f"{error_class}#0000000000000000")
+    reports = ears.wait_for_good(6)
+    seconds = time.monotonic() - begun
+    others = transmitted() - sent - FRAMES * seconds
+    assert [generator.process.poll() for generator in flood] == [None] * len(flood)
+    for generator in flood:
+        generator.stop()
+    print(f"{others / seconds:.0f} other frames per second")
+    assert others > 1000
+    check(resistance(reports))
+    last = counters(reports)
+    assert (last.bad, last.lost, last.reconnects) == (before.bad, before.lost, before.reconnects)
+    assert last.windows_missed == before.windows_missed
+    driver = reports[-1].driver
+    assert driver is not None
+    assert any("3 error frames" in line for line in driver.complaints)
+
+
+def test_short_frames_of_our_own_identifiers_are_counted(watched: Watched, plant: Program) -> None:
+    before = watched.now()
+    short = [f"{identifier}#{'00' * length}" for identifier in OURS for length in range(8)]
+    for frame in short:
+        run("cansend", CHANNEL, frame)
+    last = watched.now()
+    assert last.bad == before.bad + len(short)
+    check(resistance(watched.ears.wait_for_good(2)))
+
+
+@pytest.mark.parametrize("how", ["down", "gone"])
+def test_it_lives_through_an_outage_of_the_bus(live: Live, watched: Watched, plant: Program, how: str) -> None:
+    """The interface is set down, as for a new bit rate, or taken away, as an adapter is unplugged."""
+    ears, before = watched.ears, watched.now()
+    run(*("ip", "link", "set", CHANNEL, "down") if how == "down" else ("ip", "link", "delete", CHANNEL))
+    assert plant.process.wait(timeout=20) == 2
+    assert "sending on the bus failed" in plant.text()
+    count = len(ears.reports)
+    reports = ears.wait_for(lambda reports: len(reports) >= count + 5)
+    quality = reports[-1].window.quality
+    assert quality.verdict is Verdict.BAD
+    assert any("no samples of" in reason for reason in quality.reasons)
+    assert resistance(reports).status is Status.HELD
+    assert counters(reports).windows_bad >= before.windows_bad + 4
+    driver = reports[-1].driver
+    assert driver is not None
+    assert not driver.up
+    assert {"down": "Network is down", "gone": "No such device"}[how] in driver.reason
+
+    if how == "gone":
+        run("ip", "link", "add", CHANNEL, "type", "vcan")
+    run("ip", "link", "set", CHANNEL, "up")
+    player = watched.machine.start("canplayer", "-I", str(live.dump))
+    begun, seen = time.time(), len(good(reports))
+    reports = ears.wait_for_good(2)
+    first = good(reports)[seen]
+    print(f"{how}: the first good window begins {first.window.start - begun:.2f} s after the bus came back")
+    check(resistance(reports))
+    assert counters(reports).reconnects == before.reconnects + 1
+    player.stop()
