@@ -4,13 +4,16 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from otolith_drivers.base import Link, Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.modbus_line import Broken, Line, Refused, Silent
 from otolith_drivers.modbus_poller import ModbusPoller, Options, Source, build
 from tests.conftest import free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
@@ -260,3 +263,45 @@ def test_refusals(keys: dict[str, object], sentence: str) -> None:
         poller(502, [source(**keys)])
     assert sentence in str(caught.value)
     assert caught.value.key == ("signals", "s0")
+
+
+WORDS = floats(24.0, 1.5)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.one_of(
+    st.binary(max_size=300),
+    st.tuples(st.integers(0, 19), st.integers(0, 16), st.binary(max_size=6)),
+))  # fmt: skip
+def test_whatever_bytes_come_are_the_right_registers_or_none(
+    shared_server: tuple[Behaviour, int], damage: bytes | tuple[int, int, bytes]
+) -> None:
+    """Arbitrary bytes, and right answers with some bytes cut out and others put in."""
+    behaviour, port = shared_server
+
+    def spoil(reply: bytes) -> bytes:
+        if isinstance(damage, bytes):
+            return damage
+        at, cut, put = damage
+        return reply[:at] + put + reply[at + cut :]
+
+    line = Line(Options(host="127.0.0.1", port=port, timeout="0.03 s"))
+    line.connect()
+    behaviour.spoil = spoil
+    try:
+        registers = line.read(1, "holding", 0, 4)
+    except (Silent, Refused, Broken):
+        return
+    finally:
+        line.close()
+    # Modbus TCP has no checksum: only the bytes of the numbers themselves can be false in an answer that is taken.
+    assert len(registers) == 4
+    assert all(0 <= register <= 65535 for register in registers)
+
+
+@pytest.fixture(scope="module")
+def shared_server() -> Iterator[tuple[Behaviour, int]]:
+    """One for many examples."""
+    behaviour, port = Behaviour(WORDS), free_port(socket.SOCK_STREAM)
+    with odd_server(behaviour, port):
+        yield behaviour, port
