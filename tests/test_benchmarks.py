@@ -60,9 +60,15 @@ def test_the_bus_is_listened_to_beside_a_bare_loop() -> None:
     assert "into the rings" in said
 
 
+def test_a_drive_is_polled_beside_a_bare_loop() -> None:
+    said = run("bench_modbus", "2")
+    assert "bare pymodbus loop" in said
+    assert "200 Hz asked" in said
+
+
 def test_every_entry_of_make_bench_is_run_here() -> None:
     found = {path.stem for path in (ROOT / "benchmarks").glob("bench_*.py")}
-    assert found == {*TIMINGS, "bench_can", "bench_estimators"}
+    assert found == {*TIMINGS, "bench_can", "bench_estimators", "bench_modbus"}
 
 
 @pytest.mark.parametrize("name", TIMINGS)
