@@ -25,6 +25,7 @@ from otolith_drivers.modbus_options import Options, Source, item_of
 from otolith_drivers.modbus_types import Order, TypeName
 from tests.conftest import OwnMachine, free_port
 from tests.drivers.modbus_servers import Behaviour, Words, library_server, odd_server
+from tests.drivers.serial_devices import serial_device
 from tests.drivers.test_modbus_parts import registers
 
 ROOT = Path(__file__).parents[1]
@@ -154,6 +155,20 @@ def test_a_scan_lists_devices() -> None:
         ]
         nobody = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "3..4", "--timeout", "0.05")
         assert nobody.return_value == 1
+
+
+def test_a_serial_line_is_scanned_and_read() -> None:
+    with serial_device({3: 1234}, 5) as port:
+        scanned = probe("modbus", port, "--scan", "--device", "3..6", "--timeout", "0.1", "--parity", "N")
+        assert scanned.stdout.splitlines()[1:] == ["device 5"]
+        text = probe("modbus", port, "--device", "5", "--registers", "0..9", "--seconds", 0.2, "--parity", "N").stdout
+        assert re.search(r"^3 +04D2 +1234 ", text, re.MULTILINE)
+        driver = tomllib.loads(text[text.index("[driver]") : text.index("[signals]")])["driver"]
+        assert (driver["serial"], driver["baudrate"], driver["parity"], driver["device"]) == (port, 19200, "N", 5)
+        with pytest.raises(DeviceError, match=r"device 4: no answer within 0\.1 s; are baud rate, parity"):
+            probe("modbus", port, "--device", "4", "--timeout", "0.1", "--parity", "N")
+        with pytest.raises(DeviceError, match=r"the port refuses these settings: .*--parity"):
+            probe("modbus", port, "--parity", "E")  # a pseudo-terminal has none
 
 
 @pytest.fixture

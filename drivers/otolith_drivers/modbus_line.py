@@ -7,6 +7,7 @@ import contextlib
 import logging
 import os
 import socket
+import termios
 from typing import Final
 
 import serial
@@ -75,6 +76,8 @@ class Line:
         """
         try:  # by ourselves, as the library only logs why it cannot
             self._client.socket = self._opened()
+        except termios.error as error:  # which is no OSError
+            raise Broken(f"the port refuses these settings: {error.args[-1]}") from error
         except (OSError, ValueError) as error:
             raise Broken(_cause(error)) from error
 

@@ -97,6 +97,8 @@ def _way_out(options: LineOptions, cause: str) -> str:
         return "are address and cable right, and does 'ping' reach it?"
     from serial.tools import list_ports  # noqa: PLC0415 - only on the way to an error
 
+    if "settings" in cause:
+        return "try another --parity or --baudrate"
     if "denied" in cause:
         return "add yourself to the group that owns it, as a rule with 'sudo usermod -aG dialout $USER'"
     known = ", ".join(port.device for port in list_ports.comports() if port.vid is not None)
