@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -236,30 +236,37 @@ def test_a_bus_that_is_not_there_and_one_that_cannot_be_meant() -> None:
         probe("can", "--database", "nothing.dbc")
 
 
-def test_ctrl_c_ends_both_with_what_was_found(own_machine: OwnMachine, drive: int) -> None:
-    commands = {
-        "only listening": ["can", *bus_of(own_machine), "--seconds", "60"],
-        "[signals]": ["modbus", f"127.0.0.1:{drive}", "--registers", "0..3", "--seconds", "60"],
-    }
-    for said, arguments in commands.items():
-        command = [sys.executable, "-m", "otolith", "probe", *arguments]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-            deadline = time.monotonic() + 30.0
-            while not _takes_signals(process.pid) and time.monotonic() < deadline:
-                time.sleep(0.05)
-            time.sleep(1.0)
-            process.send_signal(signal.SIGINT)
-            output, errors = process.communicate(timeout=30.0)
-        assert process.returncode == 130
-        assert said in output
-        assert errors == ""
+def interrupted(arguments: Sequence[str], ready: Callable[[], bool]) -> "subprocess.CompletedProcess[str]":
+    """The command, ended by Ctrl-C when it listens to signals and the rest is ``ready``."""
+    command = [sys.executable, "-m", "otolith", "probe", *arguments, "--seconds", "60"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60.0
+        while not (_takes_signals(process.pid) and ready()) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=30.0)
+    return subprocess.CompletedProcess(command, process.returncode, output, errors)
 
 
 def _takes_signals(pid: int) -> bool:
-    """Whether the process has a handler of its own for SIGINT."""
+    """Whether the process has a handler of its own for SIGTERM."""
     status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
-    caught = int(re.search(r"SigCgt:\s*([0-9a-f]+)", status)[1], 16)  # type: ignore[index]  # it is always there
-    return bool(caught >> (signal.SIGINT - 1) & 1)
+    caught = re.search(r"SigCgt:\s*([0-9a-f]+)", status)
+    return caught is not None and bool(int(caught[1], 16) >> (signal.SIGTERM - 1) & 1)
+
+
+def test_ctrl_c_ends_listening_with_what_was_heard(own_machine: OwnMachine) -> None:
+    done = interrupted(["can", *bus_of(own_machine)], lambda: True)
+    assert (done.returncode, done.stderr) == (130, "")
+    assert "only listening" in done.stdout
+
+
+def test_ctrl_c_ends_reading_with_what_was_read() -> None:
+    behaviour, port = Behaviour({0: 7}), free_port(socket.SOCK_STREAM)
+    with odd_server(behaviour, port):
+        done = interrupted(["modbus", f"127.0.0.1:{port}", "--registers", "0..3"], lambda: len(behaviour.asked) > 3)
+    assert (done.returncode, done.stderr) == (130, "")
+    assert "[signals]" in done.stdout
 
 
 @pytest.mark.parametrize("name", ["can", "modbus"])

@@ -38,6 +38,8 @@ def grids(heads: Sequence[str], rows: Sequence[Row], width: int) -> Iterator[Tab
 
     Columns whose names begin alike stay in one table if one can hold them.
     """
+    if not rows:
+        return
     names = [name for name in dict.fromkeys(name for row in rows for name in row.cells) if _filled(rows, name)]
     fixed = sum(GAP + max(len(head), *(len(row.fixed[at]) for row in rows)) for at, head in enumerate(heads))
     families = groupby(names, key=lambda name: name.split()[0])

@@ -122,6 +122,9 @@ def show_device(probed: Probed, console: Console, *, wide: bool) -> None:
     console.print(f"{title}, read only (function code {FUNCTION_CODES[place.table]})")
     for text in probed.found.describe(place.first_address):
         console.print(text)
+    if not probed.found.blocks and not probed.found.refused:
+        console.print("ended before anything was read")
+        return
     if not probed.found.blocks:
         other = "input" if place.table == "holding" else "holding"
         console.print(f"the device is there, but not these registers: try others by --registers, or --table {other}")

@@ -155,7 +155,7 @@ def watch(asker: Asker, blocks: Sequence[Block], seconds: float, stopped: Stoppe
     period = max(SHORTEST_PERIOD, seconds / MOST_READINGS)
     begun = time.monotonic()
     round_due = begun
-    while blocks and (round_due == begun or time.monotonic() - begun < seconds) and not stopped():
+    while blocks and (round_due == begun or (time.monotonic() - begun < seconds and not stopped())):
         told(f"reading for {max(0.0, seconds - time.monotonic() + begun):.0f} s more")
         for block in blocks:
             with contextlib.suppress(Refused, Silent):  # what it has refused now, it gave before
