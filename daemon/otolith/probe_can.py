@@ -34,7 +34,7 @@ def listen(
         ConfigurationError: the database cannot be read.
     """
     picture = Picture(load_dbc(database) if database is not None else None)
-    bus = open_bus(options)
+    bus = open_bus(options, listen_only=True)
     shown = Live(_Board(picture, options), console=live, refresh_per_second=REFRESH, transient=True) if live else None
     try:
         with shown or contextlib.nullcontext():
