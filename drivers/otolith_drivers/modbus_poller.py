@@ -47,6 +47,7 @@ class ModbusPoller:
         self._held_back: list[list[Sample]] = []
         self._freshness = Freshness()
         self._received = self._bad = self._lost = self._reconnects = 0
+        self._told = False
         self._up, self._was_up, self._reason = False, False, "not opened yet"
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -140,6 +141,9 @@ class ModbusPoller:
             self._come_up()
         if answered == len(self._items) and self._pace.end(time.monotonic() - begun, repeated=repeated):
             log.warning("%s: %s", self._options.title(), self._pace.describe())
+        if self._pace.known and not self._told and self._pace.achieved is not None:
+            self._told = True
+            log.info("%s: %s, %s", self._options.title(), summary(self._requests.requests), self._pace.describe())
         return usable or self._drained()
 
     def _read(self, request: Request, deliver: Deliver) -> bool:
