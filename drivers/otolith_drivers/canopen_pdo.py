@@ -1,10 +1,8 @@
 """What CANopen drives send by themselves: process data objects, as their electronic data sheet (EDS) maps them.
 
-The ``canopen`` library reads the sheet. Nothing here has a network: a drive is never asked for anything.
+Nothing here has a network: a drive is never asked for anything.
 """
 
-import io
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,17 +15,14 @@ from otolith_drivers.base import Signal
 from otolith_drivers.can_options import CLASSIC_BITS, MOST_PDOS, OBJECT, MappedObject, PdoTable
 from otolith_drivers.can_signals import Wanted, wanted_of
 from otolith_drivers.can_source import EXTENDED_LIMIT, STANDARD_LIMIT, Source
-from otolith_drivers.canopen_sheet import usable_sections, written
+from otolith_drivers.canopen_sheet import dictionary_of
 from otolith_drivers.errors import ConfigurationError, nearest
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary, ODVariable
 
-SIZE_LIMIT = 4 << 20  # bytes; the sheets of large drives have 1 MB
 EMERGENCY_OBJECT, COMMUNICATION, MAPPING = 0x1014, 0x1800, 0x1A00  # CiA 301
 PDO_IS_OFF = 1 << 31
-
-logging.getLogger("canopen").setLevel(logging.ERROR)  # what it warns of concerns objects that nobody wants
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +65,7 @@ class Drive:
         self.warnings: list[str] = []
         self.emergency = 0x80 + node
         self._sheet = sheet
-        self._dictionary = _dictionary(sheet, node, self.warnings) if sheet is not None else None
+        self._dictionary = dictionary_of(sheet, node, self.warnings) if sheet is not None else None
         pdos = {} if self._dictionary is None else self._pdos_of_the_sheet(self._dictionary)
         self.pdos = {**pdos, **{table.number: self._pdo_of_a_table(table) for table in tables}}
         if not self.pdos:
@@ -84,9 +79,20 @@ class Drive:
         Raises:
             ConfigurationError: it is mapped nowhere, or in a PDO that is off, or measures something else.
         """
-        key = ("signals", signal.name)
         source: Source = signal.source
-        written = str(source.object)
+        key = ("signals", signal.name)
+        number, pdo, entry = self._where(str(source.object), key)
+        if not entry.typed or (entry.signal.conversion.is_float and entry.signal.length not in (32, 64)):
+            raise ConfigurationError(
+                f"{self._title()}: {entry.address} is in TPDO {number}, but its type is not known: "
+                "say what the PDO holds by [[driver.pdo]]",
+                key,
+            )
+        origin = f"node {self.node} {entry.name or entry.address} ({entry.address}), TPDO {number}"
+        return wanted_of(signal, pdo.message, entry.signal, origin)
+
+    def _where(self, written: str, key: tuple[str, ...]) -> tuple[int, Pdo, Mapped]:
+        """The object ``written``, and the PDO that it is in and its number."""
         sent = [(number, pdo, entry) for number, pdo in sorted(self.pdos.items()) for entry in pdo.objects]
         found = [place for place in sent if _is_meant(place[2], written)]
         if not found:
@@ -103,15 +109,7 @@ class Drive:
         if len({entry.address for _, _, entry in enabled}) > 1:
             addresses = ", ".join(sorted({entry.address for _, _, entry in enabled}))
             raise ConfigurationError(f"{self._title()} has {written!r} at {addresses}: write one of them", key)
-        number, pdo, entry = enabled[0]
-        if not entry.typed or (entry.signal.conversion.is_float and entry.signal.length not in (32, 64)):
-            raise ConfigurationError(
-                f"{self._title()}: {entry.address} is in TPDO {number}, but its type is not known: "
-                "say what the PDO holds by [[driver.pdo]]",
-                key,
-            )
-        origin = f"node {self.node} {entry.name or entry.address} ({entry.address}), TPDO {number}"
-        return wanted_of(signal, pdo.message, entry.signal, origin)
+        return enabled[0]
 
     def _title(self) -> str:
         return f"node {self.node}" if self._sheet is None else f"node {self.node} ({self._sheet})"
@@ -163,7 +161,7 @@ class Drive:
         return self._assembled(table.number, table.identifier(), entries, enabled=True)
 
     def _look_up(self, entry: MappedObject) -> "ODVariable | None":
-        from canopen.objectdictionary import ODVariable  # noqa: PLC0415 - see _dictionary
+        from canopen.objectdictionary import ODVariable  # noqa: PLC0415 - see canopen_sheet
 
         try:
             found = self._dictionary[entry.index] if self._dictionary is not None else None
@@ -185,7 +183,7 @@ class Drive:
 
 def _value(dictionary: "ObjectDictionary", index: int, subindex: int) -> int | None:
     """What the sheet says that the drive has there: set up (in a DCF), or by default."""
-    from canopen.objectdictionary import ODVariable  # noqa: PLC0415 - see _dictionary
+    from canopen.objectdictionary import ODVariable  # noqa: PLC0415 - see canopen_sheet
 
     try:
         found = dictionary[index]
@@ -202,7 +200,7 @@ def _address(entry: MappedObject) -> str:
 
 def _mapped(entry: MappedObject, known: "ODVariable | None", start: int) -> Mapped:
     """``entry`` from bit ``start`` on; what it does not say itself is as ``known``, else unsigned."""
-    from canopen.objectdictionary import datatypes  # noqa: PLC0415 - see _dictionary
+    from canopen.objectdictionary import datatypes  # noqa: PLC0415 - see canopen_sheet
 
     type_known = known.data_type if known is not None else None
     signed = entry.type == "i" if entry.type else type_known in datatypes.SIGNED_TYPES
@@ -224,33 +222,3 @@ def _is_meant(entry: Mapped, written: str) -> bool:
     if match is None:
         return False
     return entry.index == int(match[1], 16) and (match[2] is None or entry.subindex == int(match[2], 16))
-
-
-def _dictionary(path: Path, node: int, warnings: list[str]) -> "ObjectDictionary":
-    from canopen.objectdictionary import eds  # noqa: PLC0415 - a tenth of a second that only CANopen drives cost
-
-    key = ("driver", "eds")
-    try:
-        if path.exists() and not path.is_file():
-            raise ConfigurationError(f"{path}: is a directory or a device, not a file", key)
-        if path.stat().st_size > SIZE_LIMIT:
-            raise ConfigurationError(f"{path}: larger than {SIZE_LIMIT} bytes, so it is not read", key)
-        content = path.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}", key) from error
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("cp1252", errors="replace")
-    sections, unread = usable_sections(text)
-    if not sections:
-        raise ConfigurationError(f"{path}: not an electronic data sheet: it describes no objects", key)
-    if unread:
-        names = ", ".join(unread[:3]) + (" ..." if len(unread) > 3 else "")
-        warnings.append(f"{path.name}: {len(unread)} objects cannot be read: {names}")
-    try:
-        found: ObjectDictionary = eds.import_eds(io.StringIO(written(sections)), node)  # type: ignore[no-untyped-call]
-    except Exception as error:
-        cause = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ConfigurationError(f"{path}: not an electronic data sheet: {cause}", key) from error
-    return found

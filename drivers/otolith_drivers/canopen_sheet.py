@@ -1,11 +1,21 @@
-"""What of an electronic data sheet the library can be trusted with.
+"""Reading electronic data sheets: what of them the ``canopen`` library can be trusted with.
 
 Sheets are INI files that people edit: sections stand twice, keys are missing, numbers are words. The library refuses a
 whole sheet for one such object; here the object is left out.
 """
 
+import io
+import logging
 import re
 from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.files import content
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
 
 Sections = dict[str, dict[str, str]]
 
@@ -15,6 +25,37 @@ NUMBER = re.compile(r"0[xX][0-9A-Fa-f]{1,8}|\d{1,10}")
 KEPT = ("ParameterName", "ObjectType", "DataType", "DefaultValue", "ParameterValue", "CompactSubObj")
 SIMPLE = {"0x2", "0x7", "2", "7", "0x02", "0x07"}
 LONGEST_VALUE = 200  # characters
+SIZE_LIMIT = 4 << 20  # bytes; the sheets of large drives have 1 MB
+
+logging.getLogger("canopen").setLevel(logging.ERROR)  # what it warns of concerns objects that nobody wants
+
+
+def dictionary_of(path: Path, node: int, warnings: list[str]) -> "ObjectDictionary":
+    """The object dictionary in the sheet at ``path``; to ``warnings`` is added which of its objects cannot be read.
+
+    Raises:
+        ConfigurationError: no such file, or no electronic data sheet.
+    """
+    from canopen.objectdictionary import eds  # noqa: PLC0415 - a tenth of a second that only CANopen drives cost
+
+    key = ("driver", "eds")
+    data = content(path, SIZE_LIMIT, key)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", errors="replace")
+    sections, unread = usable_sections(text)
+    if not sections:
+        raise ConfigurationError(f"{path}: not an electronic data sheet: it describes no objects", key)
+    if unread:
+        names = ", ".join(unread[:3]) + (" ..." if len(unread) > 3 else "")
+        warnings.append(f"{path.name}: {len(unread)} objects cannot be read: {names}")
+    try:
+        found: ObjectDictionary = eds.import_eds(io.StringIO(written(sections)), node)  # type: ignore[no-untyped-call]
+    except Exception as error:
+        cause = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ConfigurationError(f"{path}: not an electronic data sheet: {cause}", key) from error
+    return found
 
 
 def usable_sections(text: str) -> tuple[Sections, list[str]]:

@@ -16,6 +16,7 @@ from cantools.database import Signal as CanSignal
 from cantools.database.can.database import Database
 
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.files import content
 
 SIZE_LIMIT = 4 << 20  # bytes; large vehicles have databases of 2 MB, and each takes some seconds
 LONGEST_FRAME = 4096  # bytes; CAN FD has 64, the transport protocol of SAE J1939 1785
@@ -108,23 +109,16 @@ def load_database(path: Path) -> Loaded:
 
 
 def _text(path: Path) -> tuple[str, list[Fault]]:
-    try:
-        if path.exists() and not path.is_file():
-            raise ConfigurationError(f"{path}: is a directory or a device, not a file", ("driver", "dbc"))
-        if path.stat().st_size > SIZE_LIMIT:
-            raise ConfigurationError(f"{path}: larger than {SIZE_LIMIT} bytes, so it is not read", ("driver", "dbc"))
-        content = path.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}", ("driver", "dbc")) from error
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return content.decode("utf-16", errors="replace"), []
+    data = content(path, SIZE_LIMIT, ("driver", "dbc"))
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return data.decode("utf-16", errors="replace"), []
     # The tools write Windows-1252 or UTF-8 and seldom say which; text in the one is hardly ever text in the other.
     for encoding in ("utf-8-sig", "cp1252"):
         try:
-            return content.decode(encoding), []
+            return data.decode(encoding), []
         except UnicodeDecodeError as error:
             place = error.start
-    return content.decode("cp1252", errors="replace"), [Fault(f"neither UTF-8 nor Windows-1252 (byte {place})")]
+    return data.decode("cp1252", errors="replace"), [Fault(f"neither UTF-8 nor Windows-1252 (byte {place})")]
 
 
 def _refuse_excess(text: str, path: Path) -> None:

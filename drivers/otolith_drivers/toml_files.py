@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.files import content
 
 FILE_SIZE_LIMIT = 1 << 20  # bytes; a machine file has a few thousand
 Location = Sequence[int | str]
@@ -48,17 +49,16 @@ def load(path: Path, model: type[Model]) -> Model:
 
 
 def read(path: Path) -> Page:
-    """The text of a file that the user named."""
+    """The text of a file that the user named, its line ends those of this system.
+
+    Raises:
+        ConfigurationError: missing, unreadable, too large, or not UTF-8.
+    """
     try:
-        if path.exists() and not path.is_file():
-            raise ConfigurationError(f"{path}: is a directory or a device, not a file")
-        if path.stat().st_size > FILE_SIZE_LIMIT:
-            raise ConfigurationError(f"{path}: larger than {FILE_SIZE_LIMIT} bytes, so this is no file of ours")
-        return Page(path, path.read_text(encoding="utf-8"))
+        text = content(path, FILE_SIZE_LIMIT).decode("utf-8")
     except UnicodeDecodeError as error:
         raise ConfigurationError(f"{path}: not UTF-8 text (byte {error.start}): is this the right file?") from error
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return Page(path, re.sub("\r\n?", "\n", text))
 
 
 def parse(page: Page) -> dict[str, Any]:
