@@ -14,6 +14,10 @@ from typing import Literal, get_args
 TypeName = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
 ORDERS: tuple[Order, ...] = get_args(Order)
+WORDS_SWAPPED: frozenset[Order] = frozenset({"CDAB", "DCBA"})
+"""The lowest register comes first."""
+BYTES_SWAPPED: frozenset[Order] = frozenset({"BADC", "DCBA"})
+"""In each register."""
 
 LETTERS: dict[TypeName, str] = {
     "int16": "h",
@@ -47,9 +51,9 @@ def orders_of(kind: TypeName) -> tuple[Order, ...]:
 def reader(kind: TypeName, order: Order) -> Callable[[Sequence[int]], float]:
     """A function from the registers of a number (each 0 to 65535, in the order of their addresses) to the number."""
     count = registers_of(kind)
-    words = struct.Struct(f"{'<' if order in ('BADC', 'DCBA') else '>'}{count}H")
+    words = struct.Struct(f"{'<' if order in BYTES_SWAPPED else '>'}{count}H")
     number = struct.Struct(f">{LETTERS[kind]}")
-    backwards = order in ("CDAB", "DCBA")
+    backwards = order in WORDS_SWAPPED
 
     def read(registers: Sequence[int]) -> float:
         found: float = number.unpack(words.pack(*(registers[::-1] if backwards else registers)))[0]

@@ -7,7 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith_drivers.modbus_plausible import fault_of_floats
-from otolith_drivers.modbus_types import LETTERS, Order, TypeName, is_float, orders_of, registers_of
+from otolith_drivers.modbus_types import (
+    BYTES_SWAPPED,
+    LETTERS,
+    WORDS_SWAPPED,
+    Order,
+    TypeName,
+    is_float,
+    orders_of,
+    registers_of,
+)
 
 Bytes = NDArray[np.uint8]
 """Readings by bytes."""
@@ -98,9 +107,9 @@ def register_layouts(kind: TypeName) -> tuple[Layout, ...]:
 
 def _places(width: int, order: Order) -> tuple[int, ...]:
     words = [(at, at + 1) for at in range(0, width, 2)]
-    if order in ("BADC", "DCBA"):
+    if order in BYTES_SWAPPED:
         words = [(second, first) for first, second in words]
-    if order in ("CDAB", "DCBA"):
+    if order in WORDS_SWAPPED:
         words = words[::-1]
     return tuple(place for word in words for place in word)
 

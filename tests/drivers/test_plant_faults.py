@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.modbus_types import Order
 from otolith_drivers.plant.bus_faults import (
     BusFault,
     ClockStep,
@@ -187,7 +188,7 @@ BYTES = {"ABCD": [0, 1, 2, 3], "DCBA": [3, 2, 1, 0], "BADC": [1, 0, 3, 2], "CDAB
     st.integers(0, 2**20),
     st.sampled_from(sorted(BYTES)),
 )
-def test_float_registers_in_any_order(one: float, other: float, index: int, order: str) -> None:
+def test_float_registers_in_any_order(one: float, other: float, index: int, order: Order) -> None:
     registers = RegisterMap(ModbusOptions(), SIGNALS).encode({"speed": one, "current": other}, index, order)
     assert registers[4] == index % 65536
     data = np.array(registers[:4], ">u2").view("u1").reshape(2, 4)[:, np.argsort(BYTES[order])]

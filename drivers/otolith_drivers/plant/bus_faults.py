@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.plant.registers import Order
+from otolith_drivers.modbus_types import Order
 from otolith_drivers.plant.spans import ROUNDING, Seconds, Share, Span, generator
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed

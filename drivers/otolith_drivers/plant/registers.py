@@ -7,23 +7,20 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from otolith_drivers.modbus_types import BYTES_SWAPPED, LETTERS, WORDS_SWAPPED, Order
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Closed
 
 SPACING = 2  # registers from one signal to the next, whatever the type
 COUNTER_VALUES = 65536
 
-Order = Literal["ABCD", "DCBA", "BADC", "CDAB"]
-"""Of the bytes of a 32-bit number, A being the most significant: ABCD as Modbus says, CDAB with its words swapped."""
 Type = Literal["float32", "int32", "int16"]
 
-FORMATS: dict[Type, str] = {"float32": ">f", "int32": ">i", "int16": ">h"}
 RANGES: dict[Type, tuple[float, float]] = {
     "float32": (-3.4028234e38, 3.4028234e38),
     "int32": (-(2.0**31), 2.0**31 - 1.0),
     "int16": (-(2.0**15), 2.0**15 - 1.0),
 }
-WORDS_SWAPPED, BYTES_SWAPPED = ("CDAB", "DCBA"), ("BADC", "DCBA")
 
 
 class ModbusOptions(Closed):
@@ -62,18 +59,18 @@ class RegisterMap:
         self.addresses = {name: SPACING * number for number, name in enumerate(signals)}
         self.counter = SPACING * len(signals)
         self.size = self.counter + 1
-        self._format = FORMATS[options.type]
+        self._format = f">{LETTERS[options.type]}"
         self._range = RANGES[options.type]
         self._scales = _scales(options, signals)
 
-    def encode(self, measured: dict[str, float], index: int, order: str) -> list[int]:
+    def encode(self, measured: dict[str, float], index: int, order: Order) -> list[int]:
         """All registers: ``measured`` in its units, ``index`` of the tick; a value beyond the type stays at its end."""
         registers: list[int] = []
         for name in self.addresses:
             registers += self._words(measured[name] / self._scales[name], order)
         return [*registers, index % COUNTER_VALUES]
 
-    def _words(self, value: float, order: str) -> list[int]:
+    def _words(self, value: float, order: Order) -> list[int]:
         low, high = self._range
         within = min(max(value, low), high)
         data = struct.pack(self._format, within if self._format == ">f" else round(within))
