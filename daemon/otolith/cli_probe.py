@@ -109,6 +109,7 @@ def modbus(
     from otolith.probe_modbus import document, probe_device, scan_line, show_device, show_scan
     from otolith_drivers.modbus_options import LineOptions
     from otolith_drivers.probe_registers import Place
+    from otolith_drivers.toml_files import fitted
 
     if device is not None and device[0] != device[1] and not scan:
         raise click.BadParameter("a range of devices goes with --scan", param_hint="--device")
@@ -116,7 +117,7 @@ def modbus(
     if registers[0] < first_address:
         raise click.BadParameter("with --first-address 1 there is no register 0", param_hint="--registers")
     keys = _address(target) | {"timeout": f"{timeout or (0.2 if scan else 0.5)} s", "framing": framing}
-    options = LineOptions.model_validate(keys | {"baudrate": baudrate, "parity": parity, "stop_bits": int(stop_bits)})
+    options = fitted(keys | {"baudrate": baudrate, "parity": parity, "stop_bits": int(stop_bits)}, LineOptions, ())
     devices = device or ((1, 247) if scan else (1, 1))
     place = Place(options, devices[0], "holding" if table == "holding" else "input", first_address)
     on_wire = (registers[0] - first_address, registers[1] - first_address)
@@ -173,16 +174,13 @@ def can_(
     """
     import time
 
-    from otolith.errors import ConfigurationError
     from otolith.probe_can import document, listen, show_bus
     from otolith.probe_grids import console
     from otolith_drivers.can_bus import BusOptions
+    from otolith_drivers.toml_files import fitted
 
     rate = {} if bitrate is None else {"bitrate": f"{bitrate} bit/s"}
-    try:
-        options = BusOptions.model_validate({"interface": interface, "channel": channel, "port": port, "fd": fd} | rate)
-    except ValueError as error:  # pydantic's, whose sentence stands behind the first colon
-        raise ConfigurationError(str(error).split("Value error, ")[-1].split(" [type=")[0]) from error
+    options = fitted({"interface": interface, "channel": channel, "port": port, "fd": fd} | rate, BusOptions, ())
     stop = StopSignal()
     terminal = console()
     begun = time.monotonic()

@@ -9,10 +9,10 @@ from typing import Any
 from rich.console import Console
 
 from otolith.probe_grids import Row, grids
-from otolith_drivers.modbus_line import FUNCTION_CODES, Line
+from otolith_drivers.modbus_line import FUNCTION_CODES
 from otolith_drivers.modbus_options import HIGHEST_ADDRESS
 from otolith_drivers.modbus_types import LETTERS, TypeName
-from otolith_drivers.probe_line import Answer, Asker, Stopped, Told, open_line, scan
+from otolith_drivers.probe_line import Answer, Asker, Stopped, Told, opened, scan
 from otolith_drivers.probe_modbus import Block, Speed, Survey, Words, possible_rate, spans, speeds, survey, watch
 from otolith_drivers.probe_numbers import Verdict
 from otolith_drivers.probe_registers import (
@@ -23,11 +23,11 @@ from otolith_drivers.probe_registers import (
     Reading,
     bytes_of,
     driver_lines,
-    number_text,
     numbers_of,
     readings_at,
     signal_lines,
 )
+from otolith_drivers.probe_text import number_text
 
 LONGEST_NUMBER = 4  # registers
 FEWEST_ZEROS = 3  # registers in a row that are one row of the table
@@ -65,10 +65,7 @@ def probe_device(place: Place, registers: tuple[int, int], seconds: float, stopp
     Raises:
         DeviceError: the line cannot be opened, or the device does not answer.
     """
-    line = Line(place.options)
-    told(f"opening {place.options.title()}")
-    open_line(line, place.options)
-    try:
+    with opened(place.options, told) as line:
         asker = Asker(line, place.options, place.device, place.table)
         first, last = registers
         if first == last:
@@ -80,8 +77,6 @@ def probe_device(place: Place, registers: tuple[int, int], seconds: float, stopp
         elapsed = time.monotonic() - begun
         told("comparing")
         return Probed(place, registers, found, readings, numbers_of(readings), speeds(asker, found.blocks), elapsed)
-    finally:
-        line.close()
 
 
 def scan_line(place: Place, devices: tuple[int, int], register: int, stopped: Stopped, told: Told) -> list[Answer]:
@@ -90,14 +85,9 @@ def scan_line(place: Place, devices: tuple[int, int], register: int, stopped: St
     Raises:
         DeviceError: the line cannot be opened.
     """
-    line = Line(place.options)
-    told(f"opening {place.options.title()}")
-    open_line(line, place.options)
-    try:
+    with opened(place.options, told) as line:
         asker = Asker(line, place.options, devices[0], place.table)
         return scan(asker, range(devices[0], devices[1] + 1), register, stopped, told)
-    finally:
-        line.close()
 
 
 def show_scan(place: Place, devices: tuple[int, int], answers: Sequence[Answer], console: Console) -> None:

@@ -12,7 +12,7 @@ from otolith_drivers.can_bus import BusOptions
 from otolith_drivers.probe_can import Heard, Picture, Value
 from otolith_drivers.probe_layouts import FRAMES, Layout
 from otolith_drivers.probe_numbers import Part, Verdict, parts
-from otolith_drivers.probe_registers import number_text, quoted, spread
+from otolith_drivers.probe_text import number_text, quoted, spread
 
 FEWEST_FRAMES = 8
 CLASSIC = 8  # bytes

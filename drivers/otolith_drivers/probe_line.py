@@ -5,7 +5,8 @@ Everything goes through :class:`otolith_drivers.modbus_line.Line`, which can rea
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from otolith_drivers.errors import DeviceError
@@ -88,6 +89,22 @@ def open_line(line: Line, options: LineOptions) -> None:
         line.connect()
     except Broken as error:
         raise DeviceError(f"{options.title()} cannot be opened: {error}; {_way_out(options, str(error))}") from error
+
+
+@contextmanager
+def opened(options: LineOptions, told: Told) -> Iterator[Line]:
+    """The line, open, and closed at the end.
+
+    Raises:
+        DeviceError: it cannot be opened; with the way out.
+    """
+    line = Line(options)
+    told(f"opening {options.title()}")
+    open_line(line, options)
+    try:
+        yield line
+    finally:
+        line.close()
 
 
 def _way_out(options: LineOptions, cause: str) -> str:

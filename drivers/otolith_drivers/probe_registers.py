@@ -4,7 +4,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from otolith_drivers.modbus_types import TypeName
 from otolith_drivers.probe_layouts import REGISTERS, Bytes, Layout, register_layouts
 from otolith_drivers.probe_modbus import Block, Survey, Words, spans
 from otolith_drivers.probe_numbers import Part, Verdict, parts
+from otolith_drivers.probe_text import number_text, quoted, spread
 
 # A device that has one order for some numbers hardly ever has another for others: bits, once and for each reading.
 OTHER_ORDER, OTHER_ORDER_OF_EACH = 8.0, 1.5
@@ -135,11 +135,6 @@ def driver_lines(place: Place, found: Survey) -> list[str]:
     return lines
 
 
-def quoted(value: Any) -> str:
-    """As TOML writes a number or a text."""
-    return str(value) if isinstance(value, int) else '"' + str(value).replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
 def signal_lines(place: Place, numbers: Sequence[Number]) -> list[str]:
     """The table ``[signals]``: a line for every number that moves, and remarks on the others."""
     lines = ["[signals]"]
@@ -171,26 +166,3 @@ def _perhaps(place: Place, number: Number) -> str:
         where = "" if address == number.address else f" of register {place.shown(address)}"
         texts.append(f"{layout.name}{where} ({number_text(latest, layout)})")
     return f"; or {', '.join(texts)}" if texts else ""
-
-
-def spread(part: Part) -> str:
-    """The latest value, and between which it was."""
-    layout = part.layout
-    if layout is None:
-        return ""
-    step = part.high - part.low
-    latest, low, high = (number_text(value, layout, step) for value in (part.latest, part.low, part.high))
-    return f"{latest} now, between {low} and {high}"
-
-
-def number_text(value: float, layout: Layout, step: float = 0.0) -> str:
-    """A number as people write it: integers in full, floats with the digits in which they differ by ``step``."""
-    if not math.isfinite(value):
-        return str(value)
-    if not layout.is_float:
-        return f"{value:.0f}"
-    size = max(abs(value), step)
-    digits = 4
-    if step > 0.0 and size > 0.0:
-        digits = min(max(digits, 2 + math.ceil(math.log10(size / step))), 7 if layout.width == 4 else 12)
-    return f"{value:.{digits}g}"
