@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.text import Text
 
 from otolith.probe_grids import Row, grids
-from otolith_drivers.can_bus import BusOptions, open_bus
+from otolith_drivers.can_bus import MOST_BAD_IN_A_ROW, BusOptions, is_gone, open_bus
 from otolith_drivers.dbc import load_dbc
 from otolith_drivers.errors import DeviceError
 from otolith_drivers.probe_can import Heard, Picture, within
@@ -19,7 +19,6 @@ from otolith_drivers.probe_frames import driver_lines, fields_of, signal_lines, 
 
 RECEIVE_TIMEOUT = 0.1  # s; how late an end is noticed
 REFRESH = 4.0  # Hz of the live table
-MOST_BAD_IN_A_ROW = 50
 MOST_NAMED = 12  # messages in a line
 LEGEND = "[..] bytes that have changed    ± half of the width in which 19 of 20 periods lie"
 
@@ -54,7 +53,7 @@ def _receive(bus: Any, options: BusOptions, picture: Picture, seconds: float, st
         except Exception as error:  # interfaces raise whatever their vendor's library does
             bad += 1
             picture.unreadable += 1
-            if isinstance(error, OSError) or isinstance(error.__cause__, OSError) or bad > MOST_BAD_IN_A_ROW:
+            if is_gone(error) or bad > MOST_BAD_IN_A_ROW:
                 raise DeviceError(f"CAN bus {options.title()}: {error}; was the interface taken down?") from error
             continue
         bad = 0

@@ -18,6 +18,7 @@ from otolith_drivers.toml_files import Closed
 
 IP_MULTICAST_ALL = 49  # of <linux/in.h>; the socket module has no name for it
 DEFAULT_CHANNEL, DEFAULT_GROUP = "vcan0", "239.74.163.2"
+MOST_BAD_IN_A_ROW = 50  # frames that cannot be unpacked; more are no accident
 GROUP = re.compile(r"239\.\d{1,3}\.\d{1,3}\.\d{1,3}")
 
 
@@ -124,6 +125,11 @@ def open_bus(
             f"CAN bus {options.title()} cannot be opened: {_cause(error)}; {_way_out(interface)}"
         ) from error
     return bus
+
+
+def is_gone(error: Exception) -> bool:
+    """Whether ``error``, raised on receiving, says that the bus has failed, and not only a frame in the unpacking."""
+    return isinstance(error, OSError) or isinstance(error.__cause__, OSError)
 
 
 def _hear_only_this_group(bus: can.BusABC) -> None:

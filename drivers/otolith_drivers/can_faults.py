@@ -1,5 +1,7 @@
 """What a bus says of itself in error frames, in the classes of Linux (``linux/can/error.h``). No clock in here."""
 
+from collections import Counter
+
 import can
 
 RECENT = 10.0  # s for which the last error is complained of
@@ -17,7 +19,6 @@ CLASSES: dict[int, str] = {
     0x80: "bus error",
     RESTARTED: "controller restarted",
 }
-CLASS_MASK = sum(CLASSES)
 CONTROLLER_STATES: dict[int, str] = {
     0x10: "error passive (receiving)",
     0x20: "error passive (sending)",
@@ -27,42 +28,39 @@ CONTROLLER_STATES: dict[int, str] = {
 OVERFLOW_RECEIVING, ACTIVE_AGAIN = 0x01, 0x40  # bits of the first data byte beside those states
 
 
+def classes_of(frame: can.Message) -> list[str]:
+    """What an error frame says, in words; an interface that does not tell classes has 0 there."""
+    return [name for bit, name in CLASSES.items() if frame.arbitration_id & bit] or ["error frame"]
+
+
 class BusFaults:
     """Counts error frames by their class, and knows whether the controller has left the bus."""
 
     def __init__(self) -> None:
         self.bus_off = False
-        """Until anything comes again."""
-        self.counts: dict[str, int] = {}
+        """Until a frame comes, or the bus is opened anew."""
+        self.total = 0
+        """Error frames, each of which may be of several classes."""
+        self.counts: Counter[str] = Counter()
+        """By what they say."""
         self.overflows = 0
         """Times that the controller had no room for a frame."""
         self._state = ""
         self._latest = ""
         self._at = 0.0
 
-    @property
-    def total(self) -> int:
-        """Error frames, each of which may be of several classes."""
-        return self.counts.get("", 0)
-
     def note(self, frame: can.Message, time: float) -> None:
-        """An error frame; an interface that does not tell classes has 0 there."""
-        self._count("")
-        bits = frame.arbitration_id & CLASS_MASK
-        names = [name for bit, name in CLASSES.items() if bits & bit] or ["error frame"]
+        """An error frame, which came at ``time`` (s)."""
+        self.total += 1
+        bits, names = frame.arbitration_id, classes_of(frame)
         if bits & CONTROLLER and len(frame.data) > 1:
-            names = [self._of_controller(frame.data[1]) if bit == CLASSES[CONTROLLER] else bit for bit in names]
-        for name in names:
-            self._count(name)
+            names = [self._of_controller(frame.data[1]) if name == CLASSES[CONTROLLER] else name for name in names]
+        self.counts.update(names)
         if bits & BUS_OFF:
             self.bus_off = True
         if bits & RESTARTED:
             self.bus_off, self._state = False, ""
         self._latest, self._at = ", ".join(names), time
-
-    def healed(self) -> None:
-        """A frame came, or the bus was opened anew."""
-        self.bus_off = False
 
     def complaints(self, now: float) -> list[str]:
         """What is wrong at ``now`` (s), a line each."""
@@ -76,10 +74,6 @@ class BusFaults:
             lines.append(f"{self.total} error frames on the bus, the latest {max(age, 0.0):.1f} s ago: {self._latest}")
         return lines
 
-    def describe(self) -> str:
-        """All of them, by class."""
-        return ", ".join(f"{name}: {count}" for name, count in sorted(self.counts.items()) if name)
-
     def _of_controller(self, status: int) -> str:
         if status & OVERFLOW_RECEIVING:
             self.overflows += 1
@@ -91,6 +85,3 @@ class BusFaults:
                 self._state = name
                 return name
         return "controller had no room for a frame" if status & OVERFLOW_RECEIVING else CLASSES[CONTROLLER]
-
-    def _count(self, name: str) -> None:
-        self.counts[name] = self.counts.get(name, 0) + 1

@@ -13,10 +13,10 @@ from dataclasses import replace
 import can
 
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
-from otolith_drivers.can_bus import BusOptions, open_bus
+from otolith_drivers.can_bus import MOST_BAD_IN_A_ROW, BusOptions, is_gone, open_bus
 from otolith_drivers.can_decoder import FrameDecoder, decoder_of
 from otolith_drivers.can_options import FrameOptions
-from otolith_drivers.can_socket import enlarge_buffer, frames_dropped, refusal
+from otolith_drivers.can_socket import Drops, enlarge_buffer, frames_dropped, refusal
 from otolith_drivers.can_source import Source
 from otolith_drivers.errors import DeviceError
 
@@ -26,13 +26,11 @@ log = logging.getLogger(__name__)
 
 RECEIVE_TIMEOUT = 0.2  # s; how late a stop can be noticed
 BACKOFF_FIRST, BACKOFF_LONGEST = 0.2, 10.0  # s
-MOST_BAD_IN_A_ROW = 50  # unreadable frames, after which the bus is opened anew
 STAMP_TOLERANCE = 1.0  # s; a kernel stamp farther from now than this met a clock that was set
 LOOK_EVERY = 0.05  # s; how often the clocks are compared: 50 ms are the longest that a clock that was set can mislead
 CLOCK_TRIES, CLOCK_SPAN = 5, 2e-5  # s
 SILENT_PERIODS, SILENT_AT_LEAST, SILENT_AT_MOST = 10.0, 2.0, 60.0  # periods; s
 NEVER_HEARD = 10.0  # s; no period is known before anything came
-RECENT = 60.0  # s for which dropped frames are told
 
 
 class Options(BusOptions, FrameOptions):
@@ -56,7 +54,7 @@ class CanReceiver:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._reconnects = self._unreadable = self._bad_in_a_row = 0
-        self._drops = _Drops()
+        self._drops = Drops()
         self._heard = self._opened = 0.0
         self._patience = 0.0
 
@@ -114,7 +112,7 @@ class CanReceiver:
         self._drops.begin()
         self._bad_in_a_row = 0
         self._opened = time.monotonic()
-        self._decoder.faults.healed()
+        self._decoder.faults.bus_off = False
         self._link = Link(up=True)
         return bus
 
@@ -170,8 +168,8 @@ class CanReceiver:
         return NEVER_HEARD if period is None else max(SILENT_AT_LEAST, SILENT_PERIODS * period)
 
     def _only_a_bad_frame(self, error: Exception) -> bool:
-        """Whether what came could not be unpacked, while the bus itself stands; many in a row are no accident."""
-        if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
+        """Whether what came could not be unpacked, while the bus itself stands."""
+        if is_gone(error):
             return False
         self._bad_in_a_row += 1
         self._unreadable += 1
@@ -194,31 +192,6 @@ class CanReceiver:
             self._link = Link(up=False, reason=trouble)
             pause = min(2 * pause, BACKOFF_LONGEST)
         return None
-
-
-class _Drops:
-    """Frames that this computer did not read in time, over all the buses that were opened."""
-
-    def __init__(self) -> None:
-        self.total = 0
-        self._of_this_bus = 0
-        self._at = 0.0
-
-    def begin(self) -> None:
-        """Another socket counts from zero."""
-        self._of_this_bus = 0
-
-    def note(self, count: int | None, now: float) -> None:
-        """What the kernel says of this bus."""
-        if count is not None and count > self._of_this_bus:
-            self.total += count - self._of_this_bus
-            self._of_this_bus, self._at = count, now
-
-    def complaints(self, now: float) -> list[str]:
-        """A line for a while after it happened."""
-        if not self.total or now - self._at > RECENT:
-            return []
-        return [f"this computer was too busy to read {self.total} frames, the last {now - self._at:.1f} s ago"]
 
 
 def wall_ahead() -> float:

@@ -12,6 +12,7 @@ SO_RCVBUFFORCE, SO_MEMINFO = 33, 55  # of <asm-generic/socket.h>; the socket mod
 MEMORY_INFO = struct.Struct("9I")  # of <linux/sock_diag.h>
 DROPS = 8  # its last
 BUFFER = 8 << 20  # bytes; a second or two of a bus at its limit
+RECENT = 60.0  # s for which dropped frames are told
 
 
 def enlarge_buffer(bus: can.BusABC) -> None:
@@ -68,3 +69,28 @@ def _descriptor(bus: can.BusABC) -> int | None:
     except (NotImplementedError, OSError):
         return None
     return found if is_socket else None
+
+
+class Drops:
+    """Frames that this computer did not read in time, over all the buses that were opened."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._of_this_bus = 0
+        self._at = 0.0
+
+    def begin(self) -> None:
+        """Another socket counts from zero."""
+        self._of_this_bus = 0
+
+    def note(self, count: int | None, now: float) -> None:
+        """What the kernel says of this bus."""
+        if count is not None and count > self._of_this_bus:
+            self.total += count - self._of_this_bus
+            self._of_this_bus, self._at = count, now
+
+    def complaints(self, now: float) -> list[str]:
+        """A line for a while after it happened."""
+        if not self.total or now - self._at > RECENT:
+            return []
+        return [f"this computer was too busy to read {self.total} frames, the last {now - self._at:.1f} s ago"]

@@ -11,23 +11,13 @@ from cantools.database import Message
 from cantools.database import Signal as CanSignal
 from cantools.database.can.database import Database
 
+from otolith_drivers.can_faults import classes_of
+from otolith_drivers.canopen_watch import STATES
+
 MOST_IDENTIFIERS = 2048  # that are kept apart; a standard bus has no more
 MOST_FRAMES = 500  # of each that are kept
 IRREGULAR = 1.0  # of the period, beyond which a frame is called irregular
 
-# Linux, include/uapi/linux/can/error.h: the classes of error frames.
-ERRORS = {
-    0x01: "sending timed out",
-    0x02: "arbitration lost",
-    0x04: "trouble of the controller",
-    0x08: "protocol violated",
-    0x10: "trouble of the transceiver",
-    0x20: "no acknowledgement",
-    0x40: "bus off",
-    0x80: "bus error",
-    0x100: "controller restarted",
-}
-HEARTBEAT_STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 # CiA 301, the predefined connection set: base of the identifiers, what they carry.
 CANOPEN = {
     0x080: "emergency",
@@ -182,8 +172,7 @@ class Picture:
         """A frame, which came at ``time`` (s, of any clock that goes on steadily)."""
         if frame.is_error_frame:
             self.error_frames += 1
-            bits = frame.arbitration_id
-            self.errors.update([name for bit, name in ERRORS.items() if bits & bit] or ["error frame"])
+            self.errors.update(classes_of(frame))
             return
         key = (frame.arbitration_id, bool(frame.is_extended_id))
         heard = self.heard.get(key)
@@ -216,7 +205,7 @@ class Picture:
             not heard.extended
             and 0x701 <= heard.identifier <= 0x77F
             and heard.lengths == {1}
-            and heard.latest[0] & 0x7F in HEARTBEAT_STATES
+            and heard.latest[0] & 0x7F in STATES
             for heard in self.heard.values()
         )
 
@@ -230,7 +219,7 @@ class Picture:
         if not self.is_canopen:
             return f"{name}, if CANopen"
         if name.startswith("heartbeat") and len(heard.latest) == 1:
-            name += f": {HEARTBEAT_STATES.get(heard.latest[0] & 0x7F, 'state unknown')}"
+            name += f": {STATES.get(heard.latest[0] & 0x7F, 'state unknown')}"
         return f"CANopen {name}"
 
 
