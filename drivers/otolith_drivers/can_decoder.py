@@ -92,13 +92,16 @@ class FrameDecoder:
             lost=max(sum(reader.lost for reader in readers), self.faults.overflows),
         )
 
-    def complaints(self, now: float) -> list[str]:
-        """What is wrong at ``now`` (s, of the clock of :meth:`decode`), a line each."""
+    def complaints(self, now: float, *, unused: bool = True) -> list[str]:
+        """What is wrong at ``now`` (s, of the clock of :meth:`decode`), a line each.
+
+        With ``unused`` also what came lately and could not be used.
+        """
         if self._begun is None:
             self._begun = now
         lines = self.faults.complaints(now)
         for reader in self._readers.values():
-            lines += reader.complaints(now, self._begun)
+            lines += reader.complaints(now, self._begun, unused=unused)
         for watch in self._watches:
             lines += watch.complaints(now)
         return lines

@@ -106,8 +106,11 @@ class MessageReader:
         self.received += len(samples)
         return samples
 
-    def complaints(self, now: float, begun: float) -> list[str]:
-        """What is wrong at ``now``, a line each; listening began at ``begun`` (s)."""
+    def complaints(self, now: float, begun: float, *, unused: bool = True) -> list[str]:
+        """What is wrong at ``now``, a line each; listening began at ``begun`` (s).
+
+        With ``unused`` also what came lately and could not be used.
+        """
         if self.pace.last is None and not self._troubles:
             declared = self._rules.period or self._cycle
             waited = now - begun
@@ -115,7 +118,7 @@ class MessageReader:
         lines = [
             f"{self.title}: {trouble.text}; {trouble.count} in all, the last {max(now - trouble.at, 0.0):.1f} s ago"
             for trouble in list(self._troubles.values())  # the receiving thread may add one
-            if now - trouble.at < RECENT
+            if unused and now - trouble.at < RECENT
         ]
         if self._counter is not None and self._counter.standing >= STANDS_STILL:
             lines.append(self._standing(self._counter))

@@ -113,6 +113,13 @@ def test_where_a_log_goes_back_in_time_is_said(tmp_path: Path, frames: list[can.
     assert playback.counts.lost == 4
 
 
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_message_that_is_not_in_it_is_told(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
+    electrical = [frame for frame in frames if frame.arbitration_id != 0x281]
+    _, _, complaints = read(written(tmp_path, electrical, suffix))
+    assert any("0x281) has not come once" in line for line in complaints)
+
+
 @pytest.mark.parametrize(
     ("suffix", "torn"),
     [

@@ -87,6 +87,8 @@ class CanLog:
                 self._unreadable += 1
                 self._note(frame)
                 continue
+            if not self._frames:
+                self._decoder.begin(frame.timestamp)
             self._frames += 1
             key = (frame.arbitration_id, frame.is_extended_id)
             if key not in wanted or frame.is_error_frame or frame.is_remote_frame:
@@ -142,7 +144,9 @@ class CanLog:
             names = ", ".join(sorted(self._channels))
             lines.append(f"frames of these messages come from channels {names}: are two machines mixed?")
         lines += [f"cut off: {self._opened.torn}"] if self._opened.torn else []
-        return [*lines, *self._source.notes, *(self._decoder.complaints(self._latest) if self._frames else [])]
+        lines += self._source.notes
+        # What could not be used is told above, by its place in the file.
+        return lines + (self._decoder.complaints(self._latest, unused=False) if self._frames else [])
 
     def _why_none(self) -> str:
         if self._first_bad is not None:
