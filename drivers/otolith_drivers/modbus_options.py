@@ -15,7 +15,6 @@ from otolith_drivers.toml_files import Closed
 
 MOST_REGISTERS = 125  # of one request (Modbus Application Protocol V1.1b3, sections 6.3 and 6.4)
 HIGHEST_ADDRESS = 65535
-BITS_OF_A_CHARACTER = 11  # start, 8 data, parity or a second stop bit, stop
 BYTES_OF_A_REQUEST, BYTES_OF_A_REPLY = 8, 5  # of RTU; the reply has two more for each register
 SILENCE = 3.5  # characters between frames (Modbus over Serial Line V1.02, section 2.5.1.1)
 
@@ -53,11 +52,12 @@ class LineOptions(Closed):
         return f"Modbus RTU {self.serial}, {self.baudrate} baud 8{self.parity}{self.stop_bits}"
 
     def least_time(self, registers: int) -> float:
-        """S that a request for so many registers takes on the line at least; 0 where the line's speed is not known."""
+        """Seconds that a request for so many registers takes at least; 0 where the line's speed is not known."""
         if self.serial is None:
             return 0.0
         characters = BYTES_OF_A_REQUEST + BYTES_OF_A_REPLY + 2 * registers + 2 * SILENCE
-        return characters * BITS_OF_A_CHARACTER / self.baudrate + self.pause
+        bits = 1 + 8 + (self.parity != "N") + self.stop_bits  # of a character: start, data, parity, stop
+        return characters * bits / self.baudrate + self.pause
 
 
 class Options(LineOptions):

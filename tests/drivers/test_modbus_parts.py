@@ -257,6 +257,8 @@ def test_files_may_count_registers_from_one() -> None:
 def test_the_lines_least_time_is_that_of_its_characters() -> None:
     line = Options(serial="/dev/ttyUSB0", baudrate=9600)
     assert line.least_time(10) == pytest.approx((8 + 5 + 20 + 7) * 11 / 9600)
+    without_parity = Options(serial="/dev/ttyUSB0", baudrate=9600, parity="N")
+    assert without_parity.least_time(10) == pytest.approx((8 + 5 + 20 + 7) * 10 / 9600)
     assert Path(line.serial or "").name in line.title()
 
 
