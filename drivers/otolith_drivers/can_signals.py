@@ -60,13 +60,10 @@ def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -
     slope, zero = source.scale * inner[0], source.scale * inner[1] + source.offset
     if slope == 0.0 or not math.isfinite(slope + zero):
         raise ConfigurationError(f"{origin} has a scale of {inner[0]:g} and an offset of {inner[1]:g}", key)
-    ends = [-math.inf, math.inf]
     if source.range is not None:
-        ends = sorted((float(end) - zero) / slope for end in source.range)
-    elif found.minimum is not None and found.maximum is not None and found.minimum < found.maximum:
-        # [0|0] in a DBC means that nobody said
-        ends = sorted((float(end) - inner[1]) / inner[0] for end in (found.minimum, found.maximum))
-    slack = [ROUNDING * abs(end) if math.isfinite(end) else 0.0 for end in ends]
+        low, high = _raw_ends(*source.range, slope, zero)
+    else:
+        low, high = _raw_ends(found.minimum, found.maximum, *inner)
     limit = LARGEST / max(1.0, abs(scale * slope))  # beyond the largest float there is no value, in a frame or scaled
     return Wanted(
         name=signal.name,
@@ -75,11 +72,20 @@ def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -
         signal=found,
         source_unit=unit,
         origin=f"{origin}{_times(source)} [{unit}], frame 0x{message.frame_id:X}",
-        raw_low=max(ends[0] - slack[0], -limit),
-        raw_high=min(ends[1] + slack[1], limit),
+        raw_low=max(low, -limit),
+        raw_high=min(high, limit),
         scale=scale * slope,
         offset=scale * zero + offset,
     )
+
+
+def _raw_ends(low: float | None, high: float | None, slope: float, zero: float) -> tuple[float, float]:
+    """The raw numbers, a little apart, of which ``slope * number + zero`` is ``low`` and ``high``."""
+    if low is None or high is None or not low < high:  # [0|0] in a DBC means that nobody said
+        return -math.inf, math.inf
+    ends = sorted((float(end) - zero) / slope for end in (low, high))
+    slack = [ROUNDING * abs(end) if math.isfinite(end) else 0.0 for end in ends]
+    return ends[0] - slack[0], ends[1] + slack[1]
 
 
 def _times(source: Source) -> str:
