@@ -8,6 +8,7 @@ import asyncio
 import socket
 import sys
 import time
+from collections.abc import Sequence
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -64,12 +65,12 @@ def ours(port: int, seconds: float) -> tuple[list[float], str]:
     rings = Rings([signal.name for signal in signals], 4096)
     moments: list[float] = []
 
-    def deliver(samples: list[Sample]) -> None:
+    def deliver(samples: Sequence[Sample]) -> None:
         moments.append(samples[0].time)
         rings.deliver(samples)
 
     driver = build(Options(host="127.0.0.1", port=port), Setup(signals, Path(), PERIOD))
-    driver.open(deliver)  # type: ignore[arg-type]
+    driver.open(deliver)
     time.sleep(seconds)
     driver.close()
     counters = driver.counters()
@@ -77,7 +78,7 @@ def ours(port: int, seconds: float) -> tuple[list[float], str]:
 
 
 def jitter(moments: list[float]) -> NDArray[np.float64]:
-    """S from the grid, of each reading."""
+    """Seconds from the grid, of each reading."""
     times = np.array(moments) - moments[0]
     off = times - np.rint(times / PERIOD) * PERIOD
     found: NDArray[np.float64] = np.abs(off - np.median(off))

@@ -109,7 +109,7 @@ class Pace:
         return step + missing if ratio > LATE else step
 
     def silent_for(self, now: float) -> float | None:
-        """S without one, where that is longer than it ever should be."""
+        """Seconds without one, where that is longer than it ever should be."""
         if self.last is None:
             return None
         least = SILENT_AT_LEAST if self.regular else IRREGULAR_SILENT_AT_LEAST

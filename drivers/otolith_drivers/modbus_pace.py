@@ -99,7 +99,7 @@ class Pace:
 
     @property
     def achieved(self) -> float | None:
-        """S from round to round; None while too few have followed each other."""
+        """Seconds from round to round; None while too few have followed each other."""
         if len(self._starts) < ROUNDS // 2:
             return None
         return (self._starts[-1] - self._starts[0]) / (len(self._starts) - 1)

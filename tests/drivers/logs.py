@@ -17,7 +17,6 @@ from otolith_drivers.logs.can_log import CanLog, open_log
 from otolith_drivers.logs.rows import Rows
 from otolith_drivers.plant.can_node import ALIVE_COUNTER
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.plant.plants import signals as measured_by
 from otolith_drivers.plant.plants import simulate
 from otolith_drivers.quantities import factor
 from tests.conftest import EXAMPLES, SIGNALS
@@ -37,7 +36,7 @@ WRITERS: dict[str, Any] = {
 def frames_of(scenario: MotorScenario, ticks: int, begun: float = BEGUN) -> list[can.Message]:
     """What the motor would have sent, each message with a delay of its own, with frames of others in between."""
     messages = load_dbc(EXAMPLES / "dc-motor.dbc").messages
-    units = measured_by(scenario)
+    units = scenario.SIGNALS
     found = []
     for index, tick in enumerate(islice(simulate(scenario), ticks)):
         for place, message in enumerate(messages):

@@ -12,7 +12,7 @@ from otolith.adaptation.problem import Problem
 from otolith.paper.rows import Sensor
 from otolith.paths import examples_directory
 from otolith.plan import Plan, load_plan
-from otolith_drivers.plant.plants import load_scenario, signals, simulate
+from otolith_drivers.plant.plants import load_scenario, simulate
 from otolith_drivers.quantities import factor
 
 CHUNK = 200  # records between two calls that tell of progress
@@ -106,7 +106,7 @@ def live(row: Lived, plan: Plan, seconds: float, sensors: Sequence[Sensor], live
         truth[index] = tick.truth[row.parameter]
         if index % CHUNK == CHUNK - 1:
             lived()
-    units = signals(scenario)
+    units = scenario.SIGNALS
     for column, (name, source) in enumerate(zip(plan.twin.signals, sources, strict=True)):
         scale, offset = factor(units[source], plan.twin.unit_of(name))
         values[:, column] = scale * values[:, column] + offset

@@ -46,10 +46,5 @@ def simulate(scenario: Scenario) -> Iterator[Tick]:
     return distorted(ticks, distortions) if distortions else ticks
 
 
-def signals(scenario: Scenario) -> dict[str, str]:
-    """What the machine of ``scenario`` measures, and the unit of each."""
-    return scenario.SIGNALS
-
-
 def _module(name: str) -> Any:
     return import_module(PLANTS[name])
