@@ -1,23 +1,21 @@
 """What a machine file means: its twin, its estimation problem, its driver. Faults are told with file, line and key."""
 
-import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from otolith.acquisition.alignment import Limits
 from otolith.adaptation.learned import LearnedNoise
 from otolith.adaptation.problem import Problem, SwarmOptions, WindowOptions
 from otolith.errors import ConfigurationError, nearest
+from otolith.named_driver import named_driver
 from otolith.restrictions import excluded
 from otolith.settings import MachineFile, ParameterTable, WindowTable, Written
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twins import find_twin, load_twin
-from otolith_drivers.base import Driver, DriverType, Setup, Signal
+from otolith_drivers.base import Driver
 from otolith_drivers.quantities import Quantity
-from otolith_drivers.registry import find
-from otolith_drivers.toml_files import Page, expect, parse, read, validate
+from otolith_drivers.toml_files import Context, Page, expect, parse, read, validate
 
 SMALLEST_NOISE = 1e-12  # of an output: without any, no residual could be weighed
 
@@ -65,7 +63,7 @@ def load_plan(path: Path, *, with_driver: bool = True) -> Plan:
     data = parse(page)
     expect(page, data, "machine")
     file = validate(data, MachineFile, page)
-    context = _Context(page)
+    context = Context(page)
     twin = _twin(file, context)
     problem = _problem(file, twin, context)
     table = file.window
@@ -92,29 +90,7 @@ def with_noise(plan: Plan, found: LearnedNoise) -> Plan:
     return replace(plan, problem=problem)
 
 
-class _Context:
-    """Says where in the file a fault is, when it is found after the file's own types were right."""
-
-    def __init__(self, page: Page) -> None:
-        self.page = page
-        self._location: tuple[int | str, ...] = ()
-
-    def fail(self, location: tuple[int | str, ...], message: str) -> None:
-        raise ConfigurationError(f"{self.page.place(location)}: {message}")
-
-    def at(self, *location: int | str) -> "_Context":
-        self._location = location
-        return self
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if isinstance(error, ValueError | ConfigurationError):
-            raise ConfigurationError(f"{self.page.place(self._location)}: {error}") from error
-
-
-def _twin(file: MachineFile, context: _Context) -> Definition:
+def _twin(file: MachineFile, context: Context) -> Definition:
     if (file.twin.name is None) == (file.twin.file is None):
         context.fail(("twin",), 'write either name = "dc_motor" or the like, or file = "my-twin.toml"')
     if file.twin.file is not None:
@@ -123,7 +99,7 @@ def _twin(file: MachineFile, context: _Context) -> Definition:
         return find_twin(file.twin.name or "")
 
 
-def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
+def _problem(file: MachineFile, twin: Definition, context: Context) -> Problem:
     known_names = [entry.name for entry in twin.parameters]
     for name in file.parameters:
         if name not in known_names:
@@ -163,7 +139,7 @@ def _problem(file: MachineFile, twin: Definition, context: _Context) -> Problem:
     )
 
 
-def _window(table: WindowTable, context: _Context) -> WindowOptions:
+def _window(table: WindowTable, context: Context) -> WindowOptions:
     found = {}
     for key, length in (("length", table.length), ("shortest", table.shortest), ("longest", table.longest)):
         whole = table.length if length is None else length
@@ -176,7 +152,7 @@ def _window(table: WindowTable, context: _Context) -> WindowOptions:
     return WindowOptions(found["length"], found["shortest"], found["longest"])
 
 
-def _parameter(entry: Parameter, table: ParameterTable, context: _Context, *, estimated: bool) -> Parameter:
+def _parameter(entry: Parameter, table: ParameterTable, context: Context, *, estimated: bool) -> Parameter:
     given: dict[str, float] = {"value": entry.nominal, "low": entry.low, "high": entry.high}
     for key, written in (("low", table.low), ("high", table.high), ("value", table.value)):
         if written is not None:
@@ -196,7 +172,7 @@ def _parameter(entry: Parameter, table: ParameterTable, context: _Context, *, es
 
 
 def _levels(
-    table: str, written: Mapping[str, Written], entries: Mapping[str, tuple[str, float]], context: _Context
+    table: str, written: Mapping[str, Written], entries: Mapping[str, tuple[str, float]], context: Context
 ) -> dict[str, float]:
     """Noise levels: ``entries`` has the unit of each name that may be given, and its level if it is not."""
     for name in written:
@@ -210,9 +186,7 @@ def _levels(
     return found
 
 
-def _sensor_noise(
-    file: MachineFile, twin: Definition, context: _Context
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _sensor_noise(file: MachineFile, twin: Definition, context: Context) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Of the outputs, and of the inputs."""
     signals = {entry.name: (entry.unit, 0.0) for entry in twin.inputs}
     signals |= {entry.name: (entry.unit, entry.noise) for entry in twin.outputs}
@@ -220,60 +194,9 @@ def _sensor_noise(
     return tuple(found[entry.name] for entry in twin.outputs), tuple(found[entry.name] for entry in twin.inputs)
 
 
-def _process_noise(file: MachineFile, twin: Definition, context: _Context) -> tuple[float, ...]:
+def _process_noise(file: MachineFile, twin: Definition, context: Context) -> tuple[float, ...]:
     states = {entry.name: (f"({entry.unit})/s^0.5", 0.0) for entry in twin.states}
     return tuple(_levels("process_noise", file.process_noise, states, context).values())
-
-
-@dataclass(frozen=True, slots=True)
-class NamedDriver:
-    """The driver of a machine file, and what the file says to it."""
-
-    name: str
-    module: DriverType
-    options: Any
-    setup: Setup
-    page: Page
-
-    @contextlib.contextmanager
-    def faults_placed(self) -> Iterator[None]:
-        """What a driver finds wrong is told with file and line."""
-        try:
-            yield
-        except ConfigurationError as error:
-            if error.key:
-                _Context(self.page).fail(error.key, str(error))
-            raise
-
-
-def named_driver(file: MachineFile, twin: Definition, page: Page) -> NamedDriver:
-    """What ``[driver]`` and ``[signals]`` say.
-
-    Raises:
-        ConfigurationError: they are missing, or say something that cannot be meant.
-    """
-    context = _Context(page)
-    if not file.driver:
-        way_out = "[driver] with type = \"can\" and the like, and [signals]; only 'otolith replay' does without"
-        context.fail(("driver",), f"missing: say where the signals come from by {way_out}")
-    wanted = list(twin.signals)
-    for name in file.signals:
-        if name not in wanted:
-            context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, wanted)}")
-    for name in wanted:
-        if name not in file.signals:
-            context.fail(("signals",), f"{name} ({twin.unit_of(name)}) is missing: the twin needs {', '.join(wanted)}")
-    with context.at("driver", "type"):
-        kind = file.driver.get("type")
-        if not isinstance(kind, str):
-            raise ValueError('missing: write type = "can" or another driver')  # noqa: TRY004 - a user's slip, not a bug
-        module = find(kind)
-    rest = {key: value for key, value in file.driver.items() if key != "type"}
-    options = validate(rest, module.Options, page, under=("driver",))
-    sources = {name: validate(file.signals[name], module.Source, page, under=("signals", name)) for name in wanted}
-    signals = tuple(Signal(name, twin.unit_of(name), source) for name, source in sources.items())
-    setup = Setup(signals, page.path.parent, file.window.sample_period)
-    return NamedDriver(kind, module, options, setup, page)
 
 
 def _driver(file: MachineFile, twin: Definition, page: Page) -> Driver:

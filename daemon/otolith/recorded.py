@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from otolith.errors import ConfigurationError
-from otolith.plan import NamedDriver, Plan, named_driver
+from otolith.named_driver import NamedDriver, named_driver
+from otolith.plan import Plan
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.logs.readers import format_of, holds_frames
 from otolith_drivers.logs.rows import Reader

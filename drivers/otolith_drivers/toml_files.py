@@ -38,6 +38,30 @@ class Page:
         return f"{self.path}:{line}: {dotted(location)}" if line else f"{self.path}: {dotted(location)}"
 
 
+class Context:
+    """Says where in the file a fault is, when it is found after the file's own types were right."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self._location: tuple[int | str, ...] = ()
+
+    def fail(self, location: tuple[int | str, ...], message: str) -> None:
+        """Raise ``message``, placed at ``location``."""
+        raise ConfigurationError(f"{self.page.place(location)}: {message}")
+
+    def at(self, *location: int | str) -> "Context":
+        """A context in which whatever is found wrong is placed at ``location``."""
+        self._location = location
+        return self
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, ValueError | ConfigurationError):
+            raise ConfigurationError(f"{self.page.place(self._location)}: {error}") from error
+
+
 def load(path: Path, model: type[Model]) -> Model:
     """The file as ``model``.
 
