@@ -8,6 +8,8 @@ import logging
 import os
 import socket
 import termios
+import time
+from pathlib import Path
 from typing import Final
 
 import serial
@@ -88,6 +90,8 @@ class Line:
 
     def abort(self) -> None:
         """From another thread: make a reading in progress end."""
+        if isinstance(self._client, _SerialClient):
+            self._client.aborted = True
         handle = self._client.socket
         if isinstance(handle, socket.socket):
             with contextlib.suppress(OSError):
@@ -118,6 +122,21 @@ class Line:
             raise Silent(f"an answer to another question: {len(reply.registers)} registers instead of {count}")
         return list(reply.registers)
 
+    @property
+    def confuses(self) -> bool:
+        """Whether nothing in a reply tells which question it answers: frames of a serial line have no number."""
+        return self._options.host is None or self._options.framing == "rtu"
+
+    def discard(self) -> bool:
+        """Throw away what has come and nobody waits for; whether there was any."""
+        handle = self._client.socket
+        try:
+            if isinstance(handle, socket.socket):
+                return bool(handle.recv(4096, socket.MSG_DONTWAIT))
+            return handle is not None and bool(handle.read(handle.in_waiting))
+        except OSError:
+            return False
+
     def _opened(self) -> socket.socket | serial.Serial:
         options = self._options
         if options.host is not None:
@@ -127,7 +146,7 @@ class Line:
         return serial.Serial(
             options.serial,
             baudrate=options.baudrate,
-            parity=options.parity,
+            parity="N" if _is_pseudo(options.serial) else options.parity,
             stopbits=options.stop_bits,
             timeout=options.timeout,
             write_timeout=options.timeout,
@@ -135,11 +154,33 @@ class Line:
         )
 
 
+class _SerialClient(ModbusSerialClient):
+    """Waits by the monotonic clock, as the library's own may be set back by an hour while it waits; ends when told."""
+
+    aborted = False
+
+    def _wait_for_data(self) -> int:
+        end = time.monotonic() + self.comm_params.timeout_connect
+        size = 0
+        while not self.aborted and time.monotonic() <= end:
+            available = int(self._in_waiting())  # type: ignore[no-untyped-call]  # of a library typed but for this
+            if size and available in (0, size):
+                break
+            size = available
+            time.sleep(self._recv_interval)
+        return size
+
+
+def _is_pseudo(port: str | None) -> bool:
+    """Whether it is a pseudo-terminal, which has no parity and, when it is opened again, refuses to be given any."""
+    return str(Path(port or "").resolve()).startswith("/dev/pts/")
+
+
 def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
     if options.host is not None:
         framer = FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU
         return ModbusTcpClient(options.host, port=options.port, framer=framer, timeout=options.timeout, retries=0)
-    return ModbusSerialClient(
+    return _SerialClient(
         options.serial or "",
         baudrate=options.baudrate,
         parity=options.parity,
@@ -149,7 +190,9 @@ def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
     )
 
 
-def _cause(error: OSError | ValueError) -> str:
+def _cause(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno and error.errno > 0:
         return os.strerror(error.errno)
+    if isinstance(error, termios.error):
+        return str(error.args[-1])
     return (isinstance(error, OSError) and error.strerror) or str(error)
