@@ -45,7 +45,7 @@ class ModbusPoller:
         self._requests = Requests(plan(items, options.max_gap, options.max_registers))
         self._pace = Pace(period)
         self._watch = OrderWatch(items)
-        self._held_back: list[list[Sample]] = []
+        self._held_back: dict[str, list[Sample]] = {}
         self._freshness = Freshness()
         self._received = self._bad = self._lost = self._reconnects = 0
         self._told = False
@@ -133,6 +133,7 @@ class ModbusPoller:
                 break
             except Broken:
                 self._lose(len(self._items) - answered)
+                self._settle(deliver)
                 raise
             if self._options.pause:
                 self._stop.wait(self._options.pause)
@@ -162,19 +163,17 @@ class ModbusPoller:
             part = registers[item.address - request.address : item.end - request.address]
             self._watch.take(item, part)
             samples.append(Sample(item.name, moment, item.value(part)))
-        if self._watch.ready and not self._held_back:
-            self._hand_on(samples, deliver)
-        else:
-            self._held_back.append(samples)
+        for sample in samples:
+            if self._watch.unjudged(sample.signal):
+                self._held_back.setdefault(sample.signal, []).append(sample)
+        self._hand_on([sample for sample in samples if sample.signal not in self._held_back], deliver)
         return repeated
 
     def _settle(self, deliver: Deliver) -> None:
         """Judge the order of bytes, and hand on what waited for it."""
         self._watch.end_round()
-        if self._watch.ready:
-            for samples in self._held_back:
-                self._hand_on(samples, deliver)
-            self._held_back.clear()
+        for name in [name for name in self._held_back if not self._watch.unjudged(name)]:
+            self._hand_on(self._held_back.pop(name), deliver)
 
     def _hand_on(self, samples: Sequence[Sample], deliver: Deliver) -> None:
         kept = [sample for sample in samples if sample.signal not in self._watch.withheld]

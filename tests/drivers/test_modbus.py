@@ -243,6 +243,38 @@ def test_a_swapped_word_order_is_withheld_and_named() -> None:
         assert listener.driver.counters().bad >= 20
 
 
+def test_a_device_that_comes_late_is_judged_before_anything_of_it_is_believed() -> None:
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+    behaviour.refuse = lambda device, _, __: 6 if device == 2 else None
+    state = {"reads": 0}
+
+    def moving(reply: bytes) -> bytes:
+        state["reads"] += 1
+        return reply[:-4] + struct.pack(">f", 1.5 + 0.001 * (state["reads"] % 7))
+
+    behaviour.spoil = lambda reply: moving(reply) if reply[6] == 2 and reply[7] == 3 else reply
+    sources = [source(register=0), source(register=2, device=2, order="CDAB")]
+    with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
+        wait_for(lambda: len(listener.of("s0")) > 100)
+        behaviour.refuse = lambda _, __, ___: None
+        listener.wait(lambda link: any('set order = "ABCD"' in line for line in link.complaints))
+        assert not listener.of("s1")
+
+
+def test_a_line_that_breaks_in_every_round_keeps_nothing_back_for_ever() -> None:
+    """The device hangs up after each first answer."""
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+
+    def hang_up(reply: bytes) -> bytes:
+        if behaviour.asked[-1][2] == 50:
+            raise OSError
+        return reply
+
+    behaviour.spoil = hang_up
+    with odd_server(behaviour, port), Listener(poller(port, [source(register=0), source(register=50)])) as listener:
+        wait_for(lambda: len(listener.of("s0")) > 25, 30.0)
+
+
 def test_an_unreachable_host_is_waited_for() -> None:
     port = free_port(socket.SOCK_STREAM)
     with Listener(poller(port, TWO)) as listener:

@@ -19,6 +19,7 @@ from otolith_drivers.modbus_plan import plan, split
 from otolith_drivers.modbus_plausible import judge
 from otolith_drivers.modbus_requests import LONGEST_REST, Requests
 from otolith_drivers.modbus_types import LETTERS, ORDERS, Order, TypeName, bits, orders_of, reader, registers_of
+from otolith_drivers.modbus_watch import OrderWatch
 
 KINDS: list[TypeName] = list(LETTERS)
 
@@ -214,6 +215,55 @@ def test_swapped_words_are_told_and_right_ones_are_not(name: str, kind: TypeName
     judgement = judge(history, kind, swapped[order])
     assert not judgement.plausible
     assert judgement.better is not None
+
+
+COUNT = np.arange(20)
+FLOATS = {
+    "rest, then motion": np.where(COUNT < 10, 1e-9 * RANDOM.standard_normal(20), 1500.0 + RANDOM.standard_normal(20)),
+    "square wave with noise": np.where(COUNT % 8 < 4, 1e-7, 1500.0) * (1.0 + 1e-3 * RANDOM.standard_normal(20)),
+    "set-point that jumps often": np.where(COUNT % 3 < 1, 1e-8, 1500.0),
+    "filter of a machine that stops": 1500.0 * 10.0 ** -(COUNT / 2.0),
+    "no reading now and then": np.where(COUNT % 4 == 0, np.nan, 1500.0),
+}
+INTEGERS = {
+    "encoder that wraps": (2**31 - 300 + 100 * COUNT + 2**31) % 2**32 - 2**31,
+    "encoder of 20 bits that wraps": (2**20 - 300 + 100 * COUNT) % 2**20,
+    "set-point in sixteen bits and sixteen behind the point": np.where(COUNT % 8 < 4, 1500 << 16, 0),
+    "set-point from end to end": np.where(COUNT % 8 < 4, 2**30, -(2**30)),
+    "steps of 256 about zero": 256 * np.array([0, 1, -1, 2, 3, -2, -3, 1, 0, 4] * 2),
+    "noise about zero": np.rint(3.0 * RANDOM.standard_normal(20)).astype(int),
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_what_machines_do_is_not_taken_for_swapped_words(order: Order) -> None:
+    kinds: list[tuple[TypeName, dict[str, np.ndarray]]]
+    kinds = [("float32", FLOATS), ("float64", FLOATS), ("int32", INTEGERS), ("int64", INTEGERS)]
+    withheld = [
+        (name, kind)
+        for kind, signals in kinds
+        for name, numbers in signals.items()
+        if not judge(drawn(numbers.tolist(), kind, order), kind, order).plausible
+    ]
+    assert not withheld
+
+
+def test_the_end_of_a_filter_is_as_good_as_zero_but_a_swap_on_the_way_is_told() -> None:
+    watched = item(type="float32")
+    watch = OrderWatch([watched])
+
+    def read(numbers: Sequence[float], order: Order) -> frozenset[str]:
+        for words in drawn(numbers, "float32", order):
+            watch.take(watched, words)
+            watch.end_round()
+        return watch.withheld
+
+    assert not read(np.linspace(23.0, 25.0, 40).tolist(), "ABCD")
+    assert not read(np.maximum(24.0 * np.exp(-COUNT.repeat(20) / 3.0), 7e-44).tolist(), "ABCD")
+    assert not read([7e-44] * 300, "ABCD")
+    assert not read(np.linspace(23.0, 25.0, 40).tolist(), "ABCD")
+    assert read([24.0] * 300, "CDAB") == {"s"}
+    assert not read([24.0] * 40, "ABCD")
 
 
 @pytest.mark.parametrize("kind", KINDS)
