@@ -17,6 +17,8 @@ EASY = 20  # decisions in a row by which a finer grid would do, before it is tri
 STEPS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # times a power of ten: periods that people use
 SELDOM, OFTEN = 0.02, 0.6  # shares of rounds that repeat the one before, between which the beat is heard
 BEAT_ROUNDS = 100
+QUARTERS = 4  # of the period: steps away from the beat
+MOST_BEATS = 64  # hundreds of rounds between two steps away from the beat, where steps do not help
 
 
 class Pace:
@@ -30,6 +32,7 @@ class Pace:
         self._durations: list[float] = []
         self._left_out = self._slow = self._easy = 0
         self._repeats = self._rounds = 0
+        self._beats = self._steps = 0
         self.known = False
         """Whether enough rounds were seen to know that the period can be held."""
 
@@ -65,8 +68,7 @@ class Pace:
         self._rounds += 1
         self._repeats += repeated
         if self._rounds >= BEAT_ROUNDS:
-            if SELDOM <= self._repeats / self._rounds <= OFTEN:
-                self.due += self.period / 4
+            self._step_aside(heard=SELDOM <= self._repeats / self._rounds <= OFTEN)
             self._rounds = self._repeats = 0
         if len(self._durations) < ROUNDS:
             return False
@@ -79,6 +81,15 @@ class Pace:
         self.period = wanted
         self._starts.clear()
         return True
+
+    def _step_aside(self, *, heard: bool) -> None:
+        """Away from the beat; less and less often once all quarters were tried, as coarse registers sound like one."""
+        self._beats += 1
+        if not heard:
+            self._steps = max(0, self._steps - 1)
+        elif self._beats >= min(2 ** max(0, self._steps - QUARTERS), MOST_BEATS):
+            self.due += self.period / QUARTERS
+            self._beats, self._steps = 0, self._steps + 1
 
     def _wanted(self) -> float:
         """The period (s) that the last rounds speak for."""

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus_freshness import Freshness
+from otolith_drivers.modbus_freshness import MOST_IN_A_ROW, Freshness
 from otolith_drivers.modbus_line import Refused
 from otolith_drivers.modbus_options import Item, Options, Source, item_of
 from otolith_drivers.modbus_pace import EASY, ROUNDS, Pace
@@ -189,6 +189,18 @@ def test_reading_moves_away_from_the_moment_at_which_the_device_renews_its_regis
     assert phases == {0.0, 0.25, 0.5}
 
 
+def test_a_beat_that_stays_wherever_one_reads_is_not_run_away_from_for_ever() -> None:
+    """It is a coarse register, and every step is a disturbance of the grid."""
+    pace, now, steps = Pace(0.1), 0.0, 0
+    pace.start(now)
+    for index in range(20_000):
+        before, now = now, pace.due
+        steps += now - before > 0.11
+        pace.begin(now)
+        pace.end(0.001, repeated=index % 5 == 0)
+    assert steps <= 15
+
+
 def drawn(numbers: Sequence[float], kind: TypeName, order: Order) -> list[list[int]]:
     return [registers(number, kind, order) for number in numbers]
 
@@ -315,9 +327,28 @@ def test_the_lines_least_time_is_that_of_its_characters() -> None:
 def test_an_old_image_among_new_ones_is_none() -> None:
     freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
     for index in range(500):
-        assert freshness.take(request, [index, 0]) == (False, False)
-    assert freshness.take(request, [499, 0]) == (True, True)
-    assert freshness.take(request, [500, 0]) == (False, False)
+        assert freshness.take(request, [100 * index, 0]) == (False, False)
+    assert freshness.take(request, [49900, 0]) == (True, True)
+    assert freshness.take(request, [50000, 0]) == (False, False)
+
+
+STEPS = {
+    "noise of a few steps": np.rint(4.0 * RANDOM.standard_normal(3000)).astype(int) % 65536,
+    "nearly a step in each reading": (0.93 * np.arange(3000)).astype(int) % 65536,
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_coarse_registers_repeat_by_chance(name: str) -> None:
+    freshness, request = Freshness(), plan([item("a", type="uint16")], 0, 125)[0]
+    assert not any(freshness.take(request, [int(word)])[1] for word in STEPS[name])
+
+
+def test_a_machine_that_stops_is_soon_believed() -> None:
+    freshness, request = Freshness(), plan([item("a", type="uint16")], 0, 125)[0]
+    for word in RANDOM.permutation(1000):
+        freshness.take(request, [int(word)])
+    assert sum(freshness.take(request, [0])[1] for _ in range(1000)) <= MOST_IN_A_ROW
 
 
 def test_registers_that_often_say_the_same_are_believed_and_told() -> None:
