@@ -103,6 +103,8 @@ class ModbusPoller:
                 if not self._stop.is_set():
                     connected = self._round(deliver)
             except Broken as error:
+                if self._stop.is_set():  # by ourselves
+                    break
                 self._go_down(str(error))
                 connected = False
                 self._stop.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not a secret
@@ -176,6 +178,8 @@ class ModbusPoller:
             self._hand_on(self._held_back.pop(name), deliver)
 
     def _hand_on(self, samples: Sequence[Sample], deliver: Deliver) -> None:
+        if self._stop.is_set():  # nobody waits for them any more
+            return
         kept = [sample for sample in samples if sample.signal not in self._watch.withheld]
         good = sum(math.isfinite(sample.value) for sample in kept)
         self._received += good

@@ -115,6 +115,23 @@ def test_a_window_is_not_waited_for_longer_than_the_grace() -> None:
     assert windower.due(rings, windower.next_end + GRACE)
 
 
+def test_a_gap_counts_again_once_the_grid_is_fine_again() -> None:
+    windower, rings = Windower(("a", "b"), RECORDS, PERIOD, Limits()), Rings(("a", "b"), 400)
+    windower.regrid(RECORDS, 1.0)
+    windower.regrid(RECORDS, PERIOD)
+    feed(rings, [(index * PERIOD, 1.0) for index in range(2 * RECORDS) if not 20 <= index < 40])
+    assert windower.begin(rings, 1.0, 1.0)
+    assert any("gap" in reason for reason in windower.cut(rings, unix_offset=0.0).quality.reasons)
+
+
+def test_a_sample_that_is_no_reading_is_not_received() -> None:
+    """Its driver has counted it as bad."""
+    rings = Rings(("a",), 100)
+    rings.deliver([Sample("a", 0.0, 1.0), Sample("a", 0.1, float("nan"))])
+    rings.deliver_columns({"a": (np.array([0.2, 0.3]), np.array([np.nan, 1.0]))})
+    assert rings.counters().received == 2
+
+
 def test_rings_are_bounded_and_count_what_falls_out() -> None:
     rings = Rings(("a",), 100)
     rings.deliver([Sample("a", float(index), 0.0) for index in range(130)])

@@ -16,6 +16,7 @@ class RingCounters:
     """What has passed through the rings since the start."""
 
     received: int = 0
+    """Readings; a sample without one was counted by its driver."""
     overwritten: int = 0
     """Samples that fell out of a full ring before a window took them."""
     unknown: int = 0
@@ -92,7 +93,7 @@ class Rings:
                     self._unknown += 1
                 else:
                     ring.append(sample.time, sample.value)
-                    self._received += 1
+                    self._received += math.isfinite(sample.value)
 
     def deliver_columns(self, columns: Mapping[str, tuple[Array, Array]]) -> None:
         """Take many samples at once: times (s) and values of each signal, in the order of their arrival."""
@@ -103,7 +104,7 @@ class Rings:
                     self._unknown += len(times)
                 else:
                     ring.extend(times, values)
-                    self._received += len(times)
+                    self._received += int(np.count_nonzero(np.isfinite(values)))
 
     def between(self, start: float, end: float) -> dict[str, tuple[Array, Array]]:
         """See :meth:`Ring.between`, for every signal."""

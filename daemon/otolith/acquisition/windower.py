@@ -30,7 +30,7 @@ class Windower:
         self.signals = signals
         self.records = records
         self.sample_period = sample_period
-        self._limits = limits
+        self._limits, self._gap_limit = limits, limits.gap
         self._sampling = sampling
         self._start = math.inf
         self._index = 0
@@ -93,7 +93,7 @@ class Windower:
     def regrid(self, records: int, sample_period: float) -> None:
         """From the next window on, so many records so far (s) apart; a gap is told only where records are missing."""
         self.records, self.sample_period = records, sample_period
-        self._limits = replace(self._limits, gap=max(self._limits.gap, GAP_RECORDS * sample_period))
+        self._limits = replace(self._limits, gap=max(self._gap_limit, GAP_RECORDS * sample_period))
 
     def _drift(self, aligned: dict[str, Aligned]) -> float:
         """How far (s) to move the grid so that it meets the next window's samples in their middle.
