@@ -12,6 +12,7 @@ from otolith_drivers.modbus_plan import Request
 SELDOM = 0.1  # share of readings that repeat the one before, below which one that does is old
 OFTEN = 0.6  # share, above which the user should know
 MEMORY = 0.01  # of a share: how much a reading counts
+SETTLED = 200  # readings, before which a share says more of its beginning than of them
 FEW_STEPS = 16  # of a register, from reading to reading
 COARSE = 0.5  # share of readings that move by so few, above which registers are coarse
 MOST_IN_A_ROW = 3  # old images; what says the same for longer stands still
@@ -23,6 +24,7 @@ class Freshness:
     def __init__(self) -> None:
         self._images: dict[Request, Sequence[int]] = {}
         self._shares: dict[Request, float] = {}
+        self._readings: dict[Request, int] = {}
         self._coarse: dict[Request, float] = {}
         self._in_a_row: dict[Request, int] = {}
 
@@ -33,18 +35,20 @@ class Freshness:
         self._images[request] = registers
         share = self._shares.get(request, 1.0)  # until it has shown otherwise, a device may repeat itself
         self._shares[request] = share + MEMORY * (repeated - share)
+        self._readings[request] = self._readings.get(request, 0) + 1
         coarse = self._coarse.get(request, 1.0)
         if before is not None and not repeated:
             self._coarse[request] = coarse + MEMORY * (_near(before, registers) - coarse)
         in_a_row = self._in_a_row[request] = self._in_a_row.get(request, 0) + 1 if repeated else 0
         return repeated, 0 < in_a_row <= MOST_IN_A_ROW and share < SELDOM and coarse < COARSE
 
-    def complaints(self, period: float) -> list[str]:
-        """Which registers say the same too often to be read every ``period`` s, a line each."""
+    def complaints(self, requests: Sequence[Request], period: float) -> list[str]:
+        """Which of ``requests`` say the same too often to be read every ``period`` s, a line each."""
+        shares = {entry: self._shares[entry] for entry in requests if self._readings.get(entry, 0) >= SETTLED}
         return [
             f"{request.describe()} say the same in {share:.0%} of the readings: the machine stands still, or they are "
             f"renewed more slowly than every {period * 1e3:g} ms"
-            for request, share in list(self._shares.items())
+            for request, share in shares.items()
             if OFTEN < share < 1.0 - MEMORY
         ]
 

@@ -73,7 +73,7 @@ class ModbusPoller:
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
         complaints = [*self._requests.complaints(time.monotonic()), *self._watch.complaints()]
-        complaints += self._freshness.complaints(self._pace.period)
+        complaints += self._freshness.complaints(self._requests.requests, self._pace.period)
         described = f"{summary(self._requests.requests)}, {self._pace.describe()}"
         period = self._pace.period if self._pace.known or self._pace.period > self._pace.asked else None
         return Link(self._up, self._reason, tuple(complaints), described, period)

@@ -356,4 +356,11 @@ def test_registers_that_often_say_the_same_are_believed_and_told() -> None:
     freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
     stale = [freshness.take(request, [index // 5, 0])[1] for index in range(1000)]
     assert not any(stale)
-    assert "80% of the readings" in freshness.complaints(0.01)[0]
+    assert "80% of the readings" in freshness.complaints([request], 0.01)[0]
+
+
+def test_registers_that_never_say_the_same_are_not_complained_of() -> None:
+    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    for index in range(300):
+        freshness.take(request, [index, 0])
+        assert not freshness.complaints([request], 0.01)
