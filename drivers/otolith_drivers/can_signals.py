@@ -26,7 +26,6 @@ class Wanted:
     target_unit: str
     message: Message
     signal: CanSignal
-    source_unit: str
     origin: str
     """Where it is read, in words."""
     raw_low: float
@@ -70,7 +69,6 @@ def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -
         target_unit=signal.unit,
         message=message,
         signal=found,
-        source_unit=unit,
         origin=f"{origin}{_times(source)} [{unit}], frame 0x{message.frame_id:X}",
         raw_low=max(low, -limit),
         raw_high=min(high, limit),
