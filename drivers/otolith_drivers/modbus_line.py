@@ -171,6 +171,22 @@ class _SerialClient(ModbusSerialClient):
         return size
 
 
+class _WithoutEcho:
+    """What some adapters hear of themselves is taken out of what comes in.
+
+    A question for one register of those from 768 to 1023 on reads, with its checksum, like an answer.
+    """
+
+    def __init__(self) -> None:
+        self._sent = b""
+
+    def __call__(self, sending: bool, data: bytes) -> bytes:
+        if sending:
+            self._sent = data
+            return data
+        return data.removeprefix(self._sent)
+
+
 def _is_pseudo(port: str | None) -> bool:
     """Whether it is a pseudo-terminal, which has no parity and, when it is opened again, refuses to be given any."""
     return str(Path(port or "").resolve()).startswith("/dev/pts/")
@@ -179,7 +195,14 @@ def _is_pseudo(port: str | None) -> bool:
 def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
     if options.host is not None:
         framer = FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU
-        return ModbusTcpClient(options.host, port=options.port, framer=framer, timeout=options.timeout, retries=0)
+        return ModbusTcpClient(
+            options.host,
+            port=options.port,
+            framer=framer,
+            timeout=options.timeout,
+            retries=0,
+            trace_packet=_WithoutEcho() if options.framing == "rtu" else None,
+        )
     return _SerialClient(
         options.serial or "",
         baudrate=options.baudrate,
@@ -187,6 +210,7 @@ def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
         stopbits=options.stop_bits,
         timeout=options.timeout,
         retries=0,
+        trace_packet=_WithoutEcho(),
     )
 
 

@@ -28,6 +28,7 @@ class Device:
         self.master, self.slave = pty.openpty()
         self.delay: Callable[[int], float | None] = lambda question: 0.0
         self.questions = 0
+        self.echo: Callable[[int], bool] = lambda question: False
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="device")
         self._thread.start()
@@ -46,6 +47,8 @@ class Device:
             if len(asked) >= 8:
                 question, asked = asked[:8], asked[8:]
                 self.questions += 1
+                if self.echo(self.questions):
+                    answers.append((time.monotonic(), question))
                 if (delay := self.delay(self.questions)) is not None:
                     answers.append((time.monotonic() + delay, answer(question)))
             for due in [entry for entry in answers if entry[0] <= time.monotonic()]:
@@ -87,6 +90,20 @@ def test_a_late_reply_is_not_taken_for_the_next_one_of_the_same_size(device: Dev
     finally:
         driver.close()
     assert driver.counters().lost > 0
+    assert {(sample.signal, sample.value) for sample in samples} == set(REGISTERS.items())
+
+
+def test_what_an_adapter_hears_of_itself_is_no_answer(device: Device) -> None:
+    """The question for register 1000 alone reads like an answer of -6144."""
+    device.echo = lambda question: question % 2 == 0
+    device.delay = lambda question: None if question % 20 == 0 else 0.0
+    driver, samples = poller(device), list[Sample]()
+    driver.open(samples.extend)
+    try:
+        wait_for(lambda: device.questions > 100, 30.0)
+    finally:
+        driver.close()
+    assert len(samples) > 50
     assert {(sample.signal, sample.value) for sample in samples} == set(REGISTERS.items())
 
 
