@@ -4,10 +4,12 @@ Only function codes 3 (read holding registers) and 4 (read input registers) leav
 """
 
 import contextlib
+import errno
 import logging
 import os
 import socket
 import termios
+import threading
 import time
 from pathlib import Path
 from typing import Final
@@ -34,6 +36,7 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 GATEWAY_CODES = (10, 11)
+HUSH_STEP, MOST_HUSH = 0.02, 5  # s; timeouts
 SILENT_LOG = logging.getLogger("pymodbus")
 
 
@@ -68,7 +71,8 @@ class Line:
     def __init__(self, options: LineOptions) -> None:
         SILENT_LOG.setLevel(logging.CRITICAL)  # it would write the last packets to the log with every error
         self._options = options
-        self._client = _client(options)
+        self._aborted = threading.Event()
+        self._client = _client(options, self._aborted)
 
     def connect(self) -> None:
         """Open the line.
@@ -90,8 +94,7 @@ class Line:
 
     def abort(self) -> None:
         """From another thread: make a reading in progress end."""
-        if isinstance(self._client, _SerialClient):
-            self._client.aborted = True
+        self._aborted.set()
         handle = self._client.socket
         if isinstance(handle, socket.socket):
             with contextlib.suppress(OSError):
@@ -122,12 +125,22 @@ class Line:
             raise Silent(f"an answer to another question: {len(reply.registers)} registers instead of {count}")
         return list(reply.registers)
 
-    @property
-    def confuses(self) -> bool:
-        """Whether nothing in a reply tells which question it answers: frames of a serial line have no number."""
-        return self._options.host is None or self._options.framing == "rtu"
+    def drain(self) -> None:
+        """Close it, so that an answer that comes late is not taken for that to the next question.
 
-    def discard(self) -> bool:
+        Frames of a serial line have no number by which it could be told: there nothing must first have come for as
+        long as a device may take. A line that never is silent is not waited for.
+        """
+        if self._options.host is None or self._options.framing == "rtu":
+            now = time.monotonic()
+            silent, longest = now + self._options.timeout, now + MOST_HUSH * self._options.timeout
+            while not self._aborted.is_set() and (now := time.monotonic()) < min(silent, longest):
+                if self._discard():
+                    silent = now + self._options.timeout
+                self._aborted.wait(min(HUSH_STEP, max(0.0, silent - now)))
+        self.close()
+
+    def _discard(self) -> bool:
         """Throw away what has come and nobody waits for; whether there was any."""
         handle = self._client.socket
         try:
@@ -140,9 +153,7 @@ class Line:
     def _opened(self) -> socket.socket | serial.Serial:
         options = self._options
         if options.host is not None:
-            connection = socket.create_connection((options.host, options.port), timeout=options.timeout)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return connection
+            return self._connected(options.host, options.port)
         return serial.Serial(
             options.serial,
             baudrate=options.baudrate,
@@ -153,16 +164,34 @@ class Line:
             exclusive=True,
         )
 
+    def _connected(self, host: str, port: int) -> socket.socket:
+        """As ``socket.create_connection`` does, but :meth:`abort` ends it."""
+        cause = OSError(0, "the name stands for no address")
+        for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            connection = self._client.socket = socket.socket(family, kind, protocol)
+            connection.settimeout(self._options.timeout)
+            try:
+                if self._aborted.is_set():
+                    raise ConnectionAbortedError(errno.ECONNABORTED, "closed")
+                connection.connect(address)
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            except OSError as error:
+                cause = error
+                self.close()
+            else:
+                return connection
+        raise cause
+
 
 class _SerialClient(ModbusSerialClient):
     """Waits by the monotonic clock, as the library's own may be set back by an hour while it waits; ends when told."""
 
-    aborted = False
+    aborted: threading.Event
 
     def _wait_for_data(self) -> int:
         end = time.monotonic() + self.comm_params.timeout_connect
         size = 0
-        while not self.aborted and time.monotonic() <= end:
+        while not self.aborted.is_set() and time.monotonic() <= end:
             available = int(self._in_waiting())  # type: ignore[no-untyped-call]  # of a library typed but for this
             if size and available in (0, size):
                 break
@@ -192,7 +221,7 @@ def _is_pseudo(port: str | None) -> bool:
     return str(Path(port or "").resolve()).startswith("/dev/pts/")
 
 
-def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
+def _client(options: LineOptions, aborted: threading.Event) -> ModbusTcpClient | ModbusSerialClient:
     if options.host is not None:
         framer = FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU
         return ModbusTcpClient(
@@ -203,7 +232,7 @@ def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
             retries=0,
             trace_packet=_WithoutEcho() if options.framing == "rtu" else None,
         )
-    return _SerialClient(
+    client = _SerialClient(
         options.serial or "",
         baudrate=options.baudrate,
         parity=options.parity,
@@ -212,6 +241,8 @@ def _client(options: LineOptions) -> ModbusTcpClient | ModbusSerialClient:
         retries=0,
         trace_packet=_WithoutEcho(),
     )
+    client.aborted = aborted
+    return client
 
 
 def _cause(error: Exception) -> str:

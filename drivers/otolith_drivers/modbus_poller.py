@@ -24,8 +24,8 @@ __all__ = ["ModbusPoller", "Options", "Source", "build"]
 log = logging.getLogger(__name__)
 
 BACKOFF_FIRST, BACKOFF_LONGEST = 0.2, 10.0  # s
+LONGEST_END = 0.9  # s; only a name that is being looked up takes longer
 LONGEST_SLEEP = 0.2  # s; how late a stop can be noticed between rounds
-HUSH_STEP, MOST_HUSH = 0.02, 5  # s; timeouts
 
 
 def build(options: Options, setup: Setup) -> "ModbusPoller":
@@ -64,7 +64,7 @@ class ModbusPoller:
         self._stop.set()
         self._line.abort()
         if self._thread is not None:
-            self._thread.join(timeout=1.0)
+            self._thread.join(timeout=LONGEST_END)
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
@@ -187,25 +187,11 @@ class ModbusPoller:
         deliver(kept)
 
     def _drained(self) -> bool:
-        """After a question without an answer, an answer without a question may come: the line is opened anew.
-
-        Where that answer could be taken for the one to the next question, it is first waited for as long once more.
-        """
-        if self._line.confuses:
-            self._hush()
-        self._line.close()
+        """After a question without an answer, an answer without a question may come: the line is opened anew."""
+        self._line.drain()
         if self._requests.all_silent:
             self._go_down("no device answers")
         return False
-
-    def _hush(self) -> None:
-        """Until nothing has come for as long as a device may take; a line that never is silent is not waited for."""
-        now = time.monotonic()
-        silent, longest = now + self._options.timeout, now + MOST_HUSH * self._options.timeout
-        while not self._stop.is_set() and (now := time.monotonic()) < min(silent, longest):
-            if self._line.discard():
-                silent = now + self._options.timeout
-            self._stop.wait(min(HUSH_STEP, max(0.0, silent - now)))
 
     def _come_up(self) -> None:
         if not self._up:

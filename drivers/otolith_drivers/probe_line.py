@@ -31,6 +31,7 @@ class Asker:
         """s, by the number of registers asked for."""
         self.alive = False
         """Whether the device has ever answered, be it with an exception."""
+        self._answered: int | None = None
 
     def read(self, address: int, count: int) -> list[int]:
         """The registers.
@@ -60,14 +61,16 @@ class Asker:
         except Broken:
             self._again()
             words = self._second(address, count)
-        self.alive = True
+        self.alive, self._answered = True, self.device
         self.round_trips.setdefault(count, deque(maxlen=MOST_TIMES)).append(time.perf_counter() - begun)
         if self.options.pause:
             time.sleep(self.options.pause)
         return words
 
     def _again(self) -> None:
-        """An answer that comes late must not be taken for that to another question."""
+        """An answer that comes late must not be taken for that to another question to the same device."""
+        if self._answered == self.device:
+            self._line.drain()
         self._line.close()
         open_line(self._line, self.options)
 

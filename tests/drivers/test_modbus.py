@@ -1,5 +1,6 @@
 """The Modbus driver against a real server and one that misbehaves: what is lost is counted, what is back is found."""
 
+import contextlib
 import socket
 import struct
 import threading
@@ -273,6 +274,21 @@ def test_a_line_that_breaks_in_every_round_keeps_nothing_back_for_ever() -> None
     behaviour.spoil = hang_up
     with odd_server(behaviour, port), Listener(poller(port, [source(register=0), source(register=50)])) as listener:
         wait_for(lambda: len(listener.of("s0")) > 25, 30.0)
+
+
+def test_a_host_that_swallows_everything_does_not_delay_the_end() -> None:
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as stack:
+        for _ in range(4):  # beyond its backlog nobody is answered
+            waiting = stack.enter_context(socket.socket())
+            waiting.setblocking(False)
+            waiting.connect_ex(full.getsockname())
+        driver = poller(full.getsockname()[1], TWO, timeout="10 s")
+        driver.open(lambda _: None)
+        time.sleep(0.2)  # it has long begun to connect
+        begun = time.monotonic()
+        driver.close()
+        assert time.monotonic() - begun < 0.5
+    assert not [thread for thread in threading.enumerate() if thread.name == "modbus-poll"]
 
 
 def test_an_unreachable_host_is_waited_for() -> None:
