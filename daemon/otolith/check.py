@@ -1,5 +1,6 @@
 """``otolith check``: what the daemon would do with a machine file, and whether its signals come."""
 
+import math
 import time
 from collections import Counter
 from collections.abc import Container, Iterator, Sequence
@@ -13,6 +14,8 @@ from otolith_drivers.base import Sample
 
 LISTEN = 1.0  # s, or as long as so many samples take:
 ENOUGH = 60
+PATIENCE, PAUSE = 4.0, 0.1  # s for what does not come, until the driver knows why
+PROBED = ("can", "modbus")
 
 
 def check_machine(path: Path, *, with_device: bool) -> Iterator[str]:
@@ -63,21 +66,36 @@ def _left_open(name: str, said: Container[str]) -> str:
 
 def _listen(plan: Plan) -> Iterator[str]:
     counts: Counter[str] = Counter()
+    latest: dict[str, float] = {}
 
     def deliver(samples: Sequence[Sample]) -> None:
         counts.update(sample.signal for sample in samples)
+        latest.update((sample.signal, sample.value) for sample in samples if math.isfinite(sample.value))
 
-    plan.driver.open(deliver)
-    listened = max(LISTEN, ENOUGH * plan.file.window.sample_period)
-    time.sleep(listened)
-    link = plan.driver.link()
-    plan.driver.close()
-    wanted = listened / plan.file.window.sample_period
-    for signal in plan.twin.signals:
-        verdict = "" if counts[signal] >= 0.5 * wanted else ", too few" if counts[signal] else ": is the machine on?"
-        yield f"heard {signal}: {counts[signal]} samples in {listened:g} s{verdict}"
+    driver, signals, period = plan.driver, plan.twin.signals, plan.file.window.sample_period
+    kind = plan.file.driver.get("type")
+    begun = time.monotonic()
+    driver.open(deliver)
+    time.sleep(max(LISTEN, ENOUGH * period))
+    while time.monotonic() < begun + PATIENCE and len(counts) < len(signals) and not driver.link().complaints:
+        time.sleep(PAUSE)
+    link, listened = driver.link(), time.monotonic() - begun
+    driver.close()
+    for signal in signals:
+        yield f"heard {signal}: {counts[signal]} samples in {listened:.1f} s" + _verdict(
+            counts[signal], listened / period, latest.get(signal), plan.twin.unit_of(signal), any_came=bool(counts)
+        )
     if link.plan:
         yield f"plan: {link.plan}"
     yield from link.complaints
     if not link.up:
         yield f"no connection: {link.reason}"
+    if kind in PROBED and len(latest) < len(signals):
+        yield f"what is there is shown by 'otolith probe {kind}'"
+
+
+def _verdict(count: int, wanted: float, latest: float | None, unit: str, *, any_came: bool) -> str:
+    if not count:
+        return ": others come, so is its place in [signals] right?" if any_came else ": is the machine on?"
+    few = "" if count >= 0.5 * wanted else ", too few"
+    return few + (", none of them a reading" if latest is None else f", now {latest:.4g} {unit}")
