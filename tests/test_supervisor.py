@@ -99,3 +99,14 @@ def test_the_worker_carries_nothing_over(batch: list[Window]) -> None:
     assert again.report is not None
     assert alone.report is not None
     assert again.report.document == alone.report.document
+
+
+def test_windows_missed_while_the_twin_is_compiled_are_explained_once(
+    batch: list[Window], caplog: pytest.LogCaptureFixture
+) -> None:
+    watched = Supervisor(state_for("R_a"), window_length=2.0)
+    for window in batch:
+        watched.submit(window, 0.0)
+    assert watched.missed == len(batch) - supervisor.ROOM
+    said = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert said == [f"window 0 missed: {supervisor.NOT_READY}"]

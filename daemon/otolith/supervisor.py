@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 ROOM = 2  # windows that wait for a busy worker; older ones are missed
 PATIENCE = 20.0  # s for a window beyond twice its length
 COMPILING = 120.0  # s more for the first one: a twin that this computer has never run is compiled before
+NOT_READY = "the worker is not ready: a twin that is new to this computer is compiled first, for a minute or two"
 
 
 class Supervisor:
@@ -36,6 +37,7 @@ class Supervisor:
         self._at_hand: Window | None = None
         self._retried: int | None = None
         self._deadline = 0.0
+        self._missed_why = ""
 
     @property
     def records(self) -> int:
@@ -60,6 +62,11 @@ class Supervisor:
         """After the last window that was finished."""
         return self._state
 
+    @property
+    def _allowed(self) -> float:
+        """S that the window at hand may take."""
+        return self._patience + (0.0 if self.finished else COMPILING)
+
     def revise(self, change: Callable[[State], State]) -> None:
         """Change the state before the next window, whatever becomes of the one at hand."""
         self._changes.append(change)
@@ -76,7 +83,7 @@ class Supervisor:
         """Queue a window, and hand it on if the worker is free."""
         self._waiting.append(window)
         while len(self._waiting) > ROOM:
-            self._miss(self._waiting.popleft(), "the worker is behind")
+            self._miss(self._waiting.popleft(), "the worker is behind" if self.finished else NOT_READY)
         self._hand_on(now)
 
     def poll(self, now: float) -> list[tuple[Report, float]]:
@@ -87,7 +94,7 @@ class Supervisor:
             if self._companion.may_start_again(now):
                 self.start()
         elif self._at_hand is not None and now > self._deadline:
-            self._take_back(f"has not finished window {self._at_hand.index} in {self._patience:.0f} s")
+            self._take_back(f"has not finished window {self._at_hand.index} in {self._allowed:.0f} s")
             self._companion.kill()
         self._hand_on(now)
         return reports
@@ -124,8 +131,10 @@ class Supervisor:
             self._state = self._changes.pop(0)(self._state)
         self._at_hand = self._waiting.popleft()
         self._companion.offer(worker.Task(self._state, self._at_hand))
-        self._deadline = now + self._patience + (0.0 if self.finished else COMPILING)
+        self._deadline = now + self._allowed
 
     def _miss(self, window: Window, why: str) -> None:
         self.missed += 1
-        log.warning("window %d missed: %s", window.index, why)
+        level = logging.DEBUG if why == NOT_READY == self._missed_why else logging.WARNING  # once is enough
+        self._missed_why = why
+        log.log(level, "window %d missed: %s", window.index, why)
