@@ -204,5 +204,5 @@ def raw_signal(signal: Signal) -> Wanted:
     message = Message(
         source.id, f"0x{source.id:X}", size, [found], is_extended_frame=source.extended, is_fd=source.fd, strict=False
     )
-    bits = f"bits {source.start}+{source.length}"
+    bits = f"bits {source.start}+{source.length}" + (" big" if source.byte_order == "big" else "")
     return wanted_of(signal, message, found, f"{message.name} {bits}")

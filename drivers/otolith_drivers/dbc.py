@@ -21,6 +21,7 @@ from otolith_drivers.files import content
 SIZE_LIMIT = 4 << 20  # bytes; large vehicles have databases of 2 MB, and each takes some seconds
 LONGEST_FRAME = 4096  # bytes; CAN FD has 64, the transport protocol of SAE J1939 1785
 MOST_MULTIPLEXERS = 1 << 16  # values of one multiplexer, and arbitration IDs of one message
+SHEETS = (".eds", ".dcf")
 FORMATS = {".dbc": "dbc", ".kcd": "kcd", ".sym": "sym", ".arxml": "arxml"}
 
 # cantools makes lists as long as these numbers say, so a slip (or worse) in one of them could fill the memory.
@@ -81,6 +82,11 @@ def load_database(path: Path) -> Loaded:
     Raises:
         ConfigurationError: no such file, no CAN database, or one that could only be meant to do harm.
     """
+    if path.suffix.lower() in SHEETS:
+        raise ConfigurationError(
+            f'{path}: the data sheet of a CANopen drive, not a CAN database: name it by eds = "..." in [driver]',
+            ("driver", "dbc"),
+        )
     text, faults = _text(path)
     _refuse_excess(text, path)
     kind = FORMATS.get(path.suffix.lower())

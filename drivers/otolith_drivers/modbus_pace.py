@@ -117,7 +117,7 @@ class Pace:
 
     def describe(self) -> str:
         """Asked and achieved, in words."""
-        achieved = "not known yet" if self.achieved is None else f"{1 / self.achieved:.1f} achieved"
+        achieved = "achieved: not known yet" if self.achieved is None else f"{1 / self.achieved:.1f} achieved"
         coarser = f" (the grid is now {self.period * 1e3:g} ms)" if self.period > self.asked else ""
         return f"{1 / self.asked:g} Hz asked, {achieved}{coarser}"
 

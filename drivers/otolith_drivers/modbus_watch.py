@@ -62,7 +62,8 @@ class OrderWatch:
             if not judgement.plausible:
                 item = self._items[name]
                 way_out = (
-                    f'as {judgement.better} it would be plausible: set order = "{judgement.better}"'
+                    f'as {judgement.better} it would be plausible: set order = "{judgement.better}", '
+                    "unless register is one off"
                     if judgement.better
                     else "no order of its bytes makes it plausible: is register or type wrong?"
                 )

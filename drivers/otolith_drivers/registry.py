@@ -36,4 +36,5 @@ def find(name: str) -> DriverType:
             return cast("DriverType", point.load())
     except ImportError as error:
         raise ConfigurationError(f"driver {name!r} cannot be loaded: {error}") from error
-    raise ConfigurationError(f"unknown driver {name!r}: {nearest(name, known())}")
+    text = f"unknown driver {name!r}: {nearest(name, known())}; a package that brings its own must be installed here"
+    raise ConfigurationError(text)

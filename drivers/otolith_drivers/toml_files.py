@@ -90,7 +90,8 @@ def parse(page: Page) -> dict[str, Any]:
     try:
         return tomllib.loads(page.text)
     except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{page.path}: not valid TOML: {error}") from error
+        hint = "; a key may stand only once in its table" if "overwrite" in str(error) else ""
+        raise ConfigurationError(f"{page.path}: not valid TOML: {error}{hint}") from error
 
 
 SHAPES = {

@@ -93,6 +93,11 @@ def test_a_huge_file_and_a_folder_are_refused(tmp_path: Path) -> None:
             load_database(path)
 
 
+def test_the_data_sheet_of_a_canopen_drive_is_called_by_its_name() -> None:
+    with pytest.raises(ConfigurationError, match=r'not a CAN database: name it by eds = "\.\.\." in \[driver\]'):
+        load_database(EXAMPLES / "canopen-drive.eds")
+
+
 def test_a_database_that_is_in_order_has_no_warnings() -> None:
     for path in sorted(EXAMPLES.glob("*.dbc")):
         assert load_database(path).warnings() == []

@@ -238,7 +238,7 @@ def test_a_swapped_word_order_is_withheld_and_named() -> None:
     behaviour.spoil = moving
     sources = [source(register=0), source(register=2, order="CDAB")]
     with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
-        listener.wait(lambda link: any('set order = "ABCD"' in line for line in link.complaints))
+        listener.wait(lambda link: any('set order = "ABCD", unless register' in line for line in link.complaints))
         wait_for(lambda: len(listener.of("s0")) > 20)
         assert not listener.of("s1")
         assert listener.driver.counters().bad >= 20
@@ -289,6 +289,21 @@ def test_a_host_that_swallows_everything_does_not_delay_the_end() -> None:
         driver.close()
         assert time.monotonic() - begun < 0.5
     assert not [thread for thread in threading.enumerate() if thread.name == "modbus-poll"]
+
+
+def test_closing_is_no_broken_connection(caplog: pytest.LogCaptureFixture) -> None:
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+
+    def slow(reply: bytes) -> bytes:
+        time.sleep(0.02)  # so that closing interrupts a reading
+        return reply
+
+    behaviour.spoil = slow
+    with odd_server(behaviour, port):
+        for _ in range(3):
+            with Listener(poller(port, TWO)) as listener:
+                wait_for(lambda: len(listener.of("s0")) > 0)
+    assert not [record.message for record in caplog.records if record.levelname == "WARNING"]
 
 
 def test_an_unreachable_host_is_waited_for() -> None:
