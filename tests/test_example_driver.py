@@ -21,7 +21,7 @@ def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
 def test_it_keeps_the_contract() -> None:
     done = run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(FOLDER), PYTHONDONTWRITEBYTECODE="1")
     assert done.returncode == 0, done.stdout
-    assert "7 passed" in done.stdout
+    assert "8 passed" in done.stdout
 
 
 def test_its_entry_point_makes_it_a_driver_of_machine_files(tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ class UdpJson:
                 Sample(name, moment, scale * float(found[key]) + offset)
                 for name, (key, scale, offset) in self._conversions.items()
             ]
-        except (ValueError, KeyError, TypeError):  # whatever comes over the wire, the thread goes on
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # whatever comes, the thread goes on
             self._bad += 1
             return
         self._latest = moment

@@ -2,6 +2,7 @@
 
 import json
 import socket
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,16 +19,48 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-@pytest.mark.parametrize("promise", CONTRACT, ids=lambda promise: promise.__name__)
-def test_the_driver_keeps_the_contract(promise: Callable[[Rig], None]) -> None:
-    port = free_port()
+def built(port: int) -> otolith_udp_json.UdpJson:
     signals = (
         Signal("omega", "rad/s", otolith_udp_json.Source(key="speed", unit="rpm")),
         Signal("i", "A", otolith_udp_json.Source(key="current", unit="mA")),
     )
-    driver = otolith_udp_json.build(otolith_udp_json.Options(port=port), Setup(signals, Path(), 0.01))
+    return otolith_udp_json.build(otolith_udp_json.Options(port=port), Setup(signals, Path(), 0.01))
+
+
+@pytest.mark.parametrize("promise", CONTRACT, ids=lambda promise: promise.__name__)
+def test_the_driver_keeps_the_contract(promise: Callable[[Rig], None]) -> None:
+    port = free_port()
+    driver = built(port)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         reading = json.dumps({"speed": 60.0, "current": 500.0}).encode()
         expected = {"omega": 2 * 3.141592653589793, "i": 0.5}
         promise(Rig(driver, expected, lambda: device.sendto(reading, ("127.0.0.1", port))))
+        driver.close()
+
+
+HOSTILE = (
+    b"",
+    b"\xff\xfe",
+    b"[]",
+    b"{}",
+    b'{"speed": "x", "current": 1}',
+    b"[" * 1400,
+    b'{"speed": 1%s}' % (b"0" * 400),
+)
+
+
+def test_nothing_that_comes_over_the_wire_ends_the_thread() -> None:
+    port = free_port()
+    driver = built(port)
+    driver.open(lambda samples: None)
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
+            for datagram in (*HOSTILE, b'{"speed": 60, "current": 500}'):
+                device.sendto(datagram, ("127.0.0.1", port))
+        deadline = time.monotonic() + 5.0
+        while driver.counters().received < 2 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        counters = driver.counters()
+        assert (counters.received, counters.bad) == (2, len(HOSTILE))
+    finally:
         driver.close()
