@@ -39,6 +39,13 @@ def test_every_machine_file_to_copy_can_be_loaded(path: Path) -> None:
     assert all(any(line.startswith(f"{signal} ") for line in lines) for signal in plan.twin.signals)
 
 
+def test_all_machine_files_to_copy_can_run_on_one_computer() -> None:
+    """Each publishes on a port of its own; only the two of the same motor share theirs."""
+    others = [path for path in sorted(EXAMPLES.glob("*.toml")) if path.stem != "dc-motor-in-process"]
+    endpoints = [endpoint for path in others for endpoint in load_plan(path).file.zenoh.listen]
+    assert len(set(endpoints)) == len(others)
+
+
 def test_the_example_means_what_it_says() -> None:
     plan = load_plan(EXAMPLES / "dc-motor.toml")
     assert [entry.name for entry in plan.problem.free] == ["R_a"]
