@@ -30,7 +30,8 @@ def watch_reports(connect: Sequence[str], machine: str, *, as_json: bool, stoppe
     with Listener(connect, key, hear) as listener:
 
         def state() -> str:
-            found = f"connected, waiting for {key}" if listener.connected else "no daemon reached yet"
+            nobody = "no daemon reached yet, --connect asks elsewhere"
+            found = f"connected, waiting for {key}" if listener.connected else nobody
             return f"{found} ({', '.join(connect)})"
 
         if as_json:
