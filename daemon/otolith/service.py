@@ -34,7 +34,7 @@ from otolith.paths import writable
 from otolith.plan import Plan
 from otolith.specialist import Decisions, decided, kept, restored
 from otolith.state import begin, regridded
-from otolith.supervisor import Supervisor
+from otolith.supervisor import COMPILING, Supervisor
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,8 @@ TICK = 0.1  # s; the longest wait, so how late a stop, a death or an outage can 
 SWITCH = 5e-4  # s that a thread of Python may keep the others waiting: what arrives is to be stamped at once
 RECORDER_ROOM = 32  # windows
 RECORDER_FLUSH, KEEPER_FLUSH = 1.5, 0.5  # s at the end
-STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed
+STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed; the first
+# one may take as much longer as the supervisor gives it, or a slow computer would never compile its twin
 OTHER_GRID = 0.01  # difference of two sample periods that matters
 KEEP_EVERY = 300.0  # s between two writes of components that are only known better
 THRIVES = 60.0  # s after which a recorder counts as healthy
@@ -221,7 +222,8 @@ class Service:
         """Feed the watchdog by progress, not by mere life; bring a dead recorder back with a file of its own."""
         if self._supervisor.finished != self._settled:
             self._settled, self._progress = self._supervisor.finished, now
-        stalled = now - self._progress > STALL + 3 * self._windower.length
+        patience = STALL + 3 * self._windower.length + (0.0 if self._supervisor.finished else COMPILING)
+        stalled = now - self._progress > patience
         if self._notifier.watchdog and not stalled and now - self._fed > self._notifier.watchdog / 4:
             self._fed = now
             self._notifier.progress()

@@ -19,6 +19,7 @@ from otolith.keeping import Keeper
 from otolith.outlets import recorder
 from otolith.plan import load_plan
 from otolith.specialist import Decisions, Kept
+from otolith.supervisor import COMPILING
 from otolith.twins import find_twin
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
@@ -86,7 +87,9 @@ def test_a_stopped_worker_starves_the_watchdog(
         watched._progress = 1000.0
         watched._watch(1002.0)
         assert fed()
-        patience = module.STALL + 3 * 2.0
+        patience = module.STALL + 3 * 2.0 + COMPILING
+        watched._watch(1000.0 + patience - 0.1)
+        assert fed()
         watched._watch(1000.0 + patience + 0.1)
         assert not fed()
         watched._supervisor.missed += 1
@@ -95,6 +98,8 @@ def test_a_stopped_worker_starves_the_watchdog(
         watched._supervisor.finished += 1
         watched._watch(1000.0 + patience + 6.0)
         assert fed()
+        watched._watch(1000.0 + patience + 6.0 + module.STALL + 3 * 2.0 + 0.1)  # nothing is compiled any more
+        assert not fed()
         watched._notifier.close()
 
 
