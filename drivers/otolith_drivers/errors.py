@@ -46,7 +46,9 @@ def nearest(word: str, known: list[str]) -> str:
     """The end of a sentence that helps after a misspelt ``word``: the nearest known one, or the list of them."""
     import difflib  # noqa: PLC0415 - only on the way to an error
 
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    alike = {name.casefold(): name for name in known}
+    close = difflib.get_close_matches(word, known, n=1)
+    close = close or [alike[name] for name in difflib.get_close_matches(word.casefold(), list(alike), n=1)]
     if close:
         return f"did you mean {close[0]!r}?"
     return f"known: {', '.join(sorted(known))}" if known else "there are none"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BeforeValidator
 
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.toml_files import Closed, Page, load, parse, validate
 
 
@@ -75,3 +75,11 @@ def test_any_text_is_read_or_refused(text: str) -> None:
         validate(parse(page), Outer, page)
     except ConfigurationError as error:
         assert str(error).startswith("any.toml")  # noqa: PT017 - either outcome is right, another error is not
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [("cna", "did you mean 'can'?"), ("CAN", "did you mean 'can'?"), ("xyz", "known: can, modbus")],
+)
+def test_the_nearest_name_is_found_whatever_its_case(word: str, hint: str) -> None:
+    assert nearest(word, ["modbus", "can"]) == hint
