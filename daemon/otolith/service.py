@@ -47,6 +47,7 @@ RECORDER_FLUSH, KEEPER_FLUSH = 1.5, 0.5  # s at the end
 STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed; the first
 # one may take as much longer as the supervisor gives it, or a slow computer would never compile its twin
 OTHER_GRID = 0.01  # difference of two sample periods that matters
+FORGET = "if signals or units were corrected since, 'otolith components forget' clears it"
 KEEP_EVERY = 300.0  # s between two writes of components that are only known better
 THRIVES = 60.0  # s after which a recorder counts as healthy
 
@@ -71,6 +72,8 @@ class Service:
         except OtolithError as error:  # a file that cannot be read is no reason not to watch the machine
             log.warning("begun without components: %s", error)
         self._kept, self._kept_at = tuple(entry.component.key for entry in state.catalogue), 0.0
+        if self._kept:
+            log.info("begun with what was found earlier: %s; %s", ", ".join(map(str, self._kept)), FORGET)
         self._supervisor = Supervisor(decided(state, decisions), longest)
         self._recorder = Companion("otolith-recorder", "otolith.outlets.recorder:main", RECORDER_ROOM)
         self._recording = recording if plan.file.recording.enabled else None
