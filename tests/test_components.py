@@ -18,6 +18,7 @@ from otolith.keeping import Keeper
 from otolith.plan import load_plan
 from otolith.specialist import Decisions, decided, restored
 from otolith.state import begin
+from tests.conftest import EXAMPLES
 from tests.replays import MACHINE
 
 KEY = "shaft/periodic/angle(omega)"
@@ -39,6 +40,33 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def otolith(*arguments: str | Path, said: str = "") -> Result:
     return CliRunner().invoke(cli, list(map(str, arguments)), input=said, catch_exceptions=False, standalone_mode=False)
+
+
+def test_what_was_found_in_other_signals_is_not_believed(data: Path) -> None:
+    """A unit that was wrong, and is put right, must not leave behind what it made the daemon find."""
+    assert otolith("commission", MACHINE, data, "--windows", "8", said="y\n").exit_code == 0
+    plan = load_plan(MACHINE, with_driver=False)
+    names, folder, found = (
+        (plan.file.machine.site, plan.file.machine.name),
+        keeper().known.parent,
+        keeper().components(),
+    )
+    Keeper(*names, plan.twin, folder, "before").keep(found)
+    assert Keeper(*names, plan.twin, folder, "before").components() == found
+    assert Keeper(*names, plan.twin, folder, "after").components() == ()
+
+
+def test_a_plan_knows_how_its_signals_are_said(tmp_path: Path) -> None:
+    """Scale, unit and place matter; over which wire they come does not."""
+    text = (EXAMPLES / "dc-motor-modbus.toml").read_text(encoding="utf-8")
+    heard = []
+    changes = {"": "", "port = 1502": "port = 1503", 'unit = "A"': 'unit = "mA"', "register = 4": "register = 5"}
+    for old, new in changes.items():
+        path = tmp_path / "machine.toml"
+        path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
+        heard.append(load_plan(path, with_driver=False).heard)
+    assert heard[0] == heard[1]
+    assert len(set(heard)) == 3
 
 
 def keeper() -> Keeper:

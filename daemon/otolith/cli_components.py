@@ -113,7 +113,7 @@ def _keeper(file: Path) -> "tuple[Plan, Keeper]":
     from otolith.plan import load_plan
 
     plan = load_plan(file, with_driver=False)
-    return plan, Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin)
+    return plan, Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin, heard=plan.heard)
 
 
 def _unsaid(keeper: "Keeper", component: str) -> "Decisions":

@@ -1,6 +1,7 @@
 """Components on disk: what the daemon knows of them, and what the specialist has said; each file has one writer."""
 
 import contextlib
+import logging
 import math
 import os
 import tempfile
@@ -17,6 +18,8 @@ from otolith.twin.metamodels import NAMES
 from otolith.twin.slots import SLOTS, sites, sources
 from otolith_drivers.toml_files import Closed
 
+log = logging.getLogger(__name__)
+
 VERSION = 1
 Page = TypeVar("Page", bound=Closed)
 
@@ -26,6 +29,8 @@ class _File(Closed):
 
     version: int = VERSION
     twin: str
+    heard: str = ""
+    """See :attr:`otolith.plan.Plan.heard`."""
     components: tuple[Kept, ...] = ()
 
 
@@ -41,20 +46,25 @@ class _Said(Closed):
 class Keeper:
     """The two files of one machine."""
 
-    def __init__(self, site: str, machine: str, twin: Definition, folder: Path | None = None) -> None:
+    def __init__(self, site: str, machine: str, twin: Definition, folder: Path | None = None, heard: str = "") -> None:
+        """``heard`` is how the signals are: what was found in others is none of this machine's."""
+        self._heard = heard
         folder = folder or state_directory() / "components"
         self._twin = twin
         self.known = folder / f"{site}.{machine}.json"
         self.said = folder / f"{site}.{machine}.specialist.json"
 
     def components(self) -> tuple[Kept, ...]:
-        """Those that are kept and that this twin can have.
+        """Those that are kept and that this twin can have, found in signals that are said as they are now.
 
         Raises:
             ConfigurationError: the file is not one of ours.
         """
         file = _read(self.known, _File)
         if file is None or file.twin != self._twin.name:
+            return ()
+        if file.heard and self._heard and file.heard != self._heard:
+            log.warning("begun without the components of earlier runs: since then [signals] have changed")
             return ()
         usable = [entry for entry in file.components if self._is_possible(entry)]
         return tuple(usable[:SLOTS])
@@ -78,7 +88,7 @@ class Keeper:
         Raises:
             ServiceError: the disk does not take it.
         """
-        _write(self.known, _File(twin=self._twin.name, components=components))
+        _write(self.known, _File(twin=self._twin.name, heard=self._heard, components=components))
 
     def decisions(self) -> Decisions:
         """What the specialist has said.

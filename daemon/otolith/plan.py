@@ -1,5 +1,7 @@
 """What a machine file means: its twin, its estimation problem, its driver. Faults are told with file, line and key."""
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +19,7 @@ from otolith_drivers.base import Driver
 from otolith_drivers.quantities import Quantity
 from otolith_drivers.toml_files import Context, Page, expect, parse, read, validate
 
+VALUED = ("dbc", "eds", "order", "first_address", "device")  # keys of a driver, that values of signals depend on
 SMALLEST_NOISE = 1e-12  # of an output: without any, no residual could be weighed
 
 
@@ -43,6 +46,15 @@ class Plan:
         if self.source is None:
             raise ConfigurationError(f"{self.path}: loaded without its driver")
         return self.source
+
+    @property
+    def heard(self) -> str:
+        """A fingerprint of what the values of signals depend on; empty where the file does not say where they are."""
+        file = self.file
+        if not file.signals:
+            return ""
+        said = {key: file.driver.get(key) for key in VALUED}
+        return hashlib.sha256(json.dumps([file.signals, said], sort_keys=True, default=str).encode()).hexdigest()[:16]
 
     @property
     def recording_folder(self) -> Path | None:

@@ -47,7 +47,7 @@ RECORDER_FLUSH, KEEPER_FLUSH = 1.5, 0.5  # s at the end
 STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed; the first
 # one may take as much longer as the supervisor gives it, or a slow computer would never compile its twin
 OTHER_GRID = 0.01  # difference of two sample periods that matters
-FORGET = "if signals or units were corrected since, 'otolith components forget' clears it"
+FORGET = "'otolith components forget' clears what is no longer so"
 KEEP_EVERY = 300.0  # s between two writes of components that are only known better
 THRIVES = 60.0  # s after which a recorder counts as healthy
 
@@ -63,7 +63,7 @@ class Service:
         period, sampling = plan.file.window.sample_period, plan.driver.sampling
         self._windower = Windower(plan.twin.signals, plan.records, period, plan.limits, sampling)
         longest = plan.problem.window.longest * period
-        keeper = Keeper(machine.site, machine.name, plan.twin)
+        keeper = Keeper(machine.site, machine.name, plan.twin, heard=plan.heard)
         self._housekeeper = Housekeeper(keeper, keeper.stamp())
         state = begin(machine.name, machine.site, plan.problem)
         decisions = Decisions()

@@ -125,9 +125,7 @@ def test_components_are_kept_and_the_specialist_is_heard_while_it_runs(
     running, keeper = running_with_component
     first = running.wait_for(lambda reports: len(reports) >= 1)
     assert [entry.id for entry in first[0].components] == [DRY.key]
-    assert (
-        f"begun with what was found earlier: {DRY.key}; if signals or units were corrected" in running.log.read_text()
-    )
+    assert f"begun with what was found earlier: {DRY.key}; 'otolith components forget'" in running.log.read_text()
     keeper.known.unlink()
     keeper.decide(Decisions(approved=frozenset({DRY.key})))
     running.wait_for(lambda reports: reports[-1].components[0].approval is Approval.APPROVED)
