@@ -89,6 +89,8 @@ class Source(Closed):
     offset: float = 0.0
     bits: str | None = None
     """``"3"`` or ``"4..7"``: only these bits of an integer are the number."""
+    trusted: bool = False
+    """The order of its bytes is right, however the numbers look."""
     range: tuple[float, float] | None = None
     """In ``unit``; a value beyond is no reading."""
 

@@ -15,7 +15,7 @@ class OrderWatch:
     """Over all numbers that take more than one register; each is judged again from time to time, one in a round."""
 
     def __init__(self, items: Sequence[Item]) -> None:
-        self._items = {item.name: item for item in items if item.count > 1}
+        self._items = {item.name: item for item in items if item.count > 1 and not item.source.trusted}
         self._history: dict[str, deque[Sequence[int]]] = {name: deque(maxlen=READINGS) for name in self._items}
         self._judgements: dict[str, Judgement] = {}
         self._usual: dict[str, float] = {}
@@ -67,5 +67,6 @@ class OrderWatch:
                     if judgement.better
                     else "no order of its bytes makes it plausible: is register or type wrong?"
                 )
+                way_out += ", or say trusted = true"
                 lines.append(f"{name} ({item.describe()}) is withheld: {judgement.reason}; {way_out}")
         return lines

@@ -1,6 +1,7 @@
 """The Modbus driver against a real server and one that misbehaves: what is lost is counted, what is back is found."""
 
 import contextlib
+import re
 import socket
 import struct
 import threading
@@ -221,9 +222,11 @@ def test_a_line_too_slow_for_the_rate_says_what_it_achieves() -> None:
         listener.wait(lambda link: link.period is not None and "not known" not in link.plan)
         link = listener.driver.link()
         assert link.period is not None
-        assert 0.02 < link.period < 0.04
+        assert 0.02 < link.period < 0.05
         assert "100 Hz asked" in link.plan
-        assert f"{1 / link.period:.0f}" in link.plan
+        achieved = re.search(r"([\d.]+) achieved", link.plan)
+        assert achieved is not None
+        assert float(achieved[1]) == pytest.approx(1 / link.period, rel=0.1)  # as far as a busy computer keeps it
 
 
 def test_a_swapped_word_order_is_withheld_and_named() -> None:
@@ -242,6 +245,14 @@ def test_a_swapped_word_order_is_withheld_and_named() -> None:
         wait_for(lambda: len(listener.of("s0")) > 20)
         assert not listener.of("s1")
         assert listener.driver.counters().bad >= 20
+
+
+def test_an_order_that_the_user_vouches_for_is_not_doubted() -> None:
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+    sources = [source(register=0, order="CDAB", trusted=True)]
+    with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
+        wait_for(lambda: len(listener.of("s0")) > 40)
+        assert not listener.driver.link().complaints
 
 
 def test_a_device_that_comes_late_is_judged_before_anything_of_it_is_believed() -> None:
