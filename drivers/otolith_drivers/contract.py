@@ -13,7 +13,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from otolith_drivers.base import Driver, Sample, Sampling
@@ -63,6 +63,24 @@ def counts_what_it_receives(rig: Rig) -> None:
     counters = rig.driver.counters()
     _demand(counters.received >= len(samples), f"{counters.received} counted, {len(samples)} delivered")
     _demand(counters.bad == 0, f"{counters.bad} bad ones of a healthy source")
+
+
+def never_delivers_nothing(rig: Rig) -> None:
+    """Who takes samples is called when there are some."""
+    got: list[Sample] = []
+    empty: list[int] = []
+
+    def deliver(samples: Sequence[Sample]) -> None:
+        if not samples:
+            empty.append(len(got))
+        got.extend(samples)
+
+    rig.driver.open(deliver)
+    try:
+        _wait(rig, got)
+    finally:
+        rig.driver.close()
+    _demand(not empty, f"delivered nothing {len(empty)} times")
 
 
 def says_that_it_is_connected(rig: Rig) -> None:
@@ -115,6 +133,7 @@ CONTRACT: tuple[Callable[[Rig], None], ...] = (
     delivers_in_the_wanted_units_and_stamps_at_the_source,
     keeps_the_order_of_time,
     counts_what_it_receives,
+    never_delivers_nothing,
     says_that_it_is_connected,
     stops_within_a_second_and_leaves_nothing,
     says_what_it_will_read,

@@ -102,10 +102,12 @@ class ModbusPoller:
                 self._wait()
                 if not self._stop.is_set():
                     connected = self._round(deliver)
-            except Broken as error:
+            except Exception as error:
                 if self._stop.is_set():  # by ourselves
                     break
-                self._go_down(str(error))
+                if not isinstance(error, Broken):
+                    log.exception("%s", self._options.title())
+                self._go_down(str(error) or type(error).__name__)
                 connected = False
                 self._stop.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not a secret
                 pause = min(2.0 * pause, BACKOFF_LONGEST)
@@ -184,7 +186,8 @@ class ModbusPoller:
         good = sum(math.isfinite(sample.value) for sample in kept)
         self._received += good
         self._bad += len(samples) - good
-        deliver(kept)
+        if kept:
+            deliver(kept)
 
     def _drained(self) -> bool:
         """After a question without an answer, an answer without a question may come: the line is opened anew."""

@@ -379,3 +379,20 @@ def shared_server() -> Iterator[tuple[Behaviour, int]]:
     behaviour, port = Behaviour(WORDS), free_port(socket.SOCK_STREAM)
     with odd_server(behaviour, port):
         yield behaviour, port
+
+
+def test_who_takes_the_samples_may_fail_without_ending_the_reading() -> None:
+    behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
+    calls: list[int] = []
+
+    def deliver(samples: Sequence[Sample]) -> None:
+        calls.append(len(samples))
+        if len(calls) == 3:
+            raise ValueError("a bug")
+
+    driver = poller(port, TWO)
+    with odd_server(behaviour, port):
+        driver.open(deliver)
+        wait_for(lambda: len(calls) > 20)
+        assert driver.link().up
+        driver.close()
