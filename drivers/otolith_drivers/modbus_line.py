@@ -82,9 +82,7 @@ class Line:
         """
         try:  # by ourselves, as the library only logs why it cannot
             self._client.socket = self._opened()
-        except termios.error as error:  # which is no OSError
-            raise Broken(f"the port refuses these settings: {error.args[-1]}") from error
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, termios.error) as error:
             raise Broken(_cause(error)) from error
 
     def close(self) -> None:
@@ -248,6 +246,7 @@ def _client(options: LineOptions, aborted: threading.Event) -> ModbusTcpClient |
 def _cause(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno and error.errno > 0:
         return os.strerror(error.errno)
-    if isinstance(error, termios.error):
-        return str(error.args[-1])
+    if isinstance(error, termios.error):  # which is no OSError
+        refused = error.args[0] == errno.EINVAL
+        return f"the port refuses these settings: {error.args[-1]}" if refused else str(error.args[-1])
     return (isinstance(error, OSError) and error.strerror) or str(error)
