@@ -2,7 +2,8 @@
 
 Registers with noise in them never say the same twice; where they do so now and then, the device was late. Where they do
 so often, they are coarse, the machine stands still, or the device renews them more slowly than they are read. Registers
-that move by a few steps only may repeat by chance; an old image of them is off by no more than these steps.
+that move by a few steps only may repeat by chance; an old image of them is off by no more than these steps. One image
+that comes twice is the beat of two clocks that are equally fast: it is off by less than a period, and is let pass.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ MEMORY = 0.01  # of a share: how much a reading counts
 SETTLED = 200  # readings, before which a share says more of its beginning than of them
 FEW_STEPS = 16  # of a register, from reading to reading
 COARSE = 0.5  # share of readings that move by so few, above which registers are coarse
-MOST_IN_A_ROW = 3  # old images; what says the same for longer stands still
+MOST_IN_A_ROW = 100  # old images; what says the same for longer stands still
 
 
 class Freshness:
@@ -24,6 +25,7 @@ class Freshness:
     def __init__(self) -> None:
         self._images: dict[Request, Sequence[int]] = {}
         self._shares: dict[Request, float] = {}
+        self._beats: dict[Request, float] = {}
         self._readings: dict[Request, int] = {}
         self._coarse: dict[Request, float] = {}
         self._in_a_row: dict[Request, int] = {}
@@ -40,7 +42,10 @@ class Freshness:
         if before is not None and not repeated:
             self._coarse[request] = coarse + MEMORY * (_near(before, registers) - coarse)
         in_a_row = self._in_a_row[request] = self._in_a_row.get(request, 0) + 1 if repeated else 0
-        return repeated, 0 < in_a_row <= MOST_IN_A_ROW and share < SELDOM and coarse < COARSE
+        beats = self._beats.get(request, 1.0)
+        if in_a_row <= 1:  # a device that stops to renew its registers does so once, however long
+            self._beats[request] = beats + MEMORY * (repeated - beats)
+        return repeated, 1 < in_a_row <= MOST_IN_A_ROW and beats < SELDOM and coarse < COARSE
 
     def complaints(self, requests: Sequence[Request], period: float) -> list[str]:
         """Which of ``requests`` say the same too often to be read every ``period`` s, a line each."""

@@ -328,6 +328,7 @@ def test_an_old_image_among_new_ones_is_none() -> None:
     freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
     for index in range(500):
         assert freshness.take(request, [100 * index, 0]) == (False, False)
+    assert freshness.take(request, [49900, 0]) == (True, False)  # the beat of two clocks
     assert freshness.take(request, [49900, 0]) == (True, True)
     assert freshness.take(request, [50000, 0]) == (False, False)
 
