@@ -83,7 +83,7 @@ def is_sound(report: ReportDocument) -> bool:
     return report.window.quality.verdict is Verdict.GOOD and parameter.status is Status.ESTIMATED
 
 
-# A window of which a part is frozen while the machine hardly moves opens a case, and polled windows do not always end it.
+# A window of which a part is frozen while the machine hardly moves opens a case, which polled windows may not end.
 LINGERS = pytest.mark.xfail(strict=False, reason="a case opened by half a frozen window may stay open for a while")
 LIVES = [
     pytest.param(transport, fault, marks=[LINGERS] if (transport, fault.kind) == ("modbus-tcp", "frozen") else [])
