@@ -13,6 +13,7 @@ ROOM = 1.15  # of a longer period over what rounds take
 MOST_LEFT_OUT = 0.2  # share of the grid; less is a busy computer, and passes
 MOST_AT_ONCE = 2  # left out before a round, that are laid to the line's speed; a timeout leaves out more
 SLOW_IN_A_ROW = 2  # decisions by which a coarser grid is needed, before it is made
+SLOW_FOR = 3.0  # s, for the same: a computer that is busy for a moment is no slow line
 EASY = 20  # decisions in a row by which a finer grid would do, before it is tried again
 STEPS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # times a power of ten: periods that people use
 SELDOM, OFTEN = 0.02, 0.6  # shares of rounds that repeat the one before, between which the beat is heard
@@ -31,6 +32,7 @@ class Pace:
         self._starts: deque[float] = deque(maxlen=ROUNDS + 1)
         self._durations: list[float] = []
         self._left_out = self._slow = self._easy = 0
+        self._slow_for = 0.0
         self._repeats = self._rounds = 0
         self._beats = self._steps = 0
         self.known = False
@@ -97,10 +99,12 @@ class Pace:
         share = self._left_out / (ROUNDS + self._left_out)
         if usual > FULL * self.period or share > MOST_LEFT_OUT:
             self._slow, self._easy = self._slow + 1, 0
-            if self._slow < SLOW_IN_A_ROW:
+            self._slow_for += ROUNDS * max(usual, self.period)
+            if self._slow < SLOW_IN_A_ROW or self._slow_for < SLOW_FOR:
                 return self.period
+            self._slow_for = 0.0
             return _even(ROOM * usual if usual > FULL * self.period else self.period / (1.0 - share))
-        self._slow = 0
+        self._slow, self._slow_for = 0, 0.0
         finer = max(self.asked, _even(ROOM * usual))
         self._easy = self._easy + 1 if finer < self.period else 0
         if self._easy < EASY:
