@@ -108,7 +108,9 @@ def stops_within_a_second_and_leaves_nothing(rig: Rig) -> None:
     _demand(time.monotonic() - begun < STOPS_WITHIN, f"closing took {time.monotonic() - begun:.2f} s")
     left = set(threading.enumerate()) - threads
     _demand(not left, f"threads left: {', '.join(thread.name for thread in left)}")
-    _demand(_descriptors() <= descriptors, f"{_descriptors() - descriptors} descriptors left open")
+    while (left_open := _descriptors() - descriptors) > 0:  # the machine may be of this process, and closes its own end
+        _demand(time.monotonic() - begun < STOPS_WITHIN, f"{left_open} descriptors left open")
+        time.sleep(0.005)
     delivered = len(got)
     rig.say()
     time.sleep(0.05)  # what would come would have come

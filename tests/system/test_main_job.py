@@ -157,8 +157,8 @@ def test_ctrl_c_at_any_moment_ends_everything_within_three_seconds(
         process.send_signal(signal.SIGINT)
     _, errors = daemon.communicate(timeout=10)
     assert time.monotonic() - begun < 3.0
-    assert daemon.returncode in (130, -signal.SIGINT)
     # In the first hundredths of a second the interpreter is still on its way to us, and says so in its own words.
+    assert daemon.returncode in (130, -signal.SIGINT) or "init_import_site" in errors
     assert "otolith" not in errors.partition("Traceback")[2]
     _, left = psutil.wait_procs(children, timeout=1.0)
     # Where the first process of a container reaps nobody, an ended orphan stays listed as a zombie.

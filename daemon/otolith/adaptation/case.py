@@ -11,7 +11,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.claims import Claim, Explanation, Reason, explanation, unexplained
-from otolith.adaptation.completion import places
+from otolith.adaptation.deactivation import NOTICED, says_nothing, weights
 from otolith.adaptation.fusion import Belief, carried, overall, rebased, updated, with_prior
 from otolith.adaptation.glance import glance
 from otolith.adaptation.information import inflation
@@ -25,7 +25,8 @@ WORTH = 30.0  # in -2 log evidence: an explanation worse than the best by more i
 MOST_OF_ONE = 20.0  # the same, of one window: none decides alone
 MOST_OF_FIRST = 15.0  # the same, of the first: if it was wrong, the second one outweighs it
 DIVERGED = 1e12  # χ² of a twin that explains nothing at all
-NOTICED = 4.0  # standard deviations of an amplitude, under which a component does not carry its weight
+BETTER = 4.0  # in -2 log evidence, of one window: nearer to nothing, it told for nobody
+SEEN_AGAIN = 3  # windows, after which an explanation must be more than what nothing would be
 LONGEST_MEMORY = 60.0  # the same: how far behind one may fall, so that it can come back when things change
 
 
@@ -163,6 +164,8 @@ def followed(case: Case, window: Window) -> Case:
             entry, belief=after, turned=turned(entry.problem, window, last), cost=_cost(fit),
             deviance=entry.deviance + more,
         ))  # fmt: skip
+    if case.windows + 1 >= SEEN_AGAIN:
+        found = _with_content(found, deviances)
     hypotheses = _sorted([_pruned(entry) for entry in found])
     leading = case.leading + 1 if hypotheses[0].claim.name == case.best.claim.name else 1
     case = replace(case, leading=leading)
@@ -194,17 +197,29 @@ def _sorted(found: list[Hypothesis]) -> tuple[Hypothesis, ...]:
     return tuple(replace(entry, deviance=min(entry.deviance - least, LONGEST_MEMORY)) for entry in ordered)
 
 
+def _with_content(found: list[Hypothesis], deviances: list[float]) -> list[Hypothesis]:
+    """Without those that say by now that nothing has happened, and explained the window no better than that."""
+    at = next((at for at, entry in enumerate(found) if entry.reason is Reason.NOTHING), None)
+    if at is None:
+        return found
+    calm = found[at]
+    return [
+        entry
+        for entry, deviance in zip(found, deviances, strict=True)
+        if entry is calm
+        or deviance < deviances[at] - BETTER
+        or not says_nothing(entry.problem, entry.belief, calm.problem, calm.belief)
+    ]
+
+
 def _pruned(entry: Hypothesis) -> Hypothesis:
     """Without components that do not carry their weight beside others (the paper's "deactivated")."""
     problem = entry.problem
     if len(problem.components) < 2:
         return entry
-    known = overall(entry.belief, problem)
-    deviations = np.sqrt(np.diag(known.covariance))
-    amplitudes = [places(problem, slot)[0] for slot in range(len(problem.components))]
-    weights = [abs(float(known.mean[place])) / float(deviations[place]) for place in amplitudes]
-    weakest = int(np.argmin(weights))
-    if weights[weakest] >= NOTICED:
+    carried_by = weights(problem, entry.belief)
+    weakest = int(np.argmin(carried_by))
+    if carried_by[weakest] >= NOTICED:
         return entry
     problem, belief, turn = left_out(problem, entry.belief, entry.turned, weakest)
     claim = entry.claim
