@@ -10,7 +10,9 @@ import pytest
 from click.testing import CliRunner
 
 from otolith.cli import cli
+from otolith.cli_plant import TRANSPORTS
 from otolith.topics import TOPICS
+from otolith_drivers.plant.nodes import NODES
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -33,6 +35,10 @@ def test_every_command_has_help_with_an_example_and_is_in_the_readme(name: str) 
 def test_an_unknown_option_is_a_usage_error(name: str) -> None:
     with pytest.raises(click.exceptions.NoSuchOption):
         CliRunner().invoke(cli, [name, "--no-such"], standalone_mode=False, catch_exceptions=False)
+
+
+def test_the_plant_can_be_whatever_it_has_a_node_for() -> None:
+    assert set(TRANSPORTS) == set(NODES)
 
 
 def test_every_topic_is_in_the_readme() -> None:

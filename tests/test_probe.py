@@ -26,8 +26,8 @@ from otolith_drivers.modbus_options import Options, Source, item_of
 from otolith_drivers.modbus_types import Order, TypeName
 from tests.conftest import OwnMachine, free_port
 from tests.drivers.modbus_servers import Behaviour, Words, library_server, odd_server
+from tests.drivers.registers import registers
 from tests.drivers.serial_devices import serial_device
-from tests.drivers.test_modbus_parts import registers
 
 ROOT = Path(__file__).parents[1]
 MOVING: list[tuple[int, TypeName, Order, Callable[[float, float], float]]] = [

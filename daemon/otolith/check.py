@@ -3,7 +3,7 @@
 import math
 import time
 from collections import Counter
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 
 from otolith.outlets.places import recording_folder
@@ -18,18 +18,26 @@ PATIENCE, PAUSE = 4.0, 0.1  # s for what does not come, until the driver knows w
 PROBED = ("can", "modbus")
 
 
-def check_machine(path: Path, *, with_device: bool) -> Iterator[str]:
-    """Lines to be shown, the last ones after listening to the bus for a second.
+def check_machine(path: Path, say: Callable[[str], None], *, with_device: bool) -> bool:
+    """Say, line by line, what the daemon would do, and what came from the bus within a second.
+
+    Returns:
+        Whether every signal came; also true if nobody was to listen.
 
     Raises:
         OtolithError: whatever would keep the daemon from starting.
     """
     plan = load_plan(path)
-    yield from describe(plan)
+    for line in describe(plan):
+        say(line)
     if plan.file.recording.enabled:
         complain_unless_writable(recording_folder(plan))
-    if with_device:
-        yield from _listen(plan)
+    if not with_device:
+        return True
+    counts, lines = _listen(plan)
+    for line in lines:
+        say(line)
+    return set(plan.twin.signals) <= set(counts)
 
 
 def describe(plan: Plan) -> list[str]:
@@ -64,7 +72,8 @@ def _left_open(name: str, said: Container[str]) -> str:
     return "" if name in said else " [not in the file: the twin's own value]"
 
 
-def _listen(plan: Plan) -> Iterator[str]:
+def _listen(plan: Plan) -> tuple[Counter[str], list[str]]:
+    """How many samples of each signal came, and what there is to say of it."""
     counts: Counter[str] = Counter()
     latest: dict[str, float] = {}
 
@@ -81,17 +90,19 @@ def _listen(plan: Plan) -> Iterator[str]:
         time.sleep(PAUSE)
     link, listened = driver.link(), time.monotonic() - begun
     driver.close()
-    for signal in signals:
-        yield f"heard {signal}: {counts[signal]} samples in {listened:.1f} s" + _verdict(
+    lines = [
+        f"heard {signal}: {counts[signal]} samples in {listened:.1f} s"
+        + _verdict(
             counts[signal], listened / period, latest.get(signal), plan.twin.unit_of(signal), any_came=bool(counts)
         )
-    if link.plan:
-        yield f"plan: {link.plan}"
-    yield from link.complaints
-    if not link.up:
-        yield f"no connection: {link.reason}"
+        for signal in signals
+    ]
+    lines += [f"plan: {link.plan}"] if link.plan else []
+    lines += link.complaints
+    lines += [] if link.up else [f"no connection: {link.reason}"]
     if kind in PROBED and len(latest) < len(signals):
-        yield f"what is there is shown by 'otolith probe {kind}'"
+        lines.append(f"what is there is shown by 'otolith probe {kind}'")
+    return counts, lines
 
 
 def _verdict(count: int, wanted: float, latest: float | None, unit: str, *, any_came: bool) -> str:

@@ -1,6 +1,5 @@
 """The command line: speech only. Each command imports what it needs, so that ``otolith --help`` is quick."""
 
-import math
 import re
 import signal
 from pathlib import Path
@@ -11,6 +10,7 @@ from otolith import __version__
 from otolith.cli_components import commission, components
 from otolith.cli_noise import noise
 from otolith.cli_paper import paper
+from otolith.cli_plant import plant
 from otolith.cli_probe import probe
 from otolith.cli_process import StopSignal, log_to_stderr
 from otolith.cli_twin import twin
@@ -20,7 +20,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 EXIT_CODES = """\b
 Exit codes:
   0    done; run and plant also when stopped by SIGTERM
-  1    the demo's estimate was wrong, a target of paper was missed, or probe has found nothing
+  1    the demo's estimate was wrong, a target of paper was missed, probe has found nothing, or check missed a signal
   2    a file, option, bus or port cannot be used; the message says which and what to do
   130  interrupted by Ctrl-C (128 + the number of any other signal)"""
 
@@ -94,7 +94,7 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
 @cli.command()
 @click.argument("file", type=FILE)
 @click.option("--no-device", is_flag=True, help="Do not try to open the machine's bus.")
-def check(file: Path, no_device: bool) -> None:
+def check(file: Path, no_device: bool) -> int:
     """Read the machine file FILE, say what the daemon would do, and listen whether the signals come.
 
     \b
@@ -104,8 +104,7 @@ def check(file: Path, no_device: bool) -> None:
     """
     from otolith.check import check_machine
 
-    for line in check_machine(file, with_device=not no_device):
-        click.echo(line)
+    return 0 if check_machine(file, click.echo, with_device=not no_device) else 1
 
 
 @cli.command()
@@ -133,49 +132,6 @@ def replay(file: Path, data: Path, as_json: bool, recording: Path | None, real_t
     stop = StopSignal()
     replay(file, data, recording, as_json=as_json, stopped=lambda: stop.number is not None, real_time=real_time)
     return stop.code()
-
-
-@cli.command()
-@click.argument("scenario", type=FILE)
-@click.option(
-    "--as",
-    "transport",
-    type=click.Choice(["can", "modbus-tcp", "modbus-rtu"]),
-    default="can",
-    show_default=True,
-    help="What to be: a node on the CAN bus, or a Modbus drive on a port or a serial line of its own.",
-)
-@click.option("--truth", type=FILE, help="Write the parameters as they really are into this CSV file.")
-@click.option("--summary", type=FILE, help="Write at the end what was sent, asked and withheld into this JSON file.")
-@click.option("--duration", type=click.FloatRange(0.1), default=math.inf, metavar="SECONDS", help="End by then.")
-def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | None, duration: float) -> int:
-    """Be the simulated machine of SCENARIO, a device on its bus, in real time.
-
-    \b
-    Examples:
-      otolith plant config/scenarios/demo.toml
-      otolith plant config/scenarios/bus-dropouts.toml --as modbus-tcp --summary withheld.json
-    """
-    from contextlib import ExitStack, closing
-
-    from otolith_drivers.plant.nodes import open_node, write_summary
-    from otolith_drivers.plant.plants import load_scenario
-    from otolith_drivers.plant.truth import TruthFile
-    from otolith_drivers.private import complain_unless_writable
-
-    loaded = load_scenario(scenario)
-    if summary is not None:
-        complain_unless_writable(summary.absolute().parent)
-    stop = StopSignal()
-    with ExitStack() as stack:
-        true = stack.enter_context(closing(TruthFile(truth))) if truth is not None else None
-        node = stack.enter_context(closing(open_node(transport, loaded)))
-        click.echo(f"{node.title()}; Ctrl-C ends it", err=True)
-        done = node.run(true, lambda: stop.number is not None, duration)
-    if summary is not None:
-        write_summary(summary, loaded, transport, done)
-    click.echo(node.say(done), err=True)
-    return stop.code(clean=signal.SIGTERM)
 
 
 @cli.command()
@@ -257,5 +213,6 @@ cli.add_command(commission)
 cli.add_command(components)
 cli.add_command(noise)
 cli.add_command(paper)
+cli.add_command(plant)
 cli.add_command(probe)
 cli.add_command(twin)

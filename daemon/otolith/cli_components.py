@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,10 +80,7 @@ def _words(plan: "Plan", entry: "Kept") -> str:
 @click.argument("component")
 def approve(file: Path, component: str) -> None:
     """COMPONENT belongs to the healthy machine: it stays in the twin and is no finding."""
-    _, keeper = _keeper(file)
-    said = _unsaid(keeper, component)
-    keeper.decide(replace(said, approved=said.approved | {component}))
-    click.echo(f"{component} is approved")
+    _say(file, component, "approved", lambda said: replace(said, approved=said.approved | {component}))
 
 
 @components.command()
@@ -91,10 +88,7 @@ def approve(file: Path, component: str) -> None:
 @click.argument("component")
 def reject(file: Path, component: str) -> None:
     """COMPONENT is none: it leaves the twin and is not looked for again."""
-    _, keeper = _keeper(file)
-    said = _unsaid(keeper, component)
-    keeper.decide(replace(said, rejected=said.rejected | {component}))
-    click.echo(f"{component} is rejected")
+    _say(file, component, "rejected", lambda said: replace(said, rejected=said.rejected | {component}))
 
 
 @components.command()
@@ -102,10 +96,15 @@ def reject(file: Path, component: str) -> None:
 @click.argument("component")
 def forget(file: Path, component: str) -> None:
     """Forget COMPONENT and what was said of it: if it is there, it will be found anew."""
+    moment = time.time()
+    _say(file, component, "forgotten", lambda said: replace(said, forgotten={**said.forgotten, component: moment}))
+
+
+def _say(file: Path, component: str, word: str, more: "Callable[[Decisions], Decisions]") -> None:
+    """Keep ``more`` in the place of what has been said of ``component``."""
     _, keeper = _keeper(file)
-    said = _unsaid(keeper, component)
-    keeper.decide(replace(said, forgotten={**said.forgotten, component: time.time()}))
-    click.echo(f"{component} is forgotten")
+    keeper.decide(more(_unsaid(keeper, component)))
+    click.echo(f"{component} is {word}")
 
 
 def _keeper(file: Path) -> "tuple[Plan, Keeper]":

@@ -15,7 +15,7 @@ from pymodbus.framer.rtu import FramerRTU
 
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.modbus_poller import ModbusPoller, Options, Source, build
-from tests.drivers.test_modbus import wait_for
+from tests.drivers.modbus_readers import wait_for
 
 REGISTERS = {"a": 1000, "b": 2000}
 TIMEOUT = 0.2  # s

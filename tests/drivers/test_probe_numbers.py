@@ -12,7 +12,7 @@ from otolith_drivers.probe_layouts import FRAMES, REGISTERS, Layout
 from otolith_drivers.probe_modbus import Block, Words
 from otolith_drivers.probe_numbers import Part, Verdict, parts
 from otolith_drivers.probe_registers import Number, numbers_of
-from tests.drivers.test_modbus_parts import registers
+from tests.drivers.registers import registers
 
 READINGS = 250
 KINDS: list[TypeName] = ["int16", "uint16", "int32", "float32", "float64"]

@@ -1,0 +1,57 @@
+"""Pollers of a server of our own, and who takes what they read."""
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from otolith_drivers.base import Link, Sample, Setup, Signal
+from otolith_drivers.modbus_poller import ModbusPoller, Options, Source, build
+
+PERIOD = 0.01
+
+
+def floats(*values: float) -> dict[int, int]:
+    """The registers of numbers of 32 bits, from address 0 on."""
+    return dict(enumerate(struct.unpack(f">{2 * len(values)}H", struct.pack(f">{len(values)}f", *values))))
+
+
+def source(**keys: object) -> Source:
+    return Source.model_validate({"type": "float32", "unit": "V", **keys})
+
+
+def poller(port: int, sources: Sequence[Source], period: float = PERIOD, **options: object) -> ModbusPoller:
+    signals = tuple(Signal(f"s{index}", "V", entry) for index, entry in enumerate(sources))
+    found = Options.model_validate({"host": "127.0.0.1", "port": port, "timeout": "0.1 s", **options})
+    return build(found, Setup(signals, Path(), period))
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it never came"
+        time.sleep(0.005)
+
+
+class Listener:
+    """Opens a driver, keeps what it delivers, closes it."""
+
+    def __init__(self, driver: ModbusPoller) -> None:
+        self.driver = driver
+        self.samples: list[Sample] = []
+
+    def __enter__(self) -> "Listener":
+        self.driver.open(self.samples.extend)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.driver.close()
+
+    def of(self, name: str) -> list[Sample]:
+        return [sample for sample in self.samples if sample.signal == name]
+
+    def wait(self, condition: Callable[[Link], bool]) -> None:
+        wait_for(lambda: condition(self.driver.link()))
+
+
+TWO = [source(register=0), source(register=2)]
