@@ -15,9 +15,31 @@ from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.plants import load_scenario, simulate
 
 EXAMPLES = examples_directory()
+TESTS = Path(__file__).parent
 settings.register_profile("otolith", deadline=None)  # how long an example takes depends on who else computes
 settings.load_profile("otolith")
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
+
+
+# What only computes: no bus, no port, no clock, so that it may run slowly beside what lives in real time.
+COMPUTED = frozenset({
+    "adaptation",
+    "twin",
+    "health",
+    "test_guide.py",
+    "test_noise.py",
+    "test_paper.py",
+    "test_paper_unknown.py",
+    "test_replay.py",
+    "test_replay_tables.py",
+})  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what only computes."""
+    for item in items:
+        if item.path.is_relative_to(TESTS) and item.path.relative_to(TESTS).parts[0] in COMPUTED:
+            item.add_marker("computed")
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Verdict, Window
-from otolith.adaptation.case import Case, Hypothesis
+from otolith.adaptation.case import Case
 from otolith.adaptation.catalogue import FADES_AFTER, adopted, alternatives, approving, faded, slot_of, words
 from otolith.adaptation.claims import Reason
 from otolith.adaptation.completion import plain
@@ -28,6 +28,7 @@ from otolith.adaptation.gate import (
     refuse,
 )
 from otolith.adaptation.glance import glance
+from otolith.adaptation.hypothesis import Hypothesis
 from otolith.adaptation.length import Need, next_records
 from otolith.adaptation.objective import EXPLAINED
 from otolith.adaptation.prior import Prior

@@ -21,10 +21,10 @@ from types import FrameType
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
-from otolith.adaptation.information import QUANTILE
 from otolith.companion import SIGNALS, Companion
 from otolith.errors import OtolithError
-from otolith.health.report import CountersDocument, DriverDocument, Report, ReportDocument, Status
+from otolith.health.report import CountersDocument, DriverDocument, Report
+from otolith.health.words import summary
 from otolith.housekeeper import Housekeeper
 from otolith.keeping import Keeper
 from otolith.notify import Notifier
@@ -240,21 +240,3 @@ class Service:
             except OtolithError as error:  # recordings are not what the machine is watched for
                 log.warning("no recording: %s", error)
                 self._recorder.postpone()
-
-
-def summary(document: ReportDocument) -> str:
-    """A report in one line."""
-    parts = [f"window {document.window.index} {document.window.quality.verdict}"]
-    for name, parameter in document.parameters.items():
-        if parameter.value is None or parameter.sd is None:
-            parts.append(f"{name} unknown ({parameter.reason})")
-        else:
-            held = "" if parameter.status is Status.ESTIMATED else f" ({parameter.status}: {parameter.reason})"
-            parts.append(f"{name} {parameter.value:.5g} {parameter.unit} ± {QUANTILE * parameter.sd:.2g}{held}")
-    parts += [f"{finding.severity}: {finding.text}" for finding in document.findings]
-    if document.driver is not None:
-        parts += [] if document.driver.up else [f"no connection: {document.driver.reason}"]
-        parts += document.driver.complaints[:1]
-        more = len(document.driver.complaints) - 1
-        parts += [f"and {more} more like that"] if more > 0 else []
-    return ", ".join(parts)

@@ -30,7 +30,7 @@ class Injected:
     until: float
     keys: str = ""
     on: tuple[str, ...] = BOTH
-    within: float = 5 * WINDOW
+    within: float = 3 * WINDOW
     """s, from its end to the beginning of the next window that is estimated from."""
 
     def __str__(self) -> str:
@@ -83,14 +83,7 @@ def is_sound(report: ReportDocument) -> bool:
     return report.window.quality.verdict is Verdict.GOOD and parameter.status is Status.ESTIMATED
 
 
-# A window of which a part is frozen while the machine hardly moves opens a case, which polled windows may not end.
-LINGERS = pytest.mark.xfail(strict=False, reason="a case opened by half a frozen window may stay open for a while")
-LIVES = [
-    pytest.param(transport, fault, marks=[LINGERS] if (transport, fault.kind) == ("modbus-tcp", "frozen") else [])
-    for transport in BOTH
-    for fault in FAULTS
-    if transport in fault.on
-]
+LIVES = [(transport, fault) for transport in BOTH for fault in FAULTS if transport in fault.on]
 
 
 @pytest.mark.parametrize(("transport", "fault"), LIVES, ids=lambda value: getattr(value, "kind", value))

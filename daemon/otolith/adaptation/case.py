@@ -9,46 +9,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
-from otolith.adaptation.claims import Claim, Explanation, Reason, explanation, unexplained
-from otolith.adaptation.deactivation import NOTICED, says_nothing, weights
-from otolith.adaptation.fusion import Belief, carried, overall, rebased, updated, with_prior
+from otolith.acquisition.window import Window
+from otolith.adaptation.claims import Explanation, Reason, explanation, unexplained
+from otolith.adaptation.deactivation import pruned, with_content
+from otolith.adaptation.fusion import Belief, carried, overall, updated
 from otolith.adaptation.glance import glance
-from otolith.adaptation.information import inflation
-from otolith.adaptation.prior import Evidence
+from otolith.adaptation.hypothesis import Hypothesis, begun, cost_of, occam
+from otolith.adaptation.hypothesis import told as told_by
 from otolith.adaptation.problem import Problem
 from otolith.adaptation.screening import CLEARLY
-from otolith.adaptation.tracking import Turned, left_out, moved_on, turned
+from otolith.adaptation.tracking import moved_on, turned
 
 MOST = 7  # explanations that are followed
 WORTH = 30.0  # in -2 log evidence: an explanation worse than the best by more is not followed
 MOST_OF_ONE = 20.0  # the same, of one window: none decides alone
 MOST_OF_FIRST = 15.0  # the same, of the first: if it was wrong, the second one outweighs it
 DIVERGED = 1e12  # χ² of a twin that explains nothing at all
-BETTER = 4.0  # in -2 log evidence, of one window: nearer to nothing, it told for nobody
 SEEN_AGAIN = 3  # windows, after which an explanation must be more than what nothing would be
 LONGEST_MEMORY = 60.0  # the same: how far behind one may fall, so that it can come back when things change
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Hypothesis:
-    """One explanation, and what it knows. Plain: it pickles."""
-
-    claim: Claim
-    problem: Problem
-    belief: Belief
-    turned: Turned
-    deviance: float
-    """-2 log evidence of all windows so far, over that of the best."""
-    cost: float
-    """RMSE over noise that it left of the last window."""
-    silent: bool = True
-    """Whether what it left of the last window looked like noise."""
-
-    @property
-    def reason(self) -> Reason:
-        """What kind of explanation it is."""
-        return self.claim.reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +108,7 @@ def opened(explanations: Sequence[Explanation], problem: Problem, expected: Beli
     kept = [at for at in order if deviances[at] <= least + WORTH][:MOST]
     kept += [at for at in order if explanations[at].reason in (Reason.NOTHING, Reason.PARAMETER) and at not in kept]
     found = [
-        _begun(explanations[at], problem, expected, window, min(deviances[at] - least, MOST_OF_FIRST)) for at in kept
+        begun(explanations[at], problem, expected, window, min(deviances[at] - least, MOST_OF_FIRST)) for at in kept
     ]
     surprise = explanations[0].chi_square / max(records, 1.0)
     best = explanations[order[0]]
@@ -148,9 +126,9 @@ def followed(case: Case, window: Window) -> Case:
     fits = [fit for fit in fits if fit[2].chi_square < DIVERGED] or fits[:1]
     records = fits[0][2].informed.count
     left = unexplained([fit.chi_square for _, _, fit in fits], records)
-    told = [_told(fit) for _, _, fit in fits]
+    told = [told_by(fit) for _, _, fit in fits]
     deviances = [
-        fit.chi_square / left + _occam(belief, evidence, entry.problem)
+        fit.chi_square / left + occam(belief, evidence, entry.problem)
         for (entry, belief, fit), (evidence, _) in zip(fits, told, strict=True)
     ]
     least = min(deviances)
@@ -161,12 +139,12 @@ def followed(case: Case, window: Window) -> Case:
         after = updated(belief, evidence, entry.problem)
         more = min(deviance - least, MOST_OF_ONE)
         found.append(replace(
-            entry, belief=after, turned=turned(entry.problem, window, last), cost=_cost(fit),
+            entry, belief=after, turned=turned(entry.problem, window, last), cost=cost_of(fit),
             deviance=entry.deviance + more,
         ))  # fmt: skip
     if case.windows + 1 >= SEEN_AGAIN:
-        found = _with_content(found, deviances)
-    hypotheses = _sorted([_pruned(entry) for entry in found])
+        found = with_content(found, deviances)
+    hypotheses = _sorted([pruned(entry) for entry in found])
     leading = case.leading + 1 if hypotheses[0].claim.name == case.best.claim.name else 1
     case = replace(case, leading=leading)
     best = next((fit for entry, _, fit in fits if entry.claim == hypotheses[0].claim), None)
@@ -195,60 +173,3 @@ def _sorted(found: list[Hypothesis]) -> tuple[Hypothesis, ...]:
     least = min(entry.deviance for entry in found)
     ordered = sorted(found, key=lambda entry: entry.deviance)
     return tuple(replace(entry, deviance=min(entry.deviance - least, LONGEST_MEMORY)) for entry in ordered)
-
-
-def _with_content(found: list[Hypothesis], deviances: list[float]) -> list[Hypothesis]:
-    """Without those that say by now that nothing has happened, and explained the window no better than that."""
-    at = next((at for at, entry in enumerate(found) if entry.reason is Reason.NOTHING), None)
-    if at is None:
-        return found
-    calm = found[at]
-    return [
-        entry
-        for entry, deviance in zip(found, deviances, strict=True)
-        if entry is calm
-        or deviance < deviances[at] - BETTER
-        or not says_nothing(entry.problem, entry.belief, calm.problem, calm.belief)
-    ]
-
-
-def _pruned(entry: Hypothesis) -> Hypothesis:
-    """Without components that do not carry their weight beside others (the paper's "deactivated")."""
-    problem = entry.problem
-    if len(problem.components) < 2:
-        return entry
-    carried_by = weights(problem, entry.belief)
-    weakest = int(np.argmin(carried_by))
-    if carried_by[weakest] >= NOTICED:
-        return entry
-    problem, belief, turn = left_out(problem, entry.belief, entry.turned, weakest)
-    claim = entry.claim
-    if claim.reason in (Reason.COMPONENT, Reason.SENSOR):  # the others are not about what is in the twin
-        claim = replace(claim, name=" and ".join(component.key for component in problem.components))
-    return replace(entry, claim=claim, problem=problem, belief=belief, turned=turn)
-
-
-def _begun(found: Explanation, problem: Problem, expected: Belief, window: Window, deviance: float) -> Hypothesis:
-    evidence, last = _told(found)
-    belief = with_prior(rebased(expected, problem, found.problem), found.prior, found.problem)
-    belief = updated(belief, evidence, found.problem)
-    after = turned(found.problem, window, last)
-    return Hypothesis(found.claim, found.problem, belief, after, deviance, _cost(found))
-
-
-def _told(found: Explanation) -> tuple[Evidence, Array]:
-    """What the window says, and the state (states,) at its last record."""
-    informed, cost = found.informed, _cost(found)
-    grown = inflation(informed.whitened(found.fit), cost)
-    return informed.evidence(found.fit, grown), informed.last_state(found.fit)
-
-
-def _cost(found: Explanation) -> float:
-    return float(np.sqrt(found.informed.chi_square(found.fit) / found.informed.count))
-
-
-def _occam(belief: Belief, evidence: Evidence, problem: Problem) -> float:
-    """How little the hypothesis said beforehand of what the window then said, as -2 log evidence."""
-    known = overall(belief, problem).covariance
-    seen = evidence.root @ known @ evidence.root.T
-    return float(np.linalg.slogdet(np.eye(len(seen)) + seen)[1])

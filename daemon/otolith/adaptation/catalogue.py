@@ -5,11 +5,12 @@ from enum import StrEnum
 
 import numpy as np
 
-from otolith.adaptation.case import Case, Hypothesis
+from otolith.adaptation.case import Case
 from otolith.adaptation.claims import Reason
 from otolith.adaptation.completion import equation, places, plain, site_of
 from otolith.adaptation.component import Component
 from otolith.adaptation.fusion import overall
+from otolith.adaptation.hypothesis import Hypothesis
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
 

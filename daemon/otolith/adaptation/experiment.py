@@ -8,9 +8,9 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.advice import ELSE, SUBSTEPS, Move, Situation, moves, numbers_at
-from otolith.adaptation.case import Hypothesis
 from otolith.adaptation.completion import plain
 from otolith.adaptation.fusion import overall
+from otolith.adaptation.hypothesis import Hypothesis
 from otolith.adaptation.screening import CLEARLY
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twin.slots import ELAPSED

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
+from otolith.adaptation.motion import MEMORY, motion
 from otolith.adaptation.prior import Evidence, Prior, vague
 from otolith.adaptation.problem import Problem
 
 AGITATIONS = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: how much a trend strays, in shares of the parameter
-MEMORY = 300.0  # s: a trend that nothing confirms dies away, so that no held value runs off
 STAY = 0.97  # probability that from one window to the next the same model holds
 CALMEST = 1  # levels under the liveliest parameter's
 LIVELIEST = len(AGITATIONS) - 1
@@ -87,7 +87,7 @@ def carried(belief: Belief, end: float) -> Belief:
         return belief
     belief = _mixed(belief)
     free = belief.mean.shape[1] // 2
-    transition, noise = _motion(min(end - belief.end, LONGEST_GAP))
+    transition, noise = motion(min(end - belief.end, LONGEST_GAP))
     move, strays = _per_parameter(transition, np.ones(free)), _per_parameter(noise, AGITATIONS[belief.level] ** 2)
     covariance = move @ belief.covariance @ move.T + strays
     return replace(belief, mean=belief.mean @ move.T, covariance=covariance, end=end)
@@ -233,24 +233,6 @@ def _mixed(belief: Belief) -> Belief:
     off = belief.mean[:, None, :] - mean[None, :, :]
     spread = belief.covariance[:, None] + off[..., :, None] * off[..., None, :]
     return replace(belief, mean=mean, covariance=np.einsum("on,onij->nij", share, spread), weight=weight)
-
-
-def _motion(passed: float) -> tuple[Array, Array]:
-    """Transition and noise (per unit of agitation) of value and trend over ``passed`` s.
-
-    The trend is an Ornstein-Uhlenbeck process, the value its integral (C. W. Gardiner, Stochastic Methods, section
-    3.8).
-    """
-    share = passed / MEMORY
-    fade = np.exp(-share)
-    run = MEMORY * -np.expm1(-share)
-    if share < 1e-3:  # the closed form loses its digits
-        noise = np.array([[passed**3 / 3.0, passed**2 / 2.0], [passed**2 / 2.0, passed]])
-    else:
-        both = MEMORY**2 * 0.5 * (1.0 - fade) ** 2
-        value = MEMORY**3 * (share - 2.0 * (1.0 - fade) + 0.5 * (1.0 - fade**2))
-        noise = np.array([[value, both], [both, MEMORY * 0.5 * (1.0 - fade**2)]])
-    return np.array([[1.0, run], [0.0, fade]]), noise
 
 
 def _size(problem: Problem) -> Array:

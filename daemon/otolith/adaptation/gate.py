@@ -10,11 +10,12 @@ from enum import StrEnum
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.case import Case, Hypothesis, followed, joined, opened
+from otolith.adaptation.case import Case, followed, joined, opened
 from otolith.adaptation.claims import Claim, Reason, explanation
 from otolith.adaptation.discovery import onset, search
 from otolith.adaptation.fusion import Belief, begin_belief, contradicted, overall, surprise, updated
 from otolith.adaptation.glance import Glance, glance
+from otolith.adaptation.hypothesis import Hypothesis
 from otolith.adaptation.objective import EXPLAINED
 from otolith.adaptation.prior import Evidence, Prior
 from otolith.adaptation.problem import Problem
