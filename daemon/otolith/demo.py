@@ -32,6 +32,7 @@ from otolith_drivers.plant.plants import load_scenario
 
 TOLERANCE = 0.005  # of the injected value: what every window with current must be found within
 START_UP, TO_FIND = 10.0, 15.0  # s until plant and daemon listen to each other, and for a component to be adopted
+MOST_UNKNOWN = 0.1  # of the windows: that may say that they do not know, as while a case is being decided
 STOP_SECONDS = 2.5  # for a process to end by itself
 PAUSE = 0.1  # s
 ROWS = 15  # of the table at the end
@@ -153,14 +154,17 @@ class Demo:
 
     def _verdict(self) -> int:
         compared = compare(self._reports, _read_columns(self._folder / "truth.csv"))
-        wrong = [row for row in compared if row.error > TOLERANCE]
+        wrong = [row for row in compared if row.found is not None and row.error > TOLERANCE]
+        unknown = sum(row.found is None for row in compared)
         begun = [fault for fault in self._unbalances() if fault.start + TO_FIND < self._duration - START_UP]
         shaken = [shaking(fault, self._life.parameters.J, self._reports) for fault in begun]
-        right = bool(compared) and not wrong and all(entry.right for entry in shaken)
+        known = bool(compared) and unknown <= MOST_UNKNOWN * len(compared)
+        right = known and not wrong and all(entry.right for entry in shaken)
         if self._as_json:
             self._print_json(compared, shaken, right=right)
         else:
-            self._print_table(compared, wrong)
+            self._print_table(compared)
+            self._print_sum(compared, wrong, unknown)
             for entry in shaken:
                 self._console.print(f"[{'green' if entry.right else 'red'}]{entry}[/]", highlight=False, soft_wrap=True)
         return 0 if right else 1
@@ -178,12 +182,13 @@ class Demo:
             "components": components,
             "right": right,
             "tolerance": TOLERANCE,
+            "unknown": sum(row.found is None for row in compared),
             "windows": rows,
             "recording": str(self.recording),
         }
         sys.stdout.write(json.dumps(verdict) + "\n")
 
-    def _print_table(self, compared: list[Comparison], wrong: list[Comparison]) -> None:
+    def _print_table(self, compared: list[Comparison]) -> None:
         units = {entry.name: entry.unit for entry in self._plan.problem.free}
         step = max(1, len(compared) // ROWS)
         every = "" if step == 1 else f" (one row of {step})"
@@ -193,24 +198,30 @@ class Demo:
         shown = [*compared[::step], *(row for row in compared[-1:] if (len(compared) - 1) % step)]
         for row in shown:
             found = "unknown" if row.found is None else f"{row.found:.5g} ± {row.half_width or 0.0:.2g}"
-            style = "red" if row.error > TOLERANCE else None
+            style = "red" if row.found is not None and row.error > TOLERANCE else None
             error = "" if row.found is None else f"{row.error:.3%}"
             table.add_row(str(row.window), row.parameter, f"{row.injected:.5g}", found, units[row.parameter], error,
                           style=style)  # fmt: skip
-        say = self._console.print
-        say(table)
+        self._console.print(table)
         for name, unit in units.items():
             rows = [row for row in compared if row.parameter == name]
-            if rows:
+            errors = [row.error for row in rows if row.found is not None]
+            if errors:
                 before, after = rows[0].injected, rows[-1].injected
                 change = f"{name} went from {before:.5g} to {after:.5g} {unit} ({after / before - 1:+.1%})"
-                say(f"{change}; largest error {max(row.error for row in rows):.3%} in {len(rows)} windows")
+                self._console.print(f"{change}; largest error {max(errors):.3%} in {len(errors)} windows")
+
+    def _print_sum(self, compared: list[Comparison], wrong: list[Comparison], unknown: int) -> None:
+        say = self._console.print
         if not compared:
             say("[red]no good window with excitation: nothing was shown[/red]")
         elif wrong:
             say(f"[red]{len(wrong)} windows are wrong by more than {TOLERANCE:.1%}[/red]")
         else:
             say(f"[green]every one is within {TOLERANCE:.1%} of what was injected[/green]")
+        if unknown:
+            style = "yellow" if unknown <= MOST_UNKNOWN * len(compared) else "red"
+            say(f"[{style}]{unknown} of {len(compared)} windows said that they do not know[/]")
         say(f"recording: {self.recording}", soft_wrap=True)
         say(f"open it with: {Path(sys.executable).with_name('otolith')} view {self.recording}", soft_wrap=True)
 

@@ -97,7 +97,9 @@ def test_foreign_processes_see_frames_and_reports_and_the_recording_is_whole(run
         half = 0.5 * (report.window.end - report.window.start) / report.window.records
         inside = (times >= report.window.start - half) & (times < report.window.end - half)
         assert inside.sum() == report.window.records
-        assert np.isfinite(values[inside]).all(axis=1).mean() >= 1.0 - report.window.quality.missing
+        estimated = report.window.quality.verdict is Verdict.GOOD  # a bad window has no twin beside it
+        whole = np.isfinite(values[inside][:, : 2 if estimated else 1]).all(axis=1)
+        assert whole.mean() >= 1.0 - report.window.quality.missing
     _, resistance = series(running.recording, "/parameters/R_a")
     assert resistance[: len(reports), 2].tolist() == [report.parameters["R_a"].value for report in reports]
 
@@ -125,7 +127,7 @@ def test_the_worker_can_be_killed_at_any_time(running: Running) -> None:
     for before, after in pairwise(reports):
         if after.window.index == before.window.index + 1:
             assert after.window.start == pytest.approx(before.window.end, abs=0.005)  # half a period
-        assert after.window.quality.verdict is Verdict.GOOD
+        assert after.window.quality.missing == 0.0
     assert reports[-1].parameters["R_a"].status is Status.ESTIMATED
 
 
