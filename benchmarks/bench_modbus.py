@@ -45,7 +45,7 @@ def drive(port: int, up: Event) -> None:
 def bare(port: int, seconds: float) -> list[float]:
     """Moments of reading by the library alone."""
     client = ModbusTcpClient("127.0.0.1", port=port, timeout=0.5, retries=0)
-    client.connect()  # type: ignore[no-untyped-call]
+    client.connect()  # type: ignore[no-untyped-call]  # of a library that is typed but for this
     begun, moments = time.monotonic(), list[float]()
     for index in range(round(seconds / PERIOD)):
         left = begun + index * PERIOD - time.monotonic()
@@ -54,7 +54,7 @@ def bare(port: int, seconds: float) -> list[float]:
         asked = time.monotonic()
         if not client.read_holding_registers(0, count=2 * NUMBERS, device_id=1).isError():
             moments.append(0.5 * (asked + time.monotonic()))
-    client.close()  # type: ignore[no-untyped-call]
+    client.close()  # type: ignore[no-untyped-call]  # as above
     return moments
 
 

@@ -97,7 +97,7 @@ def _parameters(document: ReportDocument, histories: Mapping[str, tuple[float, .
 def _components(document: ReportDocument) -> Table:
     table = Table(expand=False)
     for column in ("component", "equation", "amplitude ± 95 %", "since", "status"):
-        table.add_column(column, no_wrap=True)
+        table.add_column(column, overflow="fold")  # an equation that is cut off is none
     for entry in document.components:
         amplitude = entry.values["amplitude"]
         text = f"{amplitude.value:.4g} ± {QUANTILE * amplitude.sd:.2g} {amplitude.unit}"

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Iterator
+from datetime import UTC, datetime
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
@@ -13,7 +14,15 @@ from otolith.console import STYLES, value_cells
 from otolith.health.report import ReportDocument, Status
 
 MOST_REASONS = 5  # that are told
+DATES_FROM = 1e8  # s: three years
 FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")
+
+
+def moment(seconds: float) -> str:
+    """A time of the data: seconds as they are, or the date where they can only be those since 1970."""
+    if seconds < DATES_FROM:
+        return f"{round(seconds, 6) + 0.0:.12g} s"
+    return f"{datetime.fromtimestamp(seconds, UTC):%F %T}Z"
 
 
 class Tally:
@@ -51,8 +60,7 @@ class Tally:
             yield Text("no window")
             return
         last = self._last
-        start, end = (round(moment, 6) + 0.0 for moment in (self._first.window.start, last.window.end))
-        span = f"from {start:.12g} s to {end:.12g} s"
+        span = f"from {moment(self._first.window.start)} to {moment(last.window.end)}"
         yield Text.assemble((last.machine, "bold"), f" at {last.site}, twin {last.twin} ({last.model}), {span}")
         yield self._parameters(last)
         for name, parameter in last.parameters.items():
@@ -60,7 +68,7 @@ class Tally:
                 yield Text(f"{name} in the last window: {parameter.reason}", style="yellow")
         for entry in last.components:
             yield Text(
-                f"{entry.meaning}: {entry.equation}, since {entry.onset:.12g} s ({entry.approval})", style="bold red"
+                f"{entry.meaning}: {entry.equation}, since {moment(entry.onset)} ({entry.approval})", style="bold red"
             )
         for finding in last.findings:
             if finding.id not in {entry.id for entry in last.components}:

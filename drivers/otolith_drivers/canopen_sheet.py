@@ -51,7 +51,8 @@ def dictionary_of(path: Path, node: int, warnings: list[str]) -> "ObjectDictiona
         names = ", ".join(unread[:3]) + (" ..." if len(unread) > 3 else "")
         warnings.append(f"{path.name}: {len(unread)} objects cannot be read: {names}")
     try:
-        found: ObjectDictionary = eds.import_eds(io.StringIO(written(sections)), node)  # type: ignore[no-untyped-call]
+        sheet = io.StringIO(written(sections))
+        found: ObjectDictionary = eds.import_eds(sheet, node)  # type: ignore[no-untyped-call]  # the library has no types
     except Exception as error:
         cause = " ".join(str(error).split())[:200] or type(error).__name__
         raise ConfigurationError(f"{path}: not an electronic data sheet: {cause}", key) from error

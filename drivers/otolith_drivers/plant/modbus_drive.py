@@ -147,7 +147,7 @@ class Server(ModbusTcpServer):
 
     async def begin(self, attach: Callable[[], Awaitable[Any]]) -> None:
         """Serve what ``attach`` makes: a listening server, or a transport and its protocol."""
-        self.call_create = attach  # type: ignore[assignment]
+        self.call_create = attach  # type: ignore[assignment]  # declared as what its own constructor gives
         await self.serve_forever(background=True)
 
     def callback_new_connection(self) -> Conversation:
