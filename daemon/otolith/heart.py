@@ -33,7 +33,7 @@ from otolith.adaptation.length import Need, next_records
 from otolith.adaptation.objective import EXPLAINED
 from otolith.adaptation.prior import Prior
 from otolith.adaptation.problem import Problem
-from otolith.adaptation.repeats import counted_once
+from otolith.adaptation.repeats import counted_twice
 from otolith.adaptation.sensors import stuck
 from otolith.adaptation.spikes import without_spikes
 from otolith.adaptation.tracking import is_lost, left_out, moved_on, outlived, turned
@@ -86,7 +86,7 @@ def _judge(state: State, window: Window) -> Learned:
         vetoes = stuck(problem, window, _start(before, problem))
     if vetoes:
         return replace(untaught, memory=refuse(memory), lesson=Lesson.SENSOR, reason=UNUSED + "; ".join(vetoes))
-    window, repeated = counted_once(window, plain(problem))
+    window, repeated = counted_twice(window, plain(problem))
     learned = _learn(state, window, expected, untaught)
     return replace(learned, reason="; ".join(filter(None, (*notes, *repeated, learned.reason))))
 
