@@ -105,8 +105,9 @@ def modbus(
       otolith probe modbus /dev/ttyUSB0 --baudrate 9600 --parity N --device 5
       otolith probe modbus /dev/ttyUSB0 --scan                 which devices are on the line
     """
+    from otolith.probe_document import document
     from otolith.probe_grids import console
-    from otolith.probe_modbus import document, probe_device, scan_line, show_device, show_scan
+    from otolith.probe_modbus import probe_device, scan_line, show_device, show_scan
     from otolith_drivers.modbus_options import LineOptions
     from otolith_drivers.probe_registers import Place
     from otolith_drivers.toml_files import fitted

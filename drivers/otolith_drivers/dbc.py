@@ -184,8 +184,7 @@ def _message_by_message(text: str) -> tuple[list[Message], dict[str, str]]:
 
 def _cause(error: BaseException) -> str:
     text = " ".join(str(error).split())
-    if single := re.fullmatch(r'(?:DBC|KCD|SYM|ARXML): "(.*)"', text):
-        text = single[1]
+    text = re.sub(r'^(?:DBC|KCD|SYM|ARXML): "(.*)"$', r"\1", text)
     return text[:200] or type(error).__name__
 
 

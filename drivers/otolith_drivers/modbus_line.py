@@ -20,49 +20,12 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException
 from pymodbus.framer import FramerType
 
+from otolith_drivers.modbus_failures import Broken, Refused, Silent
 from otolith_drivers.modbus_options import LineOptions, Table
 
 FUNCTION_CODES: Final[dict[Table, int]] = {"holding": 3, "input": 4}
-# Modbus Application Protocol V1.1b3, section 7.
-EXCEPTIONS = {
-    1: "illegal function",
-    2: "illegal data address",
-    3: "illegal data value",
-    4: "server device failure",
-    5: "acknowledge, it takes longer",
-    6: "server device busy",
-    8: "memory parity error",
-    10: "gateway path unavailable",
-    11: "gateway target device failed to respond",
-}
-GATEWAY_CODES = (10, 11)
 HUSH_STEP, MOST_HUSH = 0.02, 5  # s; timeouts
 SILENT_LOG = logging.getLogger("pymodbus")
-
-
-class Refused(Exception):  # noqa: N818 - what the device has done, said in the words of the field
-    """The device answers that it does not want to.
-
-    Example scenarios: registers that it does not have, more of them than it gives at once, busy.
-    """
-
-    def __init__(self, code: int) -> None:
-        super().__init__(f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
-        self.code = code
-
-
-class Silent(Exception):  # noqa: N818
-    """No answer, or none to the question, in time; the line itself stands.
-
-    Example scenarios: device switched off, wrong device number, wrong baud rate, a late answer to an earlier question.
-    """
-
-
-class Broken(Exception):  # noqa: N818
-    """The line is gone.
-
-    Example scenarios: connection refused or closed, host unreachable, serial adapter pulled out.
-    """
 
 
 class Line:

@@ -11,8 +11,9 @@ import time
 from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
+from otolith_drivers.modbus_failures import Broken, Refused, Silent
 from otolith_drivers.modbus_freshness import Freshness
-from otolith_drivers.modbus_line import Broken, Line, Refused, Silent
+from otolith_drivers.modbus_line import Line
 from otolith_drivers.modbus_options import Item, Options, Source, item_of
 from otolith_drivers.modbus_pace import Pace
 from otolith_drivers.modbus_plan import Request, plan, summary

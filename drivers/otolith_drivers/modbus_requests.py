@@ -6,7 +6,7 @@ refused is split until only what the device does not have is left out.
 
 from dataclasses import dataclass, field
 
-from otolith_drivers.modbus_line import GATEWAY_CODES, Refused
+from otolith_drivers.modbus_failures import GATEWAY_CODES, Refused
 from otolith_drivers.modbus_plan import Request, split
 
 PATIENCE = 3  # failures in a row before something is left alone

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.modbus_line import EXCEPTIONS, GATEWAY_CODES, Broken, Line, Refused, Silent
+from otolith_drivers.modbus_failures import EXCEPTIONS, GATEWAY_CODES, Broken, Refused, Silent
+from otolith_drivers.modbus_line import Line
 from otolith_drivers.modbus_options import LineOptions, Table
 
 MOST_TIMES = 1000  # kept of each length of request

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.modbus_line import EXCEPTIONS, GATEWAY_CODES, Refused, Silent
+from otolith_drivers.modbus_failures import EXCEPTIONS, GATEWAY_CODES, Refused, Silent
 from otolith_drivers.modbus_options import MOST_REGISTERS
 from otolith_drivers.probe_line import Asker, Stopped, Told
 

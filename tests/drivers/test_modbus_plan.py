@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith_drivers.modbus_line import Refused
+from otolith_drivers.modbus_failures import Refused
 from otolith_drivers.modbus_options import Item, Options
 from otolith_drivers.modbus_pace import EASY, ROUNDS, Pace
 from otolith_drivers.modbus_plan import plan, split

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith_drivers.modbus_line import Broken, Line, Refused, Silent
+from otolith_drivers.modbus_failures import Broken, Refused, Silent
+from otolith_drivers.modbus_line import Line
 from otolith_drivers.modbus_poller import Options
 from tests.conftest import free_port
 from tests.drivers.modbus_readers import TWO, Listener, floats, poller, source, wait_for
