@@ -95,10 +95,10 @@ def past(index: int) -> Callable[[ModbusPDU], bool]:
     return lambda answer: not answer.isError() and answer.registers[COUNTER] >= index
 
 
-def line_says(line: int, enough: int) -> tuple[bytes, float]:
-    """Bytes from a line, until there are enough, and the seconds from now to the last of them."""
-    data, begun = b"", time.monotonic()
+def line_says(line: int, enough: int) -> bytes:
+    """Bytes from a line, until there are enough."""
+    data = b""
     while len(data) < enough:
         assert select.select([line], [], [], PATIENCE)[0], data.hex()
         data += os.read(line, 1000)
-    return data, time.monotonic() - begun
+    return data
