@@ -6,16 +6,18 @@ that nothing was fitted to before (prequential: A. P. Dawid, Journal of the Roya
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.claims import Explanation, Reason, explanation, unexplained
 from otolith.adaptation.deactivation import pruned, with_content
 from otolith.adaptation.fusion import Belief, carried, overall, updated
 from otolith.adaptation.glance import glance
-from otolith.adaptation.hypothesis import Hypothesis, begun, cost_of, occam
+from otolith.adaptation.hypothesis import Hypothesis, begun, cost_of, is_usable, occam
 from otolith.adaptation.hypothesis import told as told_by
+from otolith.adaptation.prior import Evidence
 from otolith.adaptation.problem import Problem
 from otolith.adaptation.screening import CLEARLY
 from otolith.adaptation.tracking import moved_on, turned
@@ -113,20 +115,18 @@ def opened(explanations: Sequence[Explanation], problem: Problem, expected: Beli
     surprise = explanations[0].chi_square / max(records, 1.0)
     best = explanations[order[0]]
     last = Told(best.chi_square, least - best.chi_square / left, records)
-    return Case(_sorted(found), window.start, last=last, surprise=max(surprise, 1.0))
+    return Case(
+        _sorted([entry for entry in found if entry is not None]), window.start, last=last, surprise=max(surprise, 1.0)
+    )
 
 
 def followed(case: Case, window: Window) -> Case:
     """The case after one more window."""
-    fits = []
-    for entry in case.hypotheses:
-        belief = carried(moved_on(entry.belief, entry.problem, entry.turned, window), window.end)
-        prior = overall(belief, entry.problem)
-        fits.append((entry, belief, explanation(replace(entry.claim, numbers=0), entry.problem, window, prior)))
-    fits = [fit for fit in fits if fit[2].chi_square < DIVERGED] or fits[:1]
+    fits, told = _explained(case, window)
+    if not fits:
+        return replace(case, windows=case.windows + 1)
     records = fits[0][2].informed.count
     left = unexplained([fit.chi_square for _, _, fit in fits], records)
-    told = [told_by(fit) for _, _, fit in fits]
     deviances = [
         fit.chi_square / left + occam(belief, evidence, entry.problem)
         for (entry, belief, fit), (evidence, _) in zip(fits, told, strict=True)
@@ -153,6 +153,24 @@ def followed(case: Case, window: Window) -> Case:
     gain = glance(best.problem, window, best.prior, best.fit.guess).gain
     hypotheses = (replace(hypotheses[0], silent=gain <= 0.0), *hypotheses[1:])
     return replace(case, hypotheses=hypotheses, windows=case.windows + 1)
+
+
+def _explained(
+    case: Case, window: Window
+) -> tuple[list[tuple[Hypothesis, Belief, Explanation]], list[tuple[Evidence, Array]]]:
+    """Each hypothesis that can use the window, with its belief carried there and its fit, and what that tells."""
+    fits = []
+    for entry in case.hypotheses:
+        belief = carried(moved_on(entry.belief, entry.problem, entry.turned, window), window.end)
+        prior = overall(belief, entry.problem)
+        fits.append((entry, belief, explanation(replace(entry.claim, numbers=0), entry.problem, window, prior)))
+    fits = [fit for fit in fits if fit[2].chi_square < DIVERGED] or fits[:1]
+    told = [told_by(fit) for _, _, fit in fits]
+    usable = [
+        entry.reason is Reason.NOTHING or is_usable(belief, evidence, entry.problem)
+        for (entry, belief, _), (evidence, _) in zip(fits, told, strict=True)
+    ]
+    return list(compress(fits, usable)), list(compress(told, usable))
 
 
 def joined(case: Case, fresh: Case) -> Case:

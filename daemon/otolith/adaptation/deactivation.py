@@ -59,7 +59,10 @@ def _weights(problem: Problem, belief: Belief) -> Array:
 
 def _says_nothing(entry: Hypothesis, calm: Hypothesis) -> bool:
     """Whether it is by now no different from ``calm``, in what it has added to the twin and in what it has freed."""
-    more = _weights(entry.problem, entry.belief)[len(calm.problem.components) :]
+    known, together = ([component.key for component in each.problem.components] for each in (calm, entry))
+    if together[: len(known)] != known:  # it says that one has gone
+        return False
+    more = _weights(entry.problem, entry.belief)[len(known) :]
     return bool((more < NOTICED).all() and (_shifts(entry, calm) < NOTICED).all())
 
 

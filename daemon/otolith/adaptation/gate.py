@@ -34,7 +34,7 @@ class Lesson(StrEnum):
     """What was made of a window."""
 
     LEARNED = "learned"
-    SUSPECTED = "it contradicts what was known: a sudden change or a wrong window; the next one decides"
+    SUSPECTED = "it contradicts what was known: a sudden change or a wrong window; further windows decide"
     STEPPED = "two windows agree on a sudden change"
     DISCOVERED = "several windows agree on a new component"
     FADED = "a component is no longer there"

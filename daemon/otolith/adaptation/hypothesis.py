@@ -34,10 +34,25 @@ class Hypothesis:
         return self.claim.reason
 
 
-def begun(found: Explanation, problem: Problem, expected: Belief, window: Window, deviance: float) -> Hypothesis:
-    """After its first window; ``expected`` is what was known of ``problem``, carried to its end."""
+SHARPEST = 1e7  # times what was known: a window that claims to say more says it where the twin all but diverges
+
+
+def is_usable(belief: Belief, evidence: Evidence, problem: Problem) -> bool:
+    """Whether a belief can be updated by that evidence without losing all digits."""
+    deviations = np.sqrt(np.diag(overall(belief, problem).covariance))
+    return bool((np.abs(evidence.root) * deviations < SHARPEST).all())  # not a number is not smaller either
+
+
+def begun(found: Explanation, problem: Problem, expected: Belief, window: Window, deviance: float) -> Hypothesis | None:
+    """After its first window; ``expected`` is what was known of ``problem``, carried to its end.
+
+    Returns:
+        None if the window cannot be used with it: its twin all but diverges.
+    """
     evidence, last = told(found)
     belief = with_prior(rebased(expected, problem, found.problem), found.prior, found.problem)
+    if found.reason is not Reason.NOTHING and not is_usable(belief, evidence, found.problem):
+        return None
     belief = updated(belief, evidence, found.problem)
     after = turned(found.problem, window, last)
     return Hypothesis(found.claim, found.problem, belief, after, deviance, cost_of(found))
