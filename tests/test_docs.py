@@ -37,6 +37,17 @@ def test_an_unknown_option_is_a_usage_error(name: str) -> None:
         CliRunner().invoke(cli, [name, "--no-such"], standalone_mode=False, catch_exceptions=False)
 
 
+@pytest.mark.parametrize("arguments", [("twin", "list"), ("--help",)], ids=" ".join)
+def test_a_reader_that_has_seen_enough_is_no_error(arguments: tuple[str, ...]) -> None:
+    command = [sys.executable, "-m", "otolith", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()  # before it has begun to write
+        assert not process.stderr.read()
+    assert process.returncode == 0
+
+
 def test_the_plant_can_be_whatever_it_has_a_node_for() -> None:
     assert set(TRANSPORTS) == set(NODES)
 

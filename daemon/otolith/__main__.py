@@ -21,6 +21,7 @@ def main() -> None:
     import click  # noqa: PLC0415 - after the lines above
 
     from otolith.cli import cli  # noqa: PLC0415
+    from otolith.cli_process import NobodyReads  # noqa: PLC0415
     from otolith.errors import OtolithError  # noqa: PLC0415
 
     try:
@@ -34,7 +35,7 @@ def main() -> None:
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = INTERRUPTED
-    except BrokenPipeError:  # the reader of our output has seen enough
+    except NobodyReads:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     except OSError as error:  # a disk that is full, a file that went away: nothing that a traceback would explain

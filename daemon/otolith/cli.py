@@ -2,7 +2,10 @@
 
 import re
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -12,7 +15,7 @@ from otolith.cli_noise import noise
 from otolith.cli_paper import paper
 from otolith.cli_plant import plant
 from otolith.cli_probe import probe
-from otolith.cli_process import StopSignal, log_to_stderr
+from otolith.cli_process import NobodyReads, StopSignal, log_to_stderr
 from otolith.cli_twin import twin
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -46,7 +49,27 @@ def _machine_name(_: click.Context, __: click.Parameter, name: str) -> str:
     return name
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog=EXIT_CODES)
+class _Commands(click.Group):
+    def make_context(self, *arguments: Any, **more: Any) -> click.Context:
+        with _read_or_not():
+            return super().make_context(*arguments, **more)
+
+    def invoke(self, ctx: click.Context) -> object:
+        with _read_or_not():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _read_or_not() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError as error:
+        raise NobodyReads from error
+
+
+@click.group(
+    cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog=EXIT_CODES
+)
 @click.version_option(__version__, prog_name="otolith")
 def cli() -> None:
     """Otolith makes an industrial machine aware of itself.

@@ -7,6 +7,10 @@ import sys
 from types import FrameType
 
 
+class NobodyReads(Exception):  # noqa: N818 - the reader of our output has seen enough, which is no error
+    """Not an OSError, as click would make exit code 1 of a broken pipe."""
+
+
 class StopSignal:
     """Remembers the signal that asks this command to end."""
 

@@ -102,6 +102,7 @@ class Demo:
         with (self._folder / f"{name}.log").open("wb") as log:
             self._processes[name] = subprocess.Popen(  # noqa: S603 - our own program
                 [sys.executable, "-m", "otolith", *arguments],
+                env={**os.environ, "STATE_DIRECTORY": str(self._folder)},  # no component of an earlier run
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

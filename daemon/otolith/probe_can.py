@@ -173,7 +173,11 @@ def show_bus(picture: Picture, options: BusOptions, database: Path | None, secon
 
 def lines_of(picture: Picture, options: BusOptions, database: Path | None) -> list[str]:
     """For the machine file."""
-    lines = [*driver_lines(options, picture, str(database) if database else None), "", *signal_lines(picture)]
+    lines = [
+        *driver_lines(options, picture, str(database.absolute()) if database else None),
+        "",
+        *signal_lines(picture),
+    ]
     quiet = [heard.name for heard in picture.ordered() if heard.message is None and not fields_of(heard)]
     if quiet:
         shown = ", ".join(quiet[:MOST_NAMED]) + (" ..." if len(quiet) > MOST_NAMED else "")

@@ -31,6 +31,7 @@ from otolith_drivers.probe_text import number_text
 LONGEST_NUMBER = 4  # registers
 FEWEST_ZEROS = 3  # registers in a row that are one row of the table
 MARKS = {Verdict.TOLD: "*", Verdict.COUNTS: "*", Verdict.LIKELY: "?"}
+ALONE = "a register alone may be half of a longer number: ask for its neighbours as well"
 LEGEND = "* what it is, told by how it moves    ? likely, but it hardly moves    · a number that no machine has"
 
 
@@ -127,6 +128,8 @@ def show_device(probed: Probed, console: Console, *, wide: bool) -> None:
         console.print(grid)
         console.print()
     console.print(LEGEND, style="dim", soft_wrap=True)
+    if probed.single:
+        console.print(ALONE, style="dim", soft_wrap=True)
     console.print()
     for text in lines_of(probed):
         console.print(text, markup=False, soft_wrap=True)

@@ -23,6 +23,8 @@ def _name(written: str) -> str:
 def _endpoint(written: str) -> str:
     if not re.fullmatch(rf"({'|'.join(PROTOCOLS)})/\S+", written):
         raise ValueError(f'{written!r} is no endpoint: write it like "tcp/127.0.0.1:7447" ({", ".join(PROTOCOLS)})')
+    if not written.startswith("unixsock-stream/") and not re.search(r":\d{1,5}$", written):
+        raise ValueError(f'{written!r} lacks its port: write it like "tcp/127.0.0.1:7447"')
     return written
 
 

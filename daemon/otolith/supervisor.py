@@ -20,7 +20,9 @@ log = logging.getLogger(__name__)
 ROOM = 2  # windows that wait for a busy worker; older ones are missed
 PATIENCE = 20.0  # s for a window beyond twice its length
 COMPILING = 120.0  # s more for the first one: a twin that this computer has never run is compiled before
-NOT_READY = "the worker is not ready: a twin that is new to this computer is compiled first, for a minute or two"
+NOT_READY = (
+    "the worker is not ready: it starts, and compiles a twin that is new to this computer, which takes a minute or two"
+)
 
 
 class Supervisor:

@@ -109,9 +109,18 @@ def findings_of(
         severity = Severity.WARNING if best.reason is not Reason.SENSOR else Severity.FAULT
         found.append(FindingDocument(
             id="case", severity=severity, condition="something has happened that is not decided yet", text=text,
-            since=case.onset, advice=experiment,
+            since=case.onset, advice="; ".join(filter(None, (experiment, _of_the_file(case)))),
         ))  # fmt: skip
     return tuple(found)
+
+
+def _of_the_file(case: Case) -> str:
+    """What to do where a parameter seems to have moved that the machine file takes as known."""
+    known = {name for entry in case.hypotheses if entry.reason is Reason.NOTHING for name, _ in entry.problem.known}
+    if case.best.reason is not Reason.PARAMETER:
+        return ""
+    names = ", ".join(entry.name for entry in case.best.problem.free if entry.name in known)
+    return names and f"if nothing has happened to the machine, {names} in its file is off: correct it or estimate it"
 
 
 def _of_component(entry: ComponentDocument) -> FindingDocument:
