@@ -35,11 +35,17 @@ COMPUTED = frozenset({
 })  # fmt: skip
 
 
+# What says how soon things happen, or how exactly: nothing may run beside it.
+ALONE = frozenset({"test_faults.py", "test_transports.py"})
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what only computes."""
+    """Mark what only computes, and what wants to be alone."""
     for item in items:
         if item.path.is_relative_to(TESTS) and item.path.relative_to(TESTS).parts[0] in COMPUTED:
             item.add_marker("computed")
+        if item.path.name in ALONE:
+            item.add_marker("alone")
 
 
 @pytest.fixture(autouse=True)

@@ -30,7 +30,7 @@ class Injected:
     until: float
     keys: str = ""
     on: tuple[str, ...] = BOTH
-    within: float = 3 * WINDOW
+    within: float = 5 * WINDOW
     """s, from its end to the beginning of the next window that is estimated from."""
 
     def __str__(self) -> str:
