@@ -13,6 +13,7 @@ from otolith.errors import OtolithError
 from otolith.health.report import ReportDocument, Status
 from otolith.plan import load_plan
 from otolith.replay import Replay
+from otolith.tally import moment
 from otolith_drivers.logs import table
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.conftest import SIGNALS
@@ -215,3 +216,12 @@ def check_any(path: Path) -> None:
     except OtolithError as error:
         said = str(error)
     assert str(path) in said
+
+
+@pytest.mark.parametrize(
+    ("seconds", "told"),
+    [(-2.5, "-2.5 s"), (0.0, "0 s"), (3600.25, "3600.25 s"), (1.7e9, "2023-11-14 22:13:20Z"), (1.7e12, "1.7e+12 s")],
+)
+def test_times_that_can_be_dates_are_told_as_dates(seconds: float, told: str) -> None:
+    """A column of milliseconds since 1970 is none."""
+    assert moment(seconds) == told

@@ -14,13 +14,13 @@ from otolith.console import STYLES, value_cells
 from otolith.health.report import ReportDocument, Status
 
 MOST_REASONS = 5  # that are told
-DATES_FROM = 1e8  # s: three years
+DATES = (1e8, 1e11)  # s since 1970: what is earlier counts from a beginning of its own, what is later is no second
 FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")
 
 
 def moment(seconds: float) -> str:
     """A time of the data: seconds as they are, or the date where they can only be those since 1970."""
-    if seconds < DATES_FROM:
+    if not DATES[0] <= seconds < DATES[1]:
         return f"{round(seconds, 6) + 0.0:.12g} s"
     return f"{datetime.fromtimestamp(seconds, UTC):%F %T}Z"
 

@@ -59,5 +59,6 @@ def test_what_a_diverging_twin_says_is_not_used(sharpness: float) -> None:
         return Evidence(np.array([6.5, 0.0]), np.full((2, 2), size), np.zeros(2))
 
     belief: Belief = begin_belief(BARE)
-    assert is_usable(belief, said(1.0), BARE)
-    assert not is_usable(belief, said(sharpness), BARE)
+    moved = Claim(Reason.PARAMETER, "R_a")
+    assert is_usable(moved, belief, said(1.0), BARE)
+    assert not is_usable(moved, belief, said(sharpness), BARE)

@@ -4,6 +4,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Self
 
 from otolith_drivers.base import Link, Sample, Setup, Signal
 from otolith_drivers.modbus_poller import ModbusPoller, Options, Source, build
@@ -40,7 +41,7 @@ class Listener:
         self.driver = driver
         self.samples: list[Sample] = []
 
-    def __enter__(self) -> "Listener":
+    def __enter__(self) -> Self:
         self.driver.open(self.samples.extend)
         return self
 

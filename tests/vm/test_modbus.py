@@ -19,9 +19,10 @@ from pathlib import Path
 
 import pytest
 
-from otolith_drivers.base import Sample, Setup, Signal
-from otolith_drivers.modbus_poller import ModbusPoller, Options, Source, build
+from otolith_drivers.base import Setup, Signal
+from otolith_drivers.modbus_poller import Options, Source, build
 from tests.conftest import free_port
+from tests.drivers.modbus_readers import Listener, wait_for
 
 SERVER = Path(__file__).with_name("modbus_server.c")
 FLAGS = ("-std=c11", "-D_DEFAULT_SOURCE", "-O1", "-Wall", "-Wextra", "-Werror")
@@ -143,36 +144,25 @@ def line(request: pytest.FixtureRequest) -> Iterator[Line]:
     cable.close()
 
 
-class Listener:
-    """Opens a driver, keeps what it delivers, closes it."""
+class Reading(Listener):
+    """What is read of a line."""
 
     def __init__(self, line: Line, sources: dict[str, dict[str, object]]) -> None:
         signals = tuple(
             Signal(name, "V", Source.model_validate({"unit": "V", **keys})) for name, keys in sources.items()
         )
         options = Options.model_validate({"device": 1, "timeout": "0.2 s", **line.options})
-        self.driver: ModbusPoller = build(options, Setup(signals, Path(), PERIOD))
-        self.samples: list[Sample] = []
+        super().__init__(build(options, Setup(signals, Path(), PERIOD)))
 
-    def __enter__(self) -> "Listener":
-        self.driver.open(self.samples.extend)
-        return self
+    def values(self, name: str) -> list[float]:
+        return [sample.value for sample in self.of(name)]
 
-    def __exit__(self, *_: object) -> None:
-        self.driver.close()
-
-    def of(self, name: str) -> list[float]:
-        return [sample.value for sample in self.samples if sample.signal == name]
-
-    def wait(self, condition: Callable[[], bool], seconds: float = 20.0) -> None:
-        deadline = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < deadline, f"it never came: {self.driver.link()}, {self.driver.counters()}"
-            time.sleep(0.01)
+    def until(self, condition: Callable[[], bool]) -> None:
+        wait_for(condition, 20.0)
 
     def wait_for_more(self, name: str, count: int = 50) -> None:
         before = len(self.of(name))
-        self.wait(lambda: len(self.of(name)) >= before + count)
+        self.until(lambda: len(self.of(name)) >= before + count)
 
 
 def only_reads(said: dict[str, dict[str, int] | int], *codes: str) -> None:
@@ -184,21 +174,21 @@ def only_reads(said: dict[str, dict[str, int] | int], *codes: str) -> None:
 
 
 def test_every_type_and_order_is_read_and_nothing_is_written(server: Path, line: Line) -> None:
-    with serving(server, *line.arguments) as serves, Listener(line, EVERYTHING) as listener:
+    with serving(server, *line.arguments) as serves, Reading(line, EVERYTHING) as listener:
         listener.wait_for_more("counter", 100)
         listener.driver.close()
         only_reads(serves.stop(), "3", "4")
     assert listener.driver.link().complaints == ()
     for name, (_, value) in STANDING.items():
-        found = set(listener.of(name))
+        found = set(listener.values(name))
         assert len(found) == 1, name
         assert found.pop() == pytest.approx(value, rel=1e-7), name
-    standard = listener.of("standard")
+    standard = listener.values("standard")
     assert len(set(standard)) > 20  # it moves
     assert {24.0 <= value < 25.0 for value in standard} == {True}
     for name in MOVING:
-        assert listener.of(name) == standard, name
-    counted = listener.of("counter")
+        assert listener.values(name) == standard, name
+    counted = listener.values("counter")
     assert counted == sorted(set(counted))  # every reading is a new one, in order
     counters = listener.driver.counters()
     assert (counters.bad, counters.reconnects) == (0, 0)
@@ -207,25 +197,25 @@ def test_every_type_and_order_is_read_and_nothing_is_written(server: Path, line:
 
 def test_a_register_that_the_server_does_not_have_costs_only_itself(server: Path, line: Line) -> None:
     sources = {"standard": MOVING["standard"], "counter": COUNTER, "absent": ABSENT}
-    with serving(server, *line.arguments) as serves, Listener(line, sources) as listener:
-        listener.wait(lambda: any("illegal data address" in line for line in listener.driver.link().complaints))
+    with serving(server, *line.arguments) as serves, Reading(line, sources) as listener:
+        listener.until(lambda: any("illegal data address" in line for line in listener.driver.link().complaints))
         listener.wait_for_more("standard")
         assert listener.driver.link().up
-        assert not listener.of("absent")
+        assert not listener.values("absent")
         listener.driver.close()
         only_reads(serves.stop(), "3")
 
 
 def test_a_server_that_goes_away_is_found_again(server: Path, line: Line) -> None:
-    with Listener(line, {"standard": MOVING["standard"], "counter": COUNTER}) as listener:
+    with Reading(line, {"standard": MOVING["standard"], "counter": COUNTER}) as listener:
         with serving(server, *line.arguments) as serves:
             listener.wait_for_more("counter")
             only_reads(serves.stop(), "3")
-        listener.wait(lambda: not listener.driver.link().up)
+        listener.until(lambda: not listener.driver.link().up)
         assert listener.driver.link().reason
         with serving(server, *line.arguments) as serves:
             begun = time.monotonic()
-            listener.wait(lambda: listener.driver.link().up)
+            listener.until(lambda: listener.driver.link().up)
             print(f"found again after {time.monotonic() - begun:.2f} s")
             listener.wait_for_more("counter")
             listener.driver.close()
@@ -233,18 +223,18 @@ def test_a_server_that_goes_away_is_found_again(server: Path, line: Line) -> Non
     counters = listener.driver.counters()
     assert counters.reconnects == 1
     assert counters.lost > 0
-    assert {24.0 <= value < 25.0 for value in listener.of("standard")} == {True}
+    assert {24.0 <= value < 25.0 for value in listener.values("standard")} == {True}
 
 
 @pytest.mark.parametrize("line", ["rtu"], indirect=True)
 def test_no_byte_that_is_spoiled_on_the_line_becomes_a_reading(server: Path, line: Line) -> None:
     """The check sum is libmodbus' own."""
     assert line.cable is not None
-    with serving(server, *line.arguments), Listener(line, {"standard": MOVING["standard"]}) as listener:
+    with serving(server, *line.arguments), Reading(line, {"standard": MOVING["standard"]}) as listener:
         listener.wait_for_more("standard")
         line.cable.spoil = lambda data: bytes([*data[:4], data[4] ^ 0x10, *data[5:]]) if len(data) > 5 else data
         lost = listener.driver.counters().lost
-        listener.wait(lambda: listener.driver.counters().lost >= lost + 5)
+        listener.until(lambda: listener.driver.counters().lost >= lost + 5)
         line.cable.spoil = lambda data: data
         listener.wait_for_more("standard")
-    assert {24.0 <= value < 25.0 for value in listener.of("standard")} == {True}
+    assert {24.0 <= value < 25.0 for value in listener.values("standard")} == {True}

@@ -15,8 +15,7 @@ from otolith.adaptation.claims import Explanation, Reason, explanation, unexplai
 from otolith.adaptation.deactivation import pruned, with_content
 from otolith.adaptation.fusion import Belief, carried, overall, updated
 from otolith.adaptation.glance import glance
-from otolith.adaptation.hypothesis import Hypothesis, begun, cost_of, is_usable, occam
-from otolith.adaptation.hypothesis import told as told_by
+from otolith.adaptation.hypothesis import Hypothesis, begun, cost_of, evidence_of, is_usable, occam
 from otolith.adaptation.prior import Evidence
 from otolith.adaptation.problem import Problem
 from otolith.adaptation.screening import CLEARLY
@@ -109,15 +108,14 @@ def opened(explanations: Sequence[Explanation], problem: Problem, expected: Beli
     least = deviances[order[0]]
     kept = [at for at in order if deviances[at] <= least + WORTH][:MOST]
     kept += [at for at in order if explanations[at].reason in (Reason.NOTHING, Reason.PARAMETER) and at not in kept]
-    found = [
+    tried = [
         begun(explanations[at], problem, expected, window, min(deviances[at] - least, MOST_OF_FIRST)) for at in kept
     ]
+    found = [entry for entry in tried if entry is not None]
     surprise = explanations[0].chi_square / max(records, 1.0)
     best = explanations[order[0]]
     last = Told(best.chi_square, least - best.chi_square / left, records)
-    return Case(
-        _sorted([entry for entry in found if entry is not None]), window.start, last=last, surprise=max(surprise, 1.0)
-    )
+    return Case(_sorted(found), window.start, last=last, surprise=max(surprise, 1.0))
 
 
 def followed(case: Case, window: Window) -> Case:
@@ -165,9 +163,9 @@ def _explained(
         prior = overall(belief, entry.problem)
         fits.append((entry, belief, explanation(replace(entry.claim, numbers=0), entry.problem, window, prior)))
     fits = [fit for fit in fits if fit[2].chi_square < DIVERGED] or fits[:1]
-    told = [told_by(fit) for _, _, fit in fits]
+    told = [evidence_of(fit) for _, _, fit in fits]
     usable = [
-        entry.reason is Reason.NOTHING or is_usable(belief, evidence, entry.problem)
+        is_usable(entry.claim, belief, evidence, entry.problem)
         for (entry, belief, _), (evidence, _) in zip(fits, told, strict=True)
     ]
     return list(compress(fits, usable)), list(compress(told, usable))

@@ -37,8 +37,10 @@ class Hypothesis:
 SHARPEST = 1e7  # times what was known: a window that claims to say more says it where the twin all but diverges
 
 
-def is_usable(belief: Belief, evidence: Evidence, problem: Problem) -> bool:
-    """Whether a belief can be updated by that evidence without losing all digits."""
+def is_usable(claim: Claim, belief: Belief, evidence: Evidence, problem: Problem) -> bool:
+    """Whether a belief can be updated by that evidence without losing all digits; that nothing has happened always."""
+    if claim.reason is Reason.NOTHING:
+        return True
     deviations = np.sqrt(np.diag(overall(belief, problem).covariance))
     return bool((np.abs(evidence.root) * deviations < SHARPEST).all())  # not a number is not smaller either
 
@@ -49,16 +51,16 @@ def begun(found: Explanation, problem: Problem, expected: Belief, window: Window
     Returns:
         None if the window cannot be used with it: its twin all but diverges.
     """
-    evidence, last = told(found)
+    evidence, last = evidence_of(found)
     belief = with_prior(rebased(expected, problem, found.problem), found.prior, found.problem)
-    if found.reason is not Reason.NOTHING and not is_usable(belief, evidence, found.problem):
+    if not is_usable(found.claim, belief, evidence, found.problem):
         return None
     belief = updated(belief, evidence, found.problem)
     after = turned(found.problem, window, last)
     return Hypothesis(found.claim, found.problem, belief, after, deviance, cost_of(found))
 
 
-def told(found: Explanation) -> tuple[Evidence, Array]:
+def evidence_of(found: Explanation) -> tuple[Evidence, Array]:
     """What the window says, and the state (states,) at its last record."""
     informed, cost = found.informed, cost_of(found)
     grown = inflation(informed.whitened(found.fit), cost)
