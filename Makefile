@@ -8,7 +8,7 @@ DEV := .venv/.dev-$(HERE)
 BENCH := .venv/.bench-$(HERE)
 PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: help demo test system-test check bench clean
+.PHONY: help demo test system-test check bench paper clean
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
@@ -17,6 +17,7 @@ help:
 	@echo "             as root on Debian: drivers against can-utils, systemd and libmodbus, in a guest that is booted"
 	@echo "make check   ruff, mypy --strict, import rules"
 	@echo "make bench   print the benchmarks"
+	@echo "make paper   the scenarios of the paper: our figures beside the paper's, with plots"
 	@echo "make clean   remove .venv and caches"
 
 demo: $(RUNTIME)
@@ -43,6 +44,9 @@ check: $(DEV)
 
 bench: $(BENCH)
 	@for file in benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
+
+paper: $(DEV)
+	$(BIN)/python -m benchmarks.paper
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

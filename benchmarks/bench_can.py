@@ -16,10 +16,9 @@ import can
 
 from otolith.acquisition.ring import Rings
 from otolith_drivers.base import Setup, Signal
-from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.can_receiver import Options, build
-from otolith_drivers.can_socket import enlarge_buffer
-from otolith_drivers.can_source import Source
+from otolith_drivers.canbus.bus import BusOptions, enlarge_buffer, open_bus
+from otolith_drivers.canbus.driver import Options, build
+from otolith_drivers.canbus.signals import Source
 
 RATE, MESSAGES, FIRST_ID = 8000.0, 10, 0x180  # frames/s
 SETTLE = 0.5  # s after the last frame

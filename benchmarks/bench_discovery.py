@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.discovery.motor import Faults, J, live, windows
-from otolith.adaptation.gate import Lesson
-from otolith.adaptation.problem import Problem
-from otolith.heart import adapt
-from otolith.state import begin
-from otolith.twins import find_twin
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import begin
+from otolith.discovery.sequential_test import Lesson
+from otolith.estimation.problem import Problem
+from otolith.machine import find_twin
 
 CALM, SEARCH = 0.015, 0.250  # s: what a window may take at the median
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks import handwritten
 from otolith.acquisition.window import Array
+from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
-from otolith.twins import find_twin
 
 RECORDS, PERIOD, SUBSTEPS = 200, 0.01, handwritten.SUBSTEPS
 TWIN = find_twin("dc_motor")

@@ -21,7 +21,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from otolith.acquisition.ring import Rings
 from otolith_drivers.base import Sample, Setup, Signal
-from otolith_drivers.modbus_poller import Options, Source, build
+from otolith_drivers.modbus.driver import Options, Source, build
 
 PERIOD = 0.005
 NUMBERS = 10  # of two registers

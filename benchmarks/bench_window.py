@@ -9,14 +9,14 @@ from functools import partial
 import numpy as np
 
 from benchmarks.motor import CONFIG, windows
-from otolith.adaptation.estimate import estimate
-from otolith.adaptation.objective import Objective
-from otolith.adaptation.problem import Problem
-from otolith.adaptation.swarm import search
-from otolith.heart import adapt
-from otolith.plan import load_plan
-from otolith.state import begin
-from otolith_drivers.plant.plants import load_scenario
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import begin
+from otolith.estimation.objective import Objective
+from otolith.estimation.particle_swarm import search
+from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import estimate
+from otolith.machine import load_plan
+from otolith_drivers.plant.scenario import load_scenario
 
 
 def median_seconds(work: Callable[[], object], runs: int) -> float:

@@ -18,12 +18,11 @@ import numpy as np
 
 from benchmarks.motor import CONFIG, RECORDS, windows
 from otolith.acquisition.window import Array
-from otolith.heart import adapt
-from otolith.plan import load_plan
-from otolith.state import begin
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import begin
+from otolith.machine import load_plan
 from otolith_drivers.plant.faults import Drift
-from otolith_drivers.plant.plants import load_scenario
-from otolith_drivers.plant.scenario import Scenario
+from otolith_drivers.plant.scenario import Scenario, load_scenario
 
 QUANTA = np.array([0.0, 0.0, 20.0 / 4096, 100.0 / 4096])  # A, rad/s
 

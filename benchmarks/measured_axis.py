@@ -20,17 +20,17 @@ from rich.console import Console
 from rich.table import Table
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.claims import Claim, Reason, explanation
-from otolith.adaptation.fusion import carried, overall
-from otolith.adaptation.information import QUANTILE
-from otolith.adaptation.learning import learn_noise
-from otolith.adaptation.objective import Objective
-from otolith.adaptation.prior import Prior
-from otolith.adaptation.problem import Problem
-from otolith.health.report import ParameterDocument, ReportDocument
-from otolith.heart import adapt
-from otolith.state import State, begin
-from otolith.twins import find_twin
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import State, begin
+from otolith.commissioning.identification import learn_noise
+from otolith.discovery.hypotheses import Claim, Reason, explanation
+from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.imm_filter import carried, overall
+from otolith.estimation.information import QUANTILE
+from otolith.estimation.objective import Objective
+from otolith.estimation.problem import Problem
+from otolith.health.schema import ParameterDocument, ReportDocument
+from otolith.machine import find_twin
 
 FILE = "data_emps.csv"
 FORCE = 35.1507  # N/V

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith_drivers.plant.plants import simulate
-from otolith_drivers.plant.scenario import Scenario
+from otolith_drivers.plant.scenario import Scenario, simulate
 
 CONFIG = Path(__file__).parents[1] / "config"
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}

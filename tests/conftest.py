@@ -10,9 +10,9 @@ import pytest
 from hypothesis import settings
 
 from otolith.acquisition.window import Window
-from otolith.paths import examples_directory
+from otolith.cli.common import examples_directory
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.plant.plants import load_scenario, simulate
+from otolith_drivers.plant.scenario import load_scenario, simulate
 
 EXAMPLES = examples_directory()
 TESTS = Path(__file__).parent
@@ -24,14 +24,17 @@ SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurre
 # What only computes: no bus, no port, no clock, so that it may run slowly beside what lives in real time.
 COMPUTED = frozenset({
     "adaptation",
-    "twin",
+    "commissioning",
+    "discovery",
+    "estimation",
     "health",
-    "test_guide.py",
-    "test_noise.py",
-    "test_paper.py",
-    "test_paper_unknown.py",
-    "test_replay.py",
-    "test_replay_tables.py",
+    "twin",
+    "cli/test_noise.py",
+    "cli/test_replay.py",
+    "cli/test_replay_tables.py",
+    "docs/test_describe_your_machine.py",
+    "benchmarks/test_paper.py",
+    "benchmarks/test_paper_discovery.py",
 })  # fmt: skip
 
 
@@ -42,8 +45,10 @@ ALONE = frozenset({"test_faults.py", "test_transports.py"})
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what only computes, and what wants to be alone."""
     for item in items:
-        if item.path.is_relative_to(TESTS) and item.path.relative_to(TESTS).parts[0] in COMPUTED:
-            item.add_marker("computed")
+        if item.path.is_relative_to(TESTS):
+            path = item.path.relative_to(TESTS)
+            if path.parts[0] in COMPUTED or path.as_posix() in COMPUTED:
+                item.add_marker("computed")
         if item.path.name in ALONE:
             item.add_marker("alone")
 

@@ -9,16 +9,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LINTER = Path(sys.executable).with_name("lint-imports")
-FILE_LIMIT = 400  # lines
+FILE_LIMIT = 600  # lines
 
 BREACHES = {
-    "a driver imports the daemon": ("drivers/otolith_drivers/base.py", "import otolith.errors"),
+    "a driver imports the daemon": ("drivers/otolith_drivers/base.py", "import otolith.machine"),
     "the plant imports the twin": ("drivers/otolith_drivers/plant/dc_motor.py", "import otolith.twin.model"),
-    "the heart reads a clock": ("daemon/otolith/heart.py", "import time"),
-    "adaptation opens a file": ("daemon/otolith/adaptation/swarm.py", "import pathlib"),
+    "the heart reads a clock": ("daemon/otolith/adaptation/adapt.py", "import time"),
+    "adaptation opens a file": ("daemon/otolith/estimation/particle_swarm.py", "import pathlib"),
     "health publishes": ("daemon/otolith/health/status.py", "import zenoh"),
-    "the twin knows the estimation": ("daemon/otolith/twin/definition.py", "import otolith.adaptation.problem"),
-    "acquisition knows the outlets": ("daemon/otolith/acquisition/ring.py", "import otolith.outlets.recorder"),
+    "the twin knows the estimation": ("daemon/otolith/twin/definition.py", "import otolith.estimation.problem"),
+    "acquisition knows the outlets": ("daemon/otolith/acquisition/ring.py", "import otolith.publishing.recorder"),
 }
 
 
@@ -48,7 +48,7 @@ def test_a_breach_is_found(copy: Path, breach: str) -> None:
 
 
 def test_the_driver_has_no_way_to_send() -> None:
-    text = (ROOT / "drivers" / "otolith_drivers" / "can_receiver.py").read_text(encoding="utf-8")
+    text = (ROOT / "drivers" / "otolith_drivers" / "canbus" / "driver.py").read_text(encoding="utf-8")
     assert "import can" in text
     assert ".send(" not in text
 

@@ -15,14 +15,13 @@ from benchmarks.discovery.motor import Faults, live, windows
 from benchmarks.discovery.setting import looked, prior, problem
 from benchmarks.discovery.truth import SHAFT, Truth, is_a_parameter
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.completion import plain
-from otolith.adaptation.dictionary import Shapes, Structure, structures
-from otolith.adaptation.glance import Glance
-from otolith.adaptation.landscape import Landscape
-from otolith.adaptation.prior import Prior
-from otolith.adaptation.screening import CLEARLY
-from otolith.twin.metamodels import METAMODELS, Kind, MetaModel, code_of
-from otolith.twin.slots import sites, sources
+from otolith.discovery.candidates import CLEARLY
+from otolith.discovery.linear_response import Landscape, Shapes, Structure, structures
+from otolith.discovery.search import Glance
+from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.augmented import plain
+from otolith.twin.augmentation import sites, sources
+from otolith.twin.component_families import METAMODELS, Kind, MetaModel, code_of
 
 SECONDS = 2.0
 LEAST, MOST = 3.0, 30.0  # of the detection limit

@@ -8,9 +8,9 @@ import numpy as np
 from benchmarks.discovery.draw import Case, draw
 from benchmarks.discovery.setting import Ranked, problem, ranked
 from benchmarks.discovery.truth import same
-from otolith.adaptation.claims import Explanation, Reason
-from otolith.adaptation.completion import places
-from otolith.adaptation.screening import CLEARLY
+from otolith.discovery.candidates import CLEARLY
+from otolith.discovery.hypotheses import Explanation, Reason
+from otolith.estimation.augmented import places
 
 APART = 2.0 * math.log(150.0)  # in -2 log evidence: what decides between two explanations
 INTERVAL = 1.96  # standard deviations on either side of which 95 % lie

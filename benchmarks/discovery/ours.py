@@ -8,8 +8,8 @@ from benchmarks.discovery.motor import SIGNALS, windows
 from benchmarks.discovery.setting import prior, problem, ranked
 from benchmarks.discovery.truth import SHAFT, WINDING, Truth, same
 from benchmarks.discovery.typical import Answer, Recorded, Typical, error_of
-from otolith.adaptation.claims import Explanation, Reason
-from otolith.adaptation.completion import places
+from otolith.discovery.hypotheses import Explanation, Reason
+from otolith.estimation.augmented import places
 
 SENSORS = {"sensor of T_load": (SHAFT, 1.0), "sensor of V_a": (WINDING, -1.0)}  # what an error adds to the machine
 

@@ -10,7 +10,7 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from benchmarks.discovery.judge import Judged
-from otolith.twin.metamodels import NAMES
+from otolith.twin.component_families import NAMES
 
 FIRST_AT_LEAST, NAMED_AT_LEAST, COVERED = 0.90, 0.98, (0.93, 0.97)
 OTHERS = ("two or more", "sensor", "parameter", "nothing")  # that a family may be taken for

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.claims import Explanation
-from otolith.adaptation.discovery import search
-from otolith.adaptation.glance import Glance, glance
-from otolith.adaptation.objective import Objective
-from otolith.adaptation.prior import Prior
-from otolith.adaptation.problem import Problem
-from otolith.plan import load_plan
+from otolith.discovery.hypotheses import Explanation
+from otolith.discovery.search import Glance, glance, search
+from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.objective import Objective
+from otolith.estimation.problem import Problem
+from otolith.machine import load_plan
 
 CONFIG = Path(__file__).parents[2] / "config" / "dc-motor.toml"
 FREE = ("R_a", "D")

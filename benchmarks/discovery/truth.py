@@ -45,7 +45,7 @@ class Truth:
 
     @property
     def key(self) -> str:
-        """As :attr:`otolith.adaptation.component.Component.key`."""
+        """As :attr:`otolith.estimation.problem.Component.key`."""
         return f"{self.site}/{self.family}" + (f"/{self.source}" if self.source else "")
 
     def shape(self, x: float) -> float:

@@ -16,11 +16,11 @@ import numpy as np
 
 from benchmarks.estimators.cases import WIDER, Case, cases, start, windows
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.estimate import estimate
-from otolith.adaptation.objective import Objective
-from otolith.adaptation.polish import polish
-from otolith.adaptation.problem import Problem
-from otolith.adaptation.swarm import search
+from otolith.estimation.gauss_newton import polish
+from otolith.estimation.objective import Objective
+from otolith.estimation.particle_swarm import search
+from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import estimate
 
 WINDOWS = 10  # machines that the starts are dealt to
 NEAR, NEAR_SHARE = 3.0, 0.01  # of the best χ²: what may be missing to it

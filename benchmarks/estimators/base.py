@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.problem import Problem
+from otolith.estimation.problem import Problem
 
 
 class Said(NamedTuple):

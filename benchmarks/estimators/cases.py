@@ -8,10 +8,10 @@ import numpy as np
 
 from benchmarks.estimators.data import APART
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.problem import Problem
+from otolith.estimation.problem import Problem
+from otolith.machine import find_twin, load_twin
 from otolith.twin.definition import Definition, Input, Parameter, Role
 from otolith.twin.kernel import Excitation, kernel_of
-from otolith.twins import find_twin, load_twin
 
 RECORDS = 200
 HELD = 20  # records that a level of an input lasts

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.problem import Problem
+from otolith.estimation.problem import Problem
+from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
-from otolith.twins import find_twin
 
 TWIN = find_twin("dc_motor")
 FREE = ("R_a", "D", "J")

@@ -7,7 +7,7 @@ from benchmarks import handwritten
 from benchmarks.estimators.base import Budget, Rival, Said
 from benchmarks.estimators.data import NOISE, full, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.problem import Problem
+from otolith.estimation.problem import Problem
 
 REACH = 5.0  # standard deviations around the first record in which the initial state is sought
 

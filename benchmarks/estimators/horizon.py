@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.estimators.base import Budget, Rival, Said
 from benchmarks.estimators.data import KNOWN, NOISE, PERIOD, RECORDS, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.problem import Problem
+from otolith.estimation.problem import Problem
 
 CALM, AWAKE = 1e-5, 3e-4  # of each parameter per window, in shares of its nominal value
 SPREAD = 0.5  # in the same, at the beginning

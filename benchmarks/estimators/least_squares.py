@@ -16,7 +16,7 @@ from benchmarks import handwritten
 from benchmarks.estimators.base import Budget, Rival, Said
 from benchmarks.estimators.data import KNOWN, NOISE, full, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.problem import Problem
+from otolith.estimation.problem import Problem
 
 Simulation = Callable[[Array, Array, Array, float], Array]
 """Parameters (free,), initial state (states,), inputs (records, inputs), sample period -> (records, outputs)."""

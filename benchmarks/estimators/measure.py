@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.estimators.base import Budget, Estimator, Rival, Said
 from benchmarks.estimators.data import FREE, RUN_IN, Machine, machines, problem
 from otolith.acquisition.window import Array, Mask
-from otolith.adaptation.information import QUANTILE
+from otolith.estimation.information import QUANTILE
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,10 @@ import numpy as np
 from benchmarks.estimators.base import Budget, Rival, Said
 from benchmarks.estimators.data import FREE
 from otolith.acquisition.window import Window
-from otolith.adaptation.problem import Problem
-from otolith.health.report import ParameterDocument
-from otolith.heart import adapt
-from otolith.state import State, begin
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import State, begin
+from otolith.estimation.problem import Problem
+from otolith.health.schema import ParameterDocument
 
 PUBLISHED, ALONE, COLD = "Otolith warm, published", "Otolith warm, window alone", "Otolith cold"
 

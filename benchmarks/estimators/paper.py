@@ -17,7 +17,7 @@ from pymoo.optimize import minimize
 from benchmarks.estimators.base import Budget, Rival, Said
 from benchmarks.estimators.data import KNOWN, TWIN, full, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.problem import Problem
+from otolith.estimation.problem import Problem
 from otolith.twin.kernel import Excitation, kernel_of
 
 STEP = 1e-4  # s

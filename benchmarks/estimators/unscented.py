@@ -14,7 +14,7 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from benchmarks.estimators.base import Budget, Rival, Said
 from benchmarks.estimators.data import KNOWN, NOISE, PERIOD, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.problem import Problem
+from otolith.estimation.problem import Problem
 
 CALM, AWAKE = 1e-6, 3e-5  # of the logarithms, standard deviation per record
 STRAY = 1e-6  # A and rad/s per record

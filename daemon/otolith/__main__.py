@@ -20,9 +20,9 @@ def main() -> None:
     """Run the command line; errors become one line each and an exit code, never a traceback."""
     import click  # noqa: PLC0415 - after the lines above
 
-    from otolith.cli import cli  # noqa: PLC0415
-    from otolith.cli_process import NobodyReads  # noqa: PLC0415
-    from otolith.errors import OtolithError  # noqa: PLC0415
+    from otolith.cli.common import NobodyReads  # noqa: PLC0415
+    from otolith.cli.main import cli  # noqa: PLC0415
+    from otolith_drivers.errors import OtolithError  # noqa: PLC0415
 
     try:
         code = cli.main(prog_name="otolith", standalone_mode=False)

@@ -19,8 +19,8 @@ from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 
-from otolith.errors import ServiceError
-from otolith.paths import cache_directory
+from otolith_drivers.errors import ServiceError
+from otolith_drivers.user_dirs import cache_directory
 
 MOST_KERNELS = 64  # folders; the oldest beyond are removed
 GENERATOR = sorted((Path(__file__).parent / "twin").glob("*.py"))

@@ -13,9 +13,9 @@ from typing import Annotated
 from pydantic import Field
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
+from otolith_drivers.config_files import Closed
 from otolith_drivers.errors import ConfigurationError, DeviceError
-from otolith_drivers.quantities import factor
-from otolith_drivers.toml_files import Closed
+from otolith_drivers.units import factor
 
 LONGEST = 1500  # bytes of a datagram
 WAKE = 0.2  # s; how late a stop can be noticed

@@ -10,7 +10,7 @@ import otolith_udp_json
 import pytest
 
 from otolith_drivers.base import Setup, Signal
-from otolith_drivers.contract import CONTRACT, Rig
+from otolith_drivers.conformance import CONTRACT, Rig
 
 
 def free_port() -> int:

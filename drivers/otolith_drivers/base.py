@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from otolith_drivers.toml_files import Closed
+from otolith_drivers.config_files import Closed
 
 
 class Sample(NamedTuple):

@@ -11,10 +11,10 @@ ENTRY_POINT_GROUP = "otolith.drivers"
 
 # The module is imported only when its driver is chosen.
 DRIVERS: dict[str, str] = {
-    "can": "otolith_drivers.can_receiver",
-    "modbus": "otolith_drivers.modbus_poller",
-    "plant": "otolith_drivers.plant.in_process",
-    "replay": "otolith_drivers.replayer",
+    "can": "otolith_drivers.canbus.driver",
+    "modbus": "otolith_drivers.modbus.driver",
+    "plant": "otolith_drivers.plant.driver",
+    "replay": "otolith_drivers.replay.driver",
 }
 
 

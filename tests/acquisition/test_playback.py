@@ -8,7 +8,7 @@ from otolith.acquisition.alignment import Limits
 from otolith.acquisition.playback import Playback
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Array, Window
-from otolith_drivers.logs.rows import Rows
+from otolith_drivers.replay.readers import Rows
 from tests.acquisition.test_windower import PERIOD, RECORDS, cut_all
 
 

@@ -11,7 +11,7 @@ from otolith.acquisition.alignment import Limits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.windower import Windower
 from otolith_drivers.base import Sampling, Setup, Signal
-from otolith_drivers.modbus_poller import Options, Source, build
+from otolith_drivers.modbus.driver import Options, Source, build
 from tests.conftest import free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.estimate import estimate
-from otolith.adaptation.objective import Objective
-from otolith.adaptation.problem import Problem
+from otolith.estimation.objective import Objective
+from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import estimate
+from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
-from otolith.twins import find_twin
 
 TWIN = find_twin("dc_motor")
 TRUTH = {entry.name: entry.nominal for entry in TWIN.parameters}

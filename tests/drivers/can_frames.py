@@ -7,9 +7,9 @@ from typing import Any
 import can
 
 from otolith_drivers.base import Sample, Setup, Signal
-from otolith_drivers.can_decoder import FrameDecoder, decoder_of
-from otolith_drivers.can_options import FrameOptions
-from otolith_drivers.can_source import Source
+from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
+from otolith_drivers.canbus.options import FrameOptions
+from otolith_drivers.canbus.signals import Source
 
 Wishes = Mapping[str, tuple[str, dict[str, Any]]]
 """Name of each signal, its unit, and its source as in a machine file."""

@@ -18,7 +18,7 @@ from pymodbus import FramerType, ModbusException
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.pdu import ModbusPDU
 
-from otolith_drivers.plant.plants import load_scenario, simulate
+from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES, free_port
 
 PLANT = [sys.executable, "-m", "otolith", "plant"]

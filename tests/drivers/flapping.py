@@ -12,10 +12,11 @@ from pathlib import Path
 
 import can
 
-from otolith_drivers import can_receiver, modbus_poller
 from otolith_drivers.base import Driver, Setup, Signal
-from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.can_source import Source
+from otolith_drivers.canbus import driver as can_receiver
+from otolith_drivers.canbus.bus import BusOptions, open_bus
+from otolith_drivers.canbus.signals import Source
+from otolith_drivers.modbus import driver as modbus_poller
 from tests.conftest import EXAMPLES, free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
 

@@ -10,15 +10,15 @@ import can
 from cantools.database import Message
 
 from otolith_drivers.base import Sample, Setup, Signal
-from otolith_drivers.can_decoder import decoder_of
-from otolith_drivers.can_receiver import Options, Source
-from otolith_drivers.dbc import load_dbc
-from otolith_drivers.logs.can_log import CanLog, open_log
-from otolith_drivers.logs.rows import Rows
+from otolith_drivers.canbus.database import load_dbc
+from otolith_drivers.canbus.decoder import decoder_of
+from otolith_drivers.canbus.driver import Options, Source
 from otolith_drivers.plant.can_node import ALIVE_COUNTER
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.plant.plants import simulate
-from otolith_drivers.quantities import factor
+from otolith_drivers.plant.scenario import simulate
+from otolith_drivers.replay.can_log import CanLog, open_log
+from otolith_drivers.replay.readers import Rows
+from otolith_drivers.units import factor
 from tests.conftest import EXAMPLES, SIGNALS
 
 UNITS = {"V_a": "V", "T_load": "N*m", "i": "A", "omega": "rad/s"}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from otolith_drivers.base import Link, Sample, Setup, Signal
-from otolith_drivers.modbus_poller import ModbusPoller, Options, Source, build
+from otolith_drivers.modbus.driver import ModbusPoller, Options, Source, build
 
 PERIOD = 0.01
 

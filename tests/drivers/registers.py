@@ -3,8 +3,8 @@
 import struct
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus_options import Item, Options, Source, item_of
-from otolith_drivers.modbus_types import LETTERS, Order, TypeName
+from otolith_drivers.modbus.options import Item, Options, Source, item_of
+from otolith_drivers.modbus.protocol import LETTERS, Order, TypeName
 
 KINDS: list[TypeName] = list(LETTERS)
 

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import can
 
-from otolith_drivers import can_receiver, modbus_poller, replayer
 from otolith_drivers.base import Setup, Signal
-from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.can_source import Source
-from otolith_drivers.contract import Rig
-from otolith_drivers.plant import in_process
+from otolith_drivers.canbus import driver as can_receiver
+from otolith_drivers.canbus.bus import BusOptions, open_bus
+from otolith_drivers.canbus.signals import Source
+from otolith_drivers.conformance import Rig
+from otolith_drivers.modbus import driver as modbus_poller
+from otolith_drivers.plant import driver as in_process
+from otolith_drivers.replay import driver as replayer
 from tests.conftest import EXAMPLES, OwnMachine
 from tests.drivers.modbus_servers import library_server
 

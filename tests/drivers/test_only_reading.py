@@ -9,13 +9,13 @@ from pathlib import Path
 import can
 import pytest
 
-from otolith_drivers import can_receiver
 from otolith_drivers.base import Sample, Setup, Signal
-from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.can_source import Source
+from otolith_drivers.canbus import driver as can_receiver
+from otolith_drivers.canbus.bus import BusOptions, open_bus
+from otolith_drivers.canbus.signals import Source
 from tests.conftest import EXAMPLES, OwnMachine
 
-DRIVERS = Path(can_receiver.__file__).parent
+DRIVERS = Path(can_receiver.__file__).parents[1]
 WRITES = {
     *("send", "send_periodic", "sendto", "sendall", "sdo", "nmt", "write_coil", "write_coils", "write_register"),
     *("write_registers", "mask_write_register", "readwrite_registers", "write_file_record"),

@@ -12,8 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from otolith.health.report import ReportDocument
-from otolith.outlets.zenoh_session import Listener
+from otolith.health.schema import ReportDocument
+from otolith.publishing.zenoh_session import Listener
 from tests.conftest import OwnMachine
 
 OTOLITH = [sys.executable, "-m", "otolith"]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import pytest
 
 from otolith.acquisition.window import Verdict
-from otolith.health.report import ReportDocument, Status
+from otolith.health.schema import ReportDocument, Status
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
 

@@ -17,8 +17,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 from otolith.acquisition.window import Array, Verdict
-from otolith.demo_truth import compare
-from otolith.health.report import Status
+from otolith.cli.demo import compare
+from otolith.health.schema import Status
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import can
 import pytest
 
-from otolith_drivers.can_bus import BusOptions, open_bus
-from otolith_drivers.dbc import load_dbc
+from otolith_drivers.canbus.bus import BusOptions, open_bus
+from otolith_drivers.canbus.database import load_dbc
 from tests.conftest import EXAMPLES, OwnMachine
 
 PLANT = [sys.executable, "-m", "otolith", "plant"]

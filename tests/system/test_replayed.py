@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from otolith.health.report import ReportDocument
-from otolith.outlets.zenoh_session import Listener
+from otolith.health.schema import ReportDocument
+from otolith.publishing.zenoh_session import Listener
 from otolith_drivers.plant.dc_motor import MotorScenario
+from tests.cli.replays import MACHINE, PERIOD, recorded, written
 from tests.conftest import OwnMachine
-from tests.replays import MACHINE, PERIOD, recorded, written
 from tests.system.conftest import Running
 
 DRIVER = """

@@ -13,14 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from otolith.adaptation.catalogue import Approval, Entry
-from otolith.adaptation.component import Component
-from otolith.keeping import Keeper
-from otolith.outlets import recorder
-from otolith.plan import load_plan
-from otolith.specialist import Decisions, Kept
-from otolith.supervisor import COMPILING
-from otolith.twins import find_twin
+from otolith.adaptation.state import Decisions, Kept
+from otolith.discovery.adopted import Approval, Entry
+from otolith.estimation.problem import Component
+from otolith.machine import find_twin, load_plan
+from otolith.publishing import recorder
+from otolith.runtime.state_store import Keeper
+from otolith.runtime.worker import COMPILING
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
 
@@ -67,7 +66,7 @@ def test_a_stopped_worker_starves_the_watchdog(
     own_machine: OwnMachine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Fed by finished windows only: the rule itself, without waiting for half a minute."""
-    from otolith import service as module  # noqa: PLC0415
+    from otolith.runtime import service as module  # noqa: PLC0415
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from otolith.acquisition.window import Verdict
-from otolith.health.report import Status
+from otolith.health.schema import Status
 from tests.conftest import TRANSPORTS, OwnMachine
 from tests.system.conftest import Running
 

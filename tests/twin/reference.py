@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from otolith.acquisition.window import Array
 from otolith.twin.definition import Definition
-from otolith_drivers.quantities import to_base
+from otolith_drivers.units import to_base
 
 MATH = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "log", "sqrt")
 FUNCTIONS = {name: getattr(math, name) for name in MATH}

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Window
-from otolith.health.report import Status
-from otolith.heart import adapt
-from otolith.plan import load_plan
-from otolith.state import begin
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import begin
+from otolith.health.schema import Status
+from otolith.machine import load_plan, load_twin
+from otolith.twin.identifiability import structure_of
 from otolith.twin.kernel import Excitation, kernel_of
-from otolith.twin.structure import structure_of
-from otolith.twins import load_twin
 
 PAGE = """
 [twin]

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from otolith import kernel_cache
-from otolith.errors import ServiceError
+from otolith.machine import find_twin
 from otolith.twin.kernel import identity_of
-from otolith.twins import find_twin
+from otolith_drivers.errors import ServiceError
 
 PROGRAM = """
 import sys, time
 import numpy as np
-from otolith.twins import find_twin
+from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
 twin = find_twin("dc_motor")
 drive = Excitation(np.zeros((10, 2)), 0.01)

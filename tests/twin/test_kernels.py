@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array
+from otolith.machine import find_twin, names
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import Excitation, Noise, kernel_of
-from otolith.twins import find_twin, names
 from tests.twin.reference import Reference
 
 PERIODS = {"dc_motor": 0.01, "dc_motor_coulomb": 0.01, "hydraulic_actuator": 0.01, "pmsm": 5e-4, "pump": 0.02,

@@ -14,16 +14,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from otolith.errors import ConfigurationError
-from otolith.twin.code import source_of
+from otolith.machine import LIBRARY, find_twin, load_twin
+from otolith.machine import names as library
 from otolith.twin.dimensions import describe, dimension_of, measure
 from otolith.twin.expressions import FUNCTIONS, ExpressionError, names, parse
 from otolith.twin.kernel import Excitation, kernel_of
+from otolith.twin.kernel_sources import source_of
 from otolith.twin.language import read_twin
-from otolith.twin.system import to_sympy
-from otolith.twins import LIBRARY, find_twin, load_twin
-from otolith.twins import names as library
-from otolith_drivers.toml_files import Page
+from otolith.twin.symbolic import to_sympy
+from otolith_drivers.config_files import Page
+from otolith_drivers.errors import ConfigurationError
 from tests.twin.reference import Reference
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "twins"

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from otolith.acquisition.window import Verdict
-from otolith.health.report import CountersDocument, ParameterDocument, ReportDocument
-from otolith.outlets.zenoh_session import Listener
+from otolith.health.schema import CountersDocument, ParameterDocument, ReportDocument
+from otolith.publishing.zenoh_session import Listener
 from tests.conftest import EXAMPLES, free_port
 
 CHANNEL = "vcan0"

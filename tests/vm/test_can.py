@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from otolith.acquisition.window import Verdict
-from otolith.health.report import CountersDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.schema import CountersDocument, ParameterDocument, ReportDocument, Status
 from tests.vm.conftest import (
     CHANNEL,
     RESISTANCE,

@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from otolith_drivers.base import Setup, Signal
-from otolith_drivers.modbus_poller import Options, Source, build
+from otolith_drivers.modbus.driver import Options, Source, build
 from tests.conftest import free_port
 from tests.drivers.modbus_readers import Listener, wait_for
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from otolith.health.report import Status
+from otolith.health.schema import Status
 from tests.vm.conftest import Machine, resistance, run
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"

@@ -15,7 +15,7 @@ from otolith.acquisition.alignment import Limits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Array, Window
 from otolith.acquisition.windower import GRACE, Windower
-from otolith_drivers.logs.rows import Integers, Rows
+from otolith_drivers.replay.readers import Integers, Rows
 
 ROOM = 16  # windows that the rings hold
 MOST_ROOM = 1 << 20  # samples of each signal, however many there are in a window
@@ -32,7 +32,7 @@ class PlaybackCounts:
     lost: int = 0
     """Samples that came too late for their window, or fell out of a full ring."""
     bad: int = 0
-    """See :attr:`otolith_drivers.logs.rows.Rows.bad`, up to the last row that was taken."""
+    """See :attr:`otolith_drivers.replay.readers.Rows.bad`, up to the last row that was taken."""
     reordered: int = 0
     """Rows with a time before that of a row above."""
     late: int = 0

@@ -3,9 +3,9 @@
 import math
 from dataclasses import dataclass
 
-from otolith.adaptation.gate import TEACHING, Lesson
-from otolith.adaptation.information import QUANTILE, Identifiability, ParameterEstimate
-from otolith.health.report import ParameterDocument, Status
+from otolith.discovery.sequential_test import TEACHING, Lesson
+from otolith.estimation.information import QUANTILE, Identifiability, ParameterEstimate
+from otolith.health.schema import ParameterDocument, Status
 from otolith.twin.definition import Parameter
 
 CONTRIBUTES = 0.98  # of its variance must be left at most, if a window that does not pin a parameter estimates it

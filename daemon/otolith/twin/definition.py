@@ -117,7 +117,7 @@ class Definition:
     """Name, expression and meaning of helper quantities, in the author's order."""
     sites: tuple[Site, ...] = field(default=())
     plain: "Definition | None" = None
-    """Of a twin with slots for components (see :mod:`otolith.twin.slots`): the twin without them."""
+    """Of a twin with slots for components (see :mod:`otolith.twin.augmentation`): the twin without them."""
 
     @property
     def signals(self) -> tuple[str, ...]:

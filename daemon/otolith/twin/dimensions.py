@@ -6,7 +6,7 @@ from fractions import Fraction
 from typing import Any
 
 from otolith.twin.expressions import ExpressionError, constant
-from otolith_drivers.quantities import unit
+from otolith_drivers.units import unit
 
 Dimension = Any
 """pint's container of dimensions and exponents; None stands for the number zero, which has any dimension."""

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Collection
 from typing import Any
 
-from otolith.errors import nearest
+from otolith_drivers.errors import nearest
 
 LONGEST = 2000  # characters
 DEEPEST = 40  # levels of nesting

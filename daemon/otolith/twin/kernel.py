@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from otolith import kernel_cache
 from otolith.acquisition.window import Array, Mask
-from otolith.errors import ConfigurationError
 from otolith.twin.definition import Definition
+from otolith_drivers.errors import ConfigurationError
 
 MOST_SUBSTEPS = 1024
 
@@ -80,7 +80,7 @@ class Sensitivities(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """A twin with slots, linearised along a window (see :mod:`otolith.twin.responses`)."""
+    """A twin with slots, linearised along a window (see :mod:`otolith.twin.kernel_sources`)."""
 
     trajectory: Array
     """(records, states) as predicted."""
@@ -234,7 +234,7 @@ def identity_of(definition: Definition) -> str:
 
 
 def _source(definition: Definition) -> str:
-    from otolith.twin.code import source_of  # noqa: PLC0415 - loads SymPy, which a cached kernel does not need
+    from otolith.twin.kernel_sources import source_of  # noqa: PLC0415 - loads SymPy, which a cached kernel does not need
 
     try:
         return source_of(definition)

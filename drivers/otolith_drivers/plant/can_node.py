@@ -7,14 +7,12 @@ from collections.abc import Callable
 import can
 from cantools.database import Message
 
-from otolith_drivers.can_bus import open_bus
-from otolith_drivers.dbc import load_dbc
+from otolith_drivers.canbus.bus import open_bus
+from otolith_drivers.canbus.database import load_dbc
 from otolith_drivers.errors import ConfigurationError, DeviceError
-from otolith_drivers.plant.pace import Turn, in_real_time
+from otolith_drivers.plant.realtime import Summary, TruthFile, Turn, in_real_time
 from otolith_drivers.plant.scenario import Scenario
-from otolith_drivers.plant.summary import Summary
-from otolith_drivers.plant.truth import TruthFile
-from otolith_drivers.quantities import factor
+from otolith_drivers.units import factor
 
 ALIVE_COUNTER = "AliveCounter"  # signals whose name ends so count the frames of their message
 LISTEN_FIRST = 0.15  # s; longer than ten periods of a node that is already there
@@ -23,7 +21,7 @@ LONGEST_FRAME = 8  # bytes
 
 
 class CanNode:
-    """Implements :class:`otolith_drivers.plant.nodes.Node` over python-can."""
+    """Implements :class:`otolith_drivers.plant.realtime.Node` over python-can."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Open the bus.
@@ -44,11 +42,11 @@ class CanNode:
             raise
 
     def title(self) -> str:
-        """See :meth:`otolith_drivers.plant.nodes.Node.title`."""
+        """See :meth:`otolith_drivers.plant.realtime.Node.title`."""
         return f"{self._scenario.plant} on {self._scenario.bus.title()}, frames of {self._scenario.dbc.name}"
 
     def run(self, truth: TruthFile | None, stopped: Callable[[], bool], duration: float = math.inf) -> Summary:
-        """See :meth:`otolith_drivers.plant.nodes.Node.run`."""
+        """See :meth:`otolith_drivers.plant.realtime.Node.run`."""
         done = Summary.of(self._scenario.faults)
         for turn in in_real_time(self._scenario, done, stopped, duration):
             if turn.effect.withheld is None:
@@ -64,11 +62,11 @@ class CanNode:
         return done
 
     def close(self) -> None:
-        """See :meth:`otolith_drivers.plant.nodes.Node.close`."""
+        """See :meth:`otolith_drivers.plant.realtime.Node.close`."""
         self._bus.shutdown()
 
     def say(self, done: Summary) -> str:
-        """See :meth:`otolith_drivers.plant.nodes.Node.say`."""
+        """See :meth:`otolith_drivers.plant.realtime.Node.say`."""
         withheld = f", {done.withheld} withheld" if done.faults else ""
         return f"{done.frames} frames in {done.seconds:.1f} s of simulated time, {done.stalls} stalls{withheld}"
 

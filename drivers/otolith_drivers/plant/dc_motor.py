@@ -12,12 +12,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.plant.faults import Array, Unbalance, shaking
+from otolith_drivers.config_files import Closed
+from otolith_drivers.plant.faults import Array, Seconds, Tick, Unbalance, shaking
 from otolith_drivers.plant.scenario import POSITIVE, Scenario, Stretch, stretches
-from otolith_drivers.plant.spans import Seconds
-from otolith_drivers.plant.tick import Tick
-from otolith_drivers.quantities import Quantity
-from otolith_drivers.toml_files import Closed
+from otolith_drivers.units import Quantity
 
 EULER_STEP = 1e-4  # s, as in the paper
 # s; a hundredth of the shortest time constant: the error stays below 1e-10 of the range, 1e-9 with an unbalance at the

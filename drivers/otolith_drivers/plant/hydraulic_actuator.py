@@ -15,10 +15,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator
 
+from otolith_drivers.config_files import Closed
+from otolith_drivers.plant.faults import Tick
 from otolith_drivers.plant.scenario import POSITIVE, Scenario, Stretch, stretches
-from otolith_drivers.plant.tick import Tick
-from otolith_drivers.quantities import Quantity
-from otolith_drivers.toml_files import Closed
+from otolith_drivers.units import Quantity
 
 STEP = 1e-4  # s: of the integrator and, as in the paper, of the controller
 SIGNALS = {"ValveArea": "m^2", "LoadForce": "N", "PistonPosition": "m", "SystemPressure": "Pa"}

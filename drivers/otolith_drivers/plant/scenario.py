@@ -1,7 +1,11 @@
-"""What every scenario says, whatever the machine: seed, bus, sampling, and what happens to it."""
+"""What every scenario says, whatever the machine: seed, bus, sampling, and what happens to it.
+
+The table of simulated machines: one row each.
+"""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import count, repeat
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -9,14 +13,25 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, model_validator
 
-from otolith_drivers.can_bus import BusOptions
-from otolith_drivers.errors import nearest
-from otolith_drivers.plant.faults import Array, Drift, Fault, Step, Unbalance
-from otolith_drivers.plant.registers import ModbusOptions, RegisterMap
-from otolith_drivers.plant.sensor_faults import Distortion, Offset, SensorFault, Spikes
-from otolith_drivers.plant.spans import generator
-from otolith_drivers.quantities import Quantity
-from otolith_drivers.toml_files import Closed
+from otolith_drivers.canbus.bus import BusOptions
+from otolith_drivers.config_files import Closed, expect, parse, read, validate
+from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.plant.faults import (
+    Array,
+    Distortion,
+    Drift,
+    Fault,
+    Offset,
+    SensorFault,
+    Spikes,
+    Step,
+    Tick,
+    Unbalance,
+    distorted,
+    generator,
+)
+from otolith_drivers.plant.register_map import ModbusOptions, RegisterMap
+from otolith_drivers.units import Quantity
 
 POSITIVE = 1e-12
 SENSORS = 3  # with noise, on every machine
@@ -145,3 +160,42 @@ def _parameters(scenario: Scenario, changes: list[tuple[Drift | Step, float]], t
         change = fault.change(times, amount)
         values[fault.parameter] += change if np.ptp(change) else change.item(0)
     return values
+
+
+# Each module has SCENARIO, the model of its scenario files, and simulate(scenario), its ticks without end.
+PLANTS = {
+    "dc_motor": "otolith_drivers.plant.dc_motor",
+    "hydraulic_actuator": "otolith_drivers.plant.hydraulic_actuator",
+}
+
+
+def load_scenario(path: Path) -> Scenario:
+    """The scenario in ``path``, the files that it names made relative to it.
+
+    Raises:
+        ConfigurationError: unreadable, an unknown plant, or one line per fault.
+    """
+    page = read(path)
+    data = parse(page)
+    expect(page, data, "plant")
+    name = data.get("plant")
+    if not isinstance(name, str) or name not in PLANTS:
+        raise ConfigurationError(f"{page.place(('plant',))}: no plant {name!r}: {nearest(str(name), list(PLANTS))}")
+    scenario: Scenario = validate(data, _module(name).SCENARIO, page)
+    line = scenario.modbus.line
+    modbus = scenario.modbus.model_copy(update={"line": None if line is None else path.parent / line})
+    return scenario.model_copy(update={"dbc": path.parent / scenario.dbc, "modbus": modbus})
+
+
+def simulate(scenario: Scenario) -> Iterator[Tick]:
+    """The machine of ``scenario``, one tick per sample period, without end; the same for the same seed.
+
+    What is measured is as its sensors say it, faults included; what happens on the bus is not in it.
+    """
+    ticks: Iterator[Tick] = _module(scenario.plant).simulate(scenario)
+    distortions = scenario.distortions()
+    return distorted(ticks, distortions) if distortions else ticks
+
+
+def _module(name: str) -> Any:
+    return import_module(PLANTS[name])

@@ -1,0 +1,86 @@
+"""Jobs, several at a time, each in a process that ends with this one: simulating and estimating take a whole core."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from typing import Any
+
+from benchmarks.paper.discovery import Discovery, Search, discover
+from benchmarks.paper.study import Job, Limit, Study, study
+from otolith.runtime.process import Companion
+from otolith_drivers.errors import OtolithError, ServiceError
+
+MOST = 4  # processes: there are no more jobs that take long
+TOLD_EVERY = 20  # steps
+PATIENCE = 1.0  # s between two looks whether a process has died
+
+# What is done, and what comes of it.
+Work = Job | Search
+Found = Study | Limit | Discovery
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a job has come."""
+
+    job: Work
+    steps: int
+    doing: str
+
+
+def main(connection: Any) -> None:
+    """Do jobs until None comes."""
+    while (job := connection.recv()) is not None:
+
+        def tell(steps: int, doing: str, job: Work = job) -> None:
+            if steps % TOLD_EVERY == 1:
+                connection.send(Progress(job, steps, doing))
+
+        try:
+            connection.send(discover(job, tell) if isinstance(job, Search) else study(job, tell))
+        except OtolithError as error:
+            connection.send(error)
+
+
+def perform(jobs: Sequence[Work], hear: Callable[[Progress], None]) -> list[Found]:
+    """What the jobs find, in their order; ``hear`` is told of progress.
+
+    Raises:
+        OtolithError: an example file that cannot be used, or a process that died.
+    """
+    waiting, found = list(jobs), dict[Work, Found]()
+    cores = len(os.sched_getaffinity(0))
+    crew = [
+        Companion(f"otolith-paper-{number}", f"{__name__}:main", 2) for number in range(min(cores, MOST, len(jobs)))
+    ]
+    busy: dict[Companion, Work] = {}
+    try:
+        while len(found) < len(jobs):
+            for companion in crew:
+                if waiting and companion not in busy:
+                    busy[companion] = waiting.pop(0)
+                    _hand_over(companion, busy[companion])
+            wait([waitable for companion in busy for waitable in companion.waitables], PATIENCE)
+            for companion, job in list(busy.items()):
+                for said in companion.replies():
+                    if isinstance(said, Progress):
+                        hear(said)
+                    elif isinstance(said, OtolithError):
+                        raise said
+                    else:
+                        found[job] = said
+                        del busy[companion]
+                        hear(Progress(job, job.steps, f"{job.row.name}: done"))
+                if companion in busy and not companion.alive:
+                    raise ServiceError(f"the process of {job.row.name} died: is there enough memory?")
+    finally:
+        for companion in crew:
+            companion.kill()
+    return [found[job] for job in jobs]
+
+
+def _hand_over(companion: Companion, job: Work) -> None:
+    if not companion.alive:
+        companion.start()
+    companion.offer(job)

@@ -1,0 +1,1 @@
+"""Offline: noise levels identified from a healthy record."""

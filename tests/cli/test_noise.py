@@ -1,0 +1,72 @@
+"""``otolith noise``: what it prints can be pasted into the machine file, and says what a user should know of it."""
+
+import json
+import tomllib
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from otolith.cli.main import cli
+from otolith.cli.noise import _spread
+from otolith.machine import load_plan
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.plant.dc_motor import MotorScenario
+from tests.cli.replays import MACHINE, recorded, written
+
+
+@pytest.fixture
+def data(tmp_path: Path, scenario: MotorScenario) -> Path:
+    return written(tmp_path, recorded(scenario))
+
+
+def noise(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli, ["noise", *map(str, arguments)], catch_exceptions=False, standalone_mode=False)
+
+
+def test_its_lines_are_a_machine_files_and_right(tmp_path: Path, data: Path) -> None:
+    result = noise(MACHINE, data)
+    text = MACHINE.read_text(encoding="utf-8")
+    machine = tmp_path / "machine.toml"
+    machine.write_text(text[: text.index("[noise]")] + result.stdout, encoding="utf-8")
+    problem = load_plan(machine, with_driver=False).problem
+    assert problem.noise == pytest.approx((0.005, 0.02), rel=0.1)
+    assert problem.input_noise == pytest.approx((0.0, 0.0002))
+    assert problem.process_noise == pytest.approx((0.0, 0.0), abs=0.05)
+    assert set(tomllib.loads(result.stdout)) == {"noise", "process_noise"}
+    assert "# learned from 5 windows of 2 s" in result.stdout
+    assert "chi-square between windows" in result.stdout
+    assert "T_load" in result.stdout
+
+
+def test_json_has_units_and_uncertainties(data: Path) -> None:
+    document = json.loads(noise(MACHINE, data, "--windows", "3", "--json").stdout)
+    assert document["windows"] == 3
+    assert [entry["unit"] for entry in document["outputs"]] == ["A", "rad/s"]
+    assert [entry["unit"] for entry in document["states"]] == ["(A)/s^0.5", "(rad/s)/s^0.5"]
+    for entry in document["outputs"]:
+        assert 0.0 < entry["sd"] < 0.2 * entry["value"]
+    assert document["consistency"]["degrees"] > 0
+
+
+def test_data_without_a_usable_window_is_refused_with_the_reason(tmp_path: Path, scenario: MotorScenario) -> None:
+    rows = recorded(scenario)
+    short = written(tmp_path, rows[:100])
+    with pytest.raises(ConfigurationError, match="no window of 2 s can be used: the data is too short"):
+        noise(MACHINE, short)
+    holes = written(
+        tmp_path, [row if index % 200 < 150 else [row[0], "", "", "", ""] for index, row in enumerate(rows)]
+    )
+    with pytest.raises(ConfigurationError, match=r"no window of 2 s can be used: .*(missing|no samples|gap)"):
+        noise(MACHINE, holes)
+
+
+@pytest.mark.parametrize(("count", "most", "kept"), [(0, 3, 0), (2, 3, 2), (5, 1, 1), (100, 7, 7)])
+def test_windows_are_spread_over_the_data(count: int, most: int, kept: int) -> None:
+    found = _spread(range(count), most)
+    assert len(found) == kept == len(set(found))
+    gaps = [later - earlier for earlier, later in pairwise(found)]
+    assert max(gaps, default=0) <= 2 * min(gaps, default=0)
+    assert not found or found[0] == 0
+    assert kept < 2 or found[-1] >= 0.8 * (count - 1)

@@ -1,0 +1,290 @@
+"""``otolith probe`` against a real Modbus server and a real bus: what it prints can be used as it stands."""
+
+import json
+import math
+import re
+import signal
+import socket
+import subprocess
+import sys
+import termios
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from otolith.cli.main import cli
+from otolith_drivers.base import Signal
+from otolith_drivers.canbus.driver import Options as CanOptions
+from otolith_drivers.canbus.driver import Source as CanSource
+from otolith_drivers.errors import ConfigurationError, DeviceError
+from otolith_drivers.modbus.options import Options, Source, item_of
+from otolith_drivers.modbus.protocol import Order, TypeName
+from tests.conftest import OwnMachine, free_port
+from tests.drivers.modbus_servers import Behaviour, Words, library_server, odd_server
+from tests.drivers.registers import registers
+from tests.drivers.serial_devices import serial_device
+
+ROOT = Path(__file__).parents[2]
+MOVING: list[tuple[int, TypeName, Order, Callable[[float, float], float]]] = [
+    (0, "float32", "CDAB", lambda time, noise: 24.0 + 0.01 * noise),
+    (2, "int16", "ABCD", lambda time, noise: round(1500.0 + 4.0 * noise)),
+    (3, "int32", "CDAB", lambda time, noise: round(1e6 * math.sin(3.0 * time) + 300.0 * noise)),
+    (5, "float64", "CDAB", lambda time, noise: 400.0 + 0.1 * noise),
+    (9, "float32", "CDAB", lambda time, noise: 30.0 * math.sin(4.0 * time) + 0.01 * noise),
+]
+STILL = {11: 0x0237, 12: 0x41BC, 100: 5, 101: 6}
+
+
+def probe(*arguments: str | Path | float) -> Result:
+    return CliRunner().invoke(cli, ["probe", *map(str, arguments)], standalone_mode=False, catch_exceptions=False)
+
+
+def lines_of(text: str, start: str) -> list[str]:
+    return [line for line in text.splitlines() if line.startswith(start)]
+
+
+@pytest.fixture
+def drive() -> Iterator[int]:
+    """A drive with numbers of all types in one order; the port."""
+    random, begun = np.random.default_rng(3), time.monotonic()
+
+    def moving() -> Words:
+        found: Words = {}
+        for address, kind, order, number in MOVING:
+            value = number(time.monotonic() - begun, random.standard_normal())
+            found |= {address + at: word for at, word in enumerate(registers(value, kind, order))}
+        return found
+
+    with library_server(moving() | STILL, lambda at: moving() if at < 100 else {}) as port:
+        yield port
+
+
+def test_registers_are_told_and_their_lines_can_be_read_by_the_driver(drive: int) -> None:
+    result = probe("modbus", f"127.0.0.1:{drive}", "--registers", "0..110", "--seconds", 2)
+    text = result.stdout
+    assert result.return_value == 0
+    assert "registers 0 to 12 and 100 to 101 can be read" in text
+    assert "registers 13 to 99 and 102 to 110 refused: illegal data address" in text
+    assert re.search(r"13 registers in one request: [\d.]+ ms, 99 of 100 within", text)
+    assert "# registers 11 to 12 and 100 to 101: cannot be told" in text
+    driver = tomllib.loads(text[text.index("[driver]") : text.index("[signals]")])["driver"]
+    assert driver.pop("type") == "modbus"
+    options = Options.model_validate(driver)
+    assert (options.host, options.port, options.device) == ("127.0.0.1", drive, 1)
+    found = set()
+    for line in lines_of(text, "NAME"):
+        keys = tomllib.loads(line)["NAME"] | {"unit": "V"}
+        item = item_of(Signal("s", "V", Source.model_validate(keys)), options)
+        found.add((item.address, item.kind, item.order))
+    assert found == {(address, kind, order) for address, kind, order, _ in MOVING}
+    assert re.search(r"register = 0, .*# 2[34]\.\d+ now, between 23\.9\d* and 24\.0\d*", text)
+
+
+def test_a_single_register_is_shown_in_every_type_and_order(drive: int) -> None:
+    text = probe("modbus", f"127.0.0.1:{drive}", "--registers", "5", "--seconds", 1).stdout
+    assert len(lines_of(text, "float64")) == len(lines_of(text, "int32")) == 4
+    (right,) = [line for line in lines_of(text, "float64") if "*" in line]
+    assert right.split()[1] == "CDAB"
+    assert len(lines_of(text, "NAME")) == 1
+
+
+def test_json_says_all_of_it(drive: int) -> None:
+    arguments = ("--registers", "1..14", "--first-address", "1", "--seconds", "1.5", "--json")
+    document = json.loads(probe("modbus", f"127.0.0.1:{drive}", *arguments).stdout)
+    assert document["readable"] == [[1, 13]]
+    assert document["refused"] == {"14": "illegal data address"}
+    assert {entry["register"]: entry["type"] for entry in document["numbers"] if entry["verdict"] == "told"}[
+        1
+    ] == "float32"
+    assert document["registers"][2]["values"]["int16"] == pytest.approx(1500, abs=30)
+    assert 0.0 < document["speed"][0]["median_s"] < 1.0
+    assert "first_address = 1" in document["lines"]
+
+
+def test_narrow_terminals_get_several_tables(drive: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("otolith.cli.probe_view.PLAIN_WIDTH", 80)
+    text = probe("modbus", f"127.0.0.1:{drive}", "--registers", "0..10", "--seconds", 0.2, "--wide").stdout
+    tables = text[: text.index("[driver]")]
+    assert all(len(line) <= 80 or "*" in line[:2] for line in tables.splitlines()[5:])
+    assert len(lines_of(tables, "register")) >= 4
+
+
+def test_registers_that_are_not_there_are_exit_code_one(drive: int) -> None:
+    result = probe("modbus", f"127.0.0.1:{drive}", "--registers", "50..60")
+    assert result.return_value == 1
+    assert "--table input" in result.stdout
+
+
+def test_nobody_there_is_one_line_with_cause_and_way_out() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    with pytest.raises(DeviceError, match=rf"127\.0\.0\.1:{port} cannot be opened: Connection refused; .*HOST:PORT"):
+        probe("modbus", f"127.0.0.1:{port}")
+    with pytest.raises(DeviceError, match=r"/dev/ttyNONE.* cannot be opened: No such file.*; serial adapters of this"):
+        probe("modbus", "/dev/ttyNONE")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("http://plc",),
+        ("plc:99999",),
+        ("plc", "--registers", "9..3"),
+        ("plc", "--registers", "0..5000"),
+        ("plc", "--registers", "x"),
+        ("plc", "--registers", "0..3", "--first-address", "1"),
+        ("plc", "--device", "1..9"),
+    ],
+)
+def test_what_cannot_be_meant_is_a_usage_error(arguments: tuple[str, ...]) -> None:
+    assert CliRunner().invoke(cli, ["probe", "modbus", *arguments]).exit_code == 2
+
+
+def test_a_scan_lists_devices() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    behaviour = Behaviour({}, silent=lambda device: device not in (2, 5), refuse=lambda device, *_: {5: 2}.get(device))
+    with odd_server(behaviour, port):
+        result = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "1..6", "--timeout", "0.05")
+        assert result.stdout.splitlines() == [
+            f"Modbus TCP 127.0.0.1:{port}: 2 of 6 devices answer",
+            "device 2",
+            "device 5 (that register is refused: illegal data address)",
+        ]
+        nobody = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "3..4", "--timeout", "0.05")
+        assert nobody.return_value == 1
+
+
+def refuse(*_: object) -> None:
+    raise termios.error(22, "Invalid argument")
+
+
+def test_a_serial_line_is_scanned_and_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    with serial_device({3: 1234}, 5) as port:
+        scanned = probe("modbus", port, "--scan", "--device", "3..6", "--timeout", "0.1", "--parity", "N")
+        assert scanned.stdout.splitlines()[1:] == ["device 5"]
+        text = probe("modbus", port, "--device", "5", "--registers", "0..9", "--seconds", 0.2, "--parity", "N").stdout
+        assert re.search(r"^3 +04D2 +1234 ", text, re.MULTILINE)
+        driver = tomllib.loads(text[text.index("[driver]") : text.index("[signals]")])["driver"]
+        assert (driver["serial"], driver["baudrate"], driver["parity"], driver["device"]) == (port, 19200, "N", 5)
+        with pytest.raises(DeviceError, match=r"device 4: no answer within 0\.1 s; are baud rate, parity"):
+            probe("modbus", port, "--device", "4", "--timeout", "0.1", "--parity", "N")
+        monkeypatch.setattr("termios.tcsetattr", refuse)
+        with pytest.raises(DeviceError, match=r"the port refuses these settings: .*--parity"):
+            probe("modbus", port, "--parity", "E")
+
+
+@pytest.fixture
+def plant(own_machine: OwnMachine) -> Iterator[OwnMachine]:
+    """The simulated motor in a process of its own, speaking."""
+    command = [sys.executable, "-m", "otolith", "plant", str(own_machine.scenario)]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 60.0
+        while probe("can", *bus_of(own_machine), "--seconds", 0.3).return_value and time.monotonic() < deadline:
+            assert process.poll() is None
+        yield own_machine
+        process.send_signal(signal.SIGTERM)
+
+
+def bus_of(machine: OwnMachine) -> list[str]:
+    return ["--interface", "udp_multicast", "--channel", machine.group, "--port", str(machine.port)]
+
+
+def test_frames_and_signals_of_a_bus_with_its_database(plant: OwnMachine) -> None:
+    result = probe("can", *bus_of(plant), "--database", plant.dbc, "--seconds", 2)
+    text = result.stdout
+    assert result.return_value == 0
+    assert re.search(r"^0x181 .* 8 +\d+ +\d.*MotorElectrical", text, re.MULTILINE)
+    assert "not in the database" not in text
+    driver = tomllib.loads(text[text.index("[driver]") : text.index("[signals]")])["driver"]
+    assert driver.pop("type") == "can"
+    assert CanOptions.model_validate(driver).port == plant.port
+    names = [CanSource.model_validate(tomllib.loads(line)["NAME"]).signal for line in lines_of(text, "NAME")]
+    assert names == ["ArmatureVoltage", "ArmatureCurrent", "RotorSpeed", "LoadTorque"]
+    assert re.search(r'signal = "RotorSpeed" \}  # rad/s, -?[\d.]+ now', text)
+
+
+def test_without_a_database_the_fields_are_found_where_it_has_them(plant: OwnMachine) -> None:
+    text = probe("can", *bus_of(plant), "--seconds", 4).stdout
+    fields = [tomllib.loads(line)["NAME"] for line in lines_of(text, "NAME")]
+    places = {(field["id"], field["start"], field["length"], field["byte_order"]) for field in fields}
+    assert {("0x181", 0, 16, "little"), ("0x281", 0, 16, "little")} <= places
+    assert not {start for _, start, _, _ in places} - {0, 16}, "neither padding nor counters"
+    assert "TPDO 1 of node 1, if CANopen" in text
+
+
+def test_json_of_a_bus(plant: OwnMachine) -> None:
+    document = json.loads(probe("can", *bus_of(plant), "--database", plant.dbc, "--seconds", 1, "--json").stdout)
+    assert {entry["id"]: entry["message"] for entry in document["frames"]} == {
+        "0x181": "MotorElectrical",
+        "0x281": "MotorMechanical",
+    }
+    assert all(entry["rate_hz"] == pytest.approx(100.0, rel=0.3) for entry in document["frames"])
+    assert {entry["signal"] for entry in document["signals"]} >= {"RotorSpeed", "LoadTorque"}
+
+
+def test_an_empty_bus_is_exit_code_one_and_says_what_to_try(own_machine: OwnMachine) -> None:
+    result = probe("can", *bus_of(own_machine), "--seconds", 0.2)
+    assert result.return_value == 1
+    assert "nothing was heard" in result.stdout
+    assert "--channel can0" in result.stdout
+
+
+def test_a_bus_that_is_not_there_and_one_that_cannot_be_meant() -> None:
+    with pytest.raises(DeviceError, match="can9 cannot be opened"):
+        probe("can", "--channel", "can9")
+    with pytest.raises(ConfigurationError, match="udp_multicast takes a group"):
+        probe("can", "--interface", "udp_multicast", "--channel", "can0")
+    with pytest.raises(ConfigurationError, match=r"nothing\.dbc: cannot be read"):
+        probe("can", "--database", "nothing.dbc")
+
+
+def interrupted(arguments: Sequence[str], ready: Callable[[], bool]) -> "subprocess.CompletedProcess[str]":
+    """The command, ended by Ctrl-C when it listens to signals and the rest is ``ready``."""
+    command = [sys.executable, "-m", "otolith", "probe", *arguments, "--seconds", "60"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60.0
+        while not (_takes_signals(process.pid) and ready()) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=30.0)
+    return subprocess.CompletedProcess(command, process.returncode, output, errors)
+
+
+def _takes_signals(pid: int) -> bool:
+    """Whether the process has a handler of its own for SIGTERM."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    caught = re.search(r"SigCgt:\s*([0-9a-f]+)", status)
+    return caught is not None and bool(int(caught[1], 16) >> (signal.SIGTERM - 1) & 1)
+
+
+def test_ctrl_c_ends_listening_with_what_was_heard(own_machine: OwnMachine) -> None:
+    done = interrupted(["can", *bus_of(own_machine)], lambda: True)
+    assert (done.returncode, done.stderr) == (130, "")
+    assert "only listening" in done.stdout
+
+
+def test_ctrl_c_ends_reading_with_what_was_read() -> None:
+    behaviour, port = Behaviour({0: 7}), free_port(socket.SOCK_STREAM)
+    with odd_server(behaviour, port):
+        done = interrupted(["modbus", f"127.0.0.1:{port}", "--registers", "0..3"], lambda: len(behaviour.asked) > 3)
+    assert (done.returncode, done.stderr) == (130, "")
+    assert "[signals]" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["can", "modbus"])
+def test_help_has_examples(name: str) -> None:
+    result = CliRunner().invoke(cli, ["probe", name, "--help"])
+    assert re.search(rf"Examples?:\n\s+otolith probe {name}", result.output)
+
+
+def test_neither_can_send() -> None:
+    paths = [*ROOT.glob("drivers/otolith_drivers/probe_*.py"), *ROOT.glob("daemon/otolith/*probe*.py")]
+    assert len(paths) > 8
+    for path in paths:
+        text = path.read_text(encoding="utf-8")
+        assert ".send" not in text, path
+        assert ".write" not in text, path

@@ -1,0 +1,245 @@
+"""Replay: recorded data says what the daemon would have said, to the last byte, whatever state the file is in.
+
+A golden case is a folder with ``data.*`` and ``error.txt``, where ``{file}`` stands for the data and ``{machine}`` for
+the machine file: its own, or the one that all cases without share.
+``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the sentences anew: read the difference.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import begin
+from otolith.cli.replay import replay
+from otolith.health.schema import ReportDocument
+from otolith.machine import load_plan
+from otolith.publishing.recorder import LEAST_FREE
+from otolith.runtime.replay import Replay
+from otolith_drivers.errors import ConfigurationError, OtolithError
+from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.replay import tables as table
+from tests.cli.replays import (
+    GOLDEN,
+    HEADING,
+    MACHINE,
+    PERIOD,
+    RECORDS,
+    Lines,
+    recorded,
+    reports,
+    summed_up,
+    values,
+    written,
+)
+from tests.conftest import EXAMPLES, SIGNALS
+from tests.drivers.logs import frames_of, live
+from tests.drivers.logs import written as written_log
+from tests.machine.test_machine_file import GOLDEN as MACHINE_FILES
+
+CASES = sorted(path.parent for path in GOLDEN.glob("*/data.*"))
+
+
+@pytest.fixture
+def rows(scenario: MotorScenario) -> Lines:
+    return recorded(scenario)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_file_that_cannot_be_used_gets_its_sentence(case: Path) -> None:
+    (data,) = case.glob("data.*")
+    machine = case / "machine.toml" if (case / "machine.toml").exists() else MACHINE
+    with pytest.raises(ConfigurationError) as caught:
+        replay(machine, data, None, as_json=True, stopped=lambda: False)
+    said = str(caught.value).replace(str(data), "{file}").replace(str(machine), "{machine}") + "\n"
+    if os.environ.get("OTOLITH_UPDATE_GOLDEN"):
+        (case / "error.txt").write_text(said, encoding="utf-8")
+    assert said == (case / "error.txt").read_text(encoding="utf-8")
+
+
+def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
+    for content in ("t,V_a\n0,1\n".encode("utf-16"), b"PK\3\4\0\0", b"x" * 300_000):
+        path = tmp_path / "data.csv"
+        path.write_bytes(content)
+        with pytest.raises(ConfigurationError, match=r"is no text|is this a CSV file\?"):
+            replay(MACHINE, path, None, as_json=True, stopped=lambda: False)
+    with pytest.raises(ConfigurationError, match="No such file"):
+        replay(MACHINE, tmp_path / "none.csv", None, as_json=True, stopped=lambda: False)
+    with pytest.raises(ConfigurationError, match="is a directory"):
+        replay(MACHINE, tmp_path, None, as_json=True, stopped=lambda: False)
+
+
+def test_only_a_replay_does_without_a_driver() -> None:
+    file = MACHINE_FILES / "no-driver" / "machine.toml"
+    with pytest.raises(ConfigurationError, match="loaded without its driver"):
+        _ = load_plan(file, with_driver=False).driver
+    with pytest.raises(ConfigurationError, match="say where the signals come from"):
+        load_plan(file)
+
+
+def test_the_truth_comes_back_as_from_windows_without_a_file(
+    tmp_path: Path, rows: Lines, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = load_plan(MACHINE, with_driver=False)
+    state = begin("motor", "site", plan.problem)
+    found = reports(written(tmp_path, rows), capsys)
+    assert len(found) == 5
+    with table.Table(tmp_path / "data.csv", {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
+        windows = list(Replay(plan, opened).windows())
+    for index, (window, document) in enumerate(zip(windows, found, strict=True)):
+        own = np.array([row[1:] for row in rows[index * RECORDS : (index + 1) * RECORDS]], dtype=np.float64)
+        assert np.array_equal(window.values, own)
+        assert window.start == pytest.approx(index * RECORDS * PERIOD, abs=1e-9)
+        state, report = adapt(state, window)
+        assert report.document == document.model_copy(update={"counters": None})
+        assert document.parameters["R_a"].value == pytest.approx(scenario.parameters.R_a, rel=0.005)
+    assert found[-1].counters is not None
+    assert (found[-1].counters.received, found[-1].counters.windows) == (4 * len(rows), 5)
+
+
+def test_two_runs_print_the_same_bytes(tmp_path: Path, rows: Lines) -> None:
+    data = written(tmp_path, rows)
+    printed = [
+        subprocess.run(
+            [sys.executable, "-m", "otolith", "replay", str(MACHINE), str(data), *arguments],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            capture_output=True,
+            check=True,
+        )
+        for arguments in (["--json"], [])
+        for seed in ("1", "2")
+    ]
+    assert printed[0].stdout == printed[1].stdout
+    assert printed[2].stdout == printed[3].stdout
+    assert [json.loads(line)["cost"]["seconds"] for line in printed[0].stdout.splitlines()] == [0.0] * 5
+    assert all(not run.stderr for run in printed)
+
+
+def test_unknown_columns_are_named_and_ignored(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+    data = written(tmp_path, [[*row, "x"] for row in rows], heading=(*HEADING, "Bemerkung [-]"))
+    replay(MACHINE, data, None, as_json=True, stopped=lambda: False)
+    assert capsys.readouterr().err == f"{data}: columns not used: Bemerkung\n"
+
+
+def test_the_summary_says_what_was_found(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+    text = summed_up(written(tmp_path, rows[:-50]), capsys)
+    assert "motor at site, twin dc_motor (DT'), from 0 s to 8 s" in text
+    assert "R_a" in text
+    assert "ohm" in text
+    assert "4 windows: 4 good, 0 bad; the twin explains 4 of 4" in text
+    assert "950 rows read, 0 reordered" in text
+    assert "the last 1.5 s make no window of 2 s" in text
+
+
+def test_a_recording_is_written(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "new" / "run.rrd"
+    replay(MACHINE, written(tmp_path, rows), path, as_json=False, stopped=lambda: False)
+    assert "5 windows" in capsys.readouterr().out
+    assert path.stat().st_size > 10_000
+
+
+def test_a_full_disk_ends_a_recording_with_a_sentence(
+    tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("otolith.publishing.recorder.LEAST_FREE", LEAST_FREE << 40)
+    with pytest.raises(OtolithError, match="too little room"):
+        replay(MACHINE, written(tmp_path, rows), tmp_path / "run.rrd", as_json=True, stopped=lambda: False)
+
+
+def test_control_c_ends_it_with_what_was_found(tmp_path: Path, rows: Lines) -> None:
+    later = [[f"{float(row[0]) + 10.0 * turn:.3f}", *row[1:]] for turn in range(100) for row in rows]
+    command = [sys.executable, "-m", "otolith", "replay", str(MACHINE), str(written(tmp_path, later)), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        ReportDocument.from_json(process.stdout.readline())
+        process.send_signal(signal.SIGINT)
+        rest, said = process.stdout.read(), process.stderr.read()
+    assert process.returncode == 130
+    assert len(rest.splitlines()) < 499
+    assert "interrupted after" in said
+    assert "Traceback" not in said
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path: Path, rows: Lines) -> None:
+    """Two hundred thousand rows are 13 MB of text; as cells they would be some 80 MB. Bad windows, to save time."""
+    text = "\n".join(f"{index * PERIOD:.3f},{','.join(rows[index % 1000][1:4])}," for index in range(200_000))
+    long, short = tmp_path / "long.csv", tmp_path / "short.csv"
+    long.write_text(f"{','.join(HEADING)}\n{text}\n", encoding="utf-8")
+    short.write_text("\n".join(long.read_text(encoding="utf-8").splitlines()[:20_000]), encoding="utf-8")
+    program = (
+        "import resource, sys; from pathlib import Path; from otolith.cli.replay import replay\n"
+        "for name in sys.argv[2:]:\n"
+        "    replay(Path(sys.argv[1]), Path(name), None, as_json=False, stopped=lambda: False)\n"
+        "    print('peak', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    command = [sys.executable, "-c", program, str(MACHINE), str(short), str(long)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "1000 windows: 0 good" in printed
+    small, large = (int(line.split()[1]) for line in printed.splitlines() if line.startswith("peak"))
+    assert large - small < 20_000  # kB
+
+
+def test_a_log_of_the_bus_says_what_the_table_says(
+    tmp_path: Path, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Values of the bus have the resolution of its frames, and the table has those."""
+    frames = frames_of(scenario, 600)
+    heard: dict[float, dict[str, float]] = {}
+    for sample in live(frames):
+        heard.setdefault(round(sample.time, 2), {})[sample.signal] = sample.value
+    rows = [[f"{time:.2f}", *(repr(row[name]) for name in SIGNALS)] for time, row in heard.items()]
+    table_path = written(tmp_path, rows)
+    machine = tmp_path / "machine.toml"
+    text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
+    machine.write_text(text.replace('"dc-motor.dbc"', f'"{EXAMPLES / "dc-motor.dbc"}"'), encoding="utf-8")
+    found = {}
+    for path in (
+        table_path,
+        *(written_log(tmp_path, frames, suffix) for suffix in (".log", ".asc", ".blf", ".trc.gz")),
+    ):
+        replay(machine, path, None, as_json=True, stopped=lambda: False)
+        lines = capsys.readouterr().out.splitlines()
+        found[path.suffix] = values([ReportDocument.from_json(line) for line in lines])
+    assert len(found[".csv"]) == 3
+    for printed in found.values():
+        assert printed == pytest.approx(found[".csv"], rel=1e-6)
+
+
+def test_in_real_time_a_window_comes_when_it_would_have_ended(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    machine = tmp_path / "machine.toml"
+    machine.write_text(MACHINE.read_text(encoding="utf-8") + '[window]\nlength = "0.5 s"\n', encoding="utf-8")
+    later = [[f"{float(row[0]) + 1000.0 * (index >= 100):.3f}", *row[1:]] for index, row in enumerate(rows[:200])]
+    data = written(tmp_path, later)
+    printed = []
+    for real_time in (False, True):
+        begun = time.monotonic()
+        replay(machine, data, None, as_json=True, stopped=lambda: False, real_time=real_time)
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1]
+    assert len(printed[0].splitlines()) == 4
+    assert 2.0 <= time.monotonic() - begun < 20.0  # the silence in the middle is passed over
+
+
+def test_the_columns_of_a_replayed_machine_are_found_where_it_says(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = values(reports(written(tmp_path, rows), capsys))
+    in_rpm = [[*row[:4], repr(float(row[4]) * 30 / np.pi)] for row in rows]
+    data = written(tmp_path, in_rpm, heading=("t", "U", "T_load", "i", "RotorSpeed"))
+    machine = tmp_path / "machine.toml"
+    signals = 'V_a = { column = "U" }\nT_load = {}\ni = {}\nomega = { column = "RotorSpeed", unit = "rpm" }\n'
+    driver = f'[driver]\ntype = "replay"\nfile = "{data.name}"\n\n[signals]\n{signals}\n'
+    machine.write_text(MACHINE.read_text(encoding="utf-8").replace("[twin]", driver + "[twin]"), encoding="utf-8")
+    replay(machine, data, None, as_json=True, stopped=lambda: False)
+    found = [ReportDocument.from_json(line) for line in capsys.readouterr().out.splitlines()]
+    assert values(found) == pytest.approx(plain, rel=1e-6)

@@ -1,0 +1,227 @@
+"""Tables as they are found: other ways to write one, rows and cells missing, out of order, senseless."""
+
+import gzip
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from otolith.cli.replay import moment
+from otolith.health.schema import ReportDocument, Status
+from otolith.machine import load_plan
+from otolith.runtime.replay import Replay
+from otolith_drivers.errors import OtolithError
+from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.replay import tables as table
+from tests.cli.replays import HEADING, MACHINE, PERIOD, Lines, recorded, reports, summed_up, values, written
+from tests.conftest import SIGNALS
+
+
+@pytest.fixture
+def rows(scenario: MotorScenario) -> Lines:
+    return recorded(scenario)
+
+
+def test_how_the_file_is_read_does_not_matter(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows[250], rows[251], rows[300][2], rows[400][3] = rows[251], rows[250], "", "?"
+    data = written(tmp_path, rows)
+    whole = reports(data, capsys)
+    monkeypatch.setattr(table, "CHUNK", 97)
+    assert reports(data, capsys) == whole
+
+
+def test_a_european_export_says_the_same(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = values(reports(written(tmp_path, rows), capsys))
+    lines = ["# Prüfstand 3", "", "t [ms];V_a [mV];Bemerkung;T_load;i;omega [U/min];"]
+    for t, voltage, load, current, speed in rows:
+        cells = [f"{1e3 * float(t):.1f}", repr(1e3 * float(voltage)), "ok", load, current]
+        lines.append(";".join([*cells, repr(float(speed) * 30 / np.pi), ""]).replace(".", ","))
+    path = tmp_path / "export.csv"
+    path.write_bytes("\r\n".join(lines).encode("utf-8-sig"))
+    assert values(reports(path, capsys)) == pytest.approx(plain, rel=1e-6)
+    path.write_bytes("\r\n".join(lines).encode("cp1252"))
+    assert values(reports(path, capsys)) == pytest.approx(plain, rel=1e-6)
+
+
+@pytest.mark.parametrize("style", ["tab", "quotes", "quoted decimal comma", "sep=", "gzip"])
+def test_other_ways_to_write_a_table(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str], style: str
+) -> None:
+    plain = values(reports(written(tmp_path, rows), capsys))
+    if style == "tab":
+        path = written(tmp_path, rows, separator="\t")
+    elif style == "gzip":
+        path = tmp_path / "data.csv.gz"
+        path.write_bytes(gzip.compress(written(tmp_path, rows).read_bytes()))
+    elif style == "sep=":
+        path = written(tmp_path, rows, separator="|")
+        path.write_text("sep=|\n" + path.read_text(encoding="utf-8"), encoding="utf-8")
+    else:
+        sign = "," if "comma" in style else "."
+        quoted = [[f'"{cell.replace(".", sign)}"' for cell in row] for row in rows]
+        path = written(tmp_path, quoted, heading=tuple(f'"{name}"' for name in HEADING))
+    assert values(reports(path, capsys)) == plain
+
+
+def test_a_packed_table_that_is_cut_off_is_read_as_far_as_it_goes(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "data.csv.gz"
+    path.write_bytes(gzip.compress(written(tmp_path, rows).read_bytes())[:-3000])
+    text = summed_up(path, capsys)
+    assert "4 windows: 4 good, 0 bad" in text
+    assert "cut off: Compressed file ended" in text
+
+
+def test_what_is_missing_is_counted_and_told(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+    rows[210][1], rows[220][2], rows[230][3] = "", "NaN", "#REF!"
+    rows[240][4], rows[250][0] = "1_000", "yesterday"
+    rows[260] = rows[260][:2]
+    del rows[450:453]
+    rows[300:300] = [["# a remark"], [""], ["", "", "", "", ""]]
+    data = written(tmp_path, rows)
+    found = reports(data, capsys)
+    assert len(found) == 5
+    for document in found:  # two windows lack more than one record in a hundred, and are not estimated from
+        lacking = document.window.quality.missing > 0.01
+        assert document.parameters["R_a"].status is (Status.HELD if lacking else Status.ESTIMATED)
+    assert [document.window.quality.missing > 0.01 for document in found] == [False, True, True, False, False]
+    assert found[-1].counters is not None
+    assert (found[-1].counters.bad, found[-1].counters.lost) == (4, 0)
+    text = summed_up(data, capsys)
+    assert f"{len(rows) - 5} rows read, 0 reordered, 2 bad rows, 2 bad cells, 2 cells blank" in text
+    assert "bad cells: 2, bad rows: 2, the first in line 232: i is '#REF!', no number" in text
+
+
+def test_rows_out_of_order_are_put_back_while_their_window_is_open(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = values(reports(written(tmp_path, rows), capsys))
+    for at in range(30, 190, 7):
+        rows[at], rows[at + 3] = rows[at + 3], rows[at]
+    found = reports(written(tmp_path, rows), capsys)
+    assert values(found) == plain
+    assert found[-1].counters is not None
+    assert found[-1].counters.lost == 0
+    late = rows.pop(100)
+    rows.insert(700, late)
+    text = summed_up(written(tmp_path, rows), capsys)
+    assert "; 4000 samples, 4 lost" in text
+    assert f"closed: 1, the first in line 702, with t = {float(late[0]):g} after t = 7 above" in text.replace("\n", " ")
+
+
+def test_a_stamp_far_ahead_spoils_what_follows_and_is_named(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows[500][0] = "99999999"
+    text = summed_up(written(tmp_path, rows), capsys)
+    assert "2 windows: 2 good, 0 bad" in text
+    assert "closed: 499, the first in line 503, with t = 5.01 after t = 99999999 above" in text
+
+
+def test_a_short_silence_gives_bad_windows_and_a_long_one_is_passed_over(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for silence, windows in ((10.0, 15), (1e5, 10)):
+        again = [[f"{float(row[0]) + 10.0 + silence:.3f}", *row[1:]] for row in rows]
+        found = reports(written(tmp_path, rows + again), capsys)
+        assert [document.window.index for document in found] == list(range(windows))
+        assert sum(document.window.quality.verdict == "good" for document in found) == 10
+        assert found[-1].window.end == pytest.approx(20.0 + silence)
+
+
+def test_irregular_rows_and_slow_columns(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+    random = np.random.default_rng(5)
+    for index, row in enumerate(rows):
+        row[0] = f"{float(row[0]) + random.uniform(0.0, 0.002):.6f}"
+        row[2] = row[2] if index % 10 == 0 else ""
+    found = reports(written(tmp_path, rows), capsys)
+    assert len(found) == 5
+    assert all(document.window.quality.verdict == "good" for document in found)
+    for before, after in pairwise(found):
+        assert after.window.start == pytest.approx(before.window.end, abs=PERIOD / 4)
+    assert found[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.005)
+
+
+def test_a_column_without_a_reading_gives_bad_windows_that_name_it(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = summed_up(written(tmp_path, [[*row[:4], ""] for row in rows]), capsys)
+    assert "5 windows: 0 good, 5 bad" in text
+    assert "5 bad like: no samples of omega (window 0)" in text
+
+
+def test_rows_much_denser_than_the_grid_are_not_lost(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dense = [[f"{index * 1e-4:.4f}", *rows[index // 100][1:]] for index in range(len(rows) * 100)]
+    found = reports(written(tmp_path, dense), capsys)
+    assert len(found) == 5
+    assert found[-1].counters is not None
+    assert found[-1].counters.lost == 0
+
+
+JUNK = st.sampled_from(
+    ["", "nan", "1", "-2.5", "1e308", "-1e308", "1e999", "#", '"', "a", "1,5", "\x00", "é", " ", "inf"]
+)
+ANYTHING = st.text(max_size=400) | st.builds(
+    lambda lines, sep, end: end.join(["t,V_a,T_load,i,omega".replace(",", sep), *(sep.join(line) for line in lines)]),
+    st.lists(st.lists(JUNK | st.floats(width=32).map(repr), min_size=3, max_size=6), max_size=30),
+    st.sampled_from([",", ";", "\t"]),
+    st.sampled_from(["\n", "\r\n", "\r"]),
+)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(ANYTHING)
+def test_no_text_whatever_does_more_than_complain(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "data.csv"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    check_any(path)
+
+
+ROW = st.tuples(st.floats(-0.2, 3.0), st.lists(JUNK | st.floats(-5, 5).map(repr), min_size=4, max_size=4))
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(ROW, min_size=2, max_size=80), st.booleans(), st.sampled_from([1.0, 0.1, 1e6]))
+def test_no_table_whatever_does_more_than_complain(
+    tmp_path: Path, rows: list[tuple[float, list[str]]], ordered: bool, pace: float
+) -> None:
+    lines = [[repr(time * pace), *cells] for time, cells in (sorted(rows) if ordered else rows)]
+    check_any(written(tmp_path, lines, separator=";"))
+
+
+def check_any(path: Path) -> None:
+    """It is refused with its name, or every window gets its report."""
+    machine = path.with_name("machine.toml")
+    window = '[window]\nlength = "0.2 s"\nmissing_limit = "100 %"\ngap_limit = "1 s"\njitter_limit = "1 s"\n'
+    swarm = "[swarm]\ngenerations = 2\nsize = 3\n"
+    machine.write_text(MACHINE.read_text(encoding="utf-8") + window + swarm, encoding="utf-8")
+    plan = load_plan(machine, with_driver=False)
+    said = str(path)
+    try:
+        with table.Table(path, {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
+            for index, report in enumerate(Replay(plan, opened).reports()):
+                document = report.document
+                assert document.window.index == index
+                assert document.counters is not None
+                assert document.counters.windows_missed == 0
+                assert ReportDocument.from_json(document.to_json()) == document
+    except OtolithError as error:
+        said = str(error)
+    assert str(path) in said
+
+
+@pytest.mark.parametrize(
+    ("seconds", "told"),
+    [(-2.5, "-2.5 s"), (0.0, "0 s"), (3600.25, "3600.25 s"), (1.7e9, "2023-11-14 22:13:20Z"), (1.7e12, "1.7e+12 s")],
+)
+def test_times_that_can_be_dates_are_told_as_dates(seconds: float, told: str) -> None:
+    """A column of milliseconds since 1970 is none."""
+    assert moment(seconds) == told

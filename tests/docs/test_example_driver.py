@@ -1,0 +1,54 @@
+"""The worked example of a driver of one's own: it keeps the contract, and an entry point is all it takes."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from otolith_drivers.conformance import CONTRACT
+from tests.conftest import EXAMPLES
+
+FOLDER = Path(__file__).parents[2] / "docs" / "example-driver"
+MODULE = "otolith_udp_json.py"
+
+
+def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *command], capture_output=True, text=True, timeout=120, check=False,
+        cwd=FOLDER, env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+def test_it_keeps_the_contract() -> None:
+    done = run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(FOLDER), PYTHONDONTWRITEBYTECODE="1")
+    assert done.returncode == 0, done.stdout
+    assert f"{len(CONTRACT) + 1} passed" in done.stdout  # and one of what comes over the wire
+
+
+def test_its_entry_point_makes_it_a_driver_of_machine_files(tmp_path: Path) -> None:
+    """As pip installs it: the module and its metadata in a folder of packages."""
+    (tmp_path / MODULE).write_bytes((FOLDER / MODULE).read_bytes())
+    metadata = tmp_path / "otolith_udp_json-0.1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: otolith-udp-json\nVersion: 0.1.0\n")
+    (metadata / "entry_points.txt").write_text("[otolith.drivers]\nudp_json = otolith_udp_json\n")
+    assert 'udp_json = "otolith_udp_json"' in (FOLDER / "pyproject.toml").read_text(encoding="utf-8")
+
+    text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
+    text = text.replace('type = "can"\ndbc = "dc-motor.dbc"\n', 'type = "udp_json"\nport = 5005\n')
+    for name, unit in (
+        ("ArmatureVoltage", "V"),
+        ("LoadTorque", "mN*m"),
+        ("ArmatureCurrent", "A"),
+        ("RotorSpeed", "rpm"),
+    ):
+        text = text.replace(f'{{ signal = "{name}" }}', f'{{ key = "{name}", unit = "{unit}" }}')
+    machine = tmp_path / "machine.toml"
+    machine.write_text(text, encoding="utf-8")
+    done = run("-m", "otolith", "check", "--no-device", str(machine), PYTHONPATH=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "omega from RotorSpeed" in done.stdout
+    machine.write_text(text.replace("port = 5005", "prt = 5005"), encoding="utf-8")
+    refused = run("-m", "otolith", "check", "--no-device", str(machine), PYTHONPATH=str(tmp_path))
+    assert refused.returncode == 2
+    assert "unknown key 'prt': did you mean 'port'?" in refused.stderr

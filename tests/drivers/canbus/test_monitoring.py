@@ -1,0 +1,287 @@
+"""What is lost, repeated, falsified or silent: counted exactly, and told in words."""
+
+import struct
+from functools import reduce
+from operator import xor
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import crccheck.crc
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from otolith_drivers.canbus.decoder import FrameDecoder
+from otolith_drivers.canbus.monitoring import COUNTER_NAMES, NOT_OF_MESSAGES, Pace
+from otolith_drivers.errors import ConfigurationError
+from tests.drivers.can_frames import dbc, decoder, frame
+
+PERIOD = 0.01
+MOTOR = dbc(
+    """BO_ 385 Motor: 8 Drive
+ SG_ Voltage : 0|16@1- (0.01,0) [0|0] "V" Monitor
+ SG_ Current : 16|16@1- (0.01,0) [0|0] "A" Monitor
+ SG_ Crc : 48|8@1+ (1,0) [0|0] "" Monitor
+ SG_ AliveCounter : 56|8@1+ (1,0) [0|255] "" Monitor
+ SG_ Tick : 40|4@1+ (1,0) [0|0] "" Monitor"""
+)
+WISHES = {"V_a": ("V", {"signal": "Voltage"}), "i": ("A", {"signal": "Current"})}
+UNCOUNTED = {"messages": {"Motor": {"counter": False}}}
+COUNTED = {"messages": {"Motor": {"counter": "AliveCounter"}}}
+
+
+def motor(folder: Path, **options: Any) -> FrameDecoder:
+    found = decoder(folder, WISHES, MOTOR, **options)
+    found.begin(0.0)
+    return found
+
+
+def send(found: FrameDecoder, index: int, time: float | None = None, *, count: int | None = None) -> int:
+    """The frame ``index`` of a drive that sends every 10 ms; how many samples it gave."""
+    counter = index if count is None else count
+    data = bytes(5) + bytes([counter % 15]) + bytes([0, counter % 256])
+    return len(found.decode(frame(385, data), index * PERIOD if time is None else time))
+
+
+def send_all(found: FrameDecoder, *indices: range) -> None:
+    for part in indices:
+        for index in part:
+            send(found, index)
+
+
+@pytest.mark.parametrize("options", [UNCOUNTED, COUNTED, {}], ids=["pace", "declared counter", "recognised counter"])
+@pytest.mark.parametrize("lost", [1, 2, 7, 254, 255, 256, 257, 300, 1000])
+def test_lost_frames_are_counted_exactly_as_lost_samples(tmp_path: Path, options: dict[str, Any], lost: int) -> None:
+    """Be the counter's cycle once or several times over, or be there no counter."""
+    found = motor(tmp_path, **options)
+    send_all(found, range(100), range(100 + lost, 200 + lost))
+    assert found.counters.lost == 2 * lost
+    assert found.counters.received == 400
+    assert found.counters.bad == 0
+
+
+@settings(deadline=None)
+@given(
+    gaps=st.lists(st.integers(1, 60), min_size=1, max_size=8),
+    jitter=st.floats(0, 0.2),
+    seed=st.integers(0, 1000),
+)
+def test_jitter_and_many_gaps_leave_the_count_exact(gaps: list[int], jitter: float, seed: int) -> None:
+    random = Random(seed)  # noqa: S311 - jitter, not a secret
+    pace, lost, place = Pace(), 0, 0.0
+    for index in range(60 + 20 * len(gaps)):
+        place += 1 + (gaps[(index - 60) // 20] if index >= 60 and index % 20 == 0 else 0)
+        lost += pace.note((place + jitter * random.random()) * PERIOD)
+    assert lost == sum(gaps)
+
+
+@settings(deadline=None)
+@given(
+    frames=st.lists(st.tuples(st.floats(0, 3), st.integers(0, 255), st.integers(0, 8)), max_size=200),
+    options=st.sampled_from([UNCOUNTED, COUNTED, {}]),
+)
+def test_whatever_comes_every_frame_is_delivered_or_bad(
+    tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[float, int, int]], options: dict[str, Any]
+) -> None:
+    found, time, delivered = motor(tmp_path_factory.mktemp("any"), **options), 0.0, 0
+    for pause, count, length in frames:
+        time += pause
+        before = found.counters
+        samples = found.decode(frame(385, (bytes(7) + bytes([count]))[:length]), time)
+        after = found.counters
+        delivered += len(samples)
+        assert after.bad - before.bad == (0 if samples else 1)
+        assert after.lost >= before.lost
+        assert all("\n" not in line for line in found.complaints(time))
+    assert found.counters.received == delivered
+
+
+def test_a_counter_of_fifteen_counts_is_said_by_its_modulo(tmp_path: Path) -> None:
+    found = motor(tmp_path, messages={"Motor": {"counter": "Tick", "modulo": 15}})
+    send_all(found, range(100), range(140, 200))
+    assert found.counters.lost == 2 * 40
+    assert found.counters.bad == 0
+
+
+def test_frames_that_were_held_up_are_not_lost(tmp_path: Path) -> None:
+    """An adapter that stamps on arrival gives a gap and then a burst."""
+    for options in (UNCOUNTED, COUNTED, {"messages": {"Motor": {"counter": "Tick", "modulo": 15}}}):
+        found = motor(tmp_path, **options)
+        send_all(found, range(100))
+        for index in range(100, 140):
+            send(found, index, time=1.40 + 1e-4 * (index - 100))
+        send_all(found, range(141, 200))
+        assert found.counters.lost == 2  # frame 140
+        assert found.counters.bad == 0
+
+
+def test_what_does_not_come_regularly_is_not_inferred_to_be_lost(tmp_path: Path) -> None:
+    found, time = motor(tmp_path, **UNCOUNTED), 0.0
+    for index in range(400):
+        time += (0.001, 0.3, 0.02, 1.1)[index * index % 4 + index % 3 % 2]
+        send(found, index, time)
+    assert found.counters.lost == 0
+
+
+def test_who_was_switched_off_has_lost_nothing(tmp_path: Path) -> None:
+    found = motor(tmp_path, **UNCOUNTED)
+    send_all(found, range(100), range(1_000_000, 1_000_100))
+    assert found.counters.lost == 0
+
+
+def test_another_period_is_learned_anew(tmp_path: Path) -> None:
+    found = motor(tmp_path, **UNCOUNTED)
+    send_all(found, range(100))
+    for index in range(600):
+        send(found, index, time=1.0 + 0.002 * index)
+    before = found.counters.lost
+    for index in range(100):
+        send(found, index, time=2.3 + 0.002 * index)
+    assert (before, found.counters.lost - before) == (0, 2 * 50)
+
+
+def test_a_counter_that_stands_still_delivers_nothing_new_and_is_told(tmp_path: Path) -> None:
+    found = motor(tmp_path, **COUNTED)
+    send_all(found, range(50))
+    given = [send(found, index, count=49) for index in range(50, 60)]
+    assert given == [0] * 10
+    assert (found.counters.received, found.counters.bad, found.counters.lost) == (100, 10, 0)
+    assert found.complaints(0.6) == ["the counter AliveCounter of Motor (0x181) stands still since 10 frames"]
+    send_all(found, range(60, 61))
+    assert found.complaints(0.61) == []
+    assert found.counters.lost == 2 * 10  # what came in between was not what should have come
+
+
+def test_a_signal_that_is_only_called_like_a_counter_must_count_first(tmp_path: Path) -> None:
+    found = motor(tmp_path)
+    for index in range(100):
+        assert send(found, index, count=7) == 2
+    assert found.counters.bad == 0
+    assert found.complaints(1.0) == []
+
+
+def test_a_recognised_counter_says_how_to_be_rid_of_it(tmp_path: Path) -> None:
+    found = motor(tmp_path)
+    send_all(found, range(50))
+    for index in range(50, 55):
+        assert send(found, index, count=49) == 0
+    assert "set driver.messages.Motor.counter = false" in found.complaints(0.55)[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("ElectricalAliveCounter", True),
+        ("AliveCounter", True),
+        ("RollingCounter", True),
+        ("Msg_Counter", True),
+        ("SequenceCounter", True),
+        ("ESP_21_BZ", True),
+        ("COUNTER", True),
+        ("Axis3_CNT", True),
+        ("CF_Clu_AliveCnt", True),
+        ("SeqCnt", True),
+        ("ErrorCounter", False),
+        ("EncoderCnt", False),
+        ("Pulse_Counter", False),
+        ("StartCounter", False),
+        ("Current", False),
+        ("Counterweight", False),
+        ("OperatingHours_CNT", False),
+    ],
+)
+def test_names_of_counters(name: str, counts: bool) -> None:
+    assert (bool(COUNTER_NAMES.search(name)) and not NOT_OF_MESSAGES.search(name)) is counts
+
+
+CHECKSUMS = {
+    "crc8-sae-j1850": crccheck.crc.Crc8SaeJ1850.calc,
+    "crc8-autosar": crccheck.crc.Crc8Autosar.calc,
+    "xor": lambda data: reduce(xor, data),
+    "sum8": lambda data: sum(data) % 256,
+}
+
+
+@pytest.mark.parametrize("kind", CHECKSUMS)
+def test_a_wrong_checksum_is_bad_and_nothing_is_delivered(tmp_path: Path, kind: str) -> None:
+    table = {"signal": "Crc", "kind": kind, "over": [0, 7], "suffix": "A5 01"}
+    found = motor(tmp_path, messages={"Motor": {"checksum": table, "counter": "AliveCounter"}})
+    for index in range(20):
+        data = bytearray(struct.pack("<hhBBBB", index, 2 * index, 3, 0, 0, index))
+        data[6] = CHECKSUMS[kind](bytes(data[:6] + data[7:]) + b"\xa5\x01")
+        if index in (5, 6):
+            data[index % 3] ^= 0x10
+        samples = found.decode(frame(385, bytes(data)), index * PERIOD)
+        assert len(samples) == (0 if index in (5, 6) else 2)
+    assert (found.counters.received, found.counters.bad, found.counters.lost) == (36, 2, 0)
+    assert found.complaints(0.2) == ["Motor (0x181): a frame with a wrong checksum; 2 in all, the last 0.1 s ago"]
+
+
+def test_known_checksums_are_what_the_standards_say() -> None:
+    """The check values of the catalogue of parametrised CRC algorithms, and of AUTOSAR's SWS CRC Library."""
+    from otolith_drivers.canbus.monitoring import calculation  # noqa: PLC0415 - only this test looks inside
+
+    known = {
+        "crc8-sae-j1850": 0x4B,
+        "crc8-sae-j1850-zero": 0x37,
+        "crc8-autosar": 0xDF,
+        "crc16-ccitt-false": 0x29B1,
+        "xor": 0x31,
+        "sum8": 0xDD,
+    }
+    for kind, expected in known.items():
+        assert calculation(kind)[0](b"123456789") == expected, kind  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"counter": "Alive"}, "Motor has no signal 'Alive'"),
+        ({"checksum": {"signal": "Tick", "kind": "xor"}}, "xor takes 8 bits, unsigned and whole bytes; Tick is not so"),
+        ({"checksum": {"signal": "Crc", "kind": "crc16-ccitt-false"}}, "crc16-ccitt-false takes 16 bits"),
+        ({"checksum": {"signal": "Crc", "kind": "xor", "over": [0, 8]}}, "bytes 0 to 8 are not within the 8 bytes"),
+    ],
+)
+def test_rules_that_cannot_be_meant_are_refused(tmp_path: Path, table: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        motor(tmp_path, messages={"Motor": table})
+    assert sentence in str(caught.value)
+    assert caught.value.key[:3] == ("driver", "messages", "Motor")
+
+
+def test_a_counter_of_a_raw_message_is_said_by_its_bits(tmp_path: Path) -> None:
+    source = {"id": "0x181", "start": 0, "length": 16, "unit": "V"}
+    table = {"0x181": {"counter": {"start": 56, "length": 8}, "period": "10 ms"}}
+    found = decoder(tmp_path, {"V_a": ("V", source)}, messages=table)
+    send_all(found, range(20), range(23, 40))
+    assert found.counters.lost == 3
+    assert "frames 0x181 are counted by counter, every 10.0 ms" in found.describe()
+
+
+def test_silence_is_told_with_the_pace_that_there_was(tmp_path: Path) -> None:
+    found = motor(tmp_path)
+    send_all(found, range(100))
+    assert found.complaints(1.4) == []
+    assert found.complaints(0.99 + 3.2) == ["Motor (0x181) silent for 3.2 s; it came every 10.0 ms"]
+    send_all(found, range(419, 421))
+    assert found.complaints(4.21) == []
+
+
+def test_silence_is_told_even_before_a_pace_is_known(tmp_path: Path) -> None:
+    found = motor(tmp_path)
+    send_all(found, range(3))
+    assert found.complaints(5.0) == []
+    assert found.complaints(12.02) == ["Motor (0x181) silent for 12.0 s; it came at a pace that is not known"]
+
+
+def test_what_never_came_is_told_after_a_few_seconds(tmp_path: Path) -> None:
+    found = motor(tmp_path)
+    assert found.complaints(2.0) == []
+    assert found.complaints(4.0) == ["Motor (0x181) has not come once in 4.0 s"]
+    cycle = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_ "GenMsgCycleTime" BO_ 385 900;'
+    seldom = decoder(tmp_path, WISHES, MOTOR + cycle)
+    assert (seldom.complaints(0.0), seldom.complaints(8.9), len(seldom.complaints(9.1))) == ([], [], 1)
+    slow = motor(tmp_path, messages={"Motor": {"period": "2 s"}})
+    assert slow.complaints(19.0) == []
+    assert slow.complaints(21.0) == ["Motor (0x181) has not come once in 21.0 s"]

@@ -1,0 +1,74 @@
+"""Error frames: counted by their class, told in words, and a controller off the bus is a link that is down."""
+
+from pathlib import Path
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from otolith_drivers.canbus.monitoring import BusFaults
+from tests.drivers.can_frames import decoder, frame
+
+RAW = {"V_a": ("V", {"id": "0x181", "start": 0, "length": 16, "unit": "V"})}
+
+
+def error(identifier: int, data: bytes = bytes(8)) -> can.Message:
+    return can.Message(arbitration_id=identifier, data=data, is_error_frame=True, is_extended_id=False)
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "word"),
+    [
+        (0x40, bytes(8), "bus off"),
+        (0x20, bytes(8), "no acknowledgement"),
+        (0x04, bytes([0, 0x10] + [0] * 6), "error passive (receiving)"),
+        (0x204, bytes([0, 0x20] + [0] * 6), "error passive (sending)"),
+        (0x04, bytes([0, 0x01] + [0] * 6), "controller had no room for a frame"),
+        (0x88, bytes(8), "protocol violated"),
+        (0x100, bytes(8), "controller restarted"),
+        (0x00, b"", "error frame"),
+    ],
+)
+def test_each_class_has_a_name(identifier: int, data: bytes, word: str) -> None:
+    faults = BusFaults()
+    faults.note(error(identifier, data), 1.0)
+    assert faults.total == 1
+    assert faults.counts[word] == 1
+    assert any(word in line for line in faults.complaints(2.0))
+    assert faults.complaints(1000.0) == []
+
+
+def test_bus_off_lasts_until_something_comes(tmp_path: Path) -> None:
+    found = decoder(tmp_path, RAW)
+    assert found.decode(error(0x40), 0.0) == []
+    assert found.faults.bus_off
+    found.decode(frame(0x181, bytes(8)), 0.1)
+    assert not found.faults.bus_off
+    assert found.counters.bad == 0
+
+
+def test_what_the_controller_had_no_room_for_is_lost(tmp_path: Path) -> None:
+    found = decoder(tmp_path, RAW)
+    found.decode(error(0x04, bytes([0, 1] + [0] * 6)), 0.0)
+    assert found.counters.lost == 1
+
+
+def test_error_passive_is_told_until_it_is_over() -> None:
+    faults = BusFaults()
+    faults.note(error(0x04, bytes([0, 0x20])), 0.0)
+    assert faults.complaints(30.0) == [
+        "the CAN controller is error passive (sending): look at cable, termination and bit rate"
+    ]
+    faults.note(error(0x04, bytes([0, 0x40])), 31.0)
+    assert all("controller is" not in line for line in faults.complaints(32.0))
+
+
+@given(st.lists(st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8)), max_size=50))
+def test_any_error_frame_is_counted_once(frames: list[tuple[int, bytes]]) -> None:
+    faults = BusFaults()
+    for place, (identifier, data) in enumerate(frames):
+        faults.note(error(identifier, data), float(place))
+    assert faults.total == len(frames)
+    assert all("\n" not in line for line in faults.complaints(len(frames) + 0.5))
+    assert len(faults.counts) < 32

@@ -1,0 +1,185 @@
+"""What is heard on a bus: pace, what changes, what a database makes of it, and what frames without one seem to be."""
+
+import tomllib
+
+import can
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from otolith.cli.probe_view import can_document, marked, remarks, tables
+from otolith_drivers.canbus.bus import BusOptions
+from otolith_drivers.canbus.database import load_dbc
+from otolith_drivers.canbus.probe import MOST_IDENTIFIERS, Picture, can_driver_lines, can_signal_lines, canopen_name
+from tests.conftest import EXAMPLES
+
+
+def frame(identifier: int, data: bytes, **keys: bool) -> can.Message:
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=keys.pop("extended", False), **keys)
+
+
+def heard_of(picture: Picture, count: int = 100, period: float = 0.01, jitter: float = 0.0) -> None:
+    """A speed that swings through zero in frames of 0x123, and nothing else."""
+    random = np.random.default_rng(1)
+    for index in range(count):
+        speed = round(1000 * np.sin(0.1 * index))
+        picture.take(
+            frame(0x123, speed.to_bytes(2, "big", signed=True) + b"\x00\x55"),
+            period * index + jitter * random.uniform(-1, 1),
+        )
+
+
+def test_pace_and_what_changes() -> None:
+    picture = Picture()
+    heard_of(picture, jitter=0.001)
+    (heard,) = picture.ordered()
+    assert heard.period == pytest.approx(0.01, rel=0.02)
+    assert 0.0005 < heard.jitter < 0.0025
+    assert heard.regular
+    assert heard.lengths == {4}
+    assert marked(heard).endswith("] 00 55")
+    assert marked(heard).startswith("[")
+
+
+def test_what_comes_anyhow_is_called_irregular() -> None:
+    picture, moment = Picture(), 0.0
+    for gap in [0.001, 0.5, 0.002, 0.003, 0.4, 0.001] * 10:
+        moment += gap
+        picture.take(frame(0x10, b"\x01"), moment)
+    assert not picture.ordered()[0].regular
+
+
+def test_a_field_that_moves_becomes_a_line_that_says_where_it_is() -> None:
+    picture = Picture()
+    heard_of(picture)
+    lines = list(can_signal_lines(picture))
+    table = tomllib.loads("\n".join(lines))["signals"]["NAME"]
+    assert table == {
+        "id": "0x123",
+        "start": 7,
+        "length": 16,
+        "byte_order": "big",
+        "signed": True,
+        "scale": 1.0,
+        "unit": "?",
+    }
+
+
+def test_extended_and_long_frames_say_so() -> None:
+    picture = Picture()
+    for index in range(100):
+        data = round(3000 + 300 * np.sin(0.1 * index)).to_bytes(2, "little") + bytes(10)
+        picture.take(frame(0x18FEF100, data, extended=True, is_fd=True), 0.01 * index)
+    (_, line) = can_signal_lines(picture)
+    assert "extended = true, fd = true" in line
+    assert "fd = true" in can_driver_lines(BusOptions(), picture, None)
+    assert picture.guess(picture.ordered()[0]) == "PGN 65265 from 0, if SAE J1939"
+
+
+def test_the_database_gives_names_values_and_ranges() -> None:
+    picture = Picture(load_dbc(EXAMPLES / "dc-motor.dbc"))
+    for index, raw in enumerate((100, -200, 32767)):
+        picture.take(frame(641, raw.to_bytes(2, "little", signed=True) + bytes(6)), 0.01 * index)
+    picture.take(frame(641, b"\x01"), 0.03)
+    picture.take(frame(0x7FF, b"\x01"), 0.03)
+    values = {signal.name: value for _, signal, value in picture.signals()}
+    speed = values["RotorSpeed"]
+    assert (speed.low, speed.beyond) == (-2.0, 1)
+    assert speed.high == pytest.approx(327.67)
+    assert [message.name for message in picture.missing()] == ["MotorElectrical"]
+    assert "in the database, but not heard: MotorElectrical" in list(remarks(picture))
+    lines = list(can_signal_lines(picture))
+    assert 'NAME = { signal = "RotorSpeed" }  # rad/s, 327.67 now' in lines
+    assert not any("Alive" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("identifier", "name"),
+    [
+        (0x000, "NMT command"),
+        (0x080, "SYNC"),
+        (0x085, "emergency of node 5"),
+        (0x185, "TPDO 1 of node 5"),
+        (0x4FF, "TPDO 4 of node 127"),
+        (0x705, "heartbeat of node 5"),
+        (0x180, ""),
+        (0x123, ""),
+        (0x790, ""),
+    ],
+)
+def test_identifiers_of_canopen(identifier: int, name: str) -> None:
+    assert canopen_name(identifier) == name
+
+
+def test_canopen_is_only_claimed_where_somebody_sends_heartbeats() -> None:
+    picture = Picture()
+    picture.take(frame(0x185, bytes(8)), 0.0)
+    assert picture.guess(picture.ordered()[0]) == "TPDO 1 of node 5, if CANopen"
+    picture.take(frame(0x705, b"\x05"), 0.1)
+    assert [picture.guess(heard) for heard in picture.ordered()] == [
+        "CANopen TPDO 1 of node 5",
+        "CANopen heartbeat of node 5: operational",
+    ]
+
+
+def test_error_frames_are_counted_by_kind_and_are_no_frames() -> None:
+    picture = Picture()
+    for bits in (0x20, 0x20, 0x08 | 0x80, 0):
+        picture.take(can.Message(arbitration_id=bits, is_error_frame=True, data=bytes(8)), 0.0)
+    assert picture.frames == 0
+    assert (picture.error_frames, dict(picture.errors)) == (
+        4,
+        {"no acknowledgement": 2, "protocol violated": 1, "bus error": 1, "error frame": 1},
+    )
+    assert next(remarks(picture)).startswith("4 error frames: 2 no acknowledgement")
+
+
+def test_a_bus_of_any_number_of_identifiers_takes_bounded_memory() -> None:
+    picture = Picture()
+    for identifier in range(MOST_IDENTIFIERS + 100):
+        picture.take(frame(identifier, b"", extended=True), 0.0)
+    assert len(picture.heard) == MOST_IDENTIFIERS
+    assert picture.left_out == 100
+    assert picture.frames == MOST_IDENTIFIERS + 100
+
+
+frames = st.builds(
+    lambda identifier, data, extended, error, remote, fd: can.Message(
+        arbitration_id=identifier if extended else identifier % 0x800,
+        data=None if remote else data if fd else data[:8],
+        is_extended_id=extended,
+        is_error_frame=error,
+        is_remote_frame=remote,
+        is_fd=fd and not remote,
+    ),
+    st.sampled_from([0x181, 385, 641, 0x701, 0x80, 0x1FFFFFFF, 0x18FEF100]),
+    st.binary(max_size=64),
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+)
+DATABASE = load_dbc(EXAMPLES / "dc-motor.dbc")
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.lists(st.tuples(frames, st.floats(-1e9, 1e9)), max_size=40),
+    st.booleans(),
+    st.integers(20, 200),
+)
+def test_any_frames_make_tables_and_lines(
+    came: list[tuple[can.Message, float]], with_database: bool, width: int
+) -> None:
+    picture = Picture(DATABASE if with_database else None)
+    for message, moment in came:
+        picture.take(message, moment)
+    console = Console(width=width, file=None, quiet=True)
+    for table in tables(picture, width):
+        console.print(table)
+    assert picture.frames + picture.error_frames == len(came)
+    said = can_document(picture, BusOptions(), None, 1.0)
+    assert len(said["frames"]) == len(picture.heard)
+    tomllib.loads("\n".join(can_driver_lines(BusOptions(), picture, None)))

@@ -1,0 +1,139 @@
+"""What is withheld: swapped words, old images; and what is not."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from otolith_drivers.modbus.plausibility import MOST_IN_A_ROW, Freshness, OrderWatch, judge
+from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, orders_of, registers_of
+from otolith_drivers.modbus.schedule import plan
+from tests.drivers.registers import KINDS, item, registers
+
+
+def drawn(numbers: Sequence[float], kind: TypeName, order: Order) -> list[list[int]]:
+    return [registers(number, kind, order) for number in numbers]
+
+
+RANDOM = np.random.default_rng(5)
+
+SIGNALS = {
+    "voltage with noise": 24.0 + 0.01 * RANDOM.standard_normal(20),
+    "noise around zero": 2e-4 * RANDOM.standard_normal(20),
+    "ramp": np.linspace(0.0, 1.0, 20),
+    "valve area": 1e-5 + 1e-8 * RANDOM.standard_normal(20),
+    "speed that changes its sign": 30.0 * np.sin(np.arange(20) / 3.0),
+}
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.parametrize("kind", ["float32", "float64", "int32"])
+@pytest.mark.parametrize("order", ORDERS)
+def test_swapped_words_are_told_and_right_ones_are_not(name: str, kind: TypeName, order: Order) -> None:
+    whole = 1.0 if kind.startswith("float") else 2e4 / np.abs(SIGNALS[name]).max()
+    numbers = SIGNALS[name] * whole
+    history = drawn(numbers.tolist(), kind, order)
+    assert judge(history, kind, order).plausible
+    swapped: dict[Order, Order] = {"ABCD": "CDAB", "CDAB": "ABCD", "BADC": "DCBA", "DCBA": "BADC"}
+    judgement = judge(history, kind, swapped[order])
+    assert not judgement.plausible
+    assert judgement.better is not None
+
+
+COUNT = np.arange(20)
+
+FLOATS = {
+    "rest, then motion": np.where(COUNT < 10, 1e-9 * RANDOM.standard_normal(20), 1500.0 + RANDOM.standard_normal(20)),
+    "square wave with noise": np.where(COUNT % 8 < 4, 1e-7, 1500.0) * (1.0 + 1e-3 * RANDOM.standard_normal(20)),
+    "set-point that jumps often": np.where(COUNT % 3 < 1, 1e-8, 1500.0),
+    "filter of a machine that stops": 1500.0 * 10.0 ** -(COUNT / 2.0),
+    "no reading now and then": np.where(COUNT % 4 == 0, np.nan, 1500.0),
+}
+
+INTEGERS = {
+    "encoder that wraps": (2**31 - 300 + 100 * COUNT + 2**31) % 2**32 - 2**31,
+    "encoder of 20 bits that wraps": (2**20 - 300 + 100 * COUNT) % 2**20,
+    "set-point in sixteen bits and sixteen behind the point": np.where(COUNT % 8 < 4, 1500 << 16, 0),
+    "set-point from end to end": np.where(COUNT % 8 < 4, 2**30, -(2**30)),
+    "steps of 256 about zero": 256 * np.array([0, 1, -1, 2, 3, -2, -3, 1, 0, 4] * 2),
+    "noise about zero": np.rint(3.0 * RANDOM.standard_normal(20)).astype(int),
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_what_machines_do_is_not_taken_for_swapped_words(order: Order) -> None:
+    kinds: list[tuple[TypeName, dict[str, np.ndarray]]]
+    kinds = [("float32", FLOATS), ("float64", FLOATS), ("int32", INTEGERS), ("int64", INTEGERS)]
+    withheld = [
+        (name, kind)
+        for kind, signals in kinds
+        for name, numbers in signals.items()
+        if not judge(drawn(numbers.tolist(), kind, order), kind, order).plausible
+    ]
+    assert not withheld
+
+
+def test_the_end_of_a_filter_is_as_good_as_zero_but_a_swap_on_the_way_is_told() -> None:
+    watched = item(type="float32")
+    watch = OrderWatch([watched])
+
+    def read(numbers: Sequence[float], order: Order) -> frozenset[str]:
+        for words in drawn(numbers, "float32", order):
+            watch.take(watched, words)
+            watch.end_round()
+        return watch.withheld
+
+    assert not read(np.linspace(23.0, 25.0, 40).tolist(), "ABCD")
+    assert not read(np.maximum(24.0 * np.exp(-COUNT.repeat(20) / 3.0), 7e-44).tolist(), "ABCD")
+    assert not read([7e-44] * 300, "ABCD")
+    assert not read(np.linspace(23.0, 25.0, 40).tolist(), "ABCD")
+    assert read([24.0] * 300, "CDAB") == {"s"}
+    assert not read([24.0] * 40, "ABCD")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_machine_at_rest_is_plausible(kind: TypeName) -> None:
+    assert all(judge([[0] * registers_of(kind)] * 20, kind, order).plausible for order in orders_of(kind))
+
+
+def test_an_old_image_among_new_ones_is_none() -> None:
+    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    for index in range(500):
+        assert freshness.take(request, [100 * index, 0]) == (False, False)
+    assert freshness.take(request, [49900, 0]) == (True, False)  # the beat of two clocks
+    assert freshness.take(request, [49900, 0]) == (True, True)
+    assert freshness.take(request, [50000, 0]) == (False, False)
+
+
+STEPS = {
+    "noise of a few steps": np.rint(4.0 * RANDOM.standard_normal(3000)).astype(int) % 65536,
+    "nearly a step in each reading": (0.93 * np.arange(3000)).astype(int) % 65536,
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_coarse_registers_repeat_by_chance(name: str) -> None:
+    freshness, request = Freshness(), plan([item("a", type="uint16")], 0, 125)[0]
+    assert not any(freshness.take(request, [int(word)])[1] for word in STEPS[name])
+
+
+def test_a_machine_that_stops_is_soon_believed() -> None:
+    freshness, request = Freshness(), plan([item("a", type="uint16")], 0, 125)[0]
+    for word in RANDOM.permutation(1000):
+        freshness.take(request, [int(word)])
+    assert sum(freshness.take(request, [0])[1] for _ in range(1000)) <= MOST_IN_A_ROW
+
+
+def test_registers_that_often_say_the_same_are_believed_and_told() -> None:
+    """A machine that stands still is no fault; nor is a coarse register."""
+    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    stale = [freshness.take(request, [index // 5, 0])[1] for index in range(1000)]
+    assert not any(stale)
+    assert "80% of the readings" in freshness.complaints([request], 0.01)[0]
+
+
+def test_registers_that_never_say_the_same_are_not_complained_of() -> None:
+    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    for index in range(300):
+        freshness.take(request, [index, 0])
+        assert not freshness.complaints([request], 0.01)

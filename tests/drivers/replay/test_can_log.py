@@ -1,0 +1,262 @@
+"""Logs of a CAN bus say what the bus said, and what is wrong with them is counted and located."""
+
+import gzip
+import re
+import threading
+from bisect import bisect_right
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from otolith.acquisition.alignment import Limits
+from otolith.acquisition.playback import Playback
+from otolith.acquisition.ring import Rings
+from otolith.acquisition.window import Window
+from otolith.acquisition.windower import Windower
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.replay.readers import Rows
+from tests.drivers.logs import BEGUN, UNITS, frames_of, live, opened, samples_of, written
+
+SUFFIXES = [".log", ".asc", ".blf", ".trc"]
+PACKED = [*SUFFIXES, *(f"{suffix}.gz" for suffix in SUFFIXES)]
+TICKS, RECORDS, PERIOD = 1000, 200, 0.01
+FRAME = re.compile(r"\s0?181[\s#]")  # the heads of some formats have times in them, in which there may be any digits
+
+
+@pytest.fixture
+def frames(scenario: MotorScenario) -> list[can.Message]:
+    return frames_of(scenario, TICKS)
+
+
+def read(path: Path) -> tuple[list[Rows], str, list[str]]:
+    """All rows, what was found, and the complaints."""
+    with opened(path) as log:
+        rows = list(log.stretches())
+        return rows, ", ".join(log.found()), log.complaints()
+
+
+def windows_of(stretches: list[Rows]) -> list[Window]:
+    playback = Playback(tuple(UNITS), RECORDS, PERIOD, Limits())
+    return [window for rows in stretches for window in playback.windows(rows)] + list(playback.rest())
+
+
+@pytest.mark.parametrize("suffix", PACKED)
+def test_what_was_logged_is_what_the_driver_would_have_said(
+    tmp_path: Path, frames: list[can.Message], suffix: str
+) -> None:
+    rows, found, complaints = read(written(tmp_path, frames, suffix))
+    heard = live(frames)
+    assert samples_of(rows) == [(sample.signal, sample.value) for sample in heard]
+    times = np.concatenate([part.times for part in rows])
+    expected = np.array([frame.timestamp for frame in frames if frame.arbitration_id != 0x7FF])
+    assert np.diff(times) == pytest.approx(np.diff(expected), abs=2e-6)  # the formats count microseconds
+    if not suffix.startswith(".asc"):  # whose times begin with the log
+        assert times == pytest.approx(expected, abs=2e-6)
+    assert f"{len(frames)} frames read, {TICKS} of other messages, 0 bad" in found
+    assert complaints == []
+
+
+def cut_live(frames: list[can.Message]) -> list[Window]:
+    """As the service does, while the frames come."""
+    rings = Rings(tuple(UNITS), 4 * RECORDS)
+    windower = Windower(tuple(UNITS), RECORDS, PERIOD, Limits())
+    samples, windows = live(frames), list[Window]()
+    now, last = BEGUN, samples[-1].time
+    while now < last + 0.5:
+        arrived = bisect_right(samples, now, key=lambda sample: sample.time)
+        rings.deliver(samples[:arrived])
+        del samples[:arrived]
+        if windower.begin(rings, now, now - BEGUN):
+            while windower.due(rings, now):
+                windows.append(windower.cut(rings, unix_offset=0.0))
+        now += 0.004
+    return windows
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_its_windows_are_those_of_the_live_bus(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
+    replayed = windows_of(read(written(tmp_path, frames, suffix))[0])
+    heard = cut_live(frames)
+    assert len(replayed) == len(heard) == TICKS // RECORDS
+    for one, other in zip(replayed, heard, strict=True):
+        assert np.array_equal(one.values, other.values)
+        assert not one.missing.any()
+        assert one.quality.verdict == "good"
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_where_a_log_goes_back_in_time_is_said(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
+    """Writers of text put a stamp that goes back forward; a log that two programs wrote has none of that."""
+    path = written(tmp_path, frames, suffix)
+    if suffix == ".blf":
+        late = frames[:3]
+        with can.BLFWriter(path) as writer:
+            for frame in [*frames[30:2000], *late, *frames[2000:]]:
+                writer(frame)
+        place = 1971
+    else:
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        first = next(index for index, line in enumerate(lines) if FRAME.search(line))
+        lines[first + 2000 : first + 2000] = lines[first : first + 3]
+        path.write_text("".join(lines[:first] + lines[first + 30 :]), encoding="utf-8")
+        place = first + 1971
+    playback = Playback(tuple(UNITS), RECORDS, PERIOD, Limits())
+    with opened(path) as log:
+        for rows in log.stretches():
+            list(playback.windows(rows))
+    assert playback.counts.reordered == playback.counts.late == 2
+    assert playback.counts.first_late is not None
+    assert playback.counts.first_late[0] == place
+    assert playback.counts.lost == 4
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_message_that_is_not_in_it_is_told(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
+    electrical = [frame for frame in frames if frame.arbitration_id != 0x281]
+    _, _, complaints = read(written(tmp_path, electrical, suffix))
+    assert any("0x281) has not come once" in line for line in complaints)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "torn"),
+    [
+        (".log", "(1700000001.5) vcan0 181#01\n"),
+        (".log", "(1700000001.5) vcan0 1"),
+        (".log", "1700000001.5 vcan0 181#0102\n"),
+        (".log", "(now) vcan0 181#0000000000000000\n"),
+        (".log", "(nan) vcan0 181#0000000000000000\n"),
+        (".asc", " 1.500000 1  181             Rx   d 8 0G 00 00 00 00 00 00 00\n"),
+        (".asc", " 1.500000 1  181             Rx   d 8 00\n"),
+        (".trc", "    100       500.000 DT  1     0181 Rx -  8    00 0\n"),
+        (".trc", "    100       500.000 DT  1\n"),
+        (".trc", "    100       five DT  1     0181 Rx -  8    00 00 00 00 00 00 00 00\n"),
+    ],
+)
+def test_a_line_that_is_torn_is_counted_and_located(
+    tmp_path: Path, frames: list[can.Message], suffix: str, torn: str
+) -> None:
+    path = written(tmp_path, frames[:300], suffix)
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    first = next(index for index, line in enumerate(lines) if FRAME.search(line))
+    lines.insert(first + 150, torn if torn.endswith("\n") else torn + "\n")
+    path.write_text("".join(lines), encoding="utf-8")
+    rows, found, complaints = read(path)
+    assert samples_of(rows) == [(sample.signal, sample.value) for sample in live(frames[:300])]
+    assert "1 bad" in found
+    assert len(complaints) == 1
+    assert f"bad: 1, the first in line {first + 151}: " in complaints[0]
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".trc"])
+def test_the_last_line_of_a_writer_that_was_killed_is_not_believed(
+    tmp_path: Path, frames: list[can.Message], suffix: str
+) -> None:
+    path = written(tmp_path, frames[:300], suffix)
+    text = path.read_text(encoding="utf-8").rstrip()
+    path.write_text(text.removesuffix("End TriggerBlock").rstrip()[:-7], encoding="utf-8")
+    _, found, complaints = read(path)
+    assert "300 frames read" in found or "299 frames read" in found
+    assert "1 bad" in found
+    assert "line" in complaints[0]
+
+
+def test_what_is_cut_off_is_said(tmp_path: Path, frames: list[can.Message]) -> None:
+    whole = written(tmp_path, frames, ".blf").read_bytes()
+    path = tmp_path / "cut.blf"
+    path.write_bytes(whole[: len(whole) // 2])
+    rows, _, complaints = read(path)
+    assert 100 < len(samples_of(rows)) < 4 * TICKS
+    assert any("cut off" in line for line in complaints)
+    packed = written(tmp_path, frames, ".log.gz")
+    packed.write_bytes(packed.read_bytes()[:-1000])
+    rows, _, complaints = read(packed)
+    assert 100 < len(samples_of(rows)) < 4 * TICKS
+    assert any("cut off" in line for line in complaints)
+
+
+def test_a_blf_of_a_writer_that_was_killed_is_refused_with_the_reason(tmp_path: Path) -> None:
+    path = tmp_path / "killed.blf"
+    for content in (b"", b"LOGG", b"\0" * 4096, b"no BLF at all, but long enough for the head of one" * 10):
+        path.write_bytes(content)
+        with pytest.raises(ConfigurationError, match=r"killed\.blf: no BLF file, or one whose writer was killed"):
+            opened(path)
+    writer = can.BLFWriter(path)
+    writer.file.flush()
+    with pytest.raises(ConfigurationError, match="no frames"):
+        read(path)
+    writer.stop()
+
+
+def test_a_log_without_these_frames_names_them(tmp_path: Path) -> None:
+    other = can.Message(arbitration_id=0x123, data=bytes(8), is_extended_id=False, timestamp=1.0)
+    with pytest.raises(ConfigurationError, match=r"none of its 5 frames is one of 0x181, 0x281"):
+        read(written(tmp_path, [other] * 5, ".log"))
+
+
+def test_two_machines_in_one_log_are_noticed(tmp_path: Path, frames: list[can.Message]) -> None:
+    for frame in frames[1::2]:
+        frame.channel = 1
+    _, _, complaints = read(written(tmp_path, frames, ".blf"))
+    assert any("channels 0, 1" in line for line in complaints)
+
+
+def check_any(path: Path) -> None:
+    """It is refused with its name, or read to its end with all that is bad in it counted."""
+    try:
+        rows, _, _ = read(path)
+        assert all(np.isfinite(part.times).all() for part in rows)
+    except ConfigurationError as error:
+        assert str(path) in str(error)  # noqa: PT017 - either is right
+
+
+@settings(max_examples=60, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(PACKED), st.binary(max_size=300))
+def test_garbage_is_refused_or_counted(tmp_path: Path, suffix: str, content: bytes) -> None:
+    path = tmp_path / f"garbage{suffix}"
+    path.write_bytes(gzip.compress(content) if suffix.endswith(".gz") else content)
+    check_any(path)
+    path.write_bytes(content)
+    check_any(path)
+
+
+SHARE = st.floats(0.0, 1.0, exclude_max=True)
+
+
+@settings(max_examples=150, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(PACKED), st.lists(st.tuples(SHARE, st.integers(0, 255)), max_size=4), SHARE)
+def test_a_damaged_log_is_read_as_far_as_it_goes(
+    tmp_path: Path, frames: list[can.Message], suffix: str, changes: list[tuple[float, int]], end: float
+) -> None:
+    content = bytearray(written(tmp_path, frames[:30], suffix).read_bytes())
+    for place, value in changes:
+        content[int(place * len(content))] = value
+    path = tmp_path / f"damaged{suffix}"
+    path.write_bytes(content[: int(end * len(content)) + 1])
+    check_any(path)
+
+
+@pytest.mark.parametrize("size", [0, 1, 15])
+def test_an_object_without_a_size_does_not_keep_the_reader_for_ever(
+    tmp_path: Path, frames: list[can.Message], size: int
+) -> None:
+    path = tmp_path / "loop.blf"
+    with can.BLFWriter(path, compression_level=0) as writer:
+        for frame in frames[:100]:
+            writer(frame)
+    content = bytearray(path.read_bytes())
+    at = content.find(b"LOBJ", content.find(b"LOBJ") + 4 + 1000)
+    content[at + 8 : at + 12] = size.to_bytes(4, "little")
+    path.write_bytes(content)
+    done = threading.Event()
+
+    def check() -> None:
+        check_any(path)
+        done.set()
+
+    threading.Thread(target=check, daemon=True).start()
+    assert done.wait(10.0)

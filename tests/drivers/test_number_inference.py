@@ -1,0 +1,162 @@
+"""Which numbers are in bytes: told where they move, called likely where they hardly do, never claimed where still."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from otolith_drivers.modbus.probe import Block, Number, Words, numbers_of
+from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, is_float, orders_of
+from otolith_drivers.number_inference import FRAMES, REGISTERS, Layout, Part, Verdict, parts
+from tests.drivers.registers import registers
+
+READINGS = 250
+KINDS: list[TypeName] = ["int16", "uint16", "int32", "float32", "float64"]
+FULL = {"int16": 2e4, "uint16": 6e4, "int32": 1.5e6}
+Floats = NDArray[np.float64]
+
+
+def moving(random: np.random.Generator) -> dict[str, Floats]:
+    """Signals as machines have them."""
+    time, noise = 0.012 * np.arange(READINGS), random.standard_normal(READINGS)
+    return {
+        "voltage with noise": 24.0 + 0.01 * noise,
+        "noise around zero": 2e-4 * noise,
+        "noisy ramp": np.linspace(0.0, 1.0, READINGS) + 1e-3 * noise,
+        "speed that changes its sign": 30.0 * np.sin(2.0 * time),
+        "display with two decimals": 20.0 + np.round(0.3 * time, 2),
+        "set-point in halves": 24.0 + 0.5 * np.floor(time),
+        "speed with noise": 1500.0 + 3.0 * noise,
+        "one step in the last decimal": 23.456 + 0.001 * (time > 1.5),
+    }
+
+
+SIGNALS = moving(np.random.default_rng(1))
+
+
+def words(numbers: Floats, kind: TypeName, order: Order) -> Words:
+    if not is_float(kind):
+        numbers = np.round(numbers / np.abs(numbers).max() * FULL[kind])
+        numbers = np.abs(numbers) if kind == "uint16" else numbers
+    return np.array([registers(number, kind, order) for number in numbers.tolist()], dtype=np.uint16)
+
+
+def still(*values: int) -> Words:
+    return np.tile(np.array(values, dtype=np.uint16), (READINGS, 1))
+
+
+def found_in(*columns: Words) -> list[Number]:
+    together = np.hstack(columns)
+    return numbers_of({Block(0, together.shape[1]): together})
+
+
+def same(layout: Layout | None, kind: TypeName, order: Order) -> bool:
+    """Signed or not is another question: half of the numbers are the same."""
+    return layout is not None and layout.kind.lstrip("u") == kind.lstrip("u") and layout.order == order
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_number_among_registers_that_stand_still(name: str, kind: TypeName, order: Order) -> None:
+    if order not in orders_of(kind) or (name, kind) == ("noise around zero", "uint16"):
+        pytest.skip("a register has no order of words, and this noise no unsigned form")
+    column = words(SIGNALS[name], kind, order)
+    numbers = [number for number in found_in(still(0x1234, 0), column, still(0, 7)) if number.part.layout]
+    for number in numbers:
+        layout = number.part.layout
+        if number.part.verdict is Verdict.TOLD:
+            # The high half of an integer may stand still: then its low half is all that can be told of it.
+            half = kind == "int32" and layout is not None and layout.kind in ("int16", "uint16")
+            assert half or (number.address == 2 and same(layout, kind, order))
+    if is_float(kind) and name not in ("set-point in halves", "one step in the last decimal"):
+        assert [number.part.verdict for number in numbers] == [Verdict.TOLD]
+        assert numbers[0].part.latest == pytest.approx(SIGNALS[name][-1], rel=1e-6)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("seed", range(5))
+def test_numbers_of_all_types_side_by_side(order: Order, seed: int) -> None:
+    """They move, and a device has one order: every one is told, in its place."""
+    random = np.random.default_rng(seed)
+    kinds: list[TypeName] = ["float32", "int16", "int32", "float64", "float32", "float32", "int16", "int16"]
+    signals = list(moving(random).values())
+    wanted, columns, address = [], [still(0x0237)], 1
+    for kind in kinds:
+        # An integer that keeps near its mean has a high half that stands still, which is another test.
+        number = signals[int(random.choice([2, 3] if kind == "int32" else [0, 2, 3, 6]))]
+        kept = order if kind != "int16" else "ABCD"
+        columns.append(words(number + 0.01 * random.standard_normal(READINGS), kind, kept))
+        wanted.append((address, kind, kept))
+        address += columns[-1].shape[1]
+    told = {
+        (number.address, layout.kind.lstrip("u"), layout.order)
+        for number in found_in(*columns)
+        if (layout := number.part.layout) is not None
+    }
+    assert told == set(wanted)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_claimed_of_what_stands_still(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    column = still(*random.integers(0, 1 << 16, 40).tolist(), *registers(23.5, "float32", "ABCD"))
+    assert {number.part.verdict for number in found_in(column)} == {Verdict.STILL}
+
+
+def test_noise_of_all_bits_is_no_signal() -> None:
+    random = np.random.default_rng(2)
+    column = random.integers(0, 1 << 16, (READINGS, 3)).astype(np.uint16)
+    assert {number.part.verdict for number in found_in(column)} == {Verdict.WILD}
+
+
+def frames(*columns: Floats | NDArray[np.int_], layout: str) -> NDArray[np.uint8]:
+    record = np.zeros(READINGS, dtype=np.dtype([(f"f{at}", part) for at, part in enumerate(layout.split())]))
+    for at, column in enumerate(columns):
+        record[f"f{at}"] = column
+    return record.view(np.uint8).reshape(READINGS, -1)
+
+
+def in_frames(data: NDArray[np.uint8]) -> list[Part]:
+    return [part for part in parts(data, FRAMES, 1) if part.layout is not None]
+
+
+@pytest.mark.parametrize(("mark", "order"), [("<", "little"), (">", "big")])
+def test_fields_of_a_frame(mark: str, order: str) -> None:
+    speed, current = 1000.0 * SIGNALS["speed that changes its sign"] / 30.0, 2000.0 + 300.0 * SIGNALS["noisy ramp"]
+    count = np.arange(READINGS) % 256
+    data = frames(speed.round(), current.round(), np.zeros(READINGS), count, layout=f"{mark}i2 {mark}i2 {mark}i2 u1")
+    one, other, counter = in_frames(data)
+    assert [(part.start, part.layout and part.layout.name) for part in (one, other)] == [
+        (0, f"int16 {order}"),
+        (2, f"int16 {order}"),
+    ]
+    assert (one.verdict, counter.start, counter.verdict) == (Verdict.TOLD, 6, Verdict.COUNTS)
+
+
+def test_fields_of_three_and_four_bytes() -> None:
+    position = (1e6 * SIGNALS["speed that changes its sign"]).round().astype(np.int64)
+    data = np.hstack([frames(position, layout="<i4"), frames((position // 10) << 8, layout="<i4")[:, 1:]])
+    found = in_frames(data)
+    assert [(part.start, part.layout and part.layout.name) for part in found] == [
+        (0, "int32 little"),
+        (4, "int24 little"),
+    ]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 12).flatmap(lambda width: arrays(np.uint16, st.tuples(st.integers(0, 12), st.just(width)))))
+def test_any_registers_are_covered_once_and_in_order(readings: Words) -> None:
+    found = numbers_of({Block(100, readings.shape[1]): readings})
+    places = [at for number in found for at in range(number.address, number.address + number.count)]
+    assert places == (list(range(100, 100 + readings.shape[1])) if len(readings) else [])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 12).flatmap(lambda width: arrays(np.uint8, st.tuples(st.integers(1, 12), st.just(width)))))
+def test_any_bytes_are_covered_once_and_in_order(data: NDArray[np.uint8]) -> None:
+    places = [at for part in parts(data, FRAMES, 1) for at in range(part.start, part.start + part.width)]
+    assert places == list(range(data.shape[1]))
+    assert all(layout.width <= 8 for layout in REGISTERS)

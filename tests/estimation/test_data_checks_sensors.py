@@ -1,0 +1,163 @@
+"""What lies must not teach, and what is true must not be called a lie."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from otolith.acquisition.window import Array, Window
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import State, begin
+from otolith.discovery.sequential_test import Lesson
+from otolith.estimation.data_checks import spikes
+from otolith.estimation.problem import Problem
+from otolith.health.schema import ReportDocument, Status
+from otolith.machine import find_twin
+from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.plant.faults import Step
+
+Cut = Callable[..., list[tuple[Window, float]]]
+Change = Callable[[Array], Array]
+
+TWIN = find_twin("dc_motor")
+HEALTHY, SICK = 14, 4  # windows
+
+
+def problem(*names: str) -> Problem:
+    free = tuple(entry for entry in TWIN.parameters if entry.name in names)
+    known = tuple((entry.name, entry.nominal) for entry in TWIN.parameters if entry.name not in names)
+    return Problem(TWIN, known, free, (0.005, 0.02), input_noise=(0.0, 0.0002))
+
+
+def run(state: State, windows: list[Window]) -> tuple[State, list[ReportDocument]]:
+    found = []
+    for window in windows:
+        state, report = adapt(state, window)
+        found.append(report.document)
+    return state, found
+
+
+def changed(window: Window, signal: str, change: Change) -> Window:
+    values = window.values.copy()
+    column = window.signals.index(signal)
+    values[:, column] = change(values[:, column])
+    return replace(window, values=values)
+
+
+@pytest.fixture
+def quiet(scenario: MotorScenario) -> MotorScenario:
+    return scenario.model_copy(update={"faults": ()})
+
+
+def held(documents: list[ReportDocument], word: str) -> None:
+    """Every parameter stays what it was, and the reason names the channel."""
+    for document in documents:
+        for entry in document.parameters.values():
+            assert entry.status in (Status.HELD, Status.INVALID)
+            assert word in entry.reason
+
+
+FAULTS: dict[str, tuple[str, str, Change]] = {
+    "frozen current": ("i", "i is frozen", lambda values: np.full(len(values), values[0])),
+    "frozen half-way": ("omega", "omega is", lambda values: np.where(np.arange(200) < 90, values, values[90])),
+    "clipped speed": ("omega", "omega is clipped", lambda values: np.minimum(values, np.quantile(values, 0.6))),
+    "spiking current": ("i", "i spikes", lambda values: values + 3.0 * (np.arange(200) % 15 == 7)),
+    "gain of the current": ("i", "i reads", lambda values: 1.05 * values),
+    "gain of the speed": ("omega", "omega reads", lambda values: 0.95 * values),
+}
+
+
+@pytest.mark.parametrize("names", [("R_a",), ("R_a", "D")], ids="-".join)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_lying_sensor_teaches_nothing(quiet: MotorScenario, windows: Cut, fault: str, names: tuple[str, ...]) -> None:
+    signal, word, change = FAULTS[fault]
+    record = [window for window, _ in windows(quiet, 14)]
+    state, _ = run(begin("motor", "here", problem(*names)), record[:10])
+    sick = changed(record[10], signal, change)  # the set-point has just doubled: everything moves
+    after, documents = run(state, [sick])
+    held(documents, word)
+    assert documents[0].lesson is Lesson.SENSOR
+    assert after.memory.belief is state.memory.belief
+
+
+LIES: dict[str, tuple[str, Change]] = {
+    "gain of the current": ("i", lambda values: 1.05 * values),
+    "offset of the current": ("i", lambda values: values + 0.05),
+    "gain of the speed": ("omega", lambda values: 1.05 * values),
+}
+
+
+@pytest.mark.parametrize(
+    ("lie", "names"), [*((lie, ("R_a",)) for lie in LIES), ("gain of the current", ("R_a", "D"))], ids=str
+)
+def test_a_sensor_that_keeps_lying_never_becomes_a_step(
+    quiet: MotorScenario, windows: Cut, lie: str, names: tuple[str, ...]
+) -> None:
+    """Through set-points up and down and a minute and a half; the sensor that lies is named all the while."""
+    signal, change = LIES[lie]
+    record = [window for window, _ in windows(quiet, 55)]
+    state, _ = run(begin("motor", "here", problem(*names)), record[:10])
+    _, documents = run(state, [changed(window, signal, change) for window in record[10:]])
+    assert {document.lesson for document in documents} == {Lesson.SENSOR}
+    assert all(f"{signal} reads" in document.parameters["R_a"].reason for document in documents)
+    found = documents[-1].parameters["R_a"]
+    assert found.status is Status.HELD
+    assert found.value == pytest.approx(6.5, rel=0.02)
+
+
+@pytest.mark.parametrize("names", [("R_a",), ("R_a", "D"), ("R_a", "D", "J")], ids="-".join)
+@pytest.mark.parametrize("moment", [30.0, 30.9, 41.1])
+def test_a_step_of_the_resistance_is_followed_within_three_windows(
+    quiet: MotorScenario, windows: Cut, names: tuple[str, ...], moment: float
+) -> None:
+    fault = Step.model_validate({"kind": "step", "parameter": "R_a", "start": f"{moment} s", "amount": "-0.65 ohm"})
+    record = windows(quiet.model_copy(update={"faults": (fault,)}), 24)
+    _, documents = run(begin("motor", "here", problem(*names)), [window for window, _ in record])
+    first = int(moment / 2.0)  # the window in which it happens
+    for document in documents[10:first]:
+        assert document.lesson is Lesson.LEARNED
+    followed = documents[first + 2].parameters["R_a"]
+    assert followed.status is Status.ESTIMATED
+    assert followed.low is not None
+    assert followed.high is not None
+    assert followed.value == pytest.approx(5.85, rel=0.005)
+    for document in documents[first + 3 :]:
+        assert document.parameters["R_a"].value == pytest.approx(5.85, rel=0.005)
+
+
+def test_spikes_are_left_out_and_the_rest_is_used(quiet: MotorScenario, windows: Cut) -> None:
+    record = [window for window, _ in windows(quiet, 11)]
+    state, _ = run(begin("motor", "here", problem("R_a")), record[:10])
+
+    def spike(values: Array) -> Array:
+        values[[40, 120]] += [2.0, -5.0]
+        return values
+
+    _, (document,) = run(state, [changed(record[10], "i", spike)])
+    found = document.parameters["R_a"]
+    assert found.status is Status.ESTIMATED
+    assert "2 spikes" in found.reason
+    assert found.value == pytest.approx(6.5, rel=0.005)
+
+
+def test_noise_steps_and_kinks_are_no_spikes() -> None:
+    random = np.random.default_rng(8)
+    time = 0.01 * np.arange(400)
+    curves = [
+        random.normal(size=400),
+        np.where(time > 2.0, 5.0, 0.0) + 0.01 * random.normal(size=400),
+        np.maximum(time - 2.0, 0.0) * 50.0 + 0.01 * random.normal(size=400),
+        np.exp(-5.0 * np.maximum(time - 2.0, 0.0)) * (time > 2.0),
+        np.zeros(400),
+        np.rint(3.0 * np.sin(4.0 * time)),
+    ]
+    for curve in curves:
+        assert not spikes(curve, 0.01).any()
+
+
+def test_a_healthy_machine_has_honest_sensors(quiet: MotorScenario, windows: Cut) -> None:
+    """Set-points up and down, rest and motion, for ten minutes."""
+    state, documents = run(begin("motor", "here", problem("R_a", "D")), [window for window, _ in windows(quiet, 300)])
+    assert {document.lesson for document in documents} == {Lesson.LEARNED}
+    assert state.memory.contradictions == 0

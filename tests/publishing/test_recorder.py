@@ -1,0 +1,166 @@
+"""A recording of ours, heard again, says what was said when it was made."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from otolith.cli.replay import replay
+from otolith.health.schema import ReportDocument
+from otolith.machine import Plan, load_plan
+from otolith.runtime.replay import open_recorded
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.replay.recording import Recorded
+from tests.cli.replays import MACHINE, PERIOD, RECORDS, Lines, recorded, reports, summed_up, written
+
+UNITS = {"V_a": "V", "T_load": "N*m", "i": "A", "omega": "rad/s"}
+RERUN = Path(sys.executable).with_name("rerun")
+
+
+@pytest.fixture
+def rows(scenario: MotorScenario) -> Lines:
+    return recorded(scenario)
+
+
+@pytest.fixture
+def plan() -> Plan:
+    return load_plan(MACHINE, with_driver=False)
+
+
+def record(folder: Path, rows: Lines, name: str = "run.rrd") -> Path:
+    path = folder / name
+    replay(MACHINE, written(folder, rows), path, as_json=True, stopped=lambda: False)
+    return path
+
+
+def same(found: list[ReportDocument], again: list[ReportDocument]) -> None:
+    """But for what a recording does not hold: how samples came, and how many there were."""
+    assert len(found) == len(again)
+    for one, other in zip(found, again, strict=True):
+        assert other.window.start == pytest.approx(one.window.start, abs=PERIOD / 2)  # how jitter moves the grid
+        assert other.window.quality.verdict is one.window.quality.verdict
+        assert other.lesson is one.lesson
+        for name, parameter in one.parameters.items():
+            assert other.parameters[name].status is parameter.status
+            assert other.parameters[name].value == pytest.approx(parameter.value, rel=1e-6)
+            assert other.parameters[name].sd == pytest.approx(parameter.sd, rel=1e-3)
+
+
+@pytest.mark.parametrize("begun", [0.0, 1_700_000_000.0])
+def test_the_reports_are_the_same_again(
+    tmp_path: Path, rows: Lines, begun: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With cells blank, a spike, and one window that lacks too much and one that came with jitter."""
+    random = np.random.default_rng(3)
+    for index, row in enumerate(rows):
+        jitter = random.uniform(0.0, 0.02) if 2 * RECORDS < index < 3 * RECORDS else 0.0
+        row[0] = f"{begun + float(row[0]) + jitter:.6f}"
+    rows[250][3], rows[260][1], rows[270][4] = "", "", "1e6"
+    for row in rows[650:690]:
+        row[2] = ""
+    path = record(tmp_path, rows)
+    capsys.readouterr()
+    found, again = reports(tmp_path / "data.csv", capsys), reports(path, capsys)
+    assert {document.window.quality.verdict for document in found} == {"good", "bad"}
+    same(found, again)
+    assert "windows that were bad when they were recorded, left out: 2" in summed_up(path, capsys)
+
+
+def test_two_replays_of_a_recording_print_the_same(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = record(tmp_path, rows)
+    assert reports(path, capsys) == reports(path, capsys)
+    text = summed_up(path, capsys)
+    assert "1000 records read, 0 reordered, 0 bad; 4000 samples, 0 lost" in text
+
+
+def test_a_recording_of_a_recording_is_no_worse(tmp_path: Path, rows: Lines, plan: Plan) -> None:
+    first = record(tmp_path, rows)
+    second = tmp_path / "again.rrd"
+    replay(MACHINE, first, second, as_json=True, stopped=lambda: False)
+    with open_recorded(plan, first) as one, open_recorded(plan, second) as other:
+        for left, right in zip(one.stretches(), other.stretches(), strict=True):
+            assert left.times == pytest.approx(right.times, abs=2e-9)
+            assert all(np.array_equal(left.columns[name], right.columns[name]) for name in UNITS)
+
+
+def test_what_rerun_makes_of_a_recording_is_read_as_well(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, better = record(tmp_path, rows), tmp_path / "better.rrd"
+    subprocess.run([RERUN, "rrd", "optimize", path, "-o", better], capture_output=True, check=True)
+    assert reports(better, capsys) == reports(path, capsys)
+
+
+def test_a_recording_whose_writer_was_killed_is_read_and_a_torn_one_has_a_way_out(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, killed, torn = record(tmp_path, rows), tmp_path / "killed.rrd", tmp_path / "torn.rrd"
+    program = (
+        "import os, sys; from pathlib import Path\n"
+        "import otolith.publishing.recorder as module, otolith.cli.replay as replaying\n"
+        "close = module.Recording.close\n"
+        "module.Recording.close = lambda self: (self._stream.flush(timeout_sec=5.0), os.kill(os.getpid(), 9))\n"
+        "replaying.replay(*map(Path, sys.argv[1:]), as_json=True, stopped=lambda: False)\n"
+    )
+    subprocess.run(
+        [sys.executable, "-c", program, MACHINE, tmp_path / "data.csv", killed], capture_output=True, check=False
+    )
+    assert reports(killed, capsys) == reports(path, capsys)
+    assert "never closed by the recorder" in summed_up(killed, capsys)
+    torn.write_bytes(path.read_bytes()[:-20_000])
+    with pytest.raises(ConfigurationError, match=r"torn\.rrd: torn, .*'rerun rrd optimize --continue-on-error") as said:
+        summed_up(torn, capsys)
+    command = str(said.value).split("'")[1].replace("whole.rrd", str(tmp_path / "whole.rrd"))
+    subprocess.run([RERUN.with_name(command.split()[0]), *command.split()[1:]], capture_output=True, check=True)
+    assert len(reports(tmp_path / "whole.rrd", capsys)) >= 2
+
+
+def test_other_recordings_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.rrd"
+    with pytest.raises(ConfigurationError, match="No such file"):
+        Recorded(path, UNITS)
+    stream = rr.RecordingStream("somebody_else", recording_id="x")
+    stream.save(path)
+    stream.log("signals/i", rr.Scalars([1.0]))
+    stream.disconnect()
+    with pytest.raises(ConfigurationError, match="of application 'somebody_else': one of Otolith is needed"):
+        Recorded(path, UNITS)
+
+
+def test_a_signal_that_was_not_recorded_is_named(tmp_path: Path, rows: Lines) -> None:
+    path = record(tmp_path, rows)
+    with pytest.raises(ConfigurationError, match=r"no signal 'p' \(Pa\) was recorded: it has T_load, V_a, i, omega"):
+        Recorded(path, {**UNITS, "p": "Pa"})
+    with pytest.raises(ConfigurationError, match=r"signal 'i': unit 'A' does not measure what 'V' does"):
+        Recorded(path, {**UNITS, "i": "V"})
+    with Recorded(path, {**UNITS, "i": "mA"}) as milli, Recorded(path, UNITS) as plain:
+        ampere = np.concatenate([part.columns["i"] for part in plain.stretches()])
+        assert np.concatenate([part.columns["i"] for part in milli.stretches()]) == pytest.approx(1e3 * ampere)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)), max_size=3), st.floats(0.0, 1.0))
+def test_a_damaged_recording_is_refused_or_read(
+    tmp_path: Path, scenario: MotorScenario, changes: list[tuple[float, int]], end: float
+) -> None:
+    whole = tmp_path / "whole.rrd"
+    if not whole.exists():
+        record(tmp_path, recorded(scenario)[: 2 * RECORDS], whole.name)
+    content = bytearray(whole.read_bytes())
+    for place, value in changes:
+        content[int(place * len(content))] = value
+    path = tmp_path / "damaged.rrd"
+    path.write_bytes(content[: int(end * len(content))])
+    try:
+        with Recorded(path, UNITS) as damaged:
+            assert all(len(part.times) for part in damaged.stretches())
+    except ConfigurationError as error:
+        assert str(path) in str(error)  # noqa: PT017 - either is right
