@@ -122,7 +122,7 @@ def ours(seconds: float) -> Result:
     cpu, elapsed = time.clock_gettime(clock) - before, time.monotonic() - begun
     counters, link = driver.counters(), driver.link()
     driver.close()
-    for line in link.complaints:
+    for line in link.warnings:
         print(f"  complaint: {line}")
     print(f"  counted: {counters}")
     return Result(sent, rings.counters().received, elapsed, cpu)

@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.discovery.motor import Faults, J, live, windows
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
-from otolith.discovery.sequential_test import Lesson
+from otolith.adaptation.state import initial_state
+from otolith.discovery.sequential_test import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 
@@ -21,7 +21,7 @@ def main() -> int:
     free = tuple(entry for entry in twin.parameters if entry.name in ("R_a", "D"))
     known = tuple((entry.name, entry.nominal) for entry in twin.parameters if entry not in free)
     problem = Problem(twin, known, free, (0.005, 0.02), input_noise=(0.0, 0.0002))
-    begun = begin("motor", "bench", problem)
+    begun = initial_state("motor", "bench", problem)
     times: dict[str, list[float]] = {"calm": [], "search": [], "followed": [], "switched off": []}
     for seed in range(8):
 
@@ -33,10 +33,10 @@ def main() -> int:
             start = time.perf_counter()
             state, report = adapt(state, window)
             seconds = time.perf_counter() - start
-            lesson = report.document.lesson
-            if window.index > 2 and lesson is Lesson.LEARNED and not state.problem.components:
+            decision = report.document.decision
+            if window.index > 2 and decision is WindowDecision.LEARNED and not state.problem.components:
                 times["calm"].append(seconds)
-            elif lesson is Lesson.SUSPECTED and state.memory.case is not None:
+            elif decision is WindowDecision.SUSPECTED and state.memory.case is not None:
                 times["search" if state.memory.case.windows == 1 else "followed"].append(seconds)
             if window.end <= 20.0:
                 start = time.perf_counter()

@@ -10,12 +10,12 @@ import numpy as np
 
 from benchmarks.motor import CONFIG, windows
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
+from otolith.adaptation.state import initial_state
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import search
+from otolith.estimation.particle_swarm import particle_swarm
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate
-from otolith.machine import load_plan
+from otolith.machine import load_machine
 from otolith_drivers.plant.scenario import load_scenario
 
 
@@ -37,7 +37,7 @@ def of(problem: Problem, names: tuple[str, ...]) -> Problem:
 
 
 def main() -> int:
-    problem = load_plan(CONFIG / "dc-motor.toml").problem
+    problem = load_machine(CONFIG / "dc-motor.toml").problem
     record = list(windows(load_scenario(CONFIG / "scenarios" / "demo.toml"), 12))
     for names in (("R_a",), ("R_a", "D"), ("R_a", "D", "J")):
         free = of(problem, names)
@@ -47,11 +47,11 @@ def main() -> int:
         objective = Objective(free, record[-1], start)
         guess = objective.guess(start)
         kernel = median_seconds(partial(objective.linearised, guess), 200)
-        generations = search(objective, free.swarm, start, seed=1).generations
+        generations = particle_swarm(objective, free.swarm, start, seed=1).generations
         print(f"200 records, unknown: {', '.join(names)}, and the initial state")
         print(f"  warm {warm * 1e3:8.2f} ms   one linearisation is {kernel / warm:.1%} of it")
         print(f"  cold {cold * 1e3:8.2f} ms   {cold / warm:.0f} x warm, {generations} generations of the swarm")
-    state = begin("motor", "bench", problem)
+    state = initial_state("motor", "bench", problem)
     for window in record:
         state, _ = adapt(state, window)
     whole = median_seconds(lambda: adapt(state, record[-1]), 50)

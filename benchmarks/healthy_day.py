@@ -19,8 +19,8 @@ import numpy as np
 from benchmarks.motor import CONFIG, RECORDS, windows
 from otolith.acquisition.window import Array
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
-from otolith.machine import load_plan
+from otolith.adaptation.state import initial_state
+from otolith.machine import load_machine
 from otolith_drivers.plant.faults import Drift
 from otolith_drivers.plant.scenario import Scenario, load_scenario
 
@@ -50,12 +50,12 @@ def converted(values: Array) -> Array:
 
 def run(scenario: Scenario, hours: float) -> dict[str, Any]:
     """Lessons, statuses, and how far R_a and D strayed from the truth."""
-    plan = load_plan(CONFIG / "dc-motor.toml", with_driver=False)
+    plan = load_machine(CONFIG / "dc-motor.toml", with_driver=False)
     twin = plan.twin
     free = tuple(twin.parameter(name) for name in ("R_a", "D"))
     known = tuple((entry.name, entry.nominal) for entry in twin.parameters if entry not in free)
-    state = begin("motor", "bench", replace(plan.problem, known=known, free=free))
-    lessons: Counter[str] = Counter()
+    state = initial_state("motor", "bench", replace(plan.problem, known=known, free=free))
+    decisions: Counter[str] = Counter()
     statuses: Counter[str] = Counter()
     errors, pulls, seconds = [], [], []
     for window in windows(scenario, round(hours * 3600.0 / (RECORDS * scenario.sample_period))):
@@ -64,7 +64,7 @@ def run(scenario: Scenario, hours: float) -> dict[str, Any]:
         state, report = adapt(state, seen)
         seconds.append(time.perf_counter() - begun)
         document = report.document
-        lessons[document.lesson.name] += 1
+        decisions[document.decision.name] += 1
         for entry in document.parameters.values():
             statuses[entry.status] += 1
         found = [(entry.value, entry.sd, entry.nominal) for entry in document.parameters.values()]
@@ -73,8 +73,8 @@ def run(scenario: Scenario, hours: float) -> dict[str, Any]:
             pulls.append([(value - nominal) / sd for value, sd, nominal in found if value is not None and sd])
     return {
         "hours": hours,
-        "windows": sum(lessons.values()),
-        "lessons": dict(lessons),
+        "windows": sum(decisions.values()),
+        "lessons": dict(decisions),
         "statuses": dict(statuses),
         "largest_error": np.max(errors, axis=0).tolist(),
         "median_error": np.median(errors, axis=0).tolist(),

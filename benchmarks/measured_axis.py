@@ -21,11 +21,11 @@ from rich.table import Table
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import State, begin
-from otolith.commissioning.identification import learn_noise
-from otolith.discovery.hypotheses import Claim, Reason, explanation
+from otolith.adaptation.state import AdaptationState, initial_state
+from otolith.commissioning.identification import identify_noise
+from otolith.discovery.hypotheses import FaultHypothesis, FaultType, fit_hypothesis
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.imm_filter import carried, overall
+from otolith.estimation.imm_filter import moment_match, predict
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -81,7 +81,7 @@ class Row:
 
 def lived(problem: Problem, record: Sequence[Window]) -> list[Row]:
     """The whole record, window by window."""
-    state, plain = begin("axis", "lab", problem), begin("axis", "lab", replace(problem, discover=False))
+    state, plain = initial_state("axis", "lab", problem), initial_state("axis", "lab", replace(problem, discover=False))
     found = []
     for window in record:
         components = _names(state)
@@ -93,16 +93,16 @@ def lived(problem: Problem, record: Sequence[Window]) -> list[Row]:
     return found
 
 
-def _names(state: State) -> str:
+def _names(state: AdaptationState) -> str:
     return ", ".join(entry.key for entry in state.problem.components)
 
 
-def strayed(state: State, window: Window) -> float:
+def strayed(state: AdaptationState, window: Window) -> float:
     """Root mean square (m) of the window in open loop, from the initial state that suits it best."""
     problem, free = replace(state.problem, open_loop=True, noise=(STRAYS,)), len(state.problem.free)
-    known = overall(carried(state.memory.belief, window.end), state.problem)
+    known = moment_match(predict(state.memory.belief, window.end), state.problem)
     still = Prior(known.mean * (np.arange(2 * free) < free), CERTAIN**2 * known.covariance)
-    fit = explanation(Claim(Reason.NOTHING), problem, window, still).fit
+    fit = fit_hypothesis(FaultHypothesis(FaultType.NOTHING), problem, window, still).fit
     objective = Objective(problem, window, fit.guess[:free])
     predicted = objective.simulate(np.concatenate([fit.guess[:free], fit.guess[2 * free :]]))
     return float(objective.rmse(predicted)[0])
@@ -118,7 +118,7 @@ def page(title: str, rows: Sequence[Row]) -> Table:
         values = (_interval(row.document.parameters[name]) for name in names)
         found = "; ".join(f"{entry.equation}" for entry in row.document.components)
         off, without = f"{1e3 * row.strayed:.3g} mm", f"{1e3 * row.strayed_without:.3g} mm" if row.components else ""
-        table.add_row(str(row.document.window.index), *values, found, off, without, row.document.lesson.name.lower())
+        table.add_row(str(row.document.window.index), *values, found, off, without, row.document.decision.name.lower())
     return table
 
 
@@ -150,8 +150,8 @@ def main() -> int:
         parser.error(f"{folder / FILE}: there is no such file")
     record, console = windows(folder), Console(width=ROOM)
     directional, symmetric = (full(name) for name in ("servo_axis_directional", "servo_axis"))
-    best = learn_noise(directional, record[::2]).applied(directional)
-    own = learn_noise(symmetric, record[::2]).applied(symmetric)
+    best = identify_noise(directional, record[::2]).applied(directional)
+    own = identify_noise(symmetric, record[::2]).applied(symmetric)
     told = [
         ("the full twin, friction by direction", best),
         ("its dry friction left out", without_dry_friction(best)),

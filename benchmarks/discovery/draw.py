@@ -16,12 +16,12 @@ from benchmarks.discovery.setting import looked, prior, problem
 from benchmarks.discovery.truth import SHAFT, Truth, is_a_parameter
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidates import CLEARLY
-from otolith.discovery.linear_response import Landscape, Shapes, Structure, structures
-from otolith.discovery.search import Glance
+from otolith.discovery.linear_response import BasisFunctions, CandidateForm, LinearResponse, candidate_library
+from otolith.discovery.search import ScreeningResult
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import plain
+from otolith.estimation.augmented import base_model
 from otolith.twin.augmentation import sites, sources
-from otolith.twin.component_families import METAMODELS, Kind, MetaModel, code_of
+from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, Kind, code_of
 
 SECONDS = 2.0
 LEAST, MOST = 3.0, 30.0  # of the detection limit
@@ -56,7 +56,7 @@ def draw(number: int, seed: int) -> Case:
         RuntimeError: nothing of the family could be seen in any operation.
     """
     random = np.random.default_rng([seed, number])
-    model = METAMODELS[number % len(METAMODELS)]
+    model = COMPONENT_FAMILIES[number % len(COMPONENT_FAMILIES)]
     for _ in range(ATTEMPTS):
         found = _attempt(number, model, random)
         if found is not None:
@@ -64,7 +64,7 @@ def draw(number: int, seed: int) -> Case:
     raise RuntimeError(f"no case of family {model.name!r} in {ATTEMPTS} attempts")
 
 
-def _attempt(number: int, model: MetaModel, random: np.random.Generator) -> Case | None:
+def _attempt(number: int, model: ComponentFamily, random: np.random.Generator) -> Case | None:
     kind, operation = str(random.choice(SUITS.get(model.name, KINDS))), int(random.integers(2**31))
     known = prior(random)
     healthy = recorded(kind, Faults(), operation)
@@ -90,11 +90,13 @@ def recorded(kind: str, faults: Faults, operation: int) -> Window:
     return windows(live(kind, SECONDS, faults, operation))[0]
 
 
-def _chosen(model: MetaModel, kind: str, landscape: Landscape, random: np.random.Generator) -> Structure | None:
+def _chosen(
+    model: ComponentFamily, kind: str, landscape: LinearResponse, random: np.random.Generator
+) -> CandidateForm | None:
     """A structure of the family that this operation shows and that is no parameter; sites are as likely."""
-    twin = plain(problem())
-    found: dict[int, list[Structure]] = {}
-    for entry in structures(twin, landscape.x):
+    twin = base_model(problem())
+    found: dict[int, list[CandidateForm]] = {}
+    for entry in candidate_library(twin, landscape.x):
         source = sources(twin)[entry.source]
         still = kind == "constant" and source.kind is Kind.SIGNAL  # only its noise moves
         own = entry.model is model and entry.site < len(twin.sites)
@@ -106,7 +108,7 @@ def _chosen(model: MetaModel, kind: str, landscape: Landscape, random: np.random
     return of_site[int(random.integers(len(of_site)))]
 
 
-def _inner(structure: Structure, random: np.random.Generator) -> float:
+def _inner(structure: CandidateForm, random: np.random.Generator) -> float:
     if structure.model.inner is None:
         return 0.0
     low, high = structure.bounds
@@ -117,9 +119,11 @@ def _inner(structure: Structure, random: np.random.Generator) -> float:
             return found
 
 
-def _truth(structure: Structure, times: float, landscape: Landscape, random: np.random.Generator) -> Truth | None:
+def _truth(
+    structure: CandidateForm, times: float, landscape: LinearResponse, random: np.random.Generator
+) -> Truth | None:
     """With an amplitude of so many ``times`` the detection limit, or nothing where that would be another motor."""
-    twin, model = plain(problem()), structure.model
+    twin, model = base_model(problem()), structure.model
     two = len(model.phases) > 1
     inner, phase = _inner(structure, random), float(random.uniform(-np.pi, np.pi)) if two else 0.0
     limit = detection_limit(structure, inner, phase, landscape)
@@ -135,18 +139,18 @@ def _truth(structure: Structure, times: float, landscape: Landscape, random: np.
     return truth if largest <= LARGEST[truth.site == SHAFT] else None
 
 
-def detection_limit(structure: Structure, inner: float, phase: float, landscape: Landscape) -> float:
+def detection_limit(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:
     """Amplitude in the unit of the site; infinite for what parameters do as well."""
     numbers = len(structure.model.phases) + (structure.model.inner is not None)
-    own = len(plain(problem()).sites)
-    rivals = sum(1 for entry in structures(plain(problem()), landscape.x) if entry.site < own)
+    own = len(base_model(problem()).sites)
+    rivals = sum(1 for entry in candidate_library(base_model(problem()), landscape.x) if entry.site < own)
     asked = numbers * math.log(landscape.objective.count) + 2.0 * math.log(3.0 * rivals) + CLEARLY
     return math.sqrt(asked / max(_information(structure, inner, phase, landscape), 1e-300))
 
 
-def _information(structure: Structure, inner: float, phase: float, landscape: Landscape) -> float:
+def _information(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:
     """Of the amplitude: what a fit gains by the square of what it finds, whatever the noise happens to be."""
-    curve = Shapes(
+    curve = BasisFunctions(
         np.array([code_of(structure.model.name)]),
         np.array([structure.source]),
         np.array([structure.site]),
@@ -158,18 +162,18 @@ def _information(structure: Structure, inner: float, phase: float, landscape: La
     return float(gains.gain[0] / amplitude**2) if amplitude else 0.0
 
 
-def _is_there(truth: Truth, structure: Structure, window: Window, known: Prior) -> bool:
+def _is_there(truth: Truth, structure: CandidateForm, window: Window, known: Prior) -> bool:
     """Whether the window lets this structure be told, and its inner number lies within what it can show."""
     values: Array = window.values
     if not np.isfinite(values).all() or float(np.abs(values).max()) > 100.0:
         return False
     x = _seen(window, known).landscape.x
-    for entry in structures(plain(problem()), x):
+    for entry in candidate_library(base_model(problem()), x):
         if (entry.site, entry.model, entry.source) == (structure.site, structure.model, structure.source):
             low, high = entry.bounds
             return structure.model.inner is None or low <= truth.inner <= high
     return False
 
 
-def _seen(window: Window, known: Prior) -> Glance:
+def _seen(window: Window, known: Prior) -> ScreeningResult:
     return looked(problem(), window, known)

@@ -9,8 +9,8 @@ from benchmarks.discovery.draw import Case, draw
 from benchmarks.discovery.setting import Ranked, problem, ranked
 from benchmarks.discovery.truth import same
 from otolith.discovery.candidates import CLEARLY
-from otolith.discovery.hypotheses import Explanation, Reason
-from otolith.estimation.augmented import places
+from otolith.discovery.hypotheses import FaultType, FittedHypothesis
+from otolith.estimation.augmented import indices
 
 APART = 2.0 * math.log(150.0)  # in -2 log evidence: what decides between two explanations
 INTERVAL = 1.96  # standard deviations on either side of which 95 % lie
@@ -92,7 +92,7 @@ def verdict(case: Case, found: Ranked) -> Judged:
     simpler = [
         value - least
         for entry, value in zip(found.explanations, found.deviances, strict=True)
-        if entry.reason in {Reason.NOTHING, Reason.PARAMETER}
+        if entry.reason in {FaultType.NOTHING, FaultType.PARAMETER}
     ]
     behind = min(right, default=math.inf) - least
     amplitude, sd, left = (math.nan, math.nan, math.nan) if own is None else _measured(own, found.count)
@@ -123,23 +123,23 @@ def verdict(case: Case, found: Ranked) -> Judged:
     )
 
 
-def label(entry: Explanation) -> str:
+def label(entry: FittedHypothesis) -> str:
     """Of any explanation."""
-    return entry.reason.value if entry.reason in {Reason.NOTHING, Reason.PARAMETER} else entry.name
+    return entry.reason.value if entry.reason in {FaultType.NOTHING, FaultType.PARAMETER} else entry.name
 
 
-def _family(best: Explanation, case: Case) -> str:
+def _family(best: FittedHypothesis, case: Case) -> str:
     """For the table: of an equal of the truth it is the truth's."""
     if best.name in same(case.truth):
         return case.truth.family
-    if best.reason is Reason.COMPONENT:
+    if best.reason is FaultType.COMPONENT:
         return "two or more" if len(best.problem.components) > 1 else best.problem.components[0].family
-    return "sensor" if best.reason is Reason.SENSOR else best.reason.name.lower()
+    return "sensor" if best.reason is FaultType.SENSOR else best.reason.name.lower()
 
 
-def _measured(entry: Explanation, count: float) -> tuple[float, float, float]:
+def _measured(entry: FittedHypothesis, count: float) -> tuple[float, float, float]:
     """Amplitude, its standard deviation with trends and initial state unknown, and χ² per value."""
-    place = places(entry.problem, 0)[0]
+    place = indices(entry.problem, 0)[0]
     normal = entry.fit.jacobian.T @ entry.fit.jacobian
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-13, hermitian=True)

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.discovery.hypotheses import Explanation
-from otolith.discovery.search import Glance, glance, search
+from otolith.discovery.hypotheses import FittedHypothesis
+from otolith.discovery.search import ScreeningResult, screening_test, search
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
-from otolith.machine import load_plan
+from otolith.machine import load_machine
 
 CONFIG = Path(__file__).parents[2] / "config" / "dc-motor.toml"
 FREE = ("R_a", "D")
@@ -22,7 +22,7 @@ KNOWN_TO = np.array([0.01, 2e-6, 1e-4, 1e-8])  # Ω, N·m·s/rad, and their tren
 @lru_cache(maxsize=1)
 def problem() -> Problem:
     """Of the machine file, with both parameters free."""
-    plan = load_plan(CONFIG, with_driver=False)
+    plan = load_machine(CONFIG, with_driver=False)
     free = tuple(plan.twin.parameter(name) for name in FREE)
     known = tuple((entry.name, entry.nominal) for entry in plan.twin.parameters if entry.name not in FREE)
     return replace(plan.problem, free=free, known=known)
@@ -45,18 +45,18 @@ def beginning(asked: Problem, window: Window, known: Prior) -> Array:
 class Ranked:
     """What a search found."""
 
-    explanations: tuple[Explanation, ...]
+    explanations: tuple[FittedHypothesis, ...]
     """The best first."""
     deviances: tuple[float, ...]
     """-2 log evidence of each."""
-    glance: Glance
+    glance: ScreeningResult
     count: float
     """Values that were measured."""
 
 
-def looked(asked: Problem, window: Window, known: Prior) -> Glance:
+def looked(asked: Problem, window: Window, known: Prior) -> ScreeningResult:
     """A glance at one window."""
-    return glance(asked, window, known, beginning(asked, window, known))
+    return screening_test(asked, window, known, beginning(asked, window, known))
 
 
 def ranked(asked: Problem, window: Window, known: Prior) -> Ranked:

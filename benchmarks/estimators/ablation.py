@@ -16,9 +16,9 @@ import numpy as np
 
 from benchmarks.estimators.cases import WIDER, Case, cases, start, windows
 from otolith.acquisition.window import Array, Window
-from otolith.estimation.gauss_newton import polish
+from otolith.estimation.gauss_newton import gauss_newton
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import search
+from otolith.estimation.particle_swarm import particle_swarm
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate
 
@@ -58,12 +58,12 @@ def attempts(problem: Problem, window: Window, begin: Array) -> tuple[Attempt, .
 
     def polished(values: Array) -> Attempt:
         begun = time.perf_counter()
-        found = polish(objective, objective.guess(values)).guess[: objective.free]
+        found = gauss_newton(objective, objective.guess(values)).guess[: objective.free]
         return Attempt(found, time.perf_counter() - begun + made)
 
     alone = polished(begin)
     begun = time.perf_counter()
-    found = search(objective, problem.swarm, begin, problem.seed + window.index).places[0]
+    found = particle_swarm(objective, problem.swarm, begin, problem.seed + window.index).places[0]
     swarm = Attempt(found, time.perf_counter() - begun + made)
     after = polished(found)
     begun = time.perf_counter()
@@ -77,12 +77,12 @@ class Judge:
 
     def __init__(self, problem: Problem, window: Window, truth: Array) -> None:
         self._objective = Objective(problem, window, truth)
-        self.best = polish(self._objective, self._objective.guess(truth)).chi_square
+        self.best = gauss_newton(self._objective, self._objective.guess(truth)).chi_square
 
     def chi_square(self, parameters: Array) -> float:
         """The least over the initial state."""
         first = self._objective.guess(parameters)[len(parameters) :]
-        return polish(_Pinned(self._objective, parameters), first).chi_square
+        return gauss_newton(_Pinned(self._objective, parameters), first).chi_square
 
 
 class _Pinned:

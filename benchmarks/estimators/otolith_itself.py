@@ -6,7 +6,7 @@ from benchmarks.estimators.base import Budget, Rival, Said
 from benchmarks.estimators.data import FREE
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import State, begin
+from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ParameterDocument
 
@@ -44,8 +44,8 @@ class Cold:
         return (_alone([report.document.parameters[name] for name in FREE]),)
 
 
-def _fresh(problem: Problem) -> State:
-    return begin("motor", "bench", problem)
+def _fresh(problem: Problem) -> AdaptationState:
+    return initial_state("motor", "bench", problem)
 
 
 def _alone(found: list[ParameterDocument]) -> Said:

@@ -9,12 +9,14 @@ from benchmarks.paper.scenarios import CHUNK, NOISE, Life, Number, Unknown, live
 from benchmarks.paper.study import LENGTH, PERIOD, SEED, Curves, Kind, Steps, Tell, curves, listened
 from otolith.acquisition.window import Array, Window
 from otolith.cli.common import examples_directory
-from otolith.discovery.sequential_test import Lesson
+from otolith.discovery.sequential_test import WindowDecision
 from otolith.health.schema import ComponentDocument, Report, ReportDocument
 from otolith_drivers.plant.faults import Step, Unbalance
 from otolith_drivers.plant.scenario import Scenario, load_scenario
 
-SUSPICIOUS = frozenset({Lesson.SUSPECTED, Lesson.REFUSED, Lesson.SENSOR, Lesson.DISCOVERED})
+SUSPICIOUS = frozenset(
+    {WindowDecision.SUSPECTED, WindowDecision.REFUSED, WindowDecision.SENSOR, WindowDecision.DISCOVERED}
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +137,7 @@ def _judged(
     found = [_component(document, job.row) for document in documents]
     first = next((at for at, entry in enumerate(found) if entry is not None), None)
     since = next((at for at, window in enumerate(windows) if window.end > begun), len(windows))
-    suspected = next((at for at in range(since, len(windows)) if documents[at].lesson in SUSPICIOUS), None)
+    suspected = next((at for at in range(since, len(windows)) if documents[at].decision in SUSPICIOUS), None)
     last = next((entry for entry in reversed(found) if entry is not None), None)
     keys = {entry.id for document in documents for entry in document.components}
     return Discovery(

@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.paper.discovery import Discovery, Search, discover
 from benchmarks.paper.study import Job, Limit, Study, study
-from otolith.runtime.process import Companion
+from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import OtolithError, ServiceError
 
 MOST = 4  # processes: there are no more jobs that take long
@@ -52,9 +52,9 @@ def perform(jobs: Sequence[Work], hear: Callable[[Progress], None]) -> list[Foun
     waiting, found = list(jobs), dict[Work, Found]()
     cores = len(os.sched_getaffinity(0))
     crew = [
-        Companion(f"otolith-paper-{number}", f"{__name__}:main", 2) for number in range(min(cores, MOST, len(jobs)))
+        ChildProcess(f"otolith-paper-{number}", f"{__name__}:main", 2) for number in range(min(cores, MOST, len(jobs)))
     ]
-    busy: dict[Companion, Work] = {}
+    busy: dict[ChildProcess, Work] = {}
     try:
         while len(found) < len(jobs):
             for companion in crew:
@@ -80,7 +80,7 @@ def perform(jobs: Sequence[Work], hear: Callable[[Progress], None]) -> list[Foun
     return [found[job] for job in jobs]
 
 
-def _hand_over(companion: Companion, job: Work) -> None:
+def _hand_over(companion: ChildProcess, job: Work) -> None:
     if not companion.alive:
         companion.start()
     companion.offer(job)

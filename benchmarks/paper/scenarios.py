@@ -16,7 +16,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.cli.common import examples_directory
 from otolith.estimation.problem import Problem
-from otolith.machine import Plan, load_plan
+from otolith.machine import LoadedMachine, load_machine
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from otolith_drivers.units import factor
 
@@ -273,16 +273,16 @@ class Life:
         return replace(self, values=values)
 
 
-def plan_of(row: Lived) -> Plan:
+def plan_of(row: Lived) -> LoadedMachine:
     """What the row's machine file means.
 
     Raises:
         OtolithError: it cannot be used.
     """
-    return load_plan(examples_directory() / f"{row.machine}.toml", with_driver=False)
+    return load_machine(examples_directory() / f"{row.machine}.toml", with_driver=False)
 
 
-def problem_of(row: Lived, plan: Plan, deviations: Mapping[str, float]) -> Problem:
+def problem_of(row: Lived, plan: LoadedMachine, deviations: Mapping[str, float]) -> Problem:
     """The plan's, with the row's parameter sought and all others known, told ``deviations`` of the sensors.
 
     An input that is measured by an ideal sensor is exact; outputs are weighed as the machine file says.
@@ -299,7 +299,7 @@ def problem_of(row: Lived, plan: Plan, deviations: Mapping[str, float]) -> Probl
     )
 
 
-def live(row: Lived, plan: Plan, seconds: float, sensors: Sequence[Sensor], lived: Callable[[], None]) -> Life:
+def live(row: Lived, plan: LoadedMachine, seconds: float, sensors: Sequence[Sensor], lived: Callable[[], None]) -> Life:
     """Simulate the row's scenario, with ideal sensors if none are given; ``lived`` is called after every 200 records.
 
     Raises:

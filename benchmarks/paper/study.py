@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.paper.scenarios import CHUNK, HIDING, PEAK, SENSORS, Life, Row, Sensor, live, plan_of, problem_of
 from otolith.acquisition.window import Array, Mask
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
+from otolith.adaptation.state import initial_state
 from otolith.estimation.information import Identifiability
 from otolith.estimation.problem import Problem
 from otolith.health.schema import Report, Status
@@ -74,7 +74,7 @@ class Curves:
 
 def listened(problem: Problem, life: Life, records: int, heard: Callable[[], None]) -> list[Report]:
     """What the heart says of ``life`` in windows of so many records; ``heard`` is called after each."""
-    state = begin("paper", "paper", problem)
+    state = initial_state("paper", "paper", problem)
     reports = []
     for window in life.windows(records):
         state, report = adapt(state, window)

@@ -25,7 +25,7 @@ from otolith.twin.component_families import NAMES
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import read_twin
 from otolith_drivers.base import Driver, DriverType, Setup, Signal
-from otolith_drivers.config_files import Context, Page, expect, parse, read, validate
+from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.registry import find
 from otolith_drivers.units import Quantity
@@ -40,7 +40,7 @@ class NamedDriver:
     module: DriverType
     options: Any
     setup: Setup
-    page: Page
+    page: SourceFile
 
     @contextlib.contextmanager
     def faults_placed(self) -> Iterator[None]:
@@ -53,7 +53,7 @@ class NamedDriver:
             raise
 
 
-def named_driver(file: MachineFile, twin: Definition, page: Page) -> NamedDriver:
+def named_driver(file: MachineFile, twin: Definition, page: SourceFile) -> NamedDriver:
     """What ``[driver]`` and ``[signals]`` say.
 
     Raises:
@@ -136,7 +136,7 @@ SMALLEST_NOISE = 1e-12  # of an output: without any, no residual could be weighe
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class LoadedMachine:
     """A machine file understood: everything the service needs to begin."""
 
     path: Path
@@ -160,7 +160,7 @@ class Plan:
         return self.source
 
     @property
-    def heard(self) -> str:
+    def signal_fingerprint(self) -> str:
         """A fingerprint of what the values of signals depend on; empty where the file does not say where they are."""
         file = self.file
         if not file.signals:
@@ -175,7 +175,7 @@ class Plan:
         return None if folder is None else self.path.parent / folder
 
 
-def load_plan(path: Path, *, with_driver: bool = True) -> Plan:
+def load_machine(path: Path, *, with_driver: bool = True) -> LoadedMachine:
     """The machine file at ``path``, its twin, its estimation problem and its driver (not yet opened).
 
     Without ``with_driver`` nobody looks at ``[driver]`` and ``[signals]``, and they may be absent.
@@ -191,7 +191,7 @@ def load_plan(path: Path, *, with_driver: bool = True) -> Plan:
     twin = _twin(file, context)
     problem = _problem(file, twin, context)
     table = file.window
-    return Plan(
+    return LoadedMachine(
         path=path,
         file=file,
         twin=twin,
@@ -311,12 +311,12 @@ def _process_noise(file: MachineFile, twin: Definition, context: Context) -> tup
     return tuple(_levels("process_noise", file.process_noise, states, context).values())
 
 
-def _driver(file: MachineFile, twin: Definition, page: Page) -> Driver:
+def _driver(file: MachineFile, twin: Definition, page: SourceFile) -> Driver:
     named = named_driver(file, twin, page)
     with named.faults_placed():
         return named.module.build(named.options, named.setup)
 
 
-def recording_folder(plan: Plan) -> Path:
+def recording_folder(plan: LoadedMachine) -> Path:
     """Where the machine file says, else in the state directory."""
     return (plan.recording_folder or state_directory() / "recordings").absolute()

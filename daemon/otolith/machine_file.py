@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.units import Quantity
 
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
@@ -39,14 +39,14 @@ Written = str | float | None
 """A quantity that is understood once its unit is known; a number without a unit is refused then."""
 
 
-class MachineTable(Closed):
+class MachineTable(StrictModel):
     """Who the machine is; both names become part of the Zenoh keys and of file names."""
 
     name: Name
     site: Name = "site"
 
 
-class TwinTable(Closed):
+class TwinTable(StrictModel):
     """Which twin: one of the library by its name, or a file of one's own."""
 
     name: str | None = None
@@ -54,7 +54,7 @@ class TwinTable(Closed):
     """Relative to the machine file."""
 
 
-class ParameterTable(Closed):
+class ParameterTable(StrictModel):
     """A parameter that is not simply known."""
 
     value: Written = None
@@ -65,7 +65,7 @@ class ParameterTable(Closed):
     high: Written = None
 
 
-class WindowTable(Closed):
+class WindowTable(StrictModel):
     """How samples become windows, and what a window may lack and still be estimated from."""
 
     length: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] = 2.0
@@ -78,7 +78,7 @@ class WindowTable(Closed):
     jitter_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 10.0))] = 0.005
 
 
-class EstimationTable(Closed):
+class EstimationTable(StrictModel):
     """What is asked of estimates."""
 
     open_loop: bool = False
@@ -87,7 +87,7 @@ class EstimationTable(Closed):
     """A parameter counts as determined when the half of its 95 % interval is at most this share of its value."""
 
 
-class DiscoveryTable(Closed):
+class DiscoveryTable(StrictModel):
     """What is looked for when the twin does not explain the machine; everything unless restricted."""
 
     enabled: bool = True
@@ -97,7 +97,7 @@ class DiscoveryTable(Closed):
     """``t``, ``angle(omega)``, or names of signals and states."""
 
 
-class SwarmTable(Closed):
+class SwarmTable(StrictModel):
     """The particle swarm; the default values are Table 2 of the paper."""
 
     size: Annotated[int, Field(ge=3, le=1000)] = 15
@@ -108,14 +108,14 @@ class SwarmTable(Closed):
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
 
 
-class ZenohTable(Closed):
+class ZenohTable(StrictModel):
     """Where reports go; loopback only unless told otherwise."""
 
     listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
     connect: tuple[Endpoint, ...] = ()
 
 
-class RecordingTable(Closed):
+class RecordingTable(StrictModel):
     """Rerun recordings."""
 
     enabled: bool = True
@@ -123,7 +123,7 @@ class RecordingTable(Closed):
     """Relative to the machine file; without it the state directory of the daemon."""
 
 
-class MachineFile(Closed):
+class MachineFile(StrictModel):
     """The whole file."""
 
     machine: MachineTable

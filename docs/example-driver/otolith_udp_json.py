@@ -13,7 +13,7 @@ from typing import Annotated
 from pydantic import Field
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.units import factor
 
@@ -22,13 +22,13 @@ WAKE = 0.2  # s; how late a stop can be noticed
 SILENCE = 2.0  # s, after which the device is taken to be gone
 
 
-class Options(Closed):
+class Options(StrictModel):
     """The keys of ``[driver]`` beside ``type``."""
 
     port: Annotated[int, Field(ge=1024, le=65535)]
 
 
-class Source(Closed):
+class Source(StrictModel):
     """The keys of each of ``[signals]``."""
 
     key: str

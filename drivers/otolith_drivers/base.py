@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 
 
 class Sample(NamedTuple):
@@ -73,7 +73,7 @@ class Link:
     up: bool
     reason: str = ""
     """Why it is down, in words."""
-    complaints: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     """What is wrong now although it is up, a line each: a silent frame, a dead device, registers that are refused."""
     plan: str = ""
     """What is asked of the machine and what is achieved; empty where the machine sets the pace."""
@@ -115,9 +115,9 @@ class Driver(Protocol):
 class DriverType(Protocol):
     """What a row of the registry points to: a module with these three names."""
 
-    Options: type[Closed]
+    Options: type[StrictModel]
     """The keys of ``[driver]`` beside ``type``."""
-    Source: type[Closed]
+    Source: type[StrictModel]
     """The keys of each of ``[signals]``: where to find the signal."""
 
     def build(self, options: Any, setup: Setup) -> Driver:

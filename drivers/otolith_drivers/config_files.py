@@ -38,14 +38,14 @@ Location = Sequence[int | str]
 Model = TypeVar("Model", bound=BaseModel)
 
 
-class Closed(BaseModel):
+class StrictModel(BaseModel):
     """A table of a file: unknown keys are errors, values are finite and do not change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
+class SourceFile:
     """A file and its text, so that a fault can say where it stands."""
 
     path: Path
@@ -60,7 +60,7 @@ class Page:
 class Context:
     """Says where in the file a fault is, when it is found after the file's own types were right."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: SourceFile) -> None:
         self.page = page
         self._location: tuple[int | str, ...] = ()
 
@@ -91,7 +91,7 @@ def load(path: Path, model: type[Model]) -> Model:
     return validate(parse(page), model, page)
 
 
-def read(path: Path) -> Page:
+def read(path: Path) -> SourceFile:
     """The text of a file that the user named, its line ends those of this system.
 
     Raises:
@@ -101,10 +101,10 @@ def read(path: Path) -> Page:
         text = content(path, FILE_SIZE_LIMIT).decode("utf-8")
     except UnicodeDecodeError as error:
         raise ConfigurationError(f"{path}: not UTF-8 text (byte {error.start}): is this the right file?") from error
-    return Page(path, re.sub("\r\n?", "\n", text))
+    return SourceFile(path, re.sub("\r\n?", "\n", text))
 
 
-def parse(page: Page) -> dict[str, Any]:
+def parse(page: SourceFile) -> dict[str, Any]:
     """The TOML of ``page``."""
     try:
         return tomllib.loads(page.text)
@@ -128,14 +128,14 @@ KINDS = {
 """The key that only one kind of file has, what the file is, and what it is for."""
 
 
-def expect(page: Page, data: dict[str, Any], key: str) -> None:
+def expect(page: SourceFile, data: dict[str, Any], key: str) -> None:
     """Refuse a file of another kind, once and by its name, instead of every key in it."""
     for other, (what, command) in KINDS.items():
         if other != key and other in data and key not in data:
             raise ConfigurationError(f"{page.path}: this is {what}, for '{command}'; {KINDS[key][0]} is needed here")
 
 
-def validate(data: Any, model: type[Model], page: Page, under: Location = ()) -> Model:
+def validate(data: Any, model: type[Model], page: SourceFile, under: Location = ()) -> Model:
     """``data`` as ``model``; ``under`` is where in the file it stands."""
     try:
         return model.model_validate(data)
@@ -147,7 +147,7 @@ def validate(data: Any, model: type[Model], page: Page, under: Location = ()) ->
         raise ConfigurationError("\n".join(dict.fromkeys(lines))) from error
 
 
-def fitted(data: Any, model: type[Model], under: tuple[str, ...]) -> Model:
+def validated(data: Any, model: type[Model], under: tuple[str, ...]) -> Model:
     """``data`` as ``model``, for who does not know the file in which it stands at ``under``.
 
     Raises:

@@ -332,7 +332,7 @@ MOST_OTHERS = 3  # that are named
 LOW_HALF = 0x2000  # magnitude from which a register may well be the low half of a number whose high half stands still
 
 
-class Verdict(StrEnum):
+class LayoutVerdict(StrEnum):
     """What can be said of a part."""
 
     TOLD = "told"
@@ -354,7 +354,7 @@ class Part:
     start: int
     """Its first byte."""
     width: int
-    verdict: Verdict
+    verdict: LayoutVerdict
     layout: Layout | None
     """None where it stands still."""
     latest: float
@@ -423,15 +423,15 @@ class _Cuts:
 
 def _part(piece: Piece, cuts: _Cuts, data: Bytes) -> Part:
     if piece.layout is None or piece.numbers is None:
-        return Part(piece.start, piece.width, Verdict.STILL, None, math.nan, math.nan, math.nan)
+        return Part(piece.start, piece.width, LayoutVerdict.STILL, None, math.nan, math.nan, math.nan)
     numbers = piece.numbers
-    verdict, others = Verdict.TOLD, _others(piece, cuts)
+    verdict, others = LayoutVerdict.TOLD, _others(piece, cuts)
     if piece.wild:
-        verdict, others = Verdict.WILD, ()
+        verdict, others = LayoutVerdict.WILD, ()
     elif not piece.layout.is_float and counts(piece.layout, piece.layout.ranks(data[:, piece.start : piece.end])):
-        verdict, others = Verdict.COUNTS, ()
+        verdict, others = LayoutVerdict.COUNTS, ()
     elif others or len(data) < FEWEST:
-        verdict = Verdict.LIKELY
+        verdict = LayoutVerdict.LIKELY
     seen = numbers[np.isfinite(numbers)]
     low, high = (float(seen.min()), float(seen.max())) if len(seen) else (math.nan, math.nan)
     return Part(piece.start, piece.width, verdict, piece.layout, float(numbers[-1]), low, high, others)

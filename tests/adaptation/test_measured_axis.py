@@ -16,9 +16,9 @@ import pytest
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
-from otolith.commissioning.consistency import agreement
-from otolith.commissioning.identification import DOUBTFUL, LearnedNoise, learn_noise
+from otolith.adaptation.state import initial_state
+from otolith.commissioning.consistency import consistency_test
+from otolith.commissioning.identification import DOUBTFUL, IdentifiedNoise, identify_noise
 from otolith.commissioning.likelihood import Likelihood
 from otolith.estimation.information import Identifiability
 from otolith.estimation.problem import Problem
@@ -56,14 +56,14 @@ def problem(twin: str) -> Problem:
 
 
 @lru_cache
-def learned(twin: str) -> LearnedNoise:
+def learned(twin: str) -> IdentifiedNoise:
     """From every other window; the rest have no part in it."""
-    return learn_noise(problem(twin), windows()[::2])
+    return identify_noise(problem(twin), windows()[::2])
 
 
 @lru_cache
 def reports(twin: str) -> tuple[ReportDocument, ...]:
-    state, found = begin("axis", "lab", learned(twin).applied(problem(twin))), []
+    state, found = initial_state("axis", "lab", learned(twin).applied(problem(twin))), []
     for window in windows():
         state, report = adapt(state, window)
         found.append(report.document)
@@ -130,7 +130,7 @@ def test_windows_that_were_not_learned_from_agree_as_much_as_they_claim() -> Non
     likelihood, levels = Likelihood(twin), np.array([*told.noise, *told.process_noise])
     fits = [likelihood.fit(levels, window, [twin.nominal]) for window in windows()]
     for some in (fits, fits[1::2]):
-        found = agreement(some, likelihood.width)
+        found = consistency_test(some, likelihood.width)
         assert found.degrees > 15
         assert 0.5 <= found.reduced <= 2.0
 
@@ -177,7 +177,9 @@ def test_dry_friction_that_the_twin_lacks_is_discovered() -> None:
     told = learned("servo_axis_directional")
     levels = {entry.name: entry.value for entry in told.states}
     process = tuple(levels[entry.name] for entry in bare.states)
-    state = begin("axis", "lab", Problem(bare, (), bare.parameters, (told.outputs[0].value,), process_noise=process))
+    state = initial_state(
+        "axis", "lab", Problem(bare, (), bare.parameters, (told.outputs[0].value,), process_noise=process)
+    )
     documents = []
     for window in windows():
         state, report = adapt(state, window)

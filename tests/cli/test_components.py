@@ -12,10 +12,10 @@ import pytest
 from benchmarks.discovery.motor import SIGNALS, Faults, live
 from click.testing import CliRunner, Result
 
-from otolith.adaptation.state import Decisions, begin, decided, restored
+from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state, restore_components
 from otolith.cli.main import cli
-from otolith.machine import load_plan
-from otolith.runtime.state_store import Keeper
+from otolith.machine import load_machine
+from otolith.runtime.state_store import StateStore
 from otolith_drivers.errors import ConfigurationError
 from tests.cli.replays import MACHINE
 from tests.conftest import EXAMPLES
@@ -44,15 +44,15 @@ def otolith(*arguments: str | Path, said: str = "") -> Result:
 def test_what_was_found_in_other_signals_is_not_believed(data: Path) -> None:
     """A unit that was wrong, and is put right, must not leave behind what it made the daemon find."""
     assert otolith("commission", MACHINE, data, "--windows", "8", said="y\n").exit_code == 0
-    plan = load_plan(MACHINE, with_driver=False)
+    plan = load_machine(MACHINE, with_driver=False)
     names, folder, found = (
         (plan.file.machine.site, plan.file.machine.name),
         keeper().known.parent,
         keeper().components(),
     )
-    Keeper(*names, plan.twin, folder, "before").keep(found)
-    assert Keeper(*names, plan.twin, folder, "before").components() == found
-    assert Keeper(*names, plan.twin, folder, "after").components() == ()
+    StateStore(*names, plan.twin, folder, "before").keep(found)
+    assert StateStore(*names, plan.twin, folder, "before").components() == found
+    assert StateStore(*names, plan.twin, folder, "after").components() == ()
 
 
 def test_a_plan_knows_how_its_signals_are_said(tmp_path: Path) -> None:
@@ -63,14 +63,14 @@ def test_a_plan_knows_how_its_signals_are_said(tmp_path: Path) -> None:
     for old, new in changes.items():
         path = tmp_path / "machine.toml"
         path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
-        heard.append(load_plan(path, with_driver=False).heard)
+        heard.append(load_machine(path, with_driver=False).signal_fingerprint)
     assert heard[0] == heard[1]
     assert len(set(heard)) == 3
 
 
-def keeper() -> Keeper:
-    plan = load_plan(MACHINE, with_driver=False)
-    return Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin)
+def keeper() -> StateStore:
+    plan = load_machine(MACHINE, with_driver=False)
+    return StateStore(plan.file.machine.site, plan.file.machine.name, plan.twin)
 
 
 def test_what_belongs_to_the_machine_is_learned_and_obeyed(data: Path) -> None:
@@ -86,13 +86,17 @@ def test_what_belongs_to_the_machine_is_learned_and_obeyed(data: Path) -> None:
     assert document["approved"] == [KEY]
     assert document["components"][0]["entry"]["component"]["family"] == "periodic"
 
-    plan = load_plan(MACHINE, with_driver=False)
-    state = decided(restored(begin("m", "s", plan.problem), keeper().components()), keeper().decisions())
+    plan = load_machine(MACHINE, with_driver=False)
+    state = apply_decisions(
+        restore_components(initial_state("m", "s", plan.problem), keeper().components()), keeper().decisions()
+    )
     assert [entry.key for entry in state.problem.components] == [KEY]
 
     otolith("components", "reject", MACHINE, KEY)
-    assert keeper().decisions() == Decisions(rejected=frozenset({KEY}))
-    state = decided(restored(begin("m", "s", plan.problem), keeper().components()), keeper().decisions())
+    assert keeper().decisions() == OperatorDecisions(rejected=frozenset({KEY}))
+    state = apply_decisions(
+        restore_components(initial_state("m", "s", plan.problem), keeper().components()), keeper().decisions()
+    )
     assert state.problem.components == ()
     assert KEY in state.problem.excluded
 
@@ -108,7 +112,7 @@ def test_a_question_that_nobody_answers_keeps_nothing_and_says_so(
     with pytest.raises(click.Abort):
         cli.main(["commission", str(MACHINE), str(data), "--windows", "4"], standalone_mode=False)
     assert "nothing is kept" in capsys.readouterr().err
-    assert keeper().decisions() == Decisions()
+    assert keeper().decisions() == OperatorDecisions()
     assert keeper().components() == ()
 
 
@@ -125,7 +129,7 @@ def test_a_file_that_is_not_ours_is_refused_by_name() -> None:
     one = keeper()
     one.known.parent.mkdir(parents=True, exist_ok=True)
     one.known.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=r"components.0.entry.*move it away"):
+    with pytest.raises(ConfigurationError, match=r"components.0.adopted.*move it away"):
         one.components()
     one.said.write_text("half a fi", encoding="utf-8")
     with pytest.raises(ConfigurationError, match=one.said.name):
@@ -144,14 +148,14 @@ def test_a_restriction_that_cannot_be_meant_is_an_error(tmp_path: Path, line: st
     machine = tmp_path / "machine.toml"
     machine.write_text(MACHINE.read_text(encoding="utf-8") + f"\n[discovery]\n{line}\n", encoding="utf-8")
     with pytest.raises(ConfigurationError, match=word):
-        load_plan(machine, with_driver=False)
+        load_machine(machine, with_driver=False)
 
 
 def test_a_restricted_search_leaves_the_rest_out(tmp_path: Path) -> None:
     machine = tmp_path / "machine.toml"
     text = MACHINE.read_text(encoding="utf-8") + '\n[discovery]\nfamilies = ["periodic"]\nsites = ["shaft"]\n'
     machine.write_text(text, encoding="utf-8")
-    excluded = load_plan(machine, with_driver=False).problem.excluded
+    excluded = load_machine(machine, with_driver=False).problem.excluded
     assert KEY not in excluded
     assert "shaft/linear/omega" in excluded
     assert "winding/periodic/t" in excluded

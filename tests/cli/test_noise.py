@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 
 from otolith.cli.main import cli
 from otolith.cli.noise import _spread
-from otolith.machine import load_plan
+from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.cli.replays import MACHINE, recorded, written
@@ -30,7 +30,7 @@ def test_its_lines_are_a_machine_files_and_right(tmp_path: Path, data: Path) -> 
     text = MACHINE.read_text(encoding="utf-8")
     machine = tmp_path / "machine.toml"
     machine.write_text(text[: text.index("[noise]")] + result.stdout, encoding="utf-8")
-    problem = load_plan(machine, with_driver=False).problem
+    problem = load_machine(machine, with_driver=False).problem
     assert problem.noise == pytest.approx((0.005, 0.02), rel=0.1)
     assert problem.input_noise == pytest.approx((0.0, 0.0002))
     assert problem.process_noise == pytest.approx((0.0, 0.0), abs=0.05)

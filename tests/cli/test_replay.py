@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
+from otolith.adaptation.state import initial_state
 from otolith.cli.replay import replay
 from otolith.health.schema import ReportDocument
-from otolith.machine import load_plan
+from otolith.machine import load_machine
 from otolith.publishing.recorder import LEAST_FREE
 from otolith.runtime.replay import Replay
 from otolith_drivers.errors import ConfigurationError, OtolithError
@@ -79,16 +79,16 @@ def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
 def test_only_a_replay_does_without_a_driver() -> None:
     file = MACHINE_FILES / "no-driver" / "machine.toml"
     with pytest.raises(ConfigurationError, match="loaded without its driver"):
-        _ = load_plan(file, with_driver=False).driver
+        _ = load_machine(file, with_driver=False).driver
     with pytest.raises(ConfigurationError, match="say where the signals come from"):
-        load_plan(file)
+        load_machine(file)
 
 
 def test_the_truth_comes_back_as_from_windows_without_a_file(
     tmp_path: Path, rows: Lines, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plan = load_plan(MACHINE, with_driver=False)
-    state = begin("motor", "site", plan.problem)
+    plan = load_machine(MACHINE, with_driver=False)
+    state = initial_state("motor", "site", plan.problem)
     found = reports(written(tmp_path, rows), capsys)
     assert len(found) == 5
     with table.Table(tmp_path / "data.csv", {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith.cli.replay import moment
+from otolith.cli.replay import time_text
 from otolith.health.schema import ReportDocument, Status
-from otolith.machine import load_plan
+from otolith.machine import load_machine
 from otolith.runtime.replay import Replay
 from otolith_drivers.errors import OtolithError
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -203,7 +203,7 @@ def check_any(path: Path) -> None:
     window = '[window]\nlength = "0.2 s"\nmissing_limit = "100 %"\ngap_limit = "1 s"\njitter_limit = "1 s"\n'
     swarm = "[swarm]\ngenerations = 2\nsize = 3\n"
     machine.write_text(MACHINE.read_text(encoding="utf-8") + window + swarm, encoding="utf-8")
-    plan = load_plan(machine, with_driver=False)
+    plan = load_machine(machine, with_driver=False)
     said = str(path)
     try:
         with table.Table(path, {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
@@ -224,4 +224,4 @@ def check_any(path: Path) -> None:
 )
 def test_times_that_can_be_dates_are_told_as_dates(seconds: float, told: str) -> None:
     """A column of milliseconds since 1970 is none."""
-    assert moment(seconds) == told
+    assert time_text(seconds) == told

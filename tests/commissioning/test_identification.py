@@ -8,8 +8,8 @@ import pytest
 
 from otolith.acquisition.window import Array, Quality, Verdict, Window
 from otolith.commissioning import identification as say
-from otolith.commissioning.consistency import touched
-from otolith.commissioning.identification import LearnedNoise, learn_noise
+from otolith.commissioning.consistency import observable_states
+from otolith.commissioning.identification import IdentifiedNoise, identify_noise
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
@@ -58,13 +58,13 @@ def window(
     return Window.whole(index, 2.0 * index, PERIOD, TWIN.signals, values)
 
 
-def levels(found: LearnedNoise) -> Array:
+def levels(found: IdentifiedNoise) -> Array:
     return np.array([entry.value for entry in (*found.outputs, *found.states)])
 
 
-def learned(seed: int, count: int = 20, **options: object) -> LearnedNoise:
+def learned(seed: int, count: int = 20, **options: object) -> IdentifiedNoise:
     random = np.random.default_rng(seed)
-    return learn_noise(PROBLEM, [window(random, index, **options) for index in range(count)])  # type: ignore[arg-type]
+    return identify_noise(PROBLEM, [window(random, index, **options) for index in range(count)])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -97,8 +97,8 @@ def test_windows_at_rest_among_others_are_left_out() -> None:
     random = np.random.default_rng(6)
     moving = [window(random, index, strays=(0.0, 0.3)) for index in range(10)]
     resting = [window(random, 10 + index, voltage=(0.0, 0.0)) for index in range(10)]
-    found = learn_noise(PROBLEM, [*moving, *resting])
-    assert levels(found)[[0, 1, 3]] == pytest.approx(levels(learn_noise(PROBLEM, moving))[[0, 1, 3]], rel=0.01)
+    found = identify_noise(PROBLEM, [*moving, *resting])
+    assert levels(found)[[0, 1, 3]] == pytest.approx(levels(identify_noise(PROBLEM, moving))[[0, 1, 3]], rel=0.01)
     assert found.remarks == (say.RESTING.format(10, 20),)
 
 
@@ -113,7 +113,7 @@ def test_without_a_usable_window_everything_stays_as_it_was() -> None:
     bad = Quality(Verdict.BAD, 1.0, 2.0, 0.0, 0.0, ("no samples of i",))
     whole = window(np.random.default_rng(8), 0)
     for windows in ([], [replace(whole, quality=bad)], [replace(whole, values=whole.values * np.nan)]):
-        found = learn_noise(PROBLEM, windows)
+        found = identify_noise(PROBLEM, windows)
         assert found.applied(PROBLEM).noise == PROBLEM.noise
         assert {entry.remark for entry in (*found.outputs, *found.states)} == {say.NO_WINDOW}
         assert found.log_likelihood is None
@@ -130,7 +130,7 @@ def test_gaps_do_no_harm_and_an_output_that_is_never_measured_is_named() -> None
         missing[:, 2] = True
         values[missing] = 99.0
         windows.append(replace(whole, missing=missing, values=values))
-    found = learn_noise(PROBLEM, windows)
+    found = identify_noise(PROBLEM, windows)
     assert found.outputs[0].remark == say.NEVER_MEASURED
     assert (found.outputs[0].value, found.outputs[0].sd) == (0.05, None)
     assert levels(found)[[1, 3]] == pytest.approx([SENSORS[1], 0.3], rel=0.15)
@@ -143,7 +143,7 @@ def test_an_output_that_never_changes_is_named() -> None:
         values = whole.values.copy()
         values[:, 2] = 0.0
         windows.append(replace(whole, values=values))
-    found = learn_noise(PROBLEM, windows)
+    found = identify_noise(PROBLEM, windows)
     assert (found.outputs[0].value, found.outputs[0].remark) == (0.05, say.CONSTANT)
     assert found.outputs[1].value == pytest.approx(SENSORS[1], rel=0.15)
 
@@ -165,7 +165,7 @@ def test_windows_that_scatter_more_than_they_claim_get_more_process_noise() -> N
 def test_where_no_window_shows_process_noise_itself_it_is_made_up_from_the_scatter_and_said() -> None:
     random = np.random.default_rng(12)
     windows = [window(random, index, R_a=6.5 + 0.1 * float(random.normal())) for index in range(12)]
-    found = learn_noise(PROBLEM, windows)
+    found = identify_noise(PROBLEM, windows)
     assert found.consistency.remark == say.FROM_NOTHING
     assert found.consistency.factor is None
     assert found.consistency.after == pytest.approx(1.0, abs=0.1)
@@ -178,16 +178,18 @@ def test_where_no_process_noise_helps_there_is_none_and_that_is_said(monkeypatch
     )
     random = np.random.default_rng(13)
     windows = [window(random, index, R_a=6.5 + 0.1 * float(random.normal())) for index in range(4)]
-    found = learn_noise(PROBLEM, windows)
+    found = identify_noise(PROBLEM, windows)
     assert found.consistency.remark == say.HELPLESS
     assert found.consistency.after == found.consistency.before
     assert (levels(found)[2:] == 0.0).all()
 
 
 def test_what_is_measured_or_driven() -> None:
-    assert touched(TWIN).tolist() == [True, True]
+    assert observable_states(TWIN).tolist() == [True, True]
     two_mass = find_twin("two_mass")
-    names = [entry.name for entry, is_touched in zip(two_mass.states, touched(two_mass), strict=True) if is_touched]
+    names = [
+        entry.name for entry, is_touched in zip(two_mass.states, observable_states(two_mass), strict=True) if is_touched
+    ]
     assert names == ["omega_m", "omega_l"]  # and not the twist between them
 
 

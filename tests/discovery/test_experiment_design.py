@@ -7,9 +7,9 @@ import pytest
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import State, begin
+from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.problem import Problem, WindowOptions
-from otolith.estimation.window_length import Need, next_records
+from otolith.estimation.window_length import WindowExcitation, next_records
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
@@ -32,9 +32,9 @@ def window(index: int, inputs: Array, initial: Array) -> Window:
     return Window.whole(index, 2.0 * index, PERIOD, TWIN.signals, values)
 
 
-def steady(count: int) -> tuple[State, ReportDocument]:
+def steady(count: int) -> tuple[AdaptationState, ReportDocument]:
     """After windows at constant speed."""
-    state = begin("motor", "here", PROBLEM)
+    state = initial_state("motor", "here", PROBLEM)
     for index in range(count):
         state, report = adapt(state, window(index, np.tile(STEADY, (RECORDS, 1)), np.array([CURRENT, SPEED])))
     return state, report.document
@@ -73,7 +73,7 @@ def test_windows_grow_while_nothing_drifts_and_shrink_with_the_drift() -> None:
         records = 200
         for _ in range(30):
             sd = 0.002 * np.sqrt(200 / records)  # of a window of this length, alone
-            need = Need(np.array([sd]), np.array([trend]), explained=True)
+            need = WindowExcitation(np.array([sd]), np.array([trend]), explained=True)
             records = next_records(options, records, PERIOD, need)
         return records
 
@@ -85,7 +85,7 @@ def test_windows_grow_while_nothing_drifts_and_shrink_with_the_drift() -> None:
 
 
 def test_without_a_choice_the_length_stays() -> None:
-    need = Need(np.array([0.1]), np.array([10.0]), explained=False)
+    need = WindowExcitation(np.array([0.1]), np.array([10.0]), explained=False)
     assert next_records(WindowOptions(200, 200, 200), 200, PERIOD, need) == 200
 
 

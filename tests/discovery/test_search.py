@@ -10,10 +10,17 @@ from benchmarks.discovery.motor import Faults, J, live, windows
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import Decisions, State, begin, decided, kept, restored
+from otolith.adaptation.state import (
+    AdaptationState,
+    OperatorDecisions,
+    apply_decisions,
+    component_records,
+    initial_state,
+    restore_components,
+)
 from otolith.discovery.adopted import Approval
-from otolith.discovery.hypotheses import Reason
-from otolith.discovery.sequential_test import Lesson
+from otolith.discovery.hypotheses import FaultType
+from otolith.discovery.sequential_test import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
@@ -33,7 +40,7 @@ def lived(kind: str, seconds: float, faults: Faults, seed: int = 3) -> list[Wind
     return windows(live(kind, seconds, faults, seed))
 
 
-def run(state: State, record: list[Window]) -> tuple[State, list[ReportDocument]]:
+def run(state: AdaptationState, record: list[Window]) -> tuple[AdaptationState, list[ReportDocument]]:
     found = []
     for window in record:
         state, report = adapt(state, window)
@@ -41,8 +48,8 @@ def run(state: State, record: list[Window]) -> tuple[State, list[ReportDocument]
     return state, found
 
 
-def begun(*names: str) -> State:
-    return begin("motor", "here", problem(*names))
+def begun(*names: str) -> AdaptationState:
+    return initial_state("motor", "here", problem(*names))
 
 
 @pytest.mark.parametrize("order", [1.0, 2.0])
@@ -51,7 +58,7 @@ def test_a_term_of_the_shaft_is_found_with_its_order_while_the_speed_changes(ord
         return 0.004 * math.sin(order * angle + 1.0)
 
     _, documents = run(begun("R_a", "D"), lived("sweep", 20, Faults(torque=torque, since=5.0)))
-    assert [document.lesson for document in documents[:2]] == [Lesson.LEARNED] * 2
+    assert [document.decision for document in documents[:2]] == [WindowDecision.LEARNED] * 2
     (found,) = documents[-1].components
     assert (found.site, found.family, found.input) == ("shaft", "periodic", "angle(omega)")
     assert found.values["order"].value == pytest.approx(order, abs=0.01)
@@ -59,7 +66,7 @@ def test_a_term_of_the_shaft_is_found_with_its_order_while_the_speed_changes(ord
     assert found.onset == pytest.approx(5.0, abs=0.3)
     assert documents[-1].model == "DT''"
     suspicion = next(document for document in documents if document.explanations)
-    assert suspicion.lesson is Lesson.SUSPECTED
+    assert suspicion.decision is WindowDecision.SUSPECTED
 
 
 def test_a_fixed_frequency_is_found_as_one_and_its_phase_stays_coherent() -> None:
@@ -95,10 +102,10 @@ def test_what_cannot_be_told_apart_is_named_together_and_nothing_is_taken_over()
     """A constant torque, and an offset of the load sensor: the same to everybody who hears both signals."""
     state, documents = run(begun("R_a", "D"), lived("steps", 24, Faults(torque=lambda *_: 0.003, since=6.5)))
     last = documents[-1]
-    assert last.lesson is Lesson.SUSPECTED
+    assert last.decision is WindowDecision.SUSPECTED
     texts = [(entry.reason, entry.text) for entry in last.explanations]
-    assert any(reason is Reason.SENSOR and "T_load" in text for reason, text in texts)
-    assert any(reason is Reason.COMPONENT and text.startswith("shaft: 0.00") for reason, text in texts)
+    assert any(reason is FaultType.SENSOR and "T_load" in text for reason, text in texts)
+    assert any(reason is FaultType.COMPONENT and text.startswith("shaft: 0.00") for reason, text in texts)
     shares = [entry.probability for entry in last.explanations]
     assert shares == sorted(shares, reverse=True)
     assert 0.99 < sum(shares) <= 1.0  # nothing else is as likely as to be worth a word
@@ -115,7 +122,7 @@ def test_a_component_that_goes_away_fades() -> None:
 
     state, documents = run(begun("R_a", "D"), lived("steps", 44, Faults(torque=torque, since=3.0)))
     assert any(document.components for document in documents)
-    assert Lesson.FADED in {document.lesson for document in documents}
+    assert WindowDecision.FADED in {document.decision for document in documents}
     assert state.problem.components == ()
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
 
@@ -124,7 +131,7 @@ def test_a_component_that_goes_away_fades() -> None:
 def test_a_healthy_machine_grows_nothing(operation: str) -> None:
     state, documents = run(begun("R_a", "D"), lived(operation, 60, Faults(), seed=11))
     assert not any(document.components for document in documents)
-    assert sum(document.lesson is not Lesson.LEARNED for document in documents) == 0
+    assert sum(document.decision is not WindowDecision.LEARNED for document in documents) == 0
     assert state.catalogue == ()
 
 
@@ -136,22 +143,22 @@ def test_a_machine_with_an_unbalance_is_restored_after_a_restart_and_obeys_the_s
     state, documents = run(begun("R_a", "D"), record[:10])
     (found,) = documents[-1].components
     assert documents[-1].findings
-    again = restored(begun("R_a", "D"), kept(state))
+    again = restore_components(begun("R_a", "D"), component_records(state))
     again, documents = run(again, record[12:16])  # some time has passed, and nobody has counted turns
-    assert {document.lesson for document in documents} == {Lesson.LEARNED}
+    assert {document.decision for document in documents} == {WindowDecision.LEARNED}
     assert documents[-1].components[0].values["amplitude"].value == pytest.approx(0.004, rel=0.03)
 
-    approved = decided(again, Decisions(approved=frozenset({found.id})))
+    approved = apply_decisions(again, OperatorDecisions(approved=frozenset({found.id})))
     _, documents = run(approved, record[16:17])
     assert documents[0].components[0].approval is Approval.APPROVED
     assert not documents[0].findings
 
-    rejected = decided(again, Decisions(rejected=frozenset({found.id})))
+    rejected = apply_decisions(again, OperatorDecisions(rejected=frozenset({found.id})))
     assert rejected.problem.components == ()
     _, documents = run(rejected, record[16:20])
     assert all(entry.id != found.id for document in documents for entry in document.components)
 
-    forgotten = decided(again, Decisions(forgotten={found.id: 1e6}))
+    forgotten = apply_decisions(again, OperatorDecisions(forgotten={found.id: 1e6}))
     assert forgotten.problem.components == ()
     _, documents = run(forgotten, record[16:20])
     assert documents[-1].components[0].id == found.id
@@ -161,10 +168,10 @@ def test_discovery_can_be_switched_off() -> None:
     def torque(t: float, *_: float) -> float:
         return 5.0 * J * math.sin(10.0 * t)
 
-    quiet = begin("motor", "here", replace(problem("R_a", "D"), discover=False))
+    quiet = initial_state("motor", "here", replace(problem("R_a", "D"), discover=False))
     _, documents = run(quiet, lived("steps", 14, Faults(torque=torque, since=4.0)))
     assert not any(document.components for document in documents)
-    assert documents[-1].lesson is not Lesson.LEARNED
+    assert documents[-1].decision is not WindowDecision.LEARNED
 
 
 @pytest.mark.parametrize(("operation", "order", "amplitude"), [("steps", 3.0, 0.001), ("sweep", 1.0, 0.0003)])
@@ -179,8 +186,8 @@ def test_what_is_not_to_be_looked_for_starts_no_search(operation: str, order: fl
         f"{site.name}/periodic/{source.name}" for site in sites(TWIN) for source in sources(TWIN) if source.name
     )
     for state in (
-        decided(begun("R_a", "D"), Decisions(rejected=periodic)),
-        begin("motor", "here", replace(problem("R_a", "D"), excluded=periodic)),
+        apply_decisions(begun("R_a", "D"), OperatorDecisions(rejected=periodic)),
+        initial_state("motor", "here", replace(problem("R_a", "D"), excluded=periodic)),
     ):
         _, documents = run(state, record)
         assert not any(document.cost.searched for document in documents)
@@ -199,15 +206,15 @@ def patched(*resistances: float) -> list[Window]:
 def test_one_wrong_window_changes_nothing_but_confidence() -> None:
     before, _ = run(begun("R_a"), patched(6.5)[:10])
     state, documents = run(begun("R_a"), patched(4.0, 6.5, 6.5))
-    assert documents[10].lesson is Lesson.SUSPECTED
-    assert documents[11].lesson is Lesson.LEARNED
+    assert documents[10].decision is WindowDecision.SUSPECTED
+    assert documents[11].decision is WindowDecision.LEARNED
     assert documents[11].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
-    assert state.memory.belief.scatter > before.memory.belief.scatter
+    assert state.memory.belief.variance_ratio > before.memory.belief.variance_ratio
 
 
 def test_windows_that_contradict_each_other_never_become_a_step() -> None:
     _, documents = run(begun("R_a"), patched(4.5, 8.5, 4.0, 9.0, 5.0))
-    assert {document.lesson for document in documents[10:]} <= {Lesson.SUSPECTED, Lesson.REFUSED}
+    assert {document.decision for document in documents[10:]} <= {WindowDecision.SUSPECTED, WindowDecision.REFUSED}
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.01)
 
 
@@ -217,13 +224,13 @@ def two_terms(*moment: float) -> float:
 
 def test_what_stays_keeps_its_numbers_when_another_leaves() -> None:
     state, _ = run(begun("R_a", "D"), lived("reversing", 24, Faults(torque=two_terms, since=3.0)))
-    before = {entry.entry.component.key: entry.values[0] for entry in kept(state)}
+    before = {entry.adopted.component.key: entry.values[0] for entry in component_records(state)}
     assert len(before) == 2
     first = state.problem.components[0].key
-    after = decided(state, Decisions(rejected=frozenset({first})))
-    (left,) = kept(after)
-    assert left.entry.component.key != first
-    assert left.values[0] == pytest.approx(before[left.entry.component.key], rel=1e-6)
+    after = apply_decisions(state, OperatorDecisions(rejected=frozenset({first})))
+    (left,) = component_records(after)
+    assert left.adopted.component.key != first
+    assert left.values[0] == pytest.approx(before[left.adopted.component.key], rel=1e-6)
 
 
 @pytest.mark.parametrize("jump", [-1e6, 1e5, 1e9])
@@ -236,7 +243,7 @@ def test_a_clock_that_is_set_costs_the_phase_and_nothing_else(jump: float) -> No
     assert documents[-1].components
     later = [replace(window, start=window.start + jump) for window in record[10:]]
     _, documents = run(state, later)
-    assert {document.lesson for document in documents} == {Lesson.LEARNED}
+    assert {document.decision for document in documents} == {WindowDecision.LEARNED}
     assert documents[-1].components[0].values["frequency"].value == pytest.approx(10.0, rel=1e-3)
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
 
@@ -248,13 +255,17 @@ def test_of_several_components_one_that_goes_away_leaves_and_the_others_stay() -
     state, _ = run(begun("R_a", "D"), lived("reversing", 24, Faults(torque=two_terms, since=3.0)))
     two = {entry.key for entry in state.problem.components}
     assert len(two) == 2
-    state, documents = run(restored(begun("R_a", "D"), kept(state)), lived("reversing", 24, Faults(torque=torque)))
+    state, documents = run(
+        restore_components(begun("R_a", "D"), component_records(state)), lived("reversing", 24, Faults(torque=torque))
+    )
     most = max(documents, key=lambda document: len(document.components))
     assert len(most.components) == 3
     assert {entry.id for entry in documents[-1].components} == two
     assert {entry.component.key for entry in state.catalogue} == two
-    assert Lesson.FADED in {document.lesson for document in documents[7:9]}  # it went in the last moment of the seventh
-    assert {document.lesson for document in documents[9:]} == {Lesson.LEARNED}
+    assert WindowDecision.FADED in {
+        document.decision for document in documents[7:9]
+    }  # it went in the last moment of the seventh
+    assert {document.decision for document in documents[9:]} == {WindowDecision.LEARNED}
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
 
 
@@ -263,8 +274,11 @@ def test_a_twin_that_is_full_goes_on() -> None:
     state, _ = run(begun("R_a", "D"), lived("reversing", 24, Faults(torque=two_terms, since=3.0)))
     entry = state.catalogue[0]
     third = replace(entry, component=replace(entry.component, site="winding", family="linear", source="V_a"))
-    keeping = (*kept(state), replace(kept(state)[0], entry=third, values=(1e-6,), deviations=(1e-3,)))
-    full = restored(begun("R_a", "D"), keeping)
+    keeping = (
+        *component_records(state),
+        replace(component_records(state)[0], adopted=third, values=(1e-6,), deviations=(1e-3,)),
+    )
+    full = restore_components(begun("R_a", "D"), keeping)
     three = [component.key for component in full.problem.components]
     assert len(three) == 3
 
@@ -273,13 +287,13 @@ def test_a_twin_that_is_full_goes_on() -> None:
 
     _, documents = run(full, lived("reversing", 20, Faults(torque=more)))
     for document in documents[:4]:
-        assert document.lesson is Lesson.REFUSED
+        assert document.decision is WindowDecision.REFUSED
         assert [entry.id for entry in document.components] == three
         assert document.parameters["R_a"].status in (Status.UNESTIMATED, Status.INVALID)
-        assert document.lesson.value in document.parameters["R_a"].reason
-        names = [entry.text for entry in document.explanations if entry.reason is Reason.PARAMETER]
+        assert document.decision.value in document.parameters["R_a"].reason
+        names = [entry.text for entry in document.explanations if entry.reason is FaultType.PARAMETER]
         assert not any(component in name.split(" and ") for name in names for component in three)
-    assert Lesson.REFUSED not in {document.lesson for document in documents[4:]}
-    assert {document.lesson for document in documents[-3:]} == {Lesson.LEARNED}
+    assert WindowDecision.REFUSED not in {document.decision for document in documents[4:]}
+    assert {document.decision for document in documents[-3:]} == {WindowDecision.LEARNED}
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
     assert len(documents[-1].components) == 2  # the third one was never there

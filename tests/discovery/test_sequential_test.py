@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.discovery.hypotheses import Claim, Hypothesis, Reason, is_usable, with_content
-from otolith.discovery.phase_tracking import Turned
+from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis, is_usable, prune
+from otolith.discovery.phase_tracking import PhaseAdvance
 from otolith.estimation.arrival_cost import Evidence, Prior
-from otolith.estimation.augmented import completed
-from otolith.estimation.imm_filter import Belief, begin_belief, with_prior
+from otolith.estimation.augmented import augment
+from otolith.estimation.imm_filter import ImmPosterior, initial_posterior, set_all_modes
 from otolith.estimation.problem import Component, Problem
 from otolith.machine import find_twin
 
@@ -21,33 +21,35 @@ SHAKING = Component("shaft", "periodic", "t", 0.004, 10.0, 1.0, 20.0)
 RUBBING = Component("shaft", "Coulomb", "omega", -0.003)
 
 
-def hypothesis(reason: Reason, problem: Problem, **certain: tuple[float, float]) -> Hypothesis:
+def hypothesis(reason: FaultType, problem: Problem, **certain: tuple[float, float]) -> TrackedHypothesis:
     """Of which some values are certain: (value, standard deviation) by name."""
     values = [certain.get(entry.name, (entry.nominal, 1e-3 * abs(entry.nominal))) for entry in problem.free]
     mean = np.array([value for value, _ in values] + [0.0] * len(values))
     deviations = np.array([sd for _, sd in values] + [1e-9] * len(values))
-    belief = with_prior(begin_belief(problem), Prior(mean, np.diag(deviations**2)), problem)
-    return Hypothesis(Claim(reason, reason.value), problem, belief, Turned(0.0, 2.0, ()), 0.0, 1.0)
+    belief = set_all_modes(initial_posterior(problem), Prior(mean, np.diag(deviations**2)), problem)
+    return TrackedHypothesis(
+        FaultHypothesis(reason, reason.value), problem, belief, PhaseAdvance(0.0, 2.0, ()), 0.0, 1.0
+    )
 
 
 def test_of_explanations_that_come_to_nothing_only_nothing_stays() -> None:
-    calm = hypothesis(Reason.NOTHING, BARE)
-    shaken = completed(BARE, [SHAKING])
+    calm = hypothesis(FaultType.NOTHING, BARE)
+    shaken = augment(BARE, [SHAKING])
     amplitude = shaken.free[1].name
-    idle = hypothesis(Reason.COMPONENT, shaken, **{amplitude: (1e-6, 1e-5)})
-    there = hypothesis(Reason.COMPONENT, shaken, **{amplitude: (4e-3, 1e-5)})
+    idle = hypothesis(FaultType.COMPONENT, shaken, **{amplitude: (1e-6, 1e-5)})
+    there = hypothesis(FaultType.COMPONENT, shaken, **{amplitude: (4e-3, 1e-5)})
     wider = replace(BARE, free=(R_A, J), known=tuple(pair for pair in KNOWN if pair[0] != "J"))
-    still = hypothesis(Reason.PARAMETER, wider)
-    moved = hypothesis(Reason.PARAMETER, wider, J=(1.1 * J.nominal, 0.01 * J.nominal))
+    still = hypothesis(FaultType.PARAMETER, wider)
+    moved = hypothesis(FaultType.PARAMETER, wider, J=(1.1 * J.nominal, 0.01 * J.nominal))
     neutral = [0.0] * 5
-    assert with_content([calm, idle, there, still, moved], neutral) == [calm, there, moved]
-    assert with_content([calm, idle], [30.0, 0.0]) == [calm, idle]  # it explained the window, little as is known of it
+    assert prune([calm, idle, there, still, moved], neutral) == [calm, there, moved]
+    assert prune([calm, idle], [30.0, 0.0]) == [calm, idle]  # it explained the window, little as is known of it
 
 
 def test_that_a_component_has_gone_is_no_nothing() -> None:
-    both, one = completed(BARE, [SHAKING, RUBBING]), completed(BARE, [RUBBING])
-    calm, gone = hypothesis(Reason.NOTHING, both), hypothesis(Reason.PARAMETER, one)
-    assert with_content([calm, gone], [0.0, 0.0]) == [calm, gone]
+    both, one = augment(BARE, [SHAKING, RUBBING]), augment(BARE, [RUBBING])
+    calm, gone = hypothesis(FaultType.NOTHING, both), hypothesis(FaultType.PARAMETER, one)
+    assert prune([calm, gone], [0.0, 0.0]) == [calm, gone]
 
 
 @pytest.mark.parametrize("sharpness", [1e20, float("inf"), float("nan")])
@@ -55,7 +57,7 @@ def test_what_a_diverging_twin_says_is_not_used(sharpness: float) -> None:
     def said(size: float) -> Evidence:
         return Evidence(np.array([6.5, 0.0]), np.full((2, 2), size), np.zeros(2))
 
-    belief: Belief = begin_belief(BARE)
-    moved = Claim(Reason.PARAMETER, "R_a")
+    belief: ImmPosterior = initial_posterior(BARE)
+    moved = FaultHypothesis(FaultType.PARAMETER, "R_a")
     assert is_usable(moved, belief, said(1.0), BARE)
     assert not is_usable(moved, belief, said(sharpness), BARE)

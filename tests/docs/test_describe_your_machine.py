@@ -8,9 +8,9 @@ import pytest
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
+from otolith.adaptation.state import initial_state
 from otolith.cli.check import describe
-from otolith.machine import load_plan, load_twin
+from otolith.machine import load_machine, load_twin
 from otolith.twin.expressions import FUNCTIONS
 from otolith.twin.identifiability import structure_of
 from otolith.twin.kernel import Excitation, kernel_of
@@ -35,7 +35,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_its_files_are_read_and_all_can_be_estimated(folder: Path) -> None:
     assert all(entry.identifiable for entry in structure_of(load_twin(folder / "fan.toml")))
-    plan = load_plan(folder / "fan-3.toml")
+    plan = load_machine(folder / "fan-3.toml")
     assert [entry.name for entry in plan.problem.free] == ["T_c", "k"]
     assert any("MotorSpeed [rpm]" in line for line in describe(plan))
 
@@ -53,14 +53,14 @@ def test_its_error_is_the_error(folder: Path) -> None:
 
 
 def test_its_twin_estimates(folder: Path) -> None:
-    plan = load_plan(folder / "fan-3.toml")
+    plan = load_machine(folder / "fan-3.toml")
     random = np.random.default_rng(1)
     torque = np.repeat(random.uniform(2.0, 12.0, 10), 50)
     truth = np.array([[0.085, 0.9, 0.00031]])
     omega = kernel_of(plan.twin).simulate(truth, np.array([[80.0]]), Excitation(torque[:, None], 0.02))[0, :, 0]
     values = np.column_stack([torque, omega + random.normal(0.0, 0.1, 500)])
     window = Window.whole(0, 0.0, 0.02, ("T_m", "omega"), values)
-    _, report = adapt(begin("fan-3", "hall-2", plan.problem), window)
+    _, report = adapt(initial_state("fan-3", "hall-2", plan.problem), window)
     found = {name: entry.value for name, entry in report.document.parameters.items()}
     assert found == pytest.approx({"T_c": 0.9, "k": 0.00031}, rel=0.02)
 

@@ -8,16 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BeforeValidator
 
-from otolith_drivers.config_files import Closed, Page, load, parse, validate
+from otolith_drivers.config_files import SourceFile, StrictModel, load, parse, validate
 from otolith_drivers.errors import ConfigurationError, nearest
 
 
-class Inner(Closed):
+class Inner(StrictModel):
     speed: float = 1.0
     torque: float = 0.0
 
 
-class Outer(Closed):
+class Outer(StrictModel):
     name: str
     inner: Inner = Inner()
     entries: tuple[Inner, ...] = ()
@@ -70,7 +70,7 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 
 @given(st.text(max_size=300))
 def test_any_text_is_read_or_refused(text: str) -> None:
-    page = Page(Path("any.toml"), text)
+    page = SourceFile(Path("any.toml"), text)
     try:
         validate(parse(page), Outer, page)
     except ConfigurationError as error:

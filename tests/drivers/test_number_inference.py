@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from otolith_drivers.modbus.probe import Block, Number, Words, numbers_of
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, is_float, orders_of
-from otolith_drivers.number_inference import FRAMES, REGISTERS, Layout, Part, Verdict, parts
+from otolith_drivers.number_inference import FRAMES, REGISTERS, Layout, LayoutVerdict, Part, parts
 from tests.drivers.registers import registers
 
 READINGS = 250
@@ -67,12 +67,12 @@ def test_a_number_among_registers_that_stand_still(name: str, kind: TypeName, or
     numbers = [number for number in found_in(still(0x1234, 0), column, still(0, 7)) if number.part.layout]
     for number in numbers:
         layout = number.part.layout
-        if number.part.verdict is Verdict.TOLD:
+        if number.part.verdict is LayoutVerdict.TOLD:
             # The high half of an integer may stand still: then its low half is all that can be told of it.
             half = kind == "int32" and layout is not None and layout.kind in ("int16", "uint16")
             assert half or (number.address == 2 and same(layout, kind, order))
     if is_float(kind) and name not in ("set-point in halves", "one step in the last decimal"):
-        assert [number.part.verdict for number in numbers] == [Verdict.TOLD]
+        assert [number.part.verdict for number in numbers] == [LayoutVerdict.TOLD]
         assert numbers[0].part.latest == pytest.approx(SIGNALS[name][-1], rel=1e-6)
 
 
@@ -103,13 +103,13 @@ def test_numbers_of_all_types_side_by_side(order: Order, seed: int) -> None:
 def test_nothing_is_claimed_of_what_stands_still(seed: int) -> None:
     random = np.random.default_rng(seed)
     column = still(*random.integers(0, 1 << 16, 40).tolist(), *registers(23.5, "float32", "ABCD"))
-    assert {number.part.verdict for number in found_in(column)} == {Verdict.STILL}
+    assert {number.part.verdict for number in found_in(column)} == {LayoutVerdict.STILL}
 
 
 def test_noise_of_all_bits_is_no_signal() -> None:
     random = np.random.default_rng(2)
     column = random.integers(0, 1 << 16, (READINGS, 3)).astype(np.uint16)
-    assert {number.part.verdict for number in found_in(column)} == {Verdict.WILD}
+    assert {number.part.verdict for number in found_in(column)} == {LayoutVerdict.WILD}
 
 
 def frames(*columns: Floats | NDArray[np.int_], layout: str) -> NDArray[np.uint8]:
@@ -133,7 +133,7 @@ def test_fields_of_a_frame(mark: str, order: str) -> None:
         (0, f"int16 {order}"),
         (2, f"int16 {order}"),
     ]
-    assert (one.verdict, counter.start, counter.verdict) == (Verdict.TOLD, 6, Verdict.COUNTS)
+    assert (one.verdict, counter.start, counter.verdict) == (LayoutVerdict.TOLD, 6, LayoutVerdict.COUNTS)
 
 
 def test_fields_of_three_and_four_bytes() -> None:

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
-from otolith.discovery.sequential_test import Lesson
-from otolith.estimation.data_checks import SHORTEST_REPEATED_RUN, counted_twice, repeats
+from otolith.adaptation.state import initial_state
+from otolith.discovery.sequential_test import WindowDecision
+from otolith.estimation.data_checks import SHORTEST_REPEATED_RUN, drop_repeats, repeated_records
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
@@ -44,7 +44,7 @@ def lived(scenario: MotorScenario, windows: Cut, first: int, last: int, dither: 
     values = np.vstack([window.values for window in record])
     noise = dither * np.random.default_rng(1).normal(size=(last - first, values.shape[1]))
     values[first:last] = values[first] + noise
-    state, documents = begin("motor", "here", problem()), []
+    state, documents = initial_state("motor", "here", problem()), []
     for index in range(WINDOWS):
         state, report = adapt(state, of(record[0], index, values))
         documents.append(report.document)
@@ -55,7 +55,7 @@ def teaches_nothing_wrong(documents: list[ReportDocument]) -> None:
     for document in documents:
         found = document.parameters["R_a"]
         assert not document.components
-        assert document.lesson is not Lesson.STEPPED
+        assert document.decision is not WindowDecision.STEPPED
         assert found.value is None or found.value == pytest.approx(6.5, rel=0.005)
 
 
@@ -66,7 +66,7 @@ def test_an_old_image_is_forgotten_with_the_first_new_window(
     documents = lived(scenario, windows, first, last)
     teaches_nothing_wrong(documents)
     after = documents[last // RECORDS + 1 :]
-    assert {document.lesson for document in after} == {Lesson.LEARNED}
+    assert {document.decision for document in after} == {WindowDecision.LEARNED}
     assert all(document.parameters["R_a"].status is Status.ESTIMATED for document in after)
 
 
@@ -77,14 +77,14 @@ def test_an_explanation_that_comes_to_nothing_is_dropped(
     """The same images with a dither, so that they pass for measurements: a case is opened, and ends by itself."""
     documents = lived(scenario, windows, first, last, dither=1e-9)
     teaches_nothing_wrong(documents)
-    assert any(document.lesson is Lesson.SUSPECTED for document in documents)
+    assert any(document.decision is WindowDecision.SUSPECTED for document in documents)
     after = documents[last // RECORDS + 3 :]
-    assert {document.lesson for document in after} == {Lesson.LEARNED}
+    assert {document.decision for document in after} == {WindowDecision.LEARNED}
 
 
 def test_a_machine_that_only_repeats_itself_is_not_estimated_from_each_repetition() -> None:
     """Digital zeros at rest: one record, whatever their number; said, and no reason to stop."""
-    state = begin("motor", "here", problem())
+    state = initial_state("motor", "here", problem())
     for index in range(3):
         window = Window.whole(index, 2.0 * index, 0.01, TWIN.signals, np.zeros((RECORDS, 4)))
         state, report = adapt(state, window)
@@ -98,14 +98,14 @@ def test_coarse_sensors_that_move_slowly_count_with_every_record(steps: float) -
     """Of a ramp in steps the first record of each is half a step ahead, so that these alone would be off."""
     ramp = np.rint(np.linspace(0.0, steps, RECORDS))
     values = np.column_stack([ramp, 0.0 * ramp, 2.0 * ramp, np.rint(0.3 * ramp)])
-    assert not repeats(Window.whole(0, 0.0, 0.01, TWIN.signals, values), SENSORS).any()
+    assert not repeated_records(Window.whole(0, 0.0, 0.01, TWIN.signals, values), SENSORS).any()
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_quiet_machine_whose_converters_flip_now_and_then_is_healthy(seed: int) -> None:
     """At constant speed; one count of the converters is four times the noise, and seldom another."""
     random = np.random.default_rng(seed)
-    state, documents = begin("motor", "here", problem()), []
+    state, documents = initial_state("motor", "here", problem()), []
     for index in range(16):
         values = np.tile([6.5 * CURRENT + 0.038 * SPEED, 0.0, CURRENT, SPEED], (RECORDS, 1))
         for column, count in ((2, 0.02), (3, 0.08)):
@@ -113,7 +113,7 @@ def test_a_quiet_machine_whose_converters_flip_now_and_then_is_healthy(seed: int
             values[:, column] += count * (flips | np.roll(flips, 1))
         state, report = adapt(state, Window.whole(index, 2.0 * index, 0.01, ("V_a", "T_load", "i", "omega"), values))
         documents.append(report.document)
-    assert {document.lesson for document in documents} == {Lesson.LEARNED}
+    assert {document.decision for document in documents} == {WindowDecision.LEARNED}
     assert documents[-1].parameters["R_a"].status is Status.ESTIMATED
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
 
@@ -127,10 +127,10 @@ def test_long_runs_in_all_channels_are_repeats_and_nothing_else_is(
     values = np.random.default_rng(seed).normal(size=(150, 4))
     values[start : start + length, :channels] = values[start, :channels]
     window = Window.whole(0, 0.0, 0.01, TWIN.signals, values)
-    found = np.flatnonzero(repeats(window, SENSORS)).tolist()
+    found = np.flatnonzero(repeated_records(window, SENSORS)).tolist()
     long = channels == 4 and length > SHORTEST_REPEATED_RUN
     assert found == (list(range(start + 1, start + length - 1)) if long else [])
-    counted, notes = counted_twice(window, TWIN)
+    counted, notes = drop_repeats(window, TWIN)
     assert bool(notes) == long
     assert np.flatnonzero(counted.missing_in("omega")).tolist() == found
     assert not counted.missing_in("V_a").any()

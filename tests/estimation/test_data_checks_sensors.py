@@ -8,9 +8,9 @@ import pytest
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import State, begin
-from otolith.discovery.sequential_test import Lesson
-from otolith.estimation.data_checks import spikes
+from otolith.adaptation.state import AdaptationState, initial_state
+from otolith.discovery.sequential_test import WindowDecision
+from otolith.estimation.data_checks import spike_records
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
@@ -30,7 +30,7 @@ def problem(*names: str) -> Problem:
     return Problem(TWIN, known, free, (0.005, 0.02), input_noise=(0.0, 0.0002))
 
 
-def run(state: State, windows: list[Window]) -> tuple[State, list[ReportDocument]]:
+def run(state: AdaptationState, windows: list[Window]) -> tuple[AdaptationState, list[ReportDocument]]:
     found = []
     for window in windows:
         state, report = adapt(state, window)
@@ -73,11 +73,11 @@ FAULTS: dict[str, tuple[str, str, Change]] = {
 def test_a_lying_sensor_teaches_nothing(quiet: MotorScenario, windows: Cut, fault: str, names: tuple[str, ...]) -> None:
     signal, word, change = FAULTS[fault]
     record = [window for window, _ in windows(quiet, 14)]
-    state, _ = run(begin("motor", "here", problem(*names)), record[:10])
+    state, _ = run(initial_state("motor", "here", problem(*names)), record[:10])
     sick = changed(record[10], signal, change)  # the set-point has just doubled: everything moves
     after, documents = run(state, [sick])
     held(documents, word)
-    assert documents[0].lesson is Lesson.SENSOR
+    assert documents[0].decision is WindowDecision.SENSOR
     assert after.memory.belief is state.memory.belief
 
 
@@ -97,9 +97,9 @@ def test_a_sensor_that_keeps_lying_never_becomes_a_step(
     """Through set-points up and down and a minute and a half; the sensor that lies is named all the while."""
     signal, change = LIES[lie]
     record = [window for window, _ in windows(quiet, 55)]
-    state, _ = run(begin("motor", "here", problem(*names)), record[:10])
+    state, _ = run(initial_state("motor", "here", problem(*names)), record[:10])
     _, documents = run(state, [changed(window, signal, change) for window in record[10:]])
-    assert {document.lesson for document in documents} == {Lesson.SENSOR}
+    assert {document.decision for document in documents} == {WindowDecision.SENSOR}
     assert all(f"{signal} reads" in document.parameters["R_a"].reason for document in documents)
     found = documents[-1].parameters["R_a"]
     assert found.status is Status.HELD
@@ -113,10 +113,10 @@ def test_a_step_of_the_resistance_is_followed_within_three_windows(
 ) -> None:
     fault = Step.model_validate({"kind": "step", "parameter": "R_a", "start": f"{moment} s", "amount": "-0.65 ohm"})
     record = windows(quiet.model_copy(update={"faults": (fault,)}), 24)
-    _, documents = run(begin("motor", "here", problem(*names)), [window for window, _ in record])
+    _, documents = run(initial_state("motor", "here", problem(*names)), [window for window, _ in record])
     first = int(moment / 2.0)  # the window in which it happens
     for document in documents[10:first]:
-        assert document.lesson is Lesson.LEARNED
+        assert document.decision is WindowDecision.LEARNED
     followed = documents[first + 2].parameters["R_a"]
     assert followed.status is Status.ESTIMATED
     assert followed.low is not None
@@ -128,7 +128,7 @@ def test_a_step_of_the_resistance_is_followed_within_three_windows(
 
 def test_spikes_are_left_out_and_the_rest_is_used(quiet: MotorScenario, windows: Cut) -> None:
     record = [window for window, _ in windows(quiet, 11)]
-    state, _ = run(begin("motor", "here", problem("R_a")), record[:10])
+    state, _ = run(initial_state("motor", "here", problem("R_a")), record[:10])
 
     def spike(values: Array) -> Array:
         values[[40, 120]] += [2.0, -5.0]
@@ -153,11 +153,13 @@ def test_noise_steps_and_kinks_are_no_spikes() -> None:
         np.rint(3.0 * np.sin(4.0 * time)),
     ]
     for curve in curves:
-        assert not spikes(curve, 0.01).any()
+        assert not spike_records(curve, 0.01).any()
 
 
 def test_a_healthy_machine_has_honest_sensors(quiet: MotorScenario, windows: Cut) -> None:
     """Set-points up and down, rest and motion, for ten minutes."""
-    state, documents = run(begin("motor", "here", problem("R_a", "D")), [window for window, _ in windows(quiet, 300)])
-    assert {document.lesson for document in documents} == {Lesson.LEARNED}
+    state, documents = run(
+        initial_state("motor", "here", problem("R_a", "D")), [window for window, _ in windows(quiet, 300)]
+    )
+    assert {document.decision for document in documents} == {WindowDecision.LEARNED}
     assert state.memory.contradictions == 0

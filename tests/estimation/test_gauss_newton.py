@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from otolith.acquisition.window import Array
-from otolith.estimation.gauss_newton import polish
+from otolith.estimation.gauss_newton import gauss_newton
 
 
 class Linear:
@@ -25,7 +25,7 @@ def test_a_bound_across_the_valley_does_not_stop_it(seed: int) -> None:
     rows = random.normal(size=(60, 2)) @ random.normal(size=(2, 5)) + 0.03 * random.normal(size=(60, 5))
     told = rows @ random.uniform(-3.0, 3.0, 5) + random.normal(size=60)
     box = Linear(rows, told, -np.ones(5), np.ones(5))
-    found = polish(box, random.uniform(-1.0, 1.0, 5), steps=200)
+    found = gauss_newton(box, random.uniform(-1.0, 1.0, 5), steps=200)
     best = lsq_linear(rows, told, (-1.0, 1.0), method="bvls")
     assert found.converged
     assert found.chi_square == pytest.approx(2.0 * best.cost, rel=1e-3)
@@ -34,4 +34,4 @@ def test_a_bound_across_the_valley_does_not_stop_it(seed: int) -> None:
 
 def test_a_start_outside_the_bounds_is_brought_inside() -> None:
     box = Linear(np.eye(2), np.array([0.3, 5.0]), -np.ones(2), np.ones(2))
-    assert polish(box, np.array([9.0, -9.0])).guess == pytest.approx([0.3, 1.0])
+    assert gauss_newton(box, np.array([9.0, -9.0])).guess == pytest.approx([0.3, 1.0])

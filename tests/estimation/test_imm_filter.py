@@ -7,7 +7,7 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.estimation.arrival_cost import Evidence
-from otolith.estimation.imm_filter import begin_belief, carried, overall, updated
+from otolith.estimation.imm_filter import initial_posterior, moment_match, predict, update
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 
@@ -34,11 +34,11 @@ def evidence(value: float, trend: float, sd: float, random: np.random.Generator)
 
 def follow(history: Array, sd: float, seed: int) -> tuple[Array, Array]:
     """Errors and standard deviations of the fused value (ohm) after each window."""
-    random, belief, found = np.random.default_rng(seed), begin_belief(PROBLEM), []
+    random, belief, found = np.random.default_rng(seed), initial_posterior(PROBLEM), []
     trends = np.gradient(history, LENGTH)
     for time, value, trend in zip(TIMES, history * SIZE, trends * SIZE, strict=True):
-        belief = updated(carried(belief, float(time)), evidence(value, trend, sd, random), PROBLEM)
-        known = overall(belief, PROBLEM)
+        belief = update(predict(belief, float(time)), evidence(value, trend, sd, random), PROBLEM)
+        known = moment_match(belief, PROBLEM)
         found.append((known.mean[0] - value, np.sqrt(known.covariance[0, 0])))
     return np.array(found).T[0], np.array(found).T[1]
 
@@ -61,11 +61,11 @@ def test_a_healthy_parameter_becomes_known_better_and_better() -> None:
 
 
 def test_what_nobody_looks_at_stays_where_it_is_and_becomes_less_certain() -> None:
-    random, belief = np.random.default_rng(2), begin_belief(PROBLEM)
+    random, belief = np.random.default_rng(2), initial_posterior(PROBLEM)
     for time in TIMES[:100]:
-        belief = updated(carried(belief, float(time)), evidence(SIZE, 0.0, 0.01, random), PROBLEM)
+        belief = update(predict(belief, float(time)), evidence(SIZE, 0.0, 0.01, random), PROBLEM)
     moments = [TIMES[99] + wait for wait in (0.0, 60.0, 3600.0, 86400.0, 1e9)]
-    known = [overall(carried(belief, float(moment)), PROBLEM) for moment in moments]
+    known = [moment_match(predict(belief, float(moment)), PROBLEM) for moment in moments]
     deviations = [np.sqrt(entry.covariance[0, 0]) for entry in known]
     assert deviations == sorted(deviations)
     for entry, deviation in zip(known, deviations, strict=True):
@@ -74,18 +74,20 @@ def test_what_nobody_looks_at_stays_where_it_is_and_becomes_less_certain() -> No
 
 
 def test_a_clock_that_goes_back_does_no_harm() -> None:
-    belief = updated(carried(begin_belief(PROBLEM), 1e9), evidence(6.0, 0.0, 0.01, np.random.default_rng(3)), PROBLEM)
-    earlier = carried(belief, 5.0)
-    assert overall(earlier, PROBLEM).mean == pytest.approx(overall(carried(belief, 1e9), PROBLEM).mean)
+    belief = update(
+        predict(initial_posterior(PROBLEM), 1e9), evidence(6.0, 0.0, 0.01, np.random.default_rng(3)), PROBLEM
+    )
+    earlier = predict(belief, 5.0)
+    assert moment_match(earlier, PROBLEM).mean == pytest.approx(moment_match(predict(belief, 1e9), PROBLEM).mean)
 
 
 def test_windows_that_scatter_more_than_they_say_are_believed_less() -> None:
-    random, belief = np.random.default_rng(5), begin_belief(PROBLEM)
+    random, belief = np.random.default_rng(5), initial_posterior(PROBLEM)
     for index in range(200):
         value = SIZE + 0.03 * float(random.standard_normal())  # three times what the window thinks
-        belief = updated(carried(belief, LENGTH * index), evidence(value, 0.0, 0.01, random), PROBLEM)
-    assert 2.0 < belief.scatter < 30.0
-    credulous = updated(replace(belief, scatter=1.0), evidence(SIZE, 0.0, 0.01, random), PROBLEM)
-    doubtful = updated(belief, evidence(SIZE, 0.0, 0.01, random), PROBLEM)
-    deviations = [overall(entry, PROBLEM).covariance[0, 0] ** 0.5 for entry in (credulous, doubtful)]
+        belief = update(predict(belief, LENGTH * index), evidence(value, 0.0, 0.01, random), PROBLEM)
+    assert 2.0 < belief.variance_ratio < 30.0
+    credulous = update(replace(belief, variance_ratio=1.0), evidence(SIZE, 0.0, 0.01, random), PROBLEM)
+    doubtful = update(belief, evidence(SIZE, 0.0, 0.01, random), PROBLEM)
+    deviations = [moment_match(entry, PROBLEM).covariance[0, 0] ** 0.5 for entry in (credulous, doubtful)]
     assert deviations[0] < 0.8 * deviations[1]

@@ -8,10 +8,10 @@ import pytest
 
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import State, begin
-from otolith.discovery.sequential_test import Lesson
+from otolith.adaptation.state import AdaptationState, initial_state
+from otolith.discovery.sequential_test import WindowDecision
 from otolith.estimation.information import Identifiability, inflation
-from otolith.estimation.objective import HOPELESS, Objective
+from otolith.estimation.objective import PENALTY, Objective
 from otolith.estimation.problem import Problem, SwarmOptions
 from otolith.estimation.window_fit import estimate
 from otolith.health.schema import Status
@@ -30,8 +30,8 @@ def problem_for(*names: str) -> Problem:
     return Problem(DC_MOTOR, known, free, (0.005, 0.02), swarm=SwarmOptions(generations=400))
 
 
-def state_for(*names: str) -> State:
-    return begin("motor", "here", problem_for(*names))
+def state_for(*names: str) -> AdaptationState:
+    return initial_state("motor", "here", problem_for(*names))
 
 
 def test_resistance_comes_back_within_half_a_percent_in_every_window(scenario: MotorScenario, windows: Cut) -> None:
@@ -88,14 +88,14 @@ def test_a_bad_window_teaches_nothing(scenario: MotorScenario, windows: Cut) -> 
     assert found.status is Status.HELD
     assert "no samples of i" in found.reason
     assert report.document.fit is None
-    assert report.document.lesson is Lesson.BAD
+    assert report.document.decision is WindowDecision.BAD
 
 
 def test_the_truth_outside_the_bounds_is_reported_as_invalid(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 5)[-1]
     problem = problem_for("R_a")
     narrow = replace(problem, free=(replace(problem.free[0], nominal=8.0, low=7.0, high=9.0),))
-    _, report = adapt(begin("motor", "here", narrow), window)
+    _, report = adapt(initial_state("motor", "here", narrow), window)
     found = report.document.parameters["R_a"]
     assert found.status is Status.INVALID
     assert "bound" in found.reason
@@ -137,7 +137,7 @@ def test_constant_windows_are_answered_honestly(value: float, records: int, name
     values = np.full((records, 4), value)
     window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     problem = replace(problem_for(*names), swarm=SwarmOptions(generations=3))
-    _, report = adapt(begin("motor", "here", problem), window)
+    _, report = adapt(initial_state("motor", "here", problem), window)
     text = report.document.to_json()
     assert "NaN" not in text
     assert "Infinity" not in text
@@ -207,7 +207,7 @@ def test_a_guess_that_diverges_never_wins(scenario: MotorScenario, windows: Cut)
     window, _ = windows(scenario, 1)[-1]
     objective = Objective(problem_for("J"), window, np.array([0.001171]))
     cost = objective.cost(np.vstack([objective.guess(np.array([1e-300])), objective.guess(np.array([np.nan]))]))
-    assert cost.tolist() == [HOPELESS, HOPELESS]
+    assert cost.tolist() == [PENALTY, PENALTY]
 
 
 def test_missing_records_do_not_count(scenario: MotorScenario, windows: Cut) -> None:

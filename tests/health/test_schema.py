@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from otolith.acquisition.window import Verdict
-from otolith.discovery.sequential_test import Lesson
+from otolith.discovery.sequential_test import WindowDecision
 from otolith.estimation.information import Identifiability, ParameterEstimate
 from otolith.health.schema import ParameterDocument, QualityDocument, ReportDocument, Status, WindowDocument
-from otolith.health.status import Fused, Heard, Standing, publish
+from otolith.health.status import MarginalPosterior, PreviousStatus, WindowEvidence, publish
 from otolith.twin.definition import Parameter
 
 RESISTANCE = Parameter("R_a", "ohm", 6.5, 3.0, 12.0, "armature resistance")
@@ -22,7 +22,7 @@ def report(**parameters: ParameterDocument) -> ReportDocument:
     quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
     window = WindowDocument(index=0, start=1.0, end=3.0, records=200, quality=quality)
     return ReportDocument(
-        machine="m", site="s", twin="dc_motor", window=window, lesson=Lesson.BAD, parameters=parameters
+        machine="m", site="s", twin="dc_motor", window=window, decision=WindowDecision.BAD, parameters=parameters
     )
 
 
@@ -32,17 +32,21 @@ ALLOWED = 0.65  # ohm
 
 
 @given(
-    st.builds(Fused, NUMBER, DEVIATION, NUMBER, DEVIATION, st.floats(0.0, 2.0)),
+    st.builds(MarginalPosterior, NUMBER, DEVIATION, NUMBER, DEVIATION, st.floats(0.0, 2.0)),
     st.none()
     | st.builds(ParameterEstimate, st.just("R_a"), NUMBER, DEVIATION, st.sampled_from(Identifiability), st.just("")),
-    st.sampled_from(Lesson),
+    st.sampled_from(WindowDecision),
     st.integers(0, 5),
-    st.builds(Standing, st.booleans(), st.sampled_from(Status)),
+    st.builds(PreviousStatus, st.booleans(), st.sampled_from(Status)),
 )
 def test_nothing_but_finite_numbers_is_published(
-    fused: Fused, estimate: ParameterEstimate | None, lesson: Lesson, contradictions: int, before: Standing
+    fused: MarginalPosterior,
+    estimate: ParameterEstimate | None,
+    decision: WindowDecision,
+    contradictions: int,
+    before: PreviousStatus,
 ) -> None:
-    heard = Heard(estimate, lesson, contradictions, 1.0, "why")
+    heard = WindowEvidence(estimate, decision, contradictions, 1.0, "why")
     after, document = publish(RESISTANCE, ALLOWED, fused, heard, before)
     text = report(R_a=document).to_json()
     assert ReportDocument.from_json(text).parameters["R_a"] == document
@@ -53,27 +57,29 @@ def test_nothing_but_finite_numbers_is_published(
 
 
 def test_absent_is_absent_and_schema_is_named() -> None:
-    heard = Heard(reason="window not estimated from: no samples of i")
-    _, document = publish(RESISTANCE, ALLOWED, Fused(6.5, 3.0, 0.0, 1.0), heard, Standing())
+    heard = WindowEvidence(reason="window not estimated from: no samples of i")
+    _, document = publish(RESISTANCE, ALLOWED, MarginalPosterior(6.5, 3.0, 0.0, 1.0), heard, PreviousStatus())
     found = json.loads(report(R_a=document).to_json())
     assert found["schema"] == "otolith.report/1"
     assert "value" not in found["parameters"]["R_a"]
     assert found["parameters"]["R_a"]["status"] == "unestimated"
-    assert found["lesson"] == Lesson.BAD
+    assert found["decision"] == WindowDecision.BAD
     assert "fit" not in found
 
 
 def said(
     sd: float,
     kept: float = 1.0,
-    lesson: Lesson = Lesson.LEARNED,
+    decision: WindowDecision = WindowDecision.LEARNED,
     contradictions: int = 0,
-    before: Standing | None = None,
-) -> tuple[Standing, ParameterDocument]:
+    before: PreviousStatus | None = None,
+) -> tuple[PreviousStatus, ParameterDocument]:
     """Of a parameter that is known to 0.1 ohm, after a window that alone knows it to ``sd``."""
     estimate = ParameterEstimate("R_a", 6.0, sd, Identifiability.DETERMINED, "")
-    fused = Fused(6.0, 0.1, 1e-4, 1e-5, kept)
-    return publish(RESISTANCE, ALLOWED, fused, Heard(estimate, lesson, contradictions), before or Standing())
+    fused = MarginalPosterior(6.0, 0.1, 1e-4, 1e-5, kept)
+    return publish(
+        RESISTANCE, ALLOWED, fused, WindowEvidence(estimate, decision, contradictions), before or PreviousStatus()
+    )
 
 
 def test_the_interval_is_two_sided_95_percent() -> None:
@@ -86,7 +92,7 @@ def test_the_interval_is_two_sided_95_percent() -> None:
 def test_the_status_does_not_flicker_at_its_limit() -> None:
     """An interval a little too wide begins nothing, but what has begun goes on."""
     a_little_wide = 1.3 * ALLOWED / 1.96
-    estimated, held = Standing(True, Status.ESTIMATED), Standing(True, Status.HELD)
+    estimated, held = PreviousStatus(True, Status.ESTIMATED), PreviousStatus(True, Status.HELD)
     assert said(a_little_wide, before=estimated)[1].status is Status.ESTIMATED
     assert said(a_little_wide, before=held)[1].status is Status.HELD
     assert said(3.0, before=estimated)[1].status is Status.HELD
@@ -94,14 +100,16 @@ def test_the_status_does_not_flicker_at_its_limit() -> None:
 
 
 def test_one_contradiction_holds_and_two_make_invalid() -> None:
-    before = Standing(True, Status.ESTIMATED)
-    assert said(0.1, lesson=Lesson.SUSPECTED, contradictions=1, before=before)[1].status is Status.HELD
-    assert said(0.1, lesson=Lesson.SUSPECTED, contradictions=2, before=before)[1].status is Status.INVALID
+    before = PreviousStatus(True, Status.ESTIMATED)
+    assert said(0.1, decision=WindowDecision.SUSPECTED, contradictions=1, before=before)[1].status is Status.HELD
+    assert said(0.1, decision=WindowDecision.SUSPECTED, contradictions=2, before=before)[1].status is Status.INVALID
 
 
 def test_progress_grows_as_the_interval_shrinks() -> None:
     found = [
-        publish(RESISTANCE, ALLOWED, Fused(6.0, sd, 0.0, 0.0), Heard(), Standing())[1].progress
+        publish(RESISTANCE, ALLOWED, MarginalPosterior(6.0, sd, 0.0, 0.0), WindowEvidence(), PreviousStatus())[
+            1
+        ].progress
         for sd in (3.0, 2.0, 1.0, 0.5, 0.3)
     ]
     assert found[0] == 0.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from otolith.cli.replay import replay
 from otolith.health.schema import ReportDocument
-from otolith.machine import Plan, load_plan
+from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.replay import open_recorded
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -29,8 +29,8 @@ def rows(scenario: MotorScenario) -> Lines:
 
 
 @pytest.fixture
-def plan() -> Plan:
-    return load_plan(MACHINE, with_driver=False)
+def plan() -> LoadedMachine:
+    return load_machine(MACHINE, with_driver=False)
 
 
 def record(folder: Path, rows: Lines, name: str = "run.rrd") -> Path:
@@ -45,7 +45,7 @@ def same(found: list[ReportDocument], again: list[ReportDocument]) -> None:
     for one, other in zip(found, again, strict=True):
         assert other.window.start == pytest.approx(one.window.start, abs=PERIOD / 2)  # how jitter moves the grid
         assert other.window.quality.verdict is one.window.quality.verdict
-        assert other.lesson is one.lesson
+        assert other.decision is one.decision
         for name, parameter in one.parameters.items():
             assert other.parameters[name].status is parameter.status
             assert other.parameters[name].value == pytest.approx(parameter.value, rel=1e-6)
@@ -81,7 +81,7 @@ def test_two_replays_of_a_recording_print_the_same(
     assert "1000 records read, 0 reordered, 0 bad; 4000 samples, 0 lost" in text
 
 
-def test_a_recording_of_a_recording_is_no_worse(tmp_path: Path, rows: Lines, plan: Plan) -> None:
+def test_a_recording_of_a_recording_is_no_worse(tmp_path: Path, rows: Lines, plan: LoadedMachine) -> None:
     first = record(tmp_path, rows)
     second = tmp_path / "again.rrd"
     replay(MACHINE, first, second, as_json=True, stopped=lambda: False)

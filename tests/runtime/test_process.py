@@ -7,15 +7,15 @@ from typing import Any
 import pytest
 
 from otolith.runtime import process as companion
-from otolith.runtime.process import Companion
+from otolith.runtime.process import ChildProcess
 
 
 def test_a_failure_to_spawn_counts_as_a_death(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_more(*_: object) -> None:
         raise OSError(24, "Too many open files")
 
-    tried = Companion("nobody", "time:sleep", room=1)
-    monkeypatch.setattr(Companion, "_spawn", no_more)
+    tried = ChildProcess("nobody", "time:sleep", room=1)
+    monkeypatch.setattr(ChildProcess, "_spawn", no_more)
     tried.start()
     assert not tried.alive
     assert tried.replies() == []
@@ -28,8 +28,8 @@ def test_a_failure_to_spawn_counts_as_a_death(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_pauses_grow_with_every_death_until_it_thrives(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Companion, "_spawn", lambda *_: None)
-    tried, pauses = Companion("nobody", "time:sleep", room=1), []
+    monkeypatch.setattr(ChildProcess, "_spawn", lambda *_: None)
+    tried, pauses = ChildProcess("nobody", "time:sleep", room=1), []
     for _ in range(9):
         now = 0.0
         while not tried.may_start_again(now):
@@ -49,7 +49,7 @@ def echo(connection: Any) -> None:
 
 
 def test_signals_to_the_group_do_not_reach_it_and_messages_do() -> None:
-    running = Companion("echo", "tests.runtime.test_process:echo", room=2)
+    running = ChildProcess("echo", "tests.runtime.test_process:echo", room=2)
     running.start()
     assert running.offer("a")
     deadline = time.monotonic() + 10.0
@@ -63,7 +63,7 @@ def test_signals_to_the_group_do_not_reach_it_and_messages_do() -> None:
 
 
 def test_a_companion_that_does_not_read_is_not_waited_for() -> None:
-    stuck = Companion("stuck", "tests.runtime.test_process:sleep", room=2)
+    stuck = ChildProcess("stuck", "tests.runtime.test_process:sleep", room=2)
     stuck.start()
     begun = time.monotonic()
     taken = [stuck.offer(bytes(1 << 20)) for _ in range(20)]

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from otolith.adaptation.state import Decisions, Kept
-from otolith.discovery.adopted import Approval, Entry
+from otolith.adaptation.state import ComponentRecord, OperatorDecisions
+from otolith.discovery.adopted import AdoptedComponent, Approval
 from otolith.estimation.problem import Component
-from otolith.machine import find_twin, load_plan
+from otolith.machine import find_twin, load_machine
 from otolith.publishing import recorder
-from otolith.runtime.state_store import Keeper
+from otolith.runtime.state_store import StateStore
 from otolith.runtime.worker import COMPILING
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
@@ -28,11 +28,11 @@ DRY = Component("shaft", "Stribeck", "omega", -0.004, inner=0.01, low=0.005, hig
 
 
 @pytest.fixture
-def running_with_component(own_machine: OwnMachine, tmp_path: Path) -> Iterator[tuple[Running, Keeper]]:
+def running_with_component(own_machine: OwnMachine, tmp_path: Path) -> Iterator[tuple[Running, StateStore]]:
     """A daemon that knows of friction at rest."""
-    plan = load_plan(own_machine.machine, with_driver=False)
-    keeper = Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin)
-    keeper.keep((Kept(Entry(DRY, 5.0), (-0.004, 0.01), (1e-3, 1e-3)),))
+    plan = load_machine(own_machine.machine, with_driver=False)
+    keeper = StateStore(plan.file.machine.site, plan.file.machine.name, plan.twin)
+    keeper.keep((ComponentRecord(AdoptedComponent(DRY, 5.0), (-0.004, 0.01), (1e-3, 1e-3)),))
     running = Running(own_machine, tmp_path)
     yield running, keeper
     running.close()
@@ -75,7 +75,7 @@ def test_a_stopped_worker_starves_the_watchdog(
         monkeypatch.setenv("WATCHDOG_USEC", "4000000")
         text = own_machine.machine.read_text(encoding="utf-8") + "\n[recording]\nenabled = false\n"
         own_machine.machine.write_text(text, encoding="utf-8")
-        watched = module.Service(load_plan(own_machine.machine))
+        watched = module.Service(load_machine(own_machine.machine))
 
         def fed() -> bool:
             try:
@@ -119,18 +119,18 @@ def test_windows_without_a_recorder_are_counted(running: Running) -> None:
 
 
 def test_components_are_kept_and_the_specialist_is_heard_while_it_runs(
-    running_with_component: tuple[Running, Keeper],
+    running_with_component: tuple[Running, StateStore],
 ) -> None:
     running, keeper = running_with_component
     first = running.wait_for(lambda reports: len(reports) >= 1)
     assert [entry.id for entry in first[0].components] == [DRY.key]
     assert f"begun with what was found earlier: {DRY.key}; 'otolith components forget'" in running.log.read_text()
     keeper.known.unlink()
-    keeper.decide(Decisions(approved=frozenset({DRY.key})))
+    keeper.decide(OperatorDecisions(approved=frozenset({DRY.key})))
     running.wait_for(lambda reports: reports[-1].components[0].approval is Approval.APPROVED)
     code, seconds = running.stop()
     assert (code, seconds < 3.0) == (0, True)
-    assert [entry.entry.component.key for entry in keeper.components()] == [DRY.key]  # known better now
+    assert [entry.adopted.component.key for entry in keeper.components()] == [DRY.key]  # known better now
 
 
 class Pipe:

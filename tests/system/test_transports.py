@@ -33,6 +33,6 @@ def test_the_armature_resistance_is_the_same_over_every_transport(transport: str
         assert last.counters.bad <= (0.05 * last.counters.received if "modbus" in transport else 0)
         assert last.driver is not None
         assert last.driver.up
-        assert not last.driver.complaints
+        assert not last.driver.warnings
     finally:
         running.close()

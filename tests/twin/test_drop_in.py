@@ -7,9 +7,9 @@ import pytest
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import begin
+from otolith.adaptation.state import initial_state
 from otolith.health.schema import Status
-from otolith.machine import load_plan, load_twin
+from otolith.machine import load_machine, load_twin
 from otolith.twin.identifiability import structure_of
 from otolith.twin.kernel import Excitation, kernel_of
 
@@ -63,7 +63,7 @@ def machine_file(tmp_path: Path) -> Path:
 
 
 def test_it_estimates_what_its_roles_say(machine_file: Path) -> None:
-    plan = load_plan(machine_file)
+    plan = load_machine(machine_file)
     assert [entry.name for entry in plan.problem.free] == ["C", "R_th"]
     random = np.random.default_rng(4)
     current = np.repeat(random.uniform(2.0, 15.0, 30), 10)
@@ -72,7 +72,7 @@ def test_it_estimates_what_its_roles_say(machine_file: Path) -> None:
     theta = kernel_of(plan.twin).simulate(truth, np.array([[20.0]]), drive)[0, :, 0] + random.normal(0.0, 0.1, 300)
     values = np.column_stack([current, theta])
     window = Window.whole(0, 0.0, 1.0, ("i", "theta"), values)
-    _, report = adapt(begin("spindle", "site", plan.problem), window)
+    _, report = adapt(initial_state("spindle", "site", plan.problem), window)
     for name, value in (("C", 95.0), ("R_th", 1.1)):
         found = report.document.parameters[name]
         assert found.status is Status.ESTIMATED

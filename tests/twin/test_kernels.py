@@ -8,7 +8,7 @@ import pytest
 from otolith.acquisition.window import Array
 from otolith.machine import find_twin, names
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import Excitation, Noise, kernel_of
+from otolith.twin.kernel import Excitation, NoiseModel, kernel_of
 from tests.twin.reference import Reference
 
 PERIODS = {"dc_motor": 0.01, "dc_motor_coulomb": 0.01, "hydraulic_actuator": 0.01, "pmsm": 5e-4, "pump": 0.02,
@@ -173,7 +173,7 @@ def test_the_gain_is_that_of_an_extended_kalman_filter() -> None:
     random = np.random.default_rng(4)
     measured = kernel.simulate(nominal(twin)[None], initial(twin)[None], drive)[0] + random.normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
-    noise = Noise(np.array([0.5, 1.0]), np.array([0.0, 0.01]), np.array([0.2, 3.0]))
+    noise = NoiseModel(np.array([0.5, 1.0]), np.array([0.0, 0.01]), np.array([0.2, 3.0]))
     found = kernel.correction(nominal(twin), initial(twin), replace(drive, measured=measured), noise)
     state, covariance, log_determinant = initial(twin), np.zeros((2, 2)), 0.0
     for record in range(RECORDS):

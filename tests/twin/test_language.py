@@ -19,10 +19,10 @@ from otolith.machine import names as library
 from otolith.twin.dimensions import describe, dimension_of, measure
 from otolith.twin.expressions import FUNCTIONS, ExpressionError, names, parse
 from otolith.twin.kernel import Excitation, kernel_of
-from otolith.twin.kernel_sources import source_of
+from otolith.twin.kernel_sources import kernel_source
 from otolith.twin.language import read_twin
 from otolith.twin.symbolic import to_sympy
-from otolith_drivers.config_files import Page
+from otolith_drivers.config_files import SourceFile
 from otolith_drivers.errors import ConfigurationError
 from tests.twin.reference import Reference
 
@@ -84,7 +84,7 @@ def test_any_expression_is_refused_or_is_one_of_the_language(text: str) -> None:
 def test_any_page_is_read_or_refused(text: str) -> None:
     for page in (text, BASE + "\n" + text, BASE.replace("(K_t*i - T_load - D*omega) / J", text.replace('"', "'"))):
         try:
-            read_twin(Page(Path("any.toml"), page))
+            read_twin(SourceFile(Path("any.toml"), page))
         except ConfigurationError as error:
             assert str(error).startswith("any.toml")  # noqa: PT017 - either outcome is right, another error is not
 
@@ -168,7 +168,7 @@ def test_a_page_in_other_units_is_the_same_machine() -> None:
     ):
         assert old in other
         other = other.replace(old, new)
-    twins = [read_twin(Page(Path("a.toml"), BASE)), read_twin(Page(Path("b.toml"), other))]
+    twins = [read_twin(SourceFile(Path("a.toml"), BASE)), read_twin(SourceFile(Path("b.toml"), other))]
     drive = Excitation(np.column_stack([np.full(100, 12.0), np.full(100, 0.02)]), 0.01)
     found = []
     for twin in twins:
@@ -207,7 +207,7 @@ k = {{ unit = "1/s", nominal = 0.3, bounds = [0, 5], meaning = "rate" }}
 "der(x)" = "-k*x + 0*k*u*a*b"
 y = "{formula}"
 """
-    twin = read_twin(Page(Path("any.toml"), page))
+    twin = read_twin(SourceFile(Path("any.toml"), page))
     parameters, initial = np.array([0.7, 1.9, 0.3]), np.array([1.3])
     drive = Excitation(np.array([[0.4], [2.3], [-1.1], [0.9], [0.2]]), 0.1, 8)
     found = kernel_of(twin).sensitivities(parameters, initial, drive)
@@ -227,12 +227,12 @@ def test_definitions_that_swell_are_refused() -> None:
         "K_e*omega)", "K_e*omega + 0*d14*V_a)"
     )
     with pytest.raises(ConfigurationError, match="written out"):
-        read_twin(Page(Path("any.toml"), page.replace('d1 = "i"', 'd1 = "i/i"').replace(" + i)", " + 1)")))
+        read_twin(SourceFile(Path("any.toml"), page.replace('d1 = "i"', 'd1 = "i/i"').replace(" + i)", " + 1)")))
 
 
 def test_nothing_but_checked_names_reaches_the_generated_code() -> None:
     page = BASE.replace('title = "', 'title = "\\"\\"\\"\\nINJECTED ').replace('source = "', 'source = "INJECTED ')
-    assert "INJECTED" not in source_of(read_twin(Page(Path("any.toml"), page)))
+    assert "INJECTED" not in kernel_source(read_twin(SourceFile(Path("any.toml"), page)))
     for name in ('x\\"\\"\\"\\nimport os', "a b", "a.b", "1a", ""):
         with pytest.raises(ConfigurationError, match="is no name"):
-            read_twin(Page(Path("any.toml"), BASE.replace('name = "dc_motor"', f'name = "{name}"', 1)))
+            read_twin(SourceFile(Path("any.toml"), BASE.replace('name = "dc_motor"', f'name = "{name}"', 1)))

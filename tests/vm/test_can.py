@@ -159,7 +159,7 @@ def test_a_flood_of_other_frames_changes_nothing(watched: Watched, plant: Progra
     assert last.windows_missed == before.windows_missed
     driver = reports[-1].driver
     assert driver is not None
-    assert any("3 error frames" in line for line in driver.complaints)
+    assert any("3 error frames" in line for line in driver.warnings)
 
 
 def test_short_frames_of_our_own_identifiers_are_counted(watched: Watched, plant: Program) -> None:

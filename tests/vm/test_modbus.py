@@ -178,7 +178,7 @@ def test_every_type_and_order_is_read_and_nothing_is_written(server: Path, line:
         listener.wait_for_more("counter", 100)
         listener.driver.close()
         only_reads(serves.stop(), "3", "4")
-    assert listener.driver.link().complaints == ()
+    assert listener.driver.link().warnings == ()
     for name, (_, value) in STANDING.items():
         found = set(listener.values(name))
         assert len(found) == 1, name
@@ -198,7 +198,7 @@ def test_every_type_and_order_is_read_and_nothing_is_written(server: Path, line:
 def test_a_register_that_the_server_does_not_have_costs_only_itself(server: Path, line: Line) -> None:
     sources = {"standard": MOVING["standard"], "counter": COUNTER, "absent": ABSENT}
     with serving(server, *line.arguments) as serves, Reading(line, sources) as listener:
-        listener.until(lambda: any("illegal data address" in line for line in listener.driver.link().complaints))
+        listener.until(lambda: any("illegal data address" in line for line in listener.driver.link().warnings))
         listener.wait_for_more("standard")
         assert listener.driver.link().up
         assert not listener.values("absent")

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.state import State
-from otolith.discovery.adopted import Alternative, Approval, Entry, alternatives, words
-from otolith.discovery.experiment_design import Situation, advise, deciding
-from otolith.discovery.hypotheses import Reason
-from otolith.discovery.sequential_test import Case, Lesson, Memory
+from otolith.adaptation.state import AdaptationState
+from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives, describe_hypothesis
+from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
+from otolith.discovery.hypotheses import FaultType
+from otolith.discovery.sequential_test import FilterState, SequentialTest, WindowDecision
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import driven, equation, places, plain, site_of, source_of
+from otolith.estimation.augmented import base_model, equation, indices, input_matrix, site_of, source_of
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.problem import Component, Problem
@@ -36,16 +36,18 @@ from otolith.health.schema import (
     Traces,
     window_document,
 )
-from otolith.health.status import Fused, Heard, Standing, publish
+from otolith.health.status import MarginalPosterior, PreviousStatus, WindowEvidence, publish
 from otolith.twin.component_families import Kind
 
 
-def component_documents(problem: Problem, known: Prior, catalogue: Sequence[Entry]) -> tuple[ComponentDocument, ...]:
+def component_documents(
+    problem: Problem, known: Prior, catalogue: Sequence[AdoptedComponent]
+) -> tuple[ComponentDocument, ...]:
     """Of the components in the twin, of whose numbers ``known`` is known."""
     entries = {entry.component.key: entry for entry in catalogue}
     found = []
     for slot, component in enumerate(problem.components):
-        entry = entries.get(component.key, Entry(component, component.origin))
+        entry = entries.get(component.key, AdoptedComponent(component, component.origin))
         numbers = numbers_of(problem, known, slot)
         if all(math.isfinite(number.value + number.sd) for number in numbers.values()):
             found.append(_document(problem, component, numbers, entry))
@@ -53,9 +55,9 @@ def component_documents(problem: Problem, known: Prior, catalogue: Sequence[Entr
 
 
 def _document(
-    problem: Problem, component: Component, numbers: Mapping[str, NumberDocument], entry: Entry
+    problem: Problem, component: Component, numbers: Mapping[str, NumberDocument], entry: AdoptedComponent
 ) -> ComponentDocument:
-    twin = plain(problem)
+    twin = base_model(problem)
     site = site_of(twin, component.site)
     return ComponentDocument(
         id=component.key,
@@ -80,24 +82,24 @@ def numbers_of(problem: Problem, known: Prior, slot: int) -> dict[str, NumberDoc
     """Amplitude, and inner number and phase as far as the component has them."""
     component = problem.components[slot]
     periodic = component.repeats
-    place = source_of(plain(problem), component.source).kind is Kind.PLACE
+    place = source_of(base_model(problem), component.source).kind is Kind.PLACE
     inner = component.model.inner
     names = ["amplitude", "order" if periodic and place else "inner" if inner is None else inner.meaning, "phase"]
     deviations = np.sqrt(np.maximum(np.diag(known.covariance), 0.0))
     found = {}
-    for name, at in zip(names, places(problem, slot), strict=False):
+    for name, at in zip(names, indices(problem, slot), strict=False):
         value, sd = float(known.mean[at]), float(deviations[at])
         low, high = value - QUANTILE * sd, value + QUANTILE * sd
         found[name] = NumberDocument(value=value, sd=sd, low=low, high=high, unit=problem.free[at].unit)
     return found
 
 
-def explanations_of(case: Case | None) -> tuple[AlternativeDocument, ...]:
+def explanations_of(case: SequentialTest | None) -> tuple[AlternativeDocument, ...]:
     """What could have happened, the most probable first, while it is not decided."""
-    if case is None or case.best.reason is Reason.NOTHING:
+    if case is None or case.best.reason is FaultType.NOTHING:
         return ()
     share = case.probabilities[0]
-    best = Alternative(case.best.reason, words(case.best), share)
+    best = Alternative(case.best.reason, describe_hypothesis(case.best), share)
     return _documents((best, *alternatives(case, case.best)))
 
 
@@ -110,7 +112,7 @@ def _documents(found: Sequence[Alternative]) -> tuple[AlternativeDocument, ...]:
 def findings_of(
     components: Sequence[ComponentDocument],
     explanations: Sequence[AlternativeDocument],
-    case: Case | None,
+    case: SequentialTest | None,
     experiment: str,
 ) -> tuple[FindingDocument, ...]:
     """What an operator should read: one line for each component that is new, and one for an open case.
@@ -122,7 +124,7 @@ def findings_of(
         best = explanations[0]
         others = "".join(f"; or {entry.text} ({entry.probability:.0%})" for entry in explanations[1:3])
         text = f"{best.reason}: {best.text} ({best.probability:.0%}){others}"
-        severity = Severity.WARNING if best.reason is not Reason.SENSOR else Severity.FAULT
+        severity = Severity.WARNING if best.reason is not FaultType.SENSOR else Severity.FAULT
         found.append(FindingDocument(
             id="case", severity=severity, condition="something has happened that is not decided yet", text=text,
             since=case.onset, advice="; ".join(filter(None, (experiment, _of_the_file(case)))),
@@ -130,10 +132,10 @@ def findings_of(
     return tuple(found)
 
 
-def _of_the_file(case: Case) -> str:
+def _of_the_file(case: SequentialTest) -> str:
     """What to do where a parameter seems to have moved that the machine file takes as known."""
-    known = {name for entry in case.hypotheses if entry.reason is Reason.NOTHING for name, _ in entry.problem.known}
-    if case.best.reason is not Reason.PARAMETER:
+    known = {name for entry in case.hypotheses if entry.reason is FaultType.NOTHING for name, _ in entry.problem.known}
+    if case.best.reason is not FaultType.PARAMETER:
         return ""
     names = ", ".join(entry.name for entry in case.best.problem.free if entry.name in known)
     return names and f"if nothing has happened to the machine, {names} in its file is off: correct it or estimate it"
@@ -147,47 +149,53 @@ def _of_component(entry: ComponentDocument) -> FindingDocument:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
+class WindowResult:
     """What is known after a window, and how it came about."""
 
-    memory: Memory
+    memory: FilterState
     before: Prior
     """What was known at the end of the window, but for the window."""
     after: Prior
     """What is known then."""
     problem: Problem
     """With the components that are in the twin then."""
-    catalogue: tuple[Entry, ...] = ()
+    catalogue: tuple[AdoptedComponent, ...] = ()
     """Of these components."""
     found: WindowEstimate | None = None
     """None for a window that was not estimated from."""
-    lesson: Lesson = Lesson.BAD
+    decision: WindowDecision = WindowDecision.BAD
     reason: str = ""
     """What there is to say of the window as a whole."""
-    case: Case | None = None
+    case: SequentialTest | None = None
     """What could have happened, if that is a question."""
     searched: bool = False
     """Whether it was asked what else could have happened."""
 
 
-def document_of(state: State, window: Window, learned: Learned) -> tuple[dict[str, Standing], ReportDocument]:
+def document_of(
+    state: AdaptationState, window: Window, learned: WindowResult
+) -> tuple[dict[str, PreviousStatus], ReportDocument]:
     """The report of ``window`` after ``state``, and what it says of each parameter."""
     problem, memory, found = learned.problem, learned.memory, learned.found
     parameters: dict[str, ParameterDocument] = {}
-    standing: dict[str, Standing] = {}
+    standing: dict[str, PreviousStatus] = {}
     allowed = problem.determined_within * problem.scale
     sure = learned.case is not None and not learned.case.doubts_parameters
     contradictions = 0 if sure else memory.contradictions
     for index, (entry, fused) in enumerate(zip(problem.free, _fused(learned), strict=True)):
         said = None if found is None else found.parameters[index]
-        heard = Heard(said, learned.lesson, contradictions, memory.belief.scatter, learned.reason)
-        before = state.standing.get(entry.label, Standing())
+        heard = WindowEvidence(said, learned.decision, contradictions, memory.belief.variance_ratio, learned.reason)
+        before = state.standing.get(entry.label, PreviousStatus())
         standing[entry.label], said_of_it = publish(entry, float(allowed[index]), fused, heard, before)
         if not entry.name.startswith("_"):
             parameters[entry.name] = said_of_it
     _advise(problem, window, learned, parameters)
     components = component_documents(problem, learned.after, learned.catalogue)
-    undecided = learned.case if learned.lesson in (Lesson.SUSPECTED, Lesson.SENSOR, Lesson.REFUSED) else None
+    undecided = (
+        learned.case
+        if learned.decision in (WindowDecision.SUSPECTED, WindowDecision.SENSOR, WindowDecision.REFUSED)
+        else None
+    )
     explanations = explanations_of(undecided)
     experiment = _experiment(window, learned, undecided)
     document = ReportDocument(
@@ -196,7 +204,7 @@ def document_of(state: State, window: Window, learned: Learned) -> tuple[dict[st
         twin=problem.twin.name,
         model=_model(problem, standing),
         window=window_document(window),
-        lesson=learned.lesson,
+        decision=learned.decision,
         parameters=parameters,
         components=components,
         explanations=explanations,
@@ -208,16 +216,16 @@ def document_of(state: State, window: Window, learned: Learned) -> tuple[dict[st
     return standing, document
 
 
-def _model(problem: Problem, standing: dict[str, Standing]) -> str:
+def _model(problem: Problem, standing: dict[str, PreviousStatus]) -> str:
     """The paper's names."""
     if problem.components:
         return "DT''"
     return "DT'" if any(entry.known for entry in standing.values()) else "DT"
 
 
-def traces_of(state: State, window: Window, learned: Learned) -> Traces:
+def traces_of(state: AdaptationState, window: Window, learned: WindowResult) -> Traces:
     """The curves behind the report; of the window as it came, with its spikes, so that it can be replayed from them."""
-    found, twin = learned.found, plain(state.problem)
+    found, twin = learned.found, base_model(state.problem)
     outputs, inputs = tuple(entry.name for entry in twin.outputs), tuple(entry.name for entry in twin.inputs)
     predicted = None if found is None else found.predicted
     return Traces(outputs, _present(window, outputs), predicted, state.problem.noise, inputs, _present(window, inputs))
@@ -229,13 +237,13 @@ def _present(window: Window, names: tuple[str, ...]) -> Array:
     return np.column_stack(columns) if columns else np.zeros((window.records, 0))
 
 
-def _fused(learned: Learned) -> list[Fused]:
+def _fused(learned: WindowResult) -> list[MarginalPosterior]:
     """Of each free parameter, what is known at the end of the window, and what this window did to it."""
     after = learned.after
     free = len(after.mean) // 2
     sd, sd_before = (np.sqrt(np.diag(known.covariance)) for known in (after, learned.before))
     return [
-        Fused(
+        MarginalPosterior(
             value=float(after.mean[index]),
             sd=float(sd[index]),
             trend=float(after.mean[free + index]),
@@ -246,19 +254,24 @@ def _fused(learned: Learned) -> list[Fused]:
     ]
 
 
-def _advise(problem: Problem, window: Window, learned: Learned, documents: dict[str, ParameterDocument]) -> None:
+def _advise(problem: Problem, window: Window, learned: WindowResult, documents: dict[str, ParameterDocument]) -> None:
     """Add what would pin down the parameters that this window did not."""
     found = learned.found
     wanted = [name for name, entry in documents.items() if entry.status in (Status.UNESTIMATED, Status.HELD)]
-    if found is None or learned.lesson is not Lesson.LEARNED or not wanted or not np.isfinite(found.last_state).all():
+    if (
+        found is None
+        or learned.decision is not WindowDecision.LEARNED
+        or not wanted
+        or not np.isfinite(found.last_state).all()
+    ):
         return
-    inputs = driven(problem.twin, window)[-1]
+    inputs = input_matrix(problem.twin, window)[-1]
     situation = Situation(inputs, found.last_state, window.records, window.sample_period)
     for name, text in advise(problem, learned.after, situation, wanted).items():
         documents[name] = documents[name].model_copy(update={"advice": text})
 
 
-def _experiment(window: Window, learned: Learned, case: Case | None) -> str:
+def _experiment(window: Window, learned: WindowResult, case: SequentialTest | None) -> str:
     """What would tell the most probable explanation from the next one."""
     found = learned.found
     if case is None or found is None or not np.isfinite(found.last_state).all():
@@ -266,12 +279,12 @@ def _experiment(window: Window, learned: Learned, case: Case | None) -> str:
     others = case.alternatives(case.best)
     if not others:
         return ""
-    inputs = driven(learned.problem.twin, window)[-1]
+    inputs = input_matrix(learned.problem.twin, window)[-1]
     situation = Situation(inputs, found.last_state, window.records, window.sample_period)
-    return deciding(case.best, others[0][0], situation)
+    return deciding_experiment(case.best, others[0][0], situation)
 
 
-def _fit(problem: Problem, found: WindowEstimate, memory: Memory) -> FitDocument:
+def _fit(problem: Problem, found: WindowEstimate, memory: FilterState) -> FitDocument:
     outputs = tuple(entry.name for entry in problem.twin.outputs)
     return FitDocument(
         rmse_configured=_finite(outputs, found.rmse_configured),
@@ -279,7 +292,7 @@ def _fit(problem: Problem, found: WindowEstimate, memory: Memory) -> FitDocument
         rmse_completed=_finite(outputs, found.rmse_completed) if problem.components else None,
         explained=found.cost <= EXPLAINED,
         cost=found.cost,
-        scatter=memory.belief.scatter,
+        variance_ratio=memory.belief.variance_ratio,
         outcome=found.outcome,
     )
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 
-from otolith.machine import Plan, load_plan, recording_folder
+from otolith.machine import LoadedMachine, load_machine, recording_folder
 from otolith.publishing.zenoh_session import prefix
 from otolith_drivers.base import Sample
 from otolith_drivers.user_dirs import complain_unless_writable
@@ -26,7 +26,7 @@ def check_machine(path: Path, say: Callable[[str], None], *, with_device: bool) 
     Raises:
         OtolithError: whatever would keep the daemon from starting.
     """
-    plan = load_plan(path)
+    plan = load_machine(path)
     for line in describe(plan):
         say(line)
     if plan.file.recording.enabled:
@@ -39,7 +39,7 @@ def check_machine(path: Path, say: Callable[[str], None], *, with_device: bool) 
     return set(plan.twin.signals) <= set(counts)
 
 
-def describe(plan: Plan) -> list[str]:
+def describe(plan: LoadedMachine) -> list[str]:
     """What the daemon would do, a line per fact; what the file leaves to the twin is marked."""
     file, problem, twin = plan.file, plan.problem, plan.twin
     lines = [
@@ -71,7 +71,7 @@ def _left_open(name: str, said: Container[str]) -> str:
     return "" if name in said else " [not in the file: the twin's own value]"
 
 
-def _listen(plan: Plan) -> tuple[Counter[str], list[str]]:
+def _listen(plan: LoadedMachine) -> tuple[Counter[str], list[str]]:
     """How many samples of each signal came, and what there is to say of it."""
     counts: Counter[str] = Counter()
     latest: dict[str, float] = {}
@@ -85,7 +85,7 @@ def _listen(plan: Plan) -> tuple[Counter[str], list[str]]:
     begun = time.monotonic()
     driver.open(deliver)
     time.sleep(max(LISTEN, ENOUGH * period))
-    while time.monotonic() < begun + PATIENCE and len(counts) < len(signals) and not driver.link().complaints:
+    while time.monotonic() < begun + PATIENCE and len(counts) < len(signals) and not driver.link().warnings:
         time.sleep(PAUSE)
     link, listened = driver.link(), time.monotonic() - begun
     driver.close()
@@ -97,7 +97,7 @@ def _listen(plan: Plan) -> tuple[Counter[str], list[str]]:
         for signal in signals
     ]
     lines += [f"plan: {link.plan}"] if link.plan else []
-    lines += link.complaints
+    lines += link.warnings
     lines += [] if link.up else [f"no connection: {link.reason}"]
     if kind in PROBED and len(latest) < len(signals):
         lines.append(f"what is there is shown by 'otolith probe {kind}'")

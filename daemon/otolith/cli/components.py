@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from otolith.adaptation.state import Decisions, Kept, State
-    from otolith.machine import Plan
-    from otolith.runtime.state_store import Keeper
+    from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
+    from otolith.machine import LoadedMachine
+    from otolith.runtime.state_store import StateStore
 
 
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -42,22 +42,22 @@ def list_them(file: Path, as_json: bool) -> None:
 
     from pydantic import TypeAdapter
 
-    from otolith.adaptation.state import Kept
+    from otolith.adaptation.state import ComponentRecord
 
     plan, keeper = _keeper(file)
     found, decisions = keeper.components(), keeper.decisions()
     if as_json:
-        rows = [TypeAdapter(Kept).dump_python(entry, mode="json") for entry in found]
+        rows = [TypeAdapter(ComponentRecord).dump_python(entry, mode="json") for entry in found]
         said = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
         click.echo(json.dumps({"components": rows, **said}, ensure_ascii=False))
         return
     for entry in found:
-        key = entry.entry.component.key
+        key = entry.adopted.component.key
         word = "approved" if key in decisions.approved else "rejected" if key in decisions.rejected else "open"
-        if decisions.forgotten.get(key, 0.0) > entry.entry.onset:
+        if decisions.forgotten.get(key, 0.0) > entry.adopted.onset:
             word = "forgotten: it will be found anew if it is there"
-        click.echo(f"{key}  {_words(plan, entry)}  since {_moment(entry.entry.onset)}  {word}")
-    known = {entry.entry.component.key for entry in found}
+        click.echo(f"{key}  {_words(plan, entry)}  since {_moment(entry.adopted.onset)}  {word}")
+    known = {entry.adopted.component.key for entry in found}
     for key in sorted(decisions.rejected - known):
         click.echo(f"{key}  is not looked for: rejected")
     if not found and not decisions.rejected:
@@ -68,11 +68,11 @@ def _moment(seconds: float) -> str:
     return time.strftime("%F %T", time.localtime(seconds))
 
 
-def _words(plan: "Plan", entry: "Kept") -> str:
+def _words(plan: "LoadedMachine", entry: "ComponentRecord") -> str:
     from otolith.estimation.augmented import equation
 
     sd = f" (amplitude ± {1.96 * entry.deviations[0]:.2g})"
-    return equation(plan.twin, entry.entry.component, entry.values) + sd
+    return equation(plan.twin, entry.adopted.component, entry.values) + sd
 
 
 @components.command()
@@ -100,22 +100,24 @@ def forget(file: Path, component: str) -> None:
     _say(file, component, "forgotten", lambda said: replace(said, forgotten={**said.forgotten, component: moment}))
 
 
-def _say(file: Path, component: str, word: str, more: "Callable[[Decisions], Decisions]") -> None:
+def _say(file: Path, component: str, word: str, more: "Callable[[OperatorDecisions], OperatorDecisions]") -> None:
     """Keep ``more`` in the place of what has been said of ``component``."""
     _, keeper = _keeper(file)
     keeper.decide(more(_unsaid(keeper, component)))
     click.echo(f"{component} is {word}")
 
 
-def _keeper(file: Path) -> "tuple[Plan, Keeper]":
-    from otolith.machine import load_plan
-    from otolith.runtime.state_store import Keeper
+def _keeper(file: Path) -> "tuple[LoadedMachine, StateStore]":
+    from otolith.machine import load_machine
+    from otolith.runtime.state_store import StateStore
 
-    plan = load_plan(file, with_driver=False)
-    return plan, Keeper(plan.file.machine.site, plan.file.machine.name, plan.twin, heard=plan.heard)
+    plan = load_machine(file, with_driver=False)
+    return plan, StateStore(
+        plan.file.machine.site, plan.file.machine.name, plan.twin, signal_fingerprint=plan.signal_fingerprint
+    )
 
 
-def _unsaid(keeper: "Keeper", component: str) -> "Decisions":
+def _unsaid(keeper: "StateStore", component: str) -> "OperatorDecisions":
     """What has been said, but for what was said of ``component``.
 
     Raises:
@@ -124,7 +126,7 @@ def _unsaid(keeper: "Keeper", component: str) -> "Decisions":
     from otolith_drivers.errors import ConfigurationError, nearest
 
     said = keeper.decisions()
-    known = {entry.entry.component.key for entry in keeper.components()} | said.approved | said.rejected
+    known = {entry.adopted.component.key for entry in keeper.components()} | said.approved | said.rejected
     if component not in known:
         raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
     return replace(said, approved=said.approved - {component}, rejected=said.rejected - {component})
@@ -165,7 +167,7 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
     _ask(plan, keeper, state, yes=yes)
 
 
-def _lived(plan: "Plan", data: Path) -> "State":
+def _lived(plan: "LoadedMachine", data: Path) -> "AdaptationState":
     """The state after all windows of the table."""
     from otolith.runtime.replay import Replay, open_recorded
 
@@ -174,7 +176,7 @@ def _lived(plan: "Plan", data: Path) -> "State":
         for report in run.reports():
             for line in _told(report.document.findings):
                 click.echo(f"window {report.document.window.index}: {line}", err=True)
-        for line in run.complaints():
+        for line in run.warnings():
             click.echo(f"{data}: {line}", err=True)
         return run.state
 
@@ -184,17 +186,17 @@ def _told(findings: object) -> Iterator[str]:
         yield finding.text
 
 
-def _ask(plan: "Plan", keeper: "Keeper", state: "State", *, yes: bool) -> None:
-    from otolith.adaptation.state import kept
+def _ask(plan: "LoadedMachine", keeper: "StateStore", state: "AdaptationState", *, yes: bool) -> None:
+    from otolith.adaptation.state import component_records
 
     said = keeper.decisions()
     approved, rejected = set[str](), set[str]()
-    found = kept(state)
+    found = component_records(state)
     for entry in found:
-        key = entry.entry.component.key
+        key = entry.adopted.component.key
         click.echo(f"found {key}: {_words(plan, entry)}", err=True)
         (approved if yes or _belongs() else rejected).add(key)
-    keeper.keep(tuple(entry for entry in found if entry.entry.component.key in approved))
+    keeper.keep(tuple(entry for entry in found if entry.adopted.component.key in approved))
     keeper.decide(replace(said, approved=said.approved | approved, rejected=(said.rejected | rejected) - approved))
     if not found:
         click.echo("no component was found: the twin explains the machine up to the noise", err=True)
@@ -210,10 +212,10 @@ def _belongs() -> bool:
         raise
 
 
-def _parameters(state: "State") -> Iterator[tuple[str, str]]:
-    from otolith.estimation.imm_filter import overall
+def _parameters(state: "AdaptationState") -> Iterator[tuple[str, str]]:
+    from otolith.estimation.imm_filter import moment_match
 
-    known = overall(state.memory.belief, state.problem)
+    known = moment_match(state.memory.belief, state.problem)
     for index, entry in enumerate(state.problem.free):
         if not entry.name.startswith("_"):
             sd = float(known.covariance[index, index]) ** 0.5

@@ -23,13 +23,13 @@ from rich.live import Live
 from rich.table import Table
 
 from otolith.acquisition.window import Verdict
-from otolith.adaptation.state import begin
-from otolith.cli.live_table import Board
+from otolith.adaptation.state import initial_state
+from otolith.cli.live_table import LiveTable
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ComponentDocument, ReportDocument, Status
-from otolith.machine import load_plan
+from otolith.machine import load_machine
 from otolith.publishing.zenoh_session import REPORT, Listener
-from otolith.runtime.process import Companion
+from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.scenario import load_scenario
@@ -134,7 +134,7 @@ class Demo:
 
     def __init__(self, machine: Path, scenario: Path, duration: float, *, as_json: bool) -> None:
         self._machine, self._scenario, self._duration, self._as_json = machine, scenario, duration, as_json
-        self._plan = load_plan(machine)
+        self._plan = load_machine(machine)
         self._life = load_scenario(scenario)
         stamp = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
         self._folder = writable(state_directory() / "demo" / f"{stamp}-{os.getpid()}")
@@ -172,8 +172,8 @@ class Demo:
     def _compile(self, stopped: Callable[[], bool]) -> None:
         """Before the clocks of plant and daemon start: a daemon whose twin is not compiled yet misses windows."""
         identity, begun = self._plan.file.machine, time.monotonic()
-        compiler = Companion("otolith-compiler", "otolith.runtime.worker:main", room=1)
-        compiler.start(begin(identity.name, identity.site, self._plan.problem))
+        compiler = ChildProcess("otolith-compiler", "otolith.runtime.worker:main", room=1)
+        compiler.start(initial_state(identity.name, identity.site, self._plan.problem))
         compiler.offer(None)  # to end as soon as it could begin
         text = "compiling the twin, which takes a minute or two the first time ..."
         if self._console.is_terminal:
@@ -202,7 +202,7 @@ class Demo:
 
     def _watch(self, connect: Sequence[str], key: str, stopped: Callable[[], bool]) -> None:
         heard: queue.SimpleQueue[str] = queue.SimpleQueue()
-        board = Board(lambda: "waiting for the first window ...")
+        board = LiveTable(lambda: "waiting for the first window ...")
         live = self._console.is_terminal and not self._as_json
         end = time.monotonic() + self._duration
         shown = Live(board, console=self._console, refresh_per_second=5) if live else contextlib.nullcontext()
@@ -212,7 +212,7 @@ class Demo:
                 self._take(heard, board, aloud=not live)
         self._take(heard, board, aloud=not live)
 
-    def _take(self, heard: "queue.SimpleQueue[str]", board: Board, *, aloud: bool) -> None:
+    def _take(self, heard: "queue.SimpleQueue[str]", board: LiveTable, *, aloud: bool) -> None:
         try:
             text = heard.get(timeout=PAUSE)
         except queue.Empty:

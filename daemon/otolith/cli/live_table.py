@@ -21,7 +21,7 @@ BARS = "▁▂▃▄▅▆▇█"
 STYLES = {Status.ESTIMATED: "green", Status.HELD: "yellow", Status.INVALID: "red", Status.UNESTIMATED: "dim"}
 
 
-class Board:
+class LiveTable:
     """Takes reports from any thread, and draws; ``state`` says in words what is waited for."""
 
     def __init__(self, state: Callable[[], str]) -> None:
@@ -150,7 +150,7 @@ def _words(document: ReportDocument) -> list[Text]:
 
 
 def _of_driver(driver: DriverDocument) -> list[Text]:
-    lines = [Text(f"driver: {complaint}", style="yellow") for complaint in driver.complaints]
+    lines = [Text(f"driver: {complaint}", style="yellow") for complaint in driver.warnings]
     if not driver.up:
         return [*lines, Text(f"driver: {driver.reason}", style="bold red")]
     return [*lines, Text(f"driver: {driver.plan}", style="dim")] if driver.plan else lines

@@ -153,11 +153,11 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
       otolith run config/dc-motor.toml
       otolith run config/dc-motor.toml --listen tcp/127.0.0.1:7450
     """
-    from otolith.machine import load_plan
+    from otolith.machine import load_machine
     from otolith.runtime.service import Service
 
     log_to_stderr(verbose=verbose)
-    ended_by = Service(load_plan(file), listen or None, recording).run()
+    ended_by = Service(load_machine(file), listen or None, recording).run()
     return INTERRUPTED if ended_by == signal.SIGINT else 0
 
 

@@ -10,8 +10,8 @@ import click
 
 if TYPE_CHECKING:
     from otolith.acquisition.window import Window
-    from otolith.commissioning.identification import LearnedNoise, Level
-    from otolith.machine import Plan
+    from otolith.commissioning.identification import IdentifiedNoise, NoiseLevel
+    from otolith.machine import LoadedMachine
 
 
 Entry = TypeVar("Entry")
@@ -40,10 +40,10 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
       otolith noise my-machine.toml monday.csv
       otolith noise my-machine.toml monday.csv --windows 100 --json
     """
-    from otolith.machine import load_plan
+    from otolith.machine import load_machine
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # so that the line of progress is put away
-    plan = load_plan(file, with_driver=False)
+    plan = load_machine(file, with_driver=False)
     found = learned_noise(plan, data, windows)
     if as_json:
         click.echo(json.dumps(_document(plan, found), indent=2, ensure_ascii=False))
@@ -52,17 +52,17 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
             click.echo(line)
 
 
-def learned_noise(plan: "Plan", data: Path, windows: int) -> "LearnedNoise":
+def learned_noise(plan: "LoadedMachine", data: Path, windows: int) -> "IdentifiedNoise":
     """From at most so many windows of the table.
 
     Raises:
         ConfigurationError: it has none that can be used.
     """
-    from otolith.commissioning.identification import learn_noise
+    from otolith.commissioning.identification import identify_noise
     from otolith_drivers.errors import ConfigurationError
 
     with _progress() as told:
-        found = learn_noise(plan.problem, _windows(plan, data, windows), told=told.update)
+        found = identify_noise(plan.problem, _windows(plan, data, windows), told=told.update)
     if plan.problem.open_loop:
         click.echo(f"{plan.path}: as long as open_loop is true, process noise will not be used", err=True)
     if not found.windows:
@@ -79,7 +79,7 @@ def _progress() -> Any:
     return console.status("reading")
 
 
-def _windows(plan: "Plan", data: Path, most: int) -> list["Window"]:
+def _windows(plan: "LoadedMachine", data: Path, most: int) -> list["Window"]:
     """At most so many windows of the table that can be used, spread over it.
 
     Raises:
@@ -101,8 +101,8 @@ def _windows(plan: "Plan", data: Path, most: int) -> list["Window"]:
     with open_recorded(plan, data) as recorded:
         run = Replay(plan, recorded)
         found = _spread(good(run.windows()), most)
-        complaints = run.complaints()
-    for line in complaints:
+        warnings = run.warnings()
+    for line in warnings:
         click.echo(f"{data}: {line}", err=True)
     if not found:
         length = f"no window of {plan.file.window.length:g} s can be used"
@@ -123,7 +123,7 @@ def _spread(entries: Iterable[Entry], most: int) -> list[Entry]:
     return [kept[round(index * (len(kept) - 1) / max(count - 1, 1))] for index in range(count)]
 
 
-def lines_of(plan: "Plan", found: "LearnedNoise") -> Iterator[str]:
+def lines_of(plan: "LoadedMachine", found: "IdentifiedNoise") -> Iterator[str]:
     """Both tables, with what there is to know of them as comments."""
     twin, problem = plan.twin, plan.problem
     yield "[noise]"
@@ -145,7 +145,7 @@ def lines_of(plan: "Plan", found: "LearnedNoise") -> Iterator[str]:
     yield from (f"# {remark}" for remark in found.remarks)
 
 
-def _row(level: "Level", unit: str) -> tuple[str, str]:
+def _row(level: "NoiseLevel", unit: str) -> tuple[str, str]:
     exactness = f"± {level.sd / level.value:.1%}" if level.sd is not None and level.value else ""
     return f'{level.name} = "{level.value:.3g} {unit}"', "; ".join(filter(None, [exactness, level.remark]))
 
@@ -155,7 +155,7 @@ def _aligned(rows: list[tuple[str, str]]) -> list[str]:
     return [f"{line:{width}}  # {comment}" if comment else line for line, comment in rows]
 
 
-def _document(plan: "Plan", found: "LearnedNoise") -> dict[str, Any]:
+def _document(plan: "LoadedMachine", found: "IdentifiedNoise") -> dict[str, Any]:
     from dataclasses import asdict
 
     units = plan.twin.units()

@@ -106,7 +106,7 @@ def modbus(
       otolith probe modbus /dev/ttyUSB0 --scan                 which devices are on the line
     """
     from otolith.cli.probe_view import console, modbus_document, probe_device, scan_line, show_device, show_scan
-    from otolith_drivers.config_files import fitted
+    from otolith_drivers.config_files import validated
     from otolith_drivers.modbus.options import LineOptions
     from otolith_drivers.modbus.probe import Place
 
@@ -116,7 +116,7 @@ def modbus(
     if registers[0] < first_address:
         raise click.BadParameter("with --first-address 1 there is no register 0", param_hint="--registers")
     keys = _address(target) | {"timeout": f"{timeout or (0.2 if scan else 0.5)} s", "framing": framing}
-    options = fitted(keys | {"baudrate": baudrate, "parity": parity, "stop_bits": int(stop_bits)}, LineOptions, ())
+    options = validated(keys | {"baudrate": baudrate, "parity": parity, "stop_bits": int(stop_bits)}, LineOptions, ())
     devices = device or ((1, 247) if scan else (1, 1))
     place = Place(options, devices[0], "holding" if table == "holding" else "input", first_address)
     on_wire = (registers[0] - first_address, registers[1] - first_address)
@@ -125,7 +125,7 @@ def modbus(
         with _progress() as told:
             answers = scan_line(place, devices, on_wire[0], lambda: stop.number is not None, told)
         if as_json:
-            click.echo(json.dumps({"devices": [{"device": entry.device, "refused": entry.said} for entry in answers]}))
+            click.echo(json.dumps({"devices": [{"device": entry.device, "refused": entry.reply} for entry in answers]}))
         else:
             show_scan(place, devices, answers, console())
         return stop.code() or (0 if answers else NOTHING_THERE)
@@ -135,7 +135,7 @@ def modbus(
         click.echo(json.dumps(modbus_document(found), ensure_ascii=False))
     else:
         show_device(found, console(), wide=wide)
-    return stop.code() or (0 if found.found.blocks else NOTHING_THERE)
+    return stop.code() or (0 if found.survey.blocks else NOTHING_THERE)
 
 
 @probe.command("can")
@@ -175,10 +175,10 @@ def can_(
 
     from otolith.cli.probe_view import can_document, console, listen, show_bus
     from otolith_drivers.canbus.bus import BusOptions
-    from otolith_drivers.config_files import fitted
+    from otolith_drivers.config_files import validated
 
     rate = {} if bitrate is None else {"bitrate": f"{bitrate} bit/s"}
-    options = fitted({"interface": interface, "channel": channel, "port": port, "fd": fd} | rate, BusOptions, ())
+    options = validated({"interface": interface, "channel": channel, "port": port, "fd": fd} | rate, BusOptions, ())
     stop = StopSignal()
     terminal = console()
     begun = time.monotonic()

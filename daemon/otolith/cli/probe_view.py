@@ -17,7 +17,7 @@ from rich.text import Text
 from otolith_drivers.canbus.bus import MOST_BAD_IN_A_ROW, BusOptions, is_gone, open_bus
 from otolith_drivers.canbus.database import load_dbc
 from otolith_drivers.canbus.probe import (
-    Heard,
+    ObservedFrames,
     Picture,
     can_driver_lines,
     can_signal_lines,
@@ -32,15 +32,15 @@ from otolith_drivers.modbus.probe import (
     COLUMNS,
     WIDE_COLUMNS,
     Answer,
-    Asker,
     Block,
+    Client,
     Number,
     Place,
+    ProgressCallback,
     Reading,
     Speed,
     Stopped,
     Survey,
-    Told,
     Words,
     bytes_of,
     modbus_driver_lines,
@@ -56,7 +56,7 @@ from otolith_drivers.modbus.probe import (
     watch,
 )
 from otolith_drivers.modbus.protocol import LETTERS, TypeName
-from otolith_drivers.number_inference import Verdict, number_text
+from otolith_drivers.number_inference import LayoutVerdict, number_text
 
 PLAIN_WIDTH = 200  # columns where nobody looks at a terminal
 GAP = 2  # columns between columns
@@ -137,7 +137,7 @@ def _cell(row: Row, name: str) -> Text:
 
 LONGEST_NUMBER = 4  # registers
 FEWEST_ZEROS = 3  # registers in a row that are one row of the table
-MARKS = {Verdict.TOLD: "*", Verdict.COUNTS: "*", Verdict.LIKELY: "?"}
+MARKS = {LayoutVerdict.TOLD: "*", LayoutVerdict.COUNTS: "*", LayoutVerdict.LIKELY: "?"}
 ALONE = "a register alone may be half of a longer number: ask for its neighbours as well"
 MODBUS_LEGEND = "* what it is, told by how it moves    ? likely, but it hardly moves    · a number that no machine has"
 
@@ -149,7 +149,7 @@ class Probed:
     place: Place
     registers: tuple[int, int]
     """First and last that were asked for, on the wire."""
-    found: Survey
+    survey: Survey
     readings: dict[Block, Words]
     numbers: list[Number]
     speeds: list[Speed]
@@ -166,14 +166,16 @@ class Probed:
         return [number for number in self.numbers if not self.single or number.address == self.registers[0]]
 
 
-def probe_device(place: Place, registers: tuple[int, int], seconds: float, stopped: Stopped, told: Told) -> Probed:
+def probe_device(
+    place: Place, registers: tuple[int, int], seconds: float, stopped: Stopped, told: ProgressCallback
+) -> Probed:
     """Look at the registers (on the wire) of a device.
 
     Raises:
         DeviceError: the line cannot be opened, or the device does not answer.
     """
     with opened(place.options, told) as line:
-        asker = Asker(line, place.options, place.device, place.table)
+        asker = Client(line, place.options, place.device, place.table)
         first, last = registers
         if first == last:
             last = min(first + LONGEST_NUMBER - 1, HIGHEST_ADDRESS)
@@ -186,14 +188,16 @@ def probe_device(place: Place, registers: tuple[int, int], seconds: float, stopp
         return Probed(place, registers, found, readings, numbers_of(readings), speeds(asker, found.blocks), elapsed)
 
 
-def scan_line(place: Place, devices: tuple[int, int], register: int, stopped: Stopped, told: Told) -> list[Answer]:
+def scan_line(
+    place: Place, devices: tuple[int, int], register: int, stopped: Stopped, told: ProgressCallback
+) -> list[Answer]:
     """The devices on a line that answer when asked for ``register`` (on the wire).
 
     Raises:
         DeviceError: the line cannot be opened.
     """
     with opened(place.options, told) as line:
-        asker = Asker(line, place.options, devices[0], place.table)
+        asker = Client(line, place.options, devices[0], place.table)
         return scan(asker, range(devices[0], devices[1] + 1), register, stopped, told)
 
 
@@ -201,8 +205,8 @@ def show_scan(place: Place, devices: tuple[int, int], answers: Sequence[Answer],
     """The answers, in words."""
     asked = devices[1] - devices[0] + 1
     console.print(f"{place.options.title()}: {len(answers)} of {asked} devices answer")
-    for said in dict.fromkeys(answer.said for answer in answers):
-        alike = spans([answer.device for answer in answers if answer.said == said], "device")
+    for said in dict.fromkeys(answer.reply for answer in answers):
+        alike = spans([answer.device for answer in answers if answer.reply == said], "device")
         console.print(alike + (f" (that register is refused: {said})" if said else ""), markup=False)
     if len(answers) == asked > 1:
         console.print("everybody answers: it seems that this host does not look at the device number")
@@ -217,12 +221,12 @@ def show_device(probed: Probed, console: Console, *, wide: bool) -> None:
     place = probed.place
     title = f"{place.options.title()}, device {place.device}, {place.table} registers"
     console.print(f"{title}, read only (function code {FUNCTION_CODES[place.table]})")
-    for text in probed.found.describe(place.first_address):
+    for text in probed.survey.describe(place.first_address):
         console.print(text)
-    if not probed.found.blocks and not probed.found.refused:
+    if not probed.survey.blocks and not probed.survey.refused:
         console.print("ended before anything was read")
         return
-    if not probed.found.blocks:
+    if not probed.survey.blocks:
         other = "input" if place.table == "holding" else "holding"
         console.print(f"the device is there, but not these registers: try others by --registers, or --table {other}")
         return
@@ -244,7 +248,7 @@ def show_device(probed: Probed, console: Console, *, wide: bool) -> None:
 
 def modbus_lines(probed: Probed) -> list[str]:
     """For the machine file."""
-    return [*modbus_driver_lines(probed.place, probed.found), "", *modbus_signal_lines(probed.place, probed.wanted)]
+    return [*modbus_driver_lines(probed.place, probed.survey), "", *modbus_signal_lines(probed.place, probed.wanted)]
 
 
 def speed_lines(probed: Probed) -> list[str]:
@@ -320,9 +324,9 @@ def modbus_document(probed: Probed) -> dict[str, Any]:
         "device": place.device,
         "table": place.table,
         "first_address": place.first_address,
-        "readable": [[place.shown(block.address), place.shown(block.end - 1)] for block in probed.found.blocks],
-        "refused": {str(place.shown(at)): reason for at, reason in probed.found.refused.items()},
-        "most_registers": probed.found.most,
+        "readable": [[place.shown(block.address), place.shown(block.end - 1)] for block in probed.survey.blocks],
+        "refused": {str(place.shown(at)): reason for at, reason in probed.survey.refused.items()},
+        "most_registers": probed.survey.most,
         "speed": [
             {"registers": speed.registers, "median_s": speed.median, "slow_s": speed.slow} for speed in probed.speeds
         ],
@@ -421,13 +425,13 @@ class _Board:
 
 
 def _title(options: BusOptions, picture: Picture) -> str:
-    identifiers = f"{len(picture.heard)} arbitration ID{'s' * (len(picture.heard) != 1)}"
+    identifiers = f"{len(picture.observed)} arbitration ID{'s' * (len(picture.observed) != 1)}"
     return f"CAN bus {options.title()}, only listening: {picture.frames} frames of {identifiers}"
 
 
 def tables(picture: Picture, width: int) -> Iterator[RenderableType]:
     """Frames, and the signals in them that a database knows."""
-    if picture.heard:
+    if picture.observed:
         yield from grids(("ID", "data"), [_frame(picture, heard) for heard in picture.ordered()], width)
     rows = [_signal(heard.message.name, signal, value) for heard, signal, value in picture.signals() if heard.message]
     if rows:
@@ -436,7 +440,7 @@ def tables(picture: Picture, width: int) -> Iterator[RenderableType]:
     yield from (Text(line, style="yellow") for line in remarks(picture))
 
 
-def _frame(picture: Picture, heard: Heard) -> Row:
+def _frame(picture: Picture, heard: ObservedFrames) -> Row:
     lengths = sorted({min(heard.lengths, default=0), max(heard.lengths, default=0)})
     cells = {"bytes": " to ".join(map(str, lengths)), "frames": f"{heard.count}", "Hz": "", "period": ""}
     if heard.period is not None:
@@ -449,7 +453,7 @@ def _frame(picture: Picture, heard: Heard) -> Row:
     return row
 
 
-def _what(picture: Picture, heard: Heard) -> str:
+def _what(picture: Picture, heard: ObservedFrames) -> str:
     if heard.remote == heard.count:
         return "remote frames"
     if heard.message is not None:
@@ -459,7 +463,7 @@ def _what(picture: Picture, heard: Heard) -> str:
     return "; ".join(filter(None, [unknown, picture.guess(heard)]))
 
 
-def marked(heard: Heard) -> str:
+def marked(heard: ObservedFrames) -> str:
     """The latest data in hexadecimal digits, with the bytes that have changed in brackets."""
     text = ""
     for place, byte in enumerate(heard.latest):
@@ -578,7 +582,7 @@ def can_document(picture: Picture, options: BusOptions, database: Path | None, s
     }
 
 
-def _frame_document(picture: Picture, heard: Heard) -> dict[str, Any]:
+def _frame_document(picture: Picture, heard: ObservedFrames) -> dict[str, Any]:
     return {
         "id": heard.name,
         "extended": heard.extended,

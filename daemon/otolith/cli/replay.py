@@ -15,10 +15,10 @@ from rich.table import Table
 from rich.text import Text
 
 from otolith.cli.live_table import STYLES, value_cells
-from otolith.discovery.sequential_test import Lesson
+from otolith.discovery.sequential_test import WindowDecision
 from otolith.health.schema import ReportDocument, Status
-from otolith.machine import load_plan
-from otolith.runtime.replay import Pace, Replay, ReplayRecorder, open_recorded
+from otolith.machine import load_machine
+from otolith.runtime.replay import RealTimePacer, Replay, ReplayRecorder, open_recorded
 
 WIDTH = 110  # columns of a summary that goes into a file
 Stopped = Callable[[], bool]
@@ -27,21 +27,21 @@ DATES = (1e8, 1e11)  # s since 1970: what is earlier counts from a beginning of 
 FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")
 
 
-def moment(seconds: float) -> str:
+def time_text(seconds: float) -> str:
     """A time of the data: seconds as they are, or the date where they can only be those since 1970."""
     if not DATES[0] <= seconds < DATES[1]:
         return f"{round(seconds, 6) + 0.0:.12g} s"
     return f"{datetime.fromtimestamp(seconds, UTC):%F %T}Z"
 
 
-class Tally:
+class ReplaySummary:
     """Takes reports, keeps the last one and counts; draws itself."""
 
     def __init__(self) -> None:
         self._first: ReportDocument | None = None
         self._last: ReportDocument | None = None
         self._windows = self._fitted = self._explained = 0
-        self._lessons: Counter[Lesson] = Counter()
+        self._lessons: Counter[WindowDecision] = Counter()
         self._statuses: dict[str, Counter[Status]] = {}
         self._reasons: Counter[str] = Counter()
         self._examples: dict[str, str] = {}
@@ -51,7 +51,7 @@ class Tally:
         self._first = self._first or document
         self._last = document
         self._windows += 1
-        self._lessons[document.lesson] += 1
+        self._lessons[document.decision] += 1
         if document.fit is not None:
             self._fitted += 1
             self._explained += document.fit.explained
@@ -69,7 +69,7 @@ class Tally:
             yield Text("no window")
             return
         last = self._last
-        span = f"from {moment(self._first.window.start)} to {moment(last.window.end)}"
+        span = f"from {time_text(self._first.window.start)} to {time_text(last.window.end)}"
         yield Text.assemble((last.machine, "bold"), f" at {last.site}, twin {last.twin} ({last.model}), {span}")
         yield self._parameters(last)
         for name, parameter in last.parameters.items():
@@ -77,7 +77,8 @@ class Tally:
                 yield Text(f"{name} in the last window: {parameter.reason}", style="yellow")
         for entry in last.components:
             yield Text(
-                f"{entry.meaning}: {entry.equation}, since {moment(entry.onset)} ({entry.approval})", style="bold red"
+                f"{entry.meaning}: {entry.equation}, since {time_text(entry.onset)} ({entry.approval})",
+                style="bold red",
             )
         for finding in last.findings:
             if finding.id not in {entry.id for entry in last.components}:
@@ -96,12 +97,12 @@ class Tally:
         return table
 
     def _words(self) -> Iterator[Text]:
-        bad = self._lessons[Lesson.BAD]
+        bad = self._lessons[WindowDecision.BAD]
         explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
         yield Text(f"{self._windows} windows: {self._windows - bad} good, {bad} bad; {explained}")
-        for lesson, count in self._lessons.items():
-            if lesson not in (Lesson.LEARNED, Lesson.BAD):
-                yield Text(f"  {count} good, but: {lesson}", style="yellow")
+        for decision, count in self._lessons.items():
+            if decision not in (WindowDecision.LEARNED, WindowDecision.BAD):
+                yield Text(f"  {count} good, but: {decision}", style="yellow")
         for kind, count in self._reasons.most_common(MOST_REASONS):
             yield Text(f"  {count} bad like: {self._examples[kind]}", style="red")
 
@@ -114,12 +115,12 @@ def replay(
     Raises:
         OtolithError: a file that cannot be used.
     """
-    plan = load_plan(machine, with_driver=False)
-    tally = Tally()
+    plan = load_machine(machine, with_driver=False)
+    tally = ReplaySummary()
     with open_recorded(plan, data) as recorded:
         if recorded.ignored:
             click.echo(f"{data}: columns not used: {', '.join(recorded.ignored)}", err=True)
-        run = Replay(plan, recorded, stopped, Pace(stopped).wait if real_time else None)
+        run = Replay(plan, recorded, stopped, RealTimePacer(stopped).wait if real_time else None)
         with ReplayRecorder(recording, plan) as recorder, _bar(as_json=as_json) as bar:
             task = bar.add_task("", total=1.0)
             for report in run.reports():
@@ -129,12 +130,12 @@ def replay(
                 if as_json:
                     click.echo(report.document.to_json())
     if as_json:
-        for line in run.complaints():
+        for line in run.warnings():
             click.echo(f"{data}: {line}", err=True)
         return
     console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
     console.print(tally)
-    for line in (run.summary(), *run.complaints()):
+    for line in (run.summary(), *run.warnings()):
         console.print(line, markup=False, soft_wrap=True)
 
 

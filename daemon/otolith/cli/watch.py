@@ -15,7 +15,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.live import Live
 
-from otolith.cli.live_table import Board
+from otolith.cli.live_table import LiveTable
 from otolith.publishing.zenoh_session import REPORT, Listener
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import cache_directory, state_directory
@@ -91,7 +91,7 @@ def watch_reports(connect: Sequence[str], machine: str, *, as_json: bool, stoppe
         if as_json:
             _stream(heard, state, stopped)
             return
-        board = Board(state)
+        board = LiveTable(state)
         with Live(board, console=Console(), refresh_per_second=5):
             while not stopped():
                 for text in _drain(heard):

@@ -12,7 +12,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Mask
 from otolith.commissioning.likelihood import Fit, Likelihood
-from otolith.estimation.arrival_cost import without_states
+from otolith.estimation.arrival_cost import eliminate_states
 from otolith.twin.definition import Definition
 
 SEEN = 2.0  # a window sees a direction in which it knows that many times more than the bounds of the parameters say
@@ -41,7 +41,7 @@ class Agreement:
         return bool(self.reduced <= chdtri(self.degrees, CHANCE) / self.degrees)
 
 
-def agreement(fits: Sequence[Fit], width: Array) -> Agreement:
+def consistency_test(fits: Sequence[Fit], width: Array) -> Agreement:
     """Of ``fits``, with ``width`` (guess,) as in :class:`Likelihood`."""
     free = fits[0].objective.free
     rows = [root(fit, width) for fit in fits]
@@ -62,7 +62,7 @@ def root(fit: Fit, width: Array) -> Array:
     """
     free = fit.objective.free
     scaled = fit.found.jacobian * width
-    _, singular, rows = np.linalg.svd(without_states(scaled[:, :free], scaled[:, free:]), full_matrices=False)
+    _, singular, rows = np.linalg.svd(eliminate_states(scaled[:, :free], scaled[:, free:]), full_matrices=False)
     singular = singular / max(fit.cost, 1.0)
     seen = singular > SEEN
     return np.asarray(singular[seen, None] * rows[seen])
@@ -84,13 +84,13 @@ def inflated(likelihood: Likelihood, levels: Callable[[float], Array], fits: Seq
     """
     from scipy.optimize import brentq  # noqa: PLC0415 - as above
 
-    tried = {0.0: Inflated(1.0, list(fits), agreement(fits, likelihood.width))}
+    tried = {0.0: Inflated(1.0, list(fits), consistency_test(fits, likelihood.width))}
 
     def excess(logarithm: float) -> float:
         if logarithm not in tried:
             factor = float(np.exp(logarithm))
             refitted = likelihood.refitted(levels(factor), list(tried.values())[-1].fits)
-            tried[logarithm] = Inflated(factor, refitted, agreement(refitted, likelihood.width))
+            tried[logarithm] = Inflated(factor, refitted, consistency_test(refitted, likelihood.width))
         reached = tried[logarithm].reached
         return float(np.log(reached.reduced)) if reached.degrees else -1.0
 
@@ -104,7 +104,7 @@ def inflated(likelihood: Likelihood, levels: Callable[[float], Array], fits: Seq
     return tried[best]
 
 
-def touched(twin: Definition) -> Mask:
+def observable_states(twin: Definition) -> Mask:
     """(states,) those that an output shows, or an input drives, without another state in between."""
     definitions = {name: expression for name, expression, _ in twin.definitions}
     right = dict(twin.equations)

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Verdict, Window
-from otolith.commissioning.consistency import agreement, inflated, root, touched
+from otolith.commissioning.consistency import consistency_test, inflated, observable_states, root
 from otolith.commissioning.likelihood import HIDDEN, Fit, Ladder, Likeliest, Likelihood, Told, fewest, noisy
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import search
+from otolith.estimation.particle_swarm import particle_swarm
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
 
@@ -108,7 +108,7 @@ DOUBTFUL = "; so much is hardly noise: the machine changes from window to window
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class NoiseLevel:
     """The noise of one output, or the process noise of one state."""
 
     name: str
@@ -135,11 +135,11 @@ class Consistency:
 
 
 @dataclass(frozen=True, slots=True)
-class LearnedNoise:
+class IdentifiedNoise:
     """Levels of noise and how well they are known."""
 
-    outputs: tuple[Level, ...]
-    states: tuple[Level, ...]
+    outputs: tuple[NoiseLevel, ...]
+    states: tuple[NoiseLevel, ...]
     log_likelihood: float | None
     """Before inflation, restricted, up to a constant; none where nothing was learned."""
     consistency: Consistency
@@ -154,15 +154,15 @@ class LearnedNoise:
         return noisy(problem, np.array([entry.value for entry in (*self.outputs, *self.states)]))
 
 
-def nothing_learned(problem: Problem, remarks: tuple[str, ...]) -> LearnedNoise:
+def nothing_learned(problem: Problem, remarks: tuple[str, ...]) -> IdentifiedNoise:
     """The levels of the problem, as they were."""
     twin = problem.twin
     strays = problem.process_noise or (0.0,) * len(twin.states)
     sensors = zip(twin.outputs, problem.noise, strict=True)
     states = zip(twin.states, strays, strict=True)
-    return LearnedNoise(
-        outputs=tuple(Level(entry.name, level, None, NO_WINDOW) for entry, level in sensors),
-        states=tuple(Level(entry.name, level, None, NO_WINDOW) for entry, level in states),
+    return IdentifiedNoise(
+        outputs=tuple(NoiseLevel(entry.name, level, None, NO_WINDOW) for entry, level in sensors),
+        states=tuple(NoiseLevel(entry.name, level, None, NO_WINDOW) for entry, level in states),
         log_likelihood=None,
         consistency=Consistency(0, None, None, None, NO_WINDOW),
         windows=0,
@@ -178,9 +178,9 @@ LITTLE = 1e-3  # of the process noise that is felt: where inflation begins if th
 SUSPICIOUS = 10.0  # a factor beyond which the noise is hardly what is wrong
 
 
-def learn_noise(
+def identify_noise(
     problem: Problem, windows: Sequence[Window], *, seed: int | None = None, told: Told = lambda _: None
-) -> LearnedNoise:
+) -> IdentifiedNoise:
     """The levels of ``problem`` are what is kept where nothing is learned; its noise of inputs is taken as known.
 
     ``told`` hears of the progress. The same problem, windows and seed give the same levels, bit for bit.
@@ -218,7 +218,7 @@ class _Learning:
         self._outputs = len(problem.twin.outputs)
         self._remarks: list[str] = []
 
-    def run(self, windows: Sequence[Window]) -> LearnedNoise:
+    def run(self, windows: Sequence[Window]) -> IdentifiedNoise:
         ground = self._ground(windows)
         if ground is None:
             return nothing_learned(self._problem, tuple(self._remarks))
@@ -230,7 +230,7 @@ class _Learning:
         )
         found = fewest(self._likelihood, ladder, ground.fits, self._told)
         consistency, levels = self._consistent(ground, found)
-        return LearnedNoise(
+        return IdentifiedNoise(
             outputs=self._sensor_levels(ground, ladder, found),
             states=self._state_levels(ground, found, levels, consistency),
             log_likelihood=-0.5 * found.unlikelihood,
@@ -272,7 +272,7 @@ class _Learning:
             fit = self._likelihood.fit(levels, window, starts)
             if not fits and fit.cost > SURPRISING:
                 objective = Objective(noisy(self._problem, levels), window, self._problem.nominal)
-                searched = search(objective, self._problem.swarm, self._problem.nominal, self._problem.seed)
+                searched = particle_swarm(objective, self._problem.swarm, self._problem.nominal, self._problem.seed)
                 fit = self._likelihood.fit(levels, window, [*starts, searched.places[0]])
             fits.append(fit)
             starts = [self._problem.nominal, fit.guess[: len(self._problem.free)]]
@@ -280,7 +280,7 @@ class _Learning:
 
     def _consistent(self, ground: _Ground, found: Likeliest) -> tuple[Consistency, Array]:
         """What windows say of each other, and the levels (outputs + states,) under which they agree."""
-        before = agreement(found.fits, self._likelihood.width)
+        before = consistency_test(found.fits, self._likelihood.width)
         if not before.degrees:
             remark = ALONE if len(found.fits) == 1 else NOTHING_SHARED
             return Consistency(0, None, None, None, remark), found.levels
@@ -290,7 +290,9 @@ class _Learning:
         strays[: self._outputs] = 0.0
         from_nothing = not strays.any()
         if from_nothing:
-            strays[self._outputs :] = np.where(touched(self._problem.twin), LITTLE * np.nan_to_num(ground.felt), 0.0)
+            strays[self._outputs :] = np.where(
+                observable_states(self._problem.twin), LITTLE * np.nan_to_num(ground.felt), 0.0
+            )
         sensors = np.where(np.arange(len(strays)) < self._outputs, found.levels, 0.0)
         self._told(f"windows scatter {before.reduced:.3g} times more than they claim")
         result = inflated(self._likelihood, lambda factor: sensors + factor * strays, found.fits)
@@ -304,36 +306,36 @@ class _Learning:
         told = Consistency(before.degrees, before.reduced, after.reduced, factor, remark)
         return told, sensors + result.factor * strays
 
-    def _sensor_levels(self, ground: _Ground, ladder: Ladder, found: Likeliest) -> tuple[Level, ...]:
+    def _sensor_levels(self, ground: _Ground, ladder: Ladder, found: Likeliest) -> tuple[NoiseLevel, ...]:
         levels = []
         for index, (entry, shown) in enumerate(zip(self._problem.twin.outputs, ground.shown, strict=True)):
             value, sd = float(found.levels[index]), float(found.deviations[index])
             if np.isnan(shown):
-                levels.append(Level(entry.name, value, None, NEVER_MEASURED))
+                levels.append(NoiseLevel(entry.name, value, None, NEVER_MEASURED))
             elif not shown:
-                levels.append(Level(entry.name, value, None, CONSTANT))
+                levels.append(NoiseLevel(entry.name, value, None, CONSTANT))
             else:
-                levels.append(Level(entry.name, value, sd, AT_MOST if value <= sd + ladder.least[index] else ""))
+                levels.append(NoiseLevel(entry.name, value, sd, AT_MOST if value <= sd + ladder.least[index] else ""))
         return tuple(levels)
 
     def _state_levels(
         self, ground: _Ground, found: Likeliest, levels: Array, consistency: Consistency
-    ) -> tuple[Level, ...]:
+    ) -> tuple[NoiseLevel, ...]:
         """The uncertainty of what was inflated is also that of the factor."""
         states = []
         for index, (entry, felt) in enumerate(zip(self._problem.twin.states, ground.felt, strict=True)):
             place = self._outputs + index
             value, likely, sd = float(levels[place]), float(found.levels[place]), float(found.deviations[place])
             if np.isnan(felt):
-                states.append(Level(entry.name, 0.0, None, UNSEEN))
+                states.append(NoiseLevel(entry.name, 0.0, None, UNSEEN))
             elif not ground.moving:
-                states.append(Level(entry.name, 0.0, None, AT_REST))
+                states.append(NoiseLevel(entry.name, 0.0, None, AT_REST))
             elif not value:
-                states.append(Level(entry.name, 0.0, sd, NONE_NEEDED.format(sd, entry.unit)))
+                states.append(NoiseLevel(entry.name, 0.0, sd, NONE_NEEDED.format(sd, entry.unit)))
             else:
                 own = sd / likely if likely else 0.0
                 of_factor = 0.0 if value == likely else 1.0 / np.sqrt(2.0 * consistency.degrees)
-                states.append(Level(entry.name, value, value * float(np.hypot(own, of_factor)), ""))
+                states.append(NoiseLevel(entry.name, value, value * float(np.hypot(own, of_factor)), ""))
         return tuple(states)
 
 
@@ -348,7 +350,7 @@ def _liveliest(twin: Definition, windows: Sequence[Window], sensors: Array) -> W
     return max(windows, key=moved)
 
 
-def with_noise(problem: Problem, learned: LearnedNoise) -> Problem:
+def with_noise(problem: Problem, learned: IdentifiedNoise) -> Problem:
     """The problem with the noise levels that were learned."""
     outputs = {level.name: level.value for level in learned.outputs}
     states = {level.name: level.value for level in learned.states}

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.gauss_newton import Polished, polish
+from otolith.estimation.gauss_newton import FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 
@@ -33,7 +33,7 @@ class Fit:
     objective: Objective
     centre: Array
     """(guess,) around which the predictor was made."""
-    found: Polished
+    found: FitResult
 
     @property
     def guess(self) -> Array:
@@ -112,15 +112,15 @@ class Likelihood:
         return self._fit(objective, window, guess)
 
     def _fit(self, objective: Objective, window: Window, centre: Array) -> Fit:
-        found = polish(objective, centre)
+        found = gauss_newton(objective, centre)
         self.evaluations += found.evaluations
         return Fit(window, objective, centre, found)
 
-    def _unlikelihood(self, objective: Objective, found: Polished) -> float:
+    def _unlikelihood(self, objective: Objective, found: FitResult) -> float:
         _, log_determinant = np.linalg.slogdet(self._information(found))
         return found.chi_square + objective.correction.log_determinant + float(log_determinant)
 
-    def _information(self, found: Polished) -> Array:
+    def _information(self, found: FitResult) -> Array:
         """(guess, guess) in shares of ``width``, with the bounds as what is known before: no direction is without."""
         scaled = found.jacobian * self.width
         return np.asarray(np.eye(len(self.width)) + scaled.T @ scaled)

@@ -5,11 +5,11 @@ from enum import StrEnum
 
 import numpy as np
 
-from otolith.discovery.hypotheses import Hypothesis, Reason
-from otolith.discovery.sequential_test import Case
+from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
+from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import equation, places, plain, site_of
-from otolith.estimation.imm_filter import overall
+from otolith.estimation.augmented import base_model, equation, indices, site_of
+from otolith.estimation.imm_filter import moment_match
 from otolith.estimation.problem import Component, Problem
 
 FADED = 3.0  # standard deviations of an amplitude under which there is nothing to be seen
@@ -29,13 +29,13 @@ class Approval(StrEnum):
 class Alternative:
     """Another explanation that the data could not tell apart."""
 
-    reason: Reason
+    reason: FaultType
     text: str
     probability: float
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class AdoptedComponent:
     """An adopted component."""
 
     component: Component
@@ -48,7 +48,9 @@ class Entry:
     """Windows in a row in which it could hardly be seen."""
 
 
-def adopted(case: Case, found: Hypothesis, catalogue: tuple[Entry, ...]) -> tuple[Entry, ...]:
+def adopt(
+    case: SequentialTest, found: TrackedHypothesis, catalogue: tuple[AdoptedComponent, ...]
+) -> tuple[AdoptedComponent, ...]:
     """The catalogue with the components of ``found`` that it does not have."""
     there = {component.key for component in found.problem.components}
     catalogue = tuple(entry for entry in catalogue if entry.component.key in there)
@@ -56,47 +58,49 @@ def adopted(case: Case, found: Hypothesis, catalogue: tuple[Entry, ...]) -> tupl
     share = case.probabilities[case.hypotheses.index(found)]
     others = alternatives(case, found)
     new = (component for component in found.problem.components if component.key not in known)
-    return (*catalogue, *(Entry(component, case.onset, share, alternatives=others) for component in new))
+    return (*catalogue, *(AdoptedComponent(component, case.onset, share, alternatives=others) for component in new))
 
 
-def approving(catalogue: tuple[Entry, ...], approved: frozenset[str]) -> tuple[Entry, ...]:
+def with_approvals(catalogue: tuple[AdoptedComponent, ...], approved: frozenset[str]) -> tuple[AdoptedComponent, ...]:
     """The catalogue with what the specialist has approved, also of what was found again."""
     return tuple(
         replace(entry, approval=Approval.APPROVED) if entry.component.key in approved else entry for entry in catalogue
     )
 
 
-def alternatives(case: Case, to: Hypothesis) -> tuple[Alternative, ...]:
+def alternatives(case: SequentialTest, to: TrackedHypothesis) -> tuple[Alternative, ...]:
     """What could be instead, in words."""
-    return tuple(Alternative(entry.reason, words(entry), share) for entry, share in case.alternatives(to))
+    return tuple(Alternative(entry.reason, describe_hypothesis(entry), share) for entry, share in case.alternatives(to))
 
 
-def words(found: Hypothesis) -> str:
+def describe_hypothesis(found: TrackedHypothesis) -> str:
     """What a hypothesis says, with its numbers."""
-    if found.reason in (Reason.NOTHING, Reason.PARAMETER):
+    if found.reason in (FaultType.NOTHING, FaultType.PARAMETER):
         return found.claim.name or str(found.reason)
-    twin, problem = plain(found.problem), found.problem
-    if found.reason is Reason.SENSOR and problem.components:
+    twin, problem = base_model(found.problem), found.problem
+    if found.reason is FaultType.SENSOR and problem.components:
         return _of_sensor(found)
-    values = overall(found.belief, problem).mean
+    values = moment_match(found.belief, problem).mean
     return "; ".join(
-        f"{entry.site}: {equation(twin, entry, values[places(problem, slot)].tolist())}"
+        f"{entry.site}: {equation(twin, entry, values[indices(problem, slot)].tolist())}"
         for slot, entry in enumerate(problem.components)
     )
 
 
-def _of_sensor(found: Hypothesis) -> str:
+def _of_sensor(found: TrackedHypothesis) -> str:
     """As an engineer would say it."""
     problem = found.problem
     slot = len(problem.components) - 1
     component = problem.components[slot]
-    site = site_of(plain(problem), component.site)
-    value = float(overall(found.belief, problem).mean[places(problem, slot)[0]])
+    site = site_of(base_model(problem), component.site)
+    value = float(moment_match(found.belief, problem).mean[indices(problem, slot)[0]])
     off = f"{value:+.1%}" if component.family == "linear" else f"{value:+.2g} {site.unit}"
     return f"{site.into} reads {off} off: look at the sensor and its scale"
 
 
-def faded(catalogue: tuple[Entry, ...], problem: Problem, known: Prior) -> tuple[Entry, ...]:
+def count_fading(
+    catalogue: tuple[AdoptedComponent, ...], problem: Problem, known: Prior
+) -> tuple[AdoptedComponent, ...]:
     """The catalogue with how long each component has hardly been seen; ``known`` is of the problem."""
     deviations = np.sqrt(np.diag(known.covariance))
     found = []
@@ -105,7 +109,7 @@ def faded(catalogue: tuple[Entry, ...], problem: Problem, known: Prior) -> tuple
         if slot is None:
             found.append(entry)
             continue
-        place = places(problem, slot)[0]
+        place = indices(problem, slot)[0]
         amplitude, small = abs(float(known.mean[place])), SMALL * abs(entry.component.amplitude)
         doubt = FADED * float(deviations[place])
         visible = doubt < abs(entry.component.amplitude)  # else nobody could see whether it is there

@@ -12,8 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.discovery.linear_response import Gains, Landscape, Structure, grid, shapes, structures
-from otolith.estimation.augmented import plain
+from otolith.discovery.linear_response import (
+    CandidateForm,
+    LinearResponse,
+    ScoreStatistics,
+    basis_functions,
+    candidate_library,
+    grid,
+)
+from otolith.estimation.augmented import base_model
 from otolith.estimation.problem import Component, Problem, SwarmOptions
 from otolith.twin.augmentation import SLOTS, sites, sources
 
@@ -22,18 +29,18 @@ CALMED = 0.3  # the inertia weight falls to it: held at the paper's 0.9 a swarm 
 BLURRED = 0.5  # lines of the spectrum, or steps of a grid, by which particles are scattered around where they begin
 
 
-def evaluated(landscape: Landscape, guesses: list[tuple[Structure, float]]) -> Gains:
+def evaluated(landscape: LinearResponse, guesses: list[tuple[CandidateForm, float]]) -> ScoreStatistics:
     """What each guess, a structure and its inner number, would gain."""
     if not guesses:
-        return Gains(np.zeros(0), np.zeros((0, 2)))
+        return ScoreStatistics(np.zeros(0), np.zeros((0, 2)))
     counts = np.array([len(entry.model.phases) for entry, _ in guesses], dtype=np.int64)
     first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     pairs = np.column_stack([first, first + counts - 1])
-    return landscape.gains(landscape.responses(shapes(iter(guesses))), pairs)
+    return landscape.gains(landscape.responses(basis_functions(iter(guesses))), pairs)
 
 
-def fly(
-    landscape: Landscape, begun: list[tuple[Structure, Array, float]], options: SwarmOptions, seed: int
+def pso_search(
+    landscape: LinearResponse, begun: list[tuple[CandidateForm, Array, float]], options: SwarmOptions, seed: int
 ) -> list[float]:
     """The best inner number of each structure, begun at (starts,) with steps of that size between them."""
     random = np.random.default_rng(seed)
@@ -69,27 +76,27 @@ WORTH, FEWEST = 500, 4  # steps of the integrator in a window up to which all ar
 LARGEST = 1e9  # amplitude, in the unit of a site: nobody could read an equation with a larger one
 
 
-Guess = tuple[Structure, float]
+Guess = tuple[CandidateForm, float]
 Settled = tuple[Guess, Array, float]
 """A guess, its amplitudes, and its gain in -2 log evidence."""
 
 
-def sought(problem: Problem, x: Array) -> list[Structure]:
+def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     """All that may be looked for where the sources are ``x`` (sources, records), while the twin has room for it.
 
     What is in the twin and what the specialist or the machine file excludes is left out. Where components are not
     looked for, the errors of sensors are.
     """
-    twin = plain(problem)
+    twin = base_model(problem)
     if len(problem.components) >= SLOTS:
         return []
     taken = problem.excluded | {entry.key for entry in problem.components}
     own = len(twin.sites)
-    return [entry for entry in structures(twin, x, taken) if problem.discover or entry.site >= own]
+    return [entry for entry in candidate_library(twin, x, taken) if problem.discover or entry.site >= own]
 
 
 def screened(
-    landscape: Landscape, problem: Problem, found: list[Structure], fineness: float
+    landscape: LinearResponse, problem: Problem, found: list[CandidateForm], fineness: float
 ) -> tuple[list[Guess], Array, Array]:
     """Guesses on the grid, their amplitudes (guesses, 2), and their gains in -2 log evidence (guesses,)."""
     guesses = [(entry, float(inner)) for entry in found for inner in grid(entry, landscape.x, fineness)]
@@ -106,23 +113,23 @@ class Rivals:
     of_machine: float
     of_sensors: float
 
-    def of(self, structure: Structure) -> float:
+    def of(self, structure: CandidateForm) -> float:
         """Of its kind."""
         return self.of_sensors if self.lies(structure) else self.of_machine
 
-    def lies(self, structure: Structure) -> bool:
+    def lies(self, structure: CandidateForm) -> bool:
         """Whether it is the error of a sensor."""
         return structure.site >= self.own
 
 
-def rivals_of(problem: Problem, found: list[Structure]) -> Rivals:
+def rivals_of(problem: Problem, found: list[CandidateForm]) -> Rivals:
     """How many structures of each kind are among ``found``."""
-    own = len(plain(problem).sites)
+    own = len(base_model(problem).sites)
     sensors = sum(entry.site >= own for entry in found)
     return Rivals(own, float(max(len(found) - sensors, 1)), float(max(sensors, 1)))
 
 
-def scores_of(landscape: Landscape, guesses: list[Guess], gain: Array, rivals: Rivals) -> Array:
+def scores_of(landscape: LinearResponse, guesses: list[Guess], gain: Array, rivals: Rivals) -> Array:
     """(guesses,) gains in -2 log evidence over parameters only."""
     records = landscape.objective.count
     counts = np.array([_numbers_of(entry) for entry, _ in guesses], dtype=np.float64)
@@ -131,7 +138,7 @@ def scores_of(landscape: Landscape, guesses: list[Guess], gain: Array, rivals: R
     return np.asarray(gain / left - counts * np.log(records) - 2.0 * np.log(3.0 * others))
 
 
-def _numbers_of(structure: Structure) -> int:
+def _numbers_of(structure: CandidateForm) -> int:
     return len(structure.model.phases) + (structure.model.inner is not None)
 
 
@@ -145,9 +152,9 @@ class Candidate:
     of_sensor: bool
 
 
-def candidates(problem: Problem, landscape: Landscape, window: Window) -> list[Candidate]:
+def candidates(problem: Problem, landscape: LinearResponse, window: Window) -> list[Candidate]:
     """The components worth a polish, the best first."""
-    found = sought(problem, landscape.x)
+    found = allowed_forms(problem, landscape.x)
     rivals = rivals_of(problem, found)
     settled = _settled(problem, landscape, window, found, rivals)
     if not settled:
@@ -156,7 +163,7 @@ def candidates(problem: Problem, landscape: Landscape, window: Window) -> list[C
     settled = _no_parameters(landscape, settled, rivals)
     least = max(best_score - KEPT - RELATIVE * abs(best_score), -CLEARLY)
     kept = [entry for entry in settled if entry[2] > least][: _affordable(landscape)]
-    kept += holding(problem, settled[len(kept) :]) if kept else []
+    kept += threshold_like(problem, settled[len(kept) :]) if kept else []
     return [
         Candidate(component_of(problem, window, *guess, pair), rivals.of(guess[0]), rivals.lies(guess[0]))
         for guess, pair, _ in kept
@@ -165,11 +172,11 @@ def candidates(problem: Problem, landscape: Landscape, window: Window) -> list[C
 
 
 def _settled(
-    problem: Problem, landscape: Landscape, window: Window, found: list[Structure], rivals: Rivals
+    problem: Problem, landscape: LinearResponse, window: Window, found: list[CandidateForm], rivals: Rivals
 ) -> list[Settled]:
     """The structures with the best inner numbers that swarms find, the best first; swarms fly for the leaders only."""
     guesses, amplitudes, scores = screened(landscape, problem, found, FINE)
-    leaders: dict[Structure, list[int]] = {}
+    leaders: dict[CandidateForm, list[int]] = {}
     for index in np.argsort(-scores, kind="stable").tolist():
         leaders.setdefault(guesses[index][0], []).append(index)
     still = [places[0] for entry, places in leaders.items() if entry.model.inner is None]
@@ -178,7 +185,7 @@ def _settled(
     if flown:
         begun = [(entry, np.array([guesses[place][1] for place in places[:PEAKS]]), _step(entry, landscape.x))
                  for entry, places in flown]  # fmt: skip
-        inner = fly(landscape, begun, problem.swarm, problem.seed + window.index)
+        inner = pso_search(landscape, begun, problem.swarm, problem.seed + window.index)
         arrived = [(entry, value) for (entry, _), value in zip(flown, inner, strict=True)]
         gains = evaluated(landscape, arrived)
         reached = scores_of(landscape, arrived, gains.gain, rivals)
@@ -186,39 +193,39 @@ def _settled(
     return sorted(settled, key=lambda entry: -entry[2])
 
 
-def _no_parameters(landscape: Landscape, settled: list[Settled], rivals: Rivals) -> list[Settled]:
+def _no_parameters(landscape: LinearResponse, settled: list[Settled], rivals: Rivals) -> list[Settled]:
     """Without components that do what a parameter would do; a sensor that lies may."""
     single = [len(guess[0].model.phases) == 1 for guess, _, _ in settled]
     heights = np.concatenate([pair[:1] if one else pair for (_, pair, _), one in zip(settled, single, strict=True)])
-    same = landscape.is_parameter(shapes(iter(guess for guess, _, _ in settled)), heights)
+    same = landscape.is_parameter(basis_functions(iter(guess for guess, _, _ in settled)), heights)
     first = np.cumsum([0, *(1 if one else 2 for one in single[:-1])]).tolist()
     return [entry for entry, at in zip(settled, first, strict=True) if rivals.lies(entry[0][0]) or not same[at]]
 
 
-def _affordable(landscape: Landscape) -> int:
+def _affordable(landscape: LinearResponse) -> int:
     """How many candidates are polished: fewer in large windows, so that a search ends before the next one."""
     return int(np.clip(TRIED * WORTH / max(landscape.objective.work, 1), FEWEST, TRIED))
 
 
-def holding(problem: Problem, rest: list[Settled]) -> list[Settled]:
+def threshold_like(problem: Problem, rest: list[Settled]) -> list[Settled]:
     """Of each site the best family that the linear picture underrates, of a state of the twin."""
-    states = {entry.name for entry in plain(problem).states}
+    states = {entry.name for entry in base_model(problem).states}
     found: dict[int, Settled] = {}
     for entry in rest:
         structure = entry[0][0]
-        if structure.model.holds and sources(plain(problem))[structure.source].name in states:
+        if structure.model.holds and sources(base_model(problem))[structure.source].name in states:
             found.setdefault(structure.site, entry)
     return list(found.values())
 
 
-def _step(structure: Structure, x: Array) -> float:
+def _step(structure: CandidateForm, x: Array) -> float:
     points = grid(structure, x, FINE)
     return float(np.diff(points).min()) if len(points) > 1 else float(np.ptp(structure.bounds))
 
 
-def component_of(problem: Problem, window: Window, structure: Structure, inner: float, pair: Array) -> Component:
+def component_of(problem: Problem, window: Window, structure: CandidateForm, inner: float, pair: Array) -> Component:
     """The component of a structure with its inner number and the amplitudes (2,) of the linear picture."""
-    twin = plain(problem)
+    twin = base_model(problem)
     first, second = map(float, pair)
     two = len(structure.model.phases) > 1
     return Component(

@@ -16,10 +16,10 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.discovery.candidates import CLEARLY
-from otolith.discovery.hypotheses import Hypothesis
+from otolith.discovery.hypotheses import TrackedHypothesis
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import plain
-from otolith.estimation.imm_filter import overall
+from otolith.estimation.augmented import base_model
+from otolith.estimation.imm_filter import moment_match
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
 from otolith.twin.augmentation import ELAPSED
@@ -80,7 +80,7 @@ def moves(problem: Problem, situation: Situation) -> Iterator[Move]:
     period = situation.records * situation.sample_period / records
     share = np.arange(records) / records
     for size in SHARES:
-        for column, entry in enumerate(plain(problem).inputs):
+        for column, entry in enumerate(base_model(problem).inputs):
             here, there = _ends(entry, float(situation.inputs[column]), size)
             step = f"a step of {entry.name} from {here:.3g} to {there:.3g} {entry.unit}"
             swing = f"swinging {entry.name} between {here:.3g} and {there:.3g} {entry.unit}"
@@ -136,7 +136,7 @@ ENOUGH = 2.0 * CLEARLY  # in χ² between the answers: what would decide with so
 HIDDEN = "no move of one input tells them apart: look at the sensors and the machine itself"
 
 
-def deciding(first: Hypothesis, second: Hypothesis, situation: Situation) -> str:
+def deciding_experiment(first: TrackedHypothesis, second: TrackedHypothesis, situation: Situation) -> str:
     """The smallest move that would tell ``first`` from ``second``, as a sentence."""
     for move in moves(first.problem, situation):
         if _distance(first, second, situation, move) >= ENOUGH:
@@ -144,7 +144,7 @@ def deciding(first: Hypothesis, second: Hypothesis, situation: Situation) -> str
     return HIDDEN
 
 
-def _distance(first: Hypothesis, second: Hypothesis, situation: Situation, move: Move) -> float:
+def _distance(first: TrackedHypothesis, second: TrackedHypothesis, situation: Situation, move: Move) -> float:
     noise = np.array(first.problem.noise)
     one, slopes = _answer(first, situation, move)
     two, _ = _answer(second, situation, move)
@@ -152,8 +152,8 @@ def _distance(first: Hypothesis, second: Hypothesis, situation: Situation, move:
     weighted = (slopes / noise[None, :, None]).reshape(len(difference), -1)
     if not (np.isfinite(difference).all() and np.isfinite(weighted).all()):
         return 0.0
-    free, states = len(first.problem.free), len(plain(first.problem).states)
-    known = overall(first.belief, first.problem).covariance
+    free, states = len(first.problem.free), len(base_model(first.problem).states)
+    known = moment_match(first.belief, first.problem).covariance
     allowed = np.sqrt(np.maximum(np.diag(known)[:free], 0.0))
     rows = np.vstack([weighted, np.diag(np.concatenate([1.0 / np.maximum(allowed, 1e-30), np.zeros(states)]))])
     wanted = np.concatenate([difference, np.zeros(free + states)])
@@ -163,11 +163,11 @@ def _distance(first: Hypothesis, second: Hypothesis, situation: Situation, move:
     return float(left @ left)
 
 
-def _answer(hypothesis: Hypothesis, situation: Situation, move: Move) -> tuple[Array, Array]:
+def _answer(hypothesis: TrackedHypothesis, situation: Situation, move: Move) -> tuple[Array, Array]:
     """(records, outputs), and its derivatives (records, outputs, free + states)."""
-    problem, author = hypothesis.problem, plain(hypothesis.problem)
+    problem, author = hypothesis.problem, base_model(hypothesis.problem)
     twin = problem.twin
-    parameters, places = numbers_at(problem, overall(hypothesis.belief, problem).mean)
+    parameters, places = numbers_at(problem, moment_match(hypothesis.belief, problem).mean)
     records, own = len(move.inputs), len(author.inputs)
     period = situation.records * situation.sample_period / records
     inputs = np.zeros((records, len(twin.inputs)))

@@ -18,20 +18,20 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidates import Candidate
-from otolith.discovery.phase_tracking import Turned, left_out, turned
-from otolith.estimation.arrival_cost import Evidence, Informed, Prior, vague
-from otolith.estimation.augmented import completed, places
-from otolith.estimation.gauss_newton import Polished, polish
-from otolith.estimation.imm_filter import Belief, overall, rebased, updated, with_prior
+from otolith.discovery.phase_tracking import PhaseAdvance, phase_advance, without_slot
+from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior, initial_prior
+from otolith.estimation.augmented import augment, indices
+from otolith.estimation.gauss_newton import FitResult, gauss_newton
+from otolith.estimation.imm_filter import ImmPosterior, moment_match, remap_parameters, set_all_modes, update
 from otolith.estimation.information import inflation
-from otolith.estimation.objective import HOPELESS, Objective
+from otolith.estimation.objective import PENALTY, Objective
 from otolith.estimation.problem import Problem
 
 STEPS = 25  # of a polish
 HALVINGS = 20  # of amplitudes with which the twin diverges
 
 
-class Reason(StrEnum):
+class FaultType(StrEnum):
     """What kind of explanation it is."""
 
     NOTHING = "nothing has happened"
@@ -41,10 +41,10 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
+class FaultHypothesis:
     """What an explanation says has happened."""
 
-    reason: Reason
+    reason: FaultType
     name: str = ""
     """Of parameters, or the keys of components."""
     numbers: int = 0
@@ -55,22 +55,22 @@ class Claim:
     @property
     def odds(self) -> float:
         """-2 log of how likely it was beforehand: reasons are, and so are the claims of a reason."""
-        return 0.0 if self.reason is Reason.NOTHING else float(2.0 * np.log(3.0 * self.rivals))
+        return 0.0 if self.reason is FaultType.NOTHING else float(2.0 * np.log(3.0 * self.rivals))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Explanation:
+class FittedHypothesis:
     """One way to explain a window."""
 
-    claim: Claim
+    claim: FaultHypothesis
     problem: Problem
     prior: Prior
     """Of everything that is free in ``problem``, before the window."""
-    fit: Polished
-    informed: Informed
+    fit: FitResult
+    informed: MapObjective
 
     @property
-    def reason(self) -> Reason:
+    def reason(self) -> FaultType:
         """What kind of explanation it is."""
         return self.claim.reason
 
@@ -90,14 +90,14 @@ class Explanation:
         return float(self.chi_square / unexplained + claim.numbers * np.log(records) + claim.odds)
 
 
-def unexplained(chi_squares: Iterable[float], records: float) -> float:
+def residual_variance_factor(chi_squares: Iterable[float], records: float) -> float:
     """How many times the noise (variance) even the best explanation leaves; at least one."""
     return max(min(chi_squares) / records, 1.0)
 
 
-def extended(prior: Prior, problem: Problem, wider: Problem) -> Prior:
+def extend_prior(prior: Prior, problem: Problem, wider: Problem) -> Prior:
     """What is known of ``problem``, and nothing of the numbers that ``wider`` has in addition."""
-    found, more = vague(wider), len(wider.free)
+    found, more = initial_prior(wider), len(wider.free)
     order = [entry.name for entry in wider.free]
     places = [order.index(entry.name) for entry in problem.free]
     places += [more + place for place in places]
@@ -107,11 +107,11 @@ def extended(prior: Prior, problem: Problem, wider: Problem) -> Prior:
 
 
 def with_candidate(
-    base: Problem, window: Window, prior: Prior, added: Candidate, before: Explanation | None = None
-) -> Explanation:
+    base: Problem, window: Window, prior: Prior, added: Candidate, before: FittedHypothesis | None = None
+) -> FittedHypothesis:
     """``base`` with one component more; ``before`` is its own explanation, from where the polish begins."""
-    wider = completed(base, [added.component])
-    wide = extended(prior, base, wider)
+    wider = augment(base, [added.component])
+    wide = extend_prior(prior, base, wider)
     start = wide.mean.copy()
     if before is not None:
         order = [entry.name for entry in wider.free]
@@ -120,36 +120,36 @@ def with_candidate(
     claimed = [entry.key for entry in wider.components]
     numbers = len(wider.free) - len(base.free) + (0 if before is None else before.claim.numbers)
     rivals = added.rivals * (1.0 if before is None else before.claim.rivals)
-    reason = Reason.SENSOR if added.of_sensor else Reason.COMPONENT
-    return explanation(Claim(reason, " and ".join(claimed), numbers, rivals), wider, window, wide, start)
+    reason = FaultType.SENSOR if added.of_sensor else FaultType.COMPONENT
+    return fit_hypothesis(FaultHypothesis(reason, " and ".join(claimed), numbers, rivals), wider, window, wide, start)
 
 
-def explanation(
-    claim: Claim, problem: Problem, window: Window, prior: Prior, start: Array | None = None
-) -> Explanation:
+def fit_hypothesis(
+    claim: FaultHypothesis, problem: Problem, window: Window, prior: Prior, start: Array | None = None
+) -> FittedHypothesis:
     """How ``problem`` explains ``window``; ``start`` (free parameters, ...) is where the polish begins."""
     free = len(problem.free)
     begin = np.clip((prior.mean if start is None else start)[:free], *problem.bounds)
     objective = Objective(problem, window, begin)
-    informed = Informed(objective, problem, prior)
+    informed = MapObjective(objective, problem, prior)
     first = objective.guess(begin)[free:]
-    amplitudes = [places(problem, slot)[0] for slot in range(len(problem.components))]
+    amplitudes = [indices(problem, slot)[0] for slot in range(len(problem.components))]
     for _ in range(HALVINGS):  # an amplitude of the linear picture may be too much for the twin itself
-        if not amplitudes or objective.cost(np.concatenate([begin, first])[None])[0] < HOPELESS:
+        if not amplitudes or objective.cost(np.concatenate([begin, first])[None])[0] < PENALTY:
             break
         begin[amplitudes] *= 0.5
-    fit = polish(informed, informed.guess(begin, first), STEPS)
-    return Explanation(claim, problem, prior, fit, informed)
+    fit = gauss_newton(informed, informed.guess(begin, first), STEPS)
+    return FittedHypothesis(claim, problem, prior, fit, informed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hypothesis:
+class TrackedHypothesis:
     """One explanation, and what it knows. Plain: it pickles."""
 
-    claim: Claim
+    claim: FaultHypothesis
     problem: Problem
-    belief: Belief
-    turned: Turned
+    belief: ImmPosterior
+    turned: PhaseAdvance
     deviance: float
     """-2 log evidence of all windows so far, over that of the best."""
     cost: float
@@ -158,7 +158,7 @@ class Hypothesis:
     """Whether what it left of the last window looked like noise."""
 
     @property
-    def reason(self) -> Reason:
+    def reason(self) -> FaultType:
         """What kind of explanation it is."""
         return self.claim.reason
 
@@ -166,44 +166,46 @@ class Hypothesis:
 SHARPEST = 1e7  # times what was known: a window that claims to say more says it where the twin all but diverges
 
 
-def is_usable(claim: Claim, belief: Belief, evidence: Evidence, problem: Problem) -> bool:
+def is_usable(claim: FaultHypothesis, belief: ImmPosterior, evidence: Evidence, problem: Problem) -> bool:
     """Whether a belief can be updated by that evidence without losing all digits; that nothing has happened always."""
-    if claim.reason is Reason.NOTHING:
+    if claim.reason is FaultType.NOTHING:
         return True
-    deviations = np.sqrt(np.diag(overall(belief, problem).covariance))
+    deviations = np.sqrt(np.diag(moment_match(belief, problem).covariance))
     return bool((np.abs(evidence.root) * deviations < SHARPEST).all())  # not a number is not smaller either
 
 
-def begun(found: Explanation, problem: Problem, expected: Belief, window: Window, deviance: float) -> Hypothesis | None:
+def begun(
+    found: FittedHypothesis, problem: Problem, expected: ImmPosterior, window: Window, deviance: float
+) -> TrackedHypothesis | None:
     """After its first window; ``expected`` is what was known of ``problem``, carried to its end.
 
     Returns:
         None if the window cannot be used with it: its twin all but diverges.
     """
     evidence, last = evidence_of(found)
-    belief = with_prior(rebased(expected, problem, found.problem), found.prior, found.problem)
+    belief = set_all_modes(remap_parameters(expected, problem, found.problem), found.prior, found.problem)
     if not is_usable(found.claim, belief, evidence, found.problem):
         return None
-    belief = updated(belief, evidence, found.problem)
-    after = turned(found.problem, window, last)
-    return Hypothesis(found.claim, found.problem, belief, after, deviance, cost_of(found))
+    belief = update(belief, evidence, found.problem)
+    after = phase_advance(found.problem, window, last)
+    return TrackedHypothesis(found.claim, found.problem, belief, after, deviance, cost_of(found))
 
 
-def evidence_of(found: Explanation) -> tuple[Evidence, Array]:
+def evidence_of(found: FittedHypothesis) -> tuple[Evidence, Array]:
     """What the window says, and the state (states,) at its last record."""
     informed, cost = found.informed, cost_of(found)
     grown = inflation(informed.whitened(found.fit), cost)
     return informed.evidence(found.fit, grown), informed.last_state(found.fit)
 
 
-def cost_of(found: Explanation) -> float:
+def cost_of(found: FittedHypothesis) -> float:
     """RMSE over noise that it leaves."""
     return float(np.sqrt(found.informed.chi_square(found.fit) / found.informed.count))
 
 
-def occam(belief: Belief, evidence: Evidence, problem: Problem) -> float:
+def occam(belief: ImmPosterior, evidence: Evidence, problem: Problem) -> float:
     """How little the hypothesis said beforehand of what the window then said, as -2 log evidence."""
-    known = overall(belief, problem).covariance
+    known = moment_match(belief, problem).covariance
     seen = evidence.root @ known @ evidence.root.T
     return float(np.linalg.slogdet(np.eye(len(seen)) + seen)[1])
 
@@ -212,9 +214,9 @@ NOTICED = 4.0  # standard deviations: nearer to nothing, neither component nor c
 BETTER = 4.0  # in -2 log evidence, of one window: nearer to nothing, it told for nobody
 
 
-def with_content(found: list[Hypothesis], deviances: list[float]) -> list[Hypothesis]:
+def prune(found: list[TrackedHypothesis], deviances: list[float]) -> list[TrackedHypothesis]:
     """Without those that say by now that nothing has happened, and explained the window no better than that."""
-    at = next((at for at, entry in enumerate(found) if entry.reason is Reason.NOTHING), None)
+    at = next((at for at, entry in enumerate(found) if entry.reason is FaultType.NOTHING), None)
     if at is None:
         return found
     calm = found[at]
@@ -225,7 +227,7 @@ def with_content(found: list[Hypothesis], deviances: list[float]) -> list[Hypoth
     ]
 
 
-def pruned(entry: Hypothesis) -> Hypothesis:
+def pruned(entry: TrackedHypothesis) -> TrackedHypothesis:
     """Without components that do not carry their weight beside others (the paper's "deactivated")."""
     problem = entry.problem
     if len(problem.components) < 2:
@@ -234,22 +236,22 @@ def pruned(entry: Hypothesis) -> Hypothesis:
     weakest = int(np.argmin(carried_by))
     if carried_by[weakest] >= NOTICED:
         return entry
-    problem, belief, turn = left_out(problem, entry.belief, entry.turned, weakest)
+    problem, belief, turn = without_slot(problem, entry.belief, entry.turned, weakest)
     claim = entry.claim
-    if claim.reason in (Reason.COMPONENT, Reason.SENSOR):  # the others are not about what is in the twin
+    if claim.reason in (FaultType.COMPONENT, FaultType.SENSOR):  # the others are not about what is in the twin
         claim = replace(claim, name=" and ".join(component.key for component in problem.components))
     return replace(entry, claim=claim, problem=problem, belief=belief, turned=turn)
 
 
-def _weights(problem: Problem, belief: Belief) -> Array:
+def _weights(problem: Problem, belief: ImmPosterior) -> Array:
     """(components,) amplitudes of the components in the twin of ``problem``, in their standard deviations."""
-    known = overall(belief, problem)
+    known = moment_match(belief, problem)
     deviations = np.sqrt(np.diag(known.covariance))
-    amplitudes = [places(problem, slot)[0] for slot in range(len(problem.components))]
+    amplitudes = [indices(problem, slot)[0] for slot in range(len(problem.components))]
     return np.abs(known.mean[amplitudes]) / deviations[amplitudes]
 
 
-def _says_nothing(entry: Hypothesis, calm: Hypothesis) -> bool:
+def _says_nothing(entry: TrackedHypothesis, calm: TrackedHypothesis) -> bool:
     """Whether it is by now no different from ``calm``, in what it has added to the twin and in what it has freed."""
     known, together = ([component.key for component in each.problem.components] for each in (calm, entry))
     if together[: len(known)] != known:  # it says that one has gone
@@ -258,9 +260,9 @@ def _says_nothing(entry: Hypothesis, calm: Hypothesis) -> bool:
     return bool((more < NOTICED).all() and (_shifts(entry, calm) < NOTICED).all())
 
 
-def _shifts(entry: Hypothesis, calm: Hypothesis) -> Array:
+def _shifts(entry: TrackedHypothesis, calm: TrackedHypothesis) -> Array:
     """(parameters,) how far its parameters, those of ``calm``, are from there, in standard deviations."""
-    own, other = overall(entry.belief, entry.problem), overall(calm.belief, calm.problem)
+    own, other = moment_match(entry.belief, entry.problem), moment_match(calm.belief, calm.problem)
     expected = {name: (value, 0.0) for name, value in calm.problem.known}
     for at, parameter in enumerate(calm.problem.free):
         expected[parameter.name] = float(other.mean[at]), float(other.covariance[at, at])

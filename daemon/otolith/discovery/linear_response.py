@@ -12,25 +12,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.arrival_cost import Informed, Prior
-from otolith.estimation.augmented import driven, plain
+from otolith.estimation.arrival_cost import MapObjective, Prior
+from otolith.estimation.augmented import base_model, input_matrix
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem, key_of
 from otolith.twin.augmentation import Source, sites, sources, with_slots
-from otolith.twin.component_families import METAMODELS, Kind, MetaModel, code_of
+from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, Kind, code_of
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import Correction, Excitation, Linear, Numbers, kernel_of
+from otolith.twin.kernel import Excitation, InnovationModel, Linear, Numbers, kernel_of
 
 SENSOR_FAMILIES = frozenset({"constant", "linear"})  # an offset and a gain
 
 
 @dataclass(frozen=True, slots=True)
-class Structure:
+class CandidateForm:
     """A component without its numbers."""
 
     site: int
     """Number of the site."""
-    model: MetaModel
+    model: ComponentFamily
     source: int
     """Number of the source."""
     bounds: tuple[float, float] = (0.0, 0.0)
@@ -38,7 +38,7 @@ class Structure:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shapes:
+class BasisFunctions:
     """Curves of components of unit amplitude; those of one guess follow each other."""
 
     families: Array
@@ -53,20 +53,20 @@ class Shapes:
     """(curves,)."""
 
 
-def structures(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[Structure]:
+def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[CandidateForm]:
     """All that can be told from each other where the sources are ``x`` (sources, records); ``twin`` is the author's.
 
     Those whose keys are ``taken`` are left out.
     """
     known = [
         (model, number, source, _bounds(model, x[number]))
-        for model in METAMODELS
+        for model in COMPONENT_FAMILIES
         for number, source in enumerate(sources(twin))
         if source.kind in model.inputs and model.valid(x[number])
     ]
     own = len(twin.sites)
     return [
-        Structure(index, model, number, bounds)
+        CandidateForm(index, model, number, bounds)
         for index, site in enumerate(sites(twin))
         for model, number, source, bounds in known
         if (index < own or _lies_so(model, source, site.into))
@@ -74,20 +74,20 @@ def structures(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) 
     ]
 
 
-def _bounds(model: MetaModel, x: Array) -> tuple[float, float]:
+def _bounds(model: ComponentFamily, x: Array) -> tuple[float, float]:
     if model.given is not None:
         return model.given(x), model.given(x)
     return (0.0, 0.0) if model.inner is None else model.inner.bounds(x)
 
 
-def _lies_so(model: MetaModel, source: Source, signal: str) -> bool:
+def _lies_so(model: ComponentFamily, source: Source, signal: str) -> bool:
     """A sensor has an offset, or a gain that is off."""
     if model.name not in SENSOR_FAMILIES:
         return False
     return source.kind is Kind.NOTHING or source.name == signal
 
 
-def grid(structure: Structure, x: Array, fineness: float) -> Array:
+def grid(structure: CandidateForm, x: Array, fineness: float) -> Array:
     """(points,) of the inner number from which a search begins; ``x`` (sources, records)."""
     inner = structure.model.inner
     low, high = structure.bounds
@@ -100,7 +100,7 @@ def grid(structure: Structure, x: Array, fineness: float) -> Array:
     return np.arange(low, high, width)
 
 
-def shapes(guesses: Iterator[tuple[Structure, float]]) -> Shapes:
+def basis_functions(guesses: Iterator[tuple[CandidateForm, float]]) -> BasisFunctions:
     """One curve for each guess, or two where the phase is free."""
     rows = [
         (code_of(entry.model.name), entry.source, entry.site, inner, phase)
@@ -109,7 +109,7 @@ def shapes(guesses: Iterator[tuple[Structure, float]]) -> Shapes:
     ]
     columns = np.array(rows, dtype=np.float64).reshape(-1, 5).T
     families, numbers, places, inner, phases = columns
-    return Shapes(families, numbers.astype(np.int64), places.astype(np.int64), inner, phases)
+    return BasisFunctions(families, numbers.astype(np.int64), places.astype(np.int64), inner, phases)
 
 
 FEW = 6  # records by which the size of a nudge is found
@@ -121,7 +121,7 @@ GONE = 1e-6  # of a response that is left beside what parameters do: it is one o
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gains:
+class ScoreStatistics:
     """What each guess would gain."""
 
     gain: Array
@@ -130,14 +130,14 @@ class Gains:
     """(guesses, 2): of each of its curves; zero for a second one that it does not have."""
 
 
-class Landscape:
+class LinearResponse:
     """One window's residual and responses, around what was known of the parameters."""
 
     def __init__(self, problem: Problem, window: Window, prior: Prior, start: Array) -> None:
         """``start`` (free parameters,) is what the twin is linearised around."""
         begin = np.clip(start, *problem.bounds)
         self.objective = Objective(problem, window, begin)
-        informed = Informed(self.objective, problem, prior)
+        informed = MapObjective(self.objective, problem, prior)
         guess = informed.guess(begin, self.objective.guess(begin)[len(begin) :])
         residuals, jacobian = informed.linearised(guess)
         own = len(residuals) - len(prior.mean)  # the rest is what the prior says
@@ -152,8 +152,8 @@ class Landscape:
         self._problem, self._window, self._guess = problem, window, guess
         self._linear, self._correction = self._linearise(guess)
 
-    def _linearise(self, guess: Array) -> tuple[Linear, Correction]:
-        twin, objective, free = plain(self._problem), self.objective, len(self._problem.free)
+    def _linearise(self, guess: Array) -> tuple[Linear, InnovationModel]:
+        twin, objective, free = base_model(self._problem), self.objective, len(self._problem.free)
         slotted = with_slots(twin)
         self._kernel = kernel_of(slotted)
         parameters = np.zeros(len(slotted.parameters))
@@ -164,7 +164,7 @@ class Landscape:
         initial[: len(states)] = states
         extra = len(slotted.states) - len(states)
         gain = np.pad(objective.correction.gain, ((0, 0), (0, extra), (0, 0)))
-        excitation = replace(objective.excitation, inputs=driven(slotted, self._window), gain=gain)
+        excitation = replace(objective.excitation, inputs=input_matrix(slotted, self._window), gain=gain)
         linear = self._kernel.along(parameters, initial, excitation, self._nudge(parameters, initial, excitation))
         inputs = [self._window.column(entry.name) for entry in twin.inputs]
         shown = [entry.name for entry in twin.outputs]
@@ -202,7 +202,7 @@ class Landscape:
 
     def _nudge(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
         """(sites,) large enough against rounding, and small enough for what is not linear."""
-        count = len(sites(plain(self._problem)))
+        count = len(sites(base_model(self._problem)))
         few = replace(
             excitation,
             inputs=excitation.inputs[:FEW],
@@ -216,7 +216,7 @@ class Landscape:
         effect = np.maximum(effect, (np.abs(tried.through).max(axis=0) * SLIGHT / noise).max(axis=0))
         return np.asarray(SLIGHT / np.maximum(effect, 1e-12))
 
-    def responses(self, shapes: Shapes) -> Array:
+    def responses(self, shapes: BasisFunctions) -> Array:
         """(residuals, curves)."""
         curves = self._kernel.curves(shapes.families, self.x, shapes.sources, shapes.inner, shapes.phases)
         return self._kernel.respond(self._linear, self._correction, self.objective.present, curves, shapes.sites)
@@ -235,12 +235,12 @@ class Landscape:
         columns = np.where(objective.present[..., None], slopes[:, :, [order.index(name) for name in names]], 0.0)
         return np.asarray(np.matmul(objective.whitening, columns).reshape(-1, len(names)))
 
-    def is_parameter(self, shapes: Shapes, amplitudes: Array) -> Mask:
+    def is_parameter(self, shapes: BasisFunctions, amplitudes: Array) -> Mask:
         """(curves,) which of them, ``amplitudes`` (curves,) high, do just what a parameter within its bounds would do.
 
         They are none but that.
         """
-        entries = plain(self._problem).parameters
+        entries = base_model(self._problem).parameters
         names = [entry.name for entry in entries]
         parameters, curves = self._of_parameters(names), self.responses(shapes)
         sizes = np.outer(np.linalg.norm(parameters, axis=0), np.linalg.norm(curves, axis=0))
@@ -255,7 +255,7 @@ class Landscape:
         reached = (low <= now + step) & (now + step <= high)
         return np.asarray(((alike > SAME) & (apart < UNTOLD) & reached).any(axis=0))
 
-    def gains(self, responses: Array, pairs: Array) -> Gains:
+    def gains(self, responses: Array, pairs: Array) -> ScoreStatistics:
         """Of ``responses`` (residuals, curves), where ``pairs`` (guesses, 2) says which curves belong together.
 
         A guess of one curve has it twice.
@@ -279,4 +279,4 @@ class Landscape:
             gain = one * along[first] + two * along[second]
         fine = np.isfinite(gain) & np.isfinite(one) & np.isfinite(two) & (inverse > 1e-9)
         found = np.where(fine, gain, 0.0)
-        return Gains(found, np.where(fine[:, None], np.column_stack([one, two]), 0.0))
+        return ScoreStatistics(found, np.where(fine[:, None], np.column_stack([one, two]), 0.0))

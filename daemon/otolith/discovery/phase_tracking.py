@@ -10,8 +10,8 @@ from typing import TypeVar
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.estimation.augmented import places, plain, source_of, without
-from otolith.estimation.imm_filter import Belief, pinned, rebased
+from otolith.estimation.augmented import base_model, indices, source_of, without
+from otolith.estimation.imm_filter import ImmPosterior, remap_parameters, reset_marginal
 from otolith.estimation.problem import Component, Problem
 
 HALF = 0.5  # of a sampling period: what a window may begin late or early and follow its predecessor
@@ -21,7 +21,7 @@ UNKNOWN = np.pi / np.sqrt(3.0)  # rad: standard deviation of a phase of which no
 
 
 @dataclass(frozen=True, slots=True)
-class Turned:
+class PhaseAdvance:
     """What the sources of components have done from the first record of a window to that of the next."""
 
     start: float
@@ -32,15 +32,15 @@ class Turned:
     """Of each slot, in the unit of its source."""
 
 
-Turn = TypeVar("Turn", Turned, Turned | None)
+Turn = TypeVar("Turn", PhaseAdvance, PhaseAdvance | None)
 
 
-def turned(problem: Problem, window: Window, last_state: Array) -> Turned:
+def phase_advance(problem: Problem, window: Window, last_state: Array) -> PhaseAdvance:
     """``last_state`` (states,) is that at the last record."""
     names = [entry.name for entry in problem.twin.states]
     found = []
     for component in problem.components:
-        symbol = source_of(plain(problem), component.source).symbol
+        symbol = source_of(base_model(problem), component.source).symbol
         if component.source == "t":
             found.append(window.records * window.sample_period)
         elif component.repeats and symbol.startswith("_"):
@@ -48,10 +48,12 @@ def turned(problem: Problem, window: Window, last_state: Array) -> Turned:
             found.append(float(last_state[names.index(symbol)] + speed * window.sample_period))
         else:
             found.append(0.0)
-    return Turned(window.start, window.end, tuple(found))
+    return PhaseAdvance(window.start, window.end, tuple(found))
 
 
-def moved_on(belief: Belief, problem: Problem, before: Turned | None, window: Window) -> Belief:
+def propagate_phases(
+    belief: ImmPosterior, problem: Problem, before: PhaseAdvance | None, window: Window
+) -> ImmPosterior:
     """The belief with phases at the first record of ``window``."""
     if before is None:
         return belief
@@ -59,18 +61,18 @@ def moved_on(belief: Belief, problem: Problem, before: Turned | None, window: Wi
     for slot, (component, by) in enumerate(zip(problem.components, before.by, strict=True)):
         if not component.repeats:
             continue
-        if component.source == "t" and _is_known(belief, problem, places(problem, slot), window.start - before.start):
-            belief = _turned_by(belief, problem, places(problem, slot), window.start - before.start)
+        if component.source == "t" and _is_known(belief, problem, indices(problem, slot), window.start - before.start):
+            belief = _turned_by(belief, problem, indices(problem, slot), window.start - before.start)
         elif component.source == "t":
-            belief = lost(belief, problem, places(problem, slot)[-1])
+            belief = phase_unknown(belief, problem, indices(problem, slot)[-1])
         elif follows:
-            belief = _turned_by(belief, problem, places(problem, slot), by)
-        elif source_of(plain(problem), component.source).symbol.startswith("_"):
-            belief = lost(belief, problem, places(problem, slot)[-1])
+            belief = _turned_by(belief, problem, indices(problem, slot), by)
+        elif source_of(base_model(problem), component.source).symbol.startswith("_"):
+            belief = phase_unknown(belief, problem, indices(problem, slot)[-1])
     return belief
 
 
-def _turned_by(belief: Belief, problem: Problem, where: list[int], by: float) -> Belief:
+def _turned_by(belief: ImmPosterior, problem: Problem, where: list[int], by: float) -> ImmPosterior:
     _, inner, phase = where
     free = len(problem.free)
     move = np.eye(2 * free)
@@ -81,35 +83,35 @@ def _turned_by(belief: Belief, problem: Problem, where: list[int], by: float) ->
     return replace(belief, mean=mean, covariance=move @ belief.covariance @ move.T)
 
 
-def _is_known(belief: Belief, problem: Problem, where: list[int], by: float) -> bool:
+def _is_known(belief: ImmPosterior, problem: Problem, where: list[int], by: float) -> bool:
     """Whether a phase can still be told after so much time; not if the clock has been set back."""
     inner = where[1]
     sd = float(np.sqrt(belief.covariance[:, inner, inner].max())) * problem.scale[inner]
     return by >= 0.0 and sd * by < UNKNOWN
 
 
-def is_lost(belief: Belief, problem: Problem) -> list[int]:
+def unknown_phases(belief: ImmPosterior, problem: Problem) -> list[int]:
     """Where in a guess the phases are of which nothing is known."""
-    phases = [places(problem, slot)[-1] for slot, entry in enumerate(problem.components) if entry.repeats]
+    phases = [indices(problem, slot)[-1] for slot, entry in enumerate(problem.components) if entry.repeats]
     known = np.sqrt(belief.covariance[0].diagonal()[: len(problem.free)]) * problem.scale
     return [phase for phase in phases if known[phase] > HARDLY]
 
 
-def lost(belief: Belief, problem: Problem, phase: int) -> Belief:
+def phase_unknown(belief: ImmPosterior, problem: Problem, phase: int) -> ImmPosterior:
     """The belief where nothing is known of a phase any more."""
-    return pinned(belief, phase, UNKNOWN / problem.scale[phase])
+    return reset_marginal(belief, phase, UNKNOWN / problem.scale[phase])
 
 
-def left_out(problem: Problem, belief: Belief, turn: Turn, slot: int) -> tuple[Problem, Belief, Turn]:
+def without_slot(problem: Problem, belief: ImmPosterior, turn: Turn, slot: int) -> tuple[Problem, ImmPosterior, Turn]:
     """Twin, knowledge and turns without the component of a slot; what stays keeps its numbers."""
     fewer = without(problem, problem.components[slot])
-    rest = rebased(belief, problem, fewer)
+    rest = remap_parameters(belief, problem, fewer)
     if turn is not None:
         turn = replace(turn, by=tuple(by for index, by in enumerate(turn.by) if index != slot))
     return fewer, rest, turn
 
 
-def outlived(problem: Problem, window: Window) -> list[Component]:
+def expired(problem: Problem, window: Window) -> list[Component]:
     """Components that ran away with time: what goes on for longer is a trend of a parameter, and a clock may be set."""
     return [
         entry

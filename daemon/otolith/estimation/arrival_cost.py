@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.estimation.gauss_newton import Polished
+from otolith.estimation.gauss_newton import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 
@@ -82,7 +82,7 @@ class Evidence:
     """(2 free,)."""
 
 
-def vague(problem: Problem) -> Prior:
+def initial_prior(problem: Problem) -> Prior:
     """All that is known before the first window: the machine file's values and bounds."""
     low, high = problem.bounds
     deviations = np.concatenate([(high - low) / np.sqrt(12.0), FASTEST * problem.scale])
@@ -96,7 +96,7 @@ def whitening(covariance: Array) -> Array:
     return np.asarray(np.linalg.inv(factor) / size)
 
 
-def without_states(rows: Array, slopes: Array) -> Array:
+def eliminate_states(rows: Array, slopes: Array) -> Array:
     """``rows`` (residuals, columns) less all that the initial state could make of them.
 
     ``slopes`` (residuals, states) are of the residuals by the initial state, in shares of what it may be.
@@ -106,7 +106,7 @@ def without_states(rows: Array, slopes: Array) -> Array:
     return np.asarray(rows - seen @ (seen.T @ rows))
 
 
-class Informed:
+class MapObjective:
     """The objective of a window together with the prior; a guess is parameters at the end, trends, initial state."""
 
     def __init__(self, objective: Objective, problem: Problem, prior: Prior) -> None:
@@ -131,7 +131,7 @@ class Informed:
         off = self._root @ (guess[:count] - self._mean)
         return np.concatenate([residuals, off]), np.vstack([jacobian, believed])
 
-    def chi_square(self, fit: Polished) -> float:
+    def chi_square(self, fit: FitResult) -> float:
         """Of the window alone."""
         own = fit.residuals[: -len(self._mean)]
         return float(own @ own)
@@ -141,26 +141,26 @@ class Informed:
         """Measured records of all outputs."""
         return self._objective.count
 
-    def whitened(self, fit: Polished) -> Array:
+    def whitened(self, fit: FitResult) -> Array:
         """(records, outputs) what is left of the window, in units of the noise."""
         return fit.residuals[: -len(self._mean)].reshape(self._objective.measured.shape)
 
-    def last_state(self, fit: Polished) -> Array:
+    def last_state(self, fit: FitResult) -> Array:
         """(states,) at the last record."""
         return self._objective.followed(fit.guess)[1]
 
-    def evidence(self, fit: Polished, grown: float) -> Evidence:
+    def evidence(self, fit: FitResult, grown: float) -> Evidence:
         """What the window says around ``fit``, with standard deviations ``grown`` by what is left unexplained."""
         count = len(self._mean)
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
         both = np.column_stack([jacobian[:, :count], residuals, self._bends(fit)])
-        both = without_states(both, jacobian[:, count:] * (self.high - self.low)[count:])
+        both = eliminate_states(both, jacobian[:, count:] * (self.high - self.low)[count:])
         directions, triangle = np.linalg.qr(both[:, :count])
         rest = directions.T @ both[:, count:]
         root, rest = discounted(triangle / grown, rest[:, 0] / grown, rest[:, 1:])
         return Evidence(fit.guess[:count], root, rest)
 
-    def _bends(self, fit: Polished) -> Array:
+    def _bends(self, fit: FitResult) -> Array:
         """(residuals, directions) how the window bends away from the linear picture around ``fit``."""
         count = len(self._mean)
         free = count // 2

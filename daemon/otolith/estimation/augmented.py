@@ -38,18 +38,18 @@ def source_of(twin: Definition, name: str) -> Source:
     return next(entry for entry in sources(twin) if entry.name == name)
 
 
-def plain(problem: Problem) -> Definition:
+def base_model(problem: Problem) -> Definition:
     """The author's twin."""
     return problem.twin.plain or problem.twin
 
 
-def completed(problem: Problem, components: Sequence[Component]) -> Problem:
+def augment(problem: Problem, components: Sequence[Component]) -> Problem:
     """The problem with ``components`` in its twin, in addition to those it has; their numbers are free.
 
     Raises:
         ValueError: there are more than a twin has slots.
     """
-    twin, together = plain(problem), (*problem.components, *components)
+    twin, together = base_model(problem), (*problem.components, *components)
     if len(together) > SLOTS:
         raise ValueError(f"{len(together)} components: a twin has {SLOTS} slots")
     free = [entry for entry in problem.free if not entry.name.startswith("_")]
@@ -66,12 +66,12 @@ def without(problem: Problem, gone: Component) -> Problem:
     rest = [entry for entry in problem.components if entry is not gone]
     bare = replace(
         problem,
-        twin=plain(problem),
+        twin=base_model(problem),
         components=(),
         free=tuple(entry for entry in problem.free if not entry.name.startswith("_")),
         known=tuple(entry for entry in problem.known if not entry[0].startswith("_")),
     )
-    return completed(bare, rest) if rest else bare
+    return augment(bare, rest) if rest else bare
 
 
 def _settings(twin: Definition, slot: int, component: Component) -> dict[str, float]:
@@ -98,13 +98,13 @@ def _numbers(twin: Definition, slot: int, component: Component) -> list[Paramete
     return found
 
 
-def places(problem: Problem, slot: int) -> list[int]:
+def indices(problem: Problem, slot: int) -> list[int]:
     """Where in a guess the numbers of a slot are: amplitude, then inner number and phase if it has them."""
     names = [entry.name for entry in problem.free]
     return [names.index(name) for name in numbers(slot) if name in names]
 
 
-def shifts(problem: Problem, window: Window) -> dict[str, float]:
+def time_offsets(problem: Problem, window: Window) -> dict[str, float]:
     """The settings that count time from the origins of the components."""
     found = {}
     for slot, component in enumerate(problem.components):
@@ -113,7 +113,7 @@ def shifts(problem: Problem, window: Window) -> dict[str, float]:
     return found
 
 
-def driven(twin: Definition, window: Window) -> Array:
+def input_matrix(twin: Definition, window: Window) -> Array:
     """(records, inputs) of a twin, slotted or not."""
     columns = [np.zeros((window.records, 0))]
     for entry in twin.inputs:

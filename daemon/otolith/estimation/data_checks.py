@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.objective import Objective, quantum
+from otolith.estimation.objective import Objective, adc_step
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
 
@@ -32,7 +32,7 @@ STUCK = 0.05  # share of records beyond which a channel is not believed
 FAR = 6.0  # standard deviations that the twin must move, or be away, while the channel stands still
 
 
-def stuck(problem: Problem, window: Window, parameters: Array) -> list[str]:
+def frozen_channels(problem: Problem, window: Window, parameters: Array) -> list[str]:
     """Which channels stand still while the twin, with ``parameters`` (free,), moves; a sentence for each."""
     found = []
     told: Array | None = None
@@ -44,7 +44,7 @@ def stuck(problem: Problem, window: Window, parameters: Array) -> list[str]:
         if told is None:
             objective = Objective(replace(problem, open_loop=True), window, parameters)
             told = objective.simulate(objective.guess(parameters))
-        far = FAR * problem.noise[index] + 2.0 * quantum(values)
+        far = FAR * problem.noise[index] + 2.0 * adc_step(values)
         lies = [run for run in runs if _disagrees(told[run, index], float(values[run.start]), far)]
         if sum(run.stop - run.start for run in lies) > STUCK * window.records:
             beyond = np.concatenate([told[run, index] for run in lies]) - values[lies[0].start]
@@ -82,10 +82,10 @@ UNMOVED = 0.3  # share of the records beside the runs in which a sensor repeats,
 FEW = 2.0  # least steps, that a coarse sensor usually moves by
 
 
-def counted_twice(window: Window, twin: Definition) -> tuple[Window, list[str]]:
+def drop_repeats(window: Window, twin: Definition) -> tuple[Window, list[str]]:
     """The window with the outputs of repeated records missing, and what there is to say of it."""
     measured = np.isin(window.signals, [entry.name for entry in twin.outputs])
-    repeated = repeats(window, measured)
+    repeated = repeated_records(window, measured)
     count = int(repeated.sum())
     if not count:
         return window, []
@@ -93,7 +93,7 @@ def counted_twice(window: Window, twin: Definition) -> tuple[Window, list[str]]:
     return replace(window, missing=window.missing | (repeated[:, None] & measured)), [note]
 
 
-def repeats(window: Window, measured: Mask) -> Mask:
+def repeated_records(window: Window, measured: Mask) -> Mask:
     """(records,) which records are within a long run of the same that is no chance; neither its first nor its last.
 
     ``measured`` (signals,) are the sensors.
@@ -128,7 +128,7 @@ USUAL = 1.4826  # median absolute deviation of a normal distribution of unit var
 SECOND = 1.2247  # standard deviation of the second difference of unit noise: the root of 3/2
 
 
-def without_spikes(window: Window, twin: Definition, noise: tuple[float, ...]) -> tuple[Window, list[str], list[str]]:
+def drop_spikes(window: Window, twin: Definition, noise: tuple[float, ...]) -> tuple[Window, list[str], list[str]]:
     """The window with spikes missing; what there is to say of it; and why it should not be estimated from.
 
     ``noise`` is of the outputs. Commands (``zoh`` inputs) may jump as they like.
@@ -139,7 +139,7 @@ def without_spikes(window: Window, twin: Definition, noise: tuple[float, ...]) -
     notes, vetoes = [], []
     for name, level in levels.items():
         column = window.signals.index(name)
-        found = spikes(window.values[:, column], level) & ~window.missing[:, column]
+        found = spike_records(window.values[:, column], level) & ~window.missing[:, column]
         count = int(found.sum())
         if not count:
             continue
@@ -154,7 +154,7 @@ def without_spikes(window: Window, twin: Definition, noise: tuple[float, ...]) -
     return (window if values is window.values else replace(window, values=values, missing=missing)), notes, vetoes
 
 
-def spikes(values: Array, noise: float) -> Mask:
+def spike_records(values: Array, noise: float) -> Mask:
     """(records,) which of ``values`` (records,) are spikes over a ``noise`` of this standard deviation."""
     found = np.zeros(len(values), dtype=np.bool_)
     if len(values) < 5:

@@ -28,7 +28,7 @@ class LeastSquares(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Polished:
+class FitResult:
     """Where Gauss-Newton came to rest."""
 
     guess: Array
@@ -42,7 +42,7 @@ class Polished:
     converged: bool
 
 
-def polish(objective: LeastSquares, start: Array, steps: int = STEPS) -> Polished:
+def gauss_newton(objective: LeastSquares, start: Array, steps: int = STEPS) -> FitResult:
     """The minimum of χ² that ``start`` (guess,) leads to; ``start`` itself where no step improves it."""
     low, high = objective.low, objective.high
     guess = np.minimum(np.maximum(start, low), high)
@@ -73,7 +73,7 @@ def polish(objective: LeastSquares, start: Array, steps: int = STEPS) -> Polishe
             damping = max(100.0 * damping, FIRST_DAMPING)
             if converged or damping > MOST_DAMPING:
                 break
-    return Polished(guess, chi_square, jacobian, residuals, evaluations, converged)
+    return FitResult(guess, chi_square, jacobian, residuals, evaluations, converged)
 
 
 def _step(residuals: Array, jacobian: Array, guess: Array, objective: LeastSquares, damping: float) -> Array:

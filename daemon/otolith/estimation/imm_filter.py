@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
-from otolith.estimation.arrival_cost import Evidence, Prior, vague
+from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
 from otolith.estimation.problem import Problem
 
 MEMORY = 300.0  # s: a trend that nothing confirms dies away, so that no held value runs off
 
 
-def motion(passed: float) -> tuple[Array, Array]:
+def process_model(passed: float) -> tuple[Array, Array]:
     """Transition and noise (per unit of agitation) of value and trend over ``passed`` s.
 
     The trend is an Ornstein-Uhlenbeck process, the value its integral (C. W. Gardiner, Stochastic Methods, section
@@ -40,10 +40,10 @@ def motion(passed: float) -> tuple[Array, Array]:
     return np.array([[1.0, run], [0.0, fade]]), noise
 
 
-AGITATIONS = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: how much a trend strays, in shares of the parameter
+TREND_NOISE = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: how much a trend strays, in shares of the parameter
 STAY = 0.97  # probability that from one window to the next the same model holds
 CALMEST = 1  # levels under the liveliest parameter's
-LIVELIEST = len(AGITATIONS) - 1
+LIVELIEST = len(TREND_NOISE) - 1
 FIRST_LEVEL = 2
 CALMER = 1.5  # how much likelier a calmer model must be to be believed: calm is the assumption that does harm
 NEWCOMER = 0.02  # weight of a model that comes into the bank
@@ -58,7 +58,7 @@ Levels = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Belief:
+class ImmPosterior:
     """What is known of parameters and trends, in shares of the parameters' sizes; plain, so that it pickles."""
 
     level: Levels
@@ -71,20 +71,20 @@ class Belief:
     """(models,) probabilities."""
     end: float
     """Unix seconds of the last record that it is about; minus infinity before the first window."""
-    scatter: float = 1.0
+    variance_ratio: float = 1.0
     """How much more windows differ from each other than they say themselves (variance): one if all is well."""
 
 
-def begin_belief(problem: Problem) -> Belief:
+def initial_posterior(problem: Problem) -> ImmPosterior:
     """Before the first window."""
-    prior, size = vague(problem), _size(problem)
+    prior, size = initial_prior(problem), _size(problem)
     free = len(problem.free)
     level = _around(np.full(free, FIRST_LEVEL))
     mean = np.tile(prior.mean / size, (len(level), 1))
     covariance = np.tile(prior.covariance / np.outer(size, size), (len(level), 1, 1))
     trends = np.arange(free, 2 * free)
-    covariance[:, trends, trends] = AGITATIONS[level] ** 2 * MEMORY / 2.0
-    return Belief(level, mean, covariance, np.full(len(level), 1.0 / len(level)), -np.inf)
+    covariance[:, trends, trends] = TREND_NOISE[level] ** 2 * MEMORY / 2.0
+    return ImmPosterior(level, mean, covariance, np.full(len(level), 1.0 / len(level)), -np.inf)
 
 
 def _around(centre: Levels) -> Levels:
@@ -101,34 +101,34 @@ def _around(centre: Levels) -> Levels:
     return np.array(list({tuple(model.tolist()): None for model in bank}))  # each once, the centre first
 
 
-def carried(belief: Belief, end: float) -> Belief:
+def predict(belief: ImmPosterior, end: float) -> ImmPosterior:
     """The belief at a later time (Unix s): values run on along their trends, and everything becomes less certain."""
     if not np.isfinite(belief.end):
         return replace(belief, end=end)
     if end <= belief.end:  # a clock that was set back tells nothing
         return belief
-    belief = _mixed(belief)
+    belief = _mix(belief)
     free = belief.mean.shape[1] // 2
-    transition, noise = motion(min(end - belief.end, LONGEST_GAP))
-    move, strays = _per_parameter(transition, np.ones(free)), _per_parameter(noise, AGITATIONS[belief.level] ** 2)
+    transition, noise = process_model(min(end - belief.end, LONGEST_GAP))
+    move, strays = _per_parameter(transition, np.ones(free)), _per_parameter(noise, TREND_NOISE[belief.level] ** 2)
     covariance = move @ belief.covariance @ move.T + strays
     return replace(belief, mean=belief.mean @ move.T, covariance=covariance, end=end)
 
 
-def overall(belief: Belief, problem: Problem) -> Prior:
+def moment_match(belief: ImmPosterior, problem: Problem) -> Prior:
     """All models as one normal distribution, in the units of the parameters."""
     size = _size(problem)
     mean, covariance = _moments(belief)
     return Prior(mean * size, covariance * np.outer(size, size))
 
 
-def _moments(belief: Belief) -> tuple[Array, Array]:
+def _moments(belief: ImmPosterior) -> tuple[Array, Array]:
     mean = belief.weight @ belief.mean
     off = belief.mean - mean
     return mean, np.einsum("m,mij->ij", belief.weight, belief.covariance + off[:, :, None] * off[:, None, :])
 
 
-def _recentred(belief: Belief) -> Belief:
+def _recentred(belief: ImmPosterior) -> ImmPosterior:
     """The bank around its likeliest model."""
     calmer = (belief.level < belief.level[0]).any(axis=1)
     best = int(np.where(calmer, belief.weight / CALMER, belief.weight).argmax())
@@ -148,15 +148,15 @@ def _recentred(belief: Belief) -> Belief:
     )
 
 
-def surprise(belief: Belief, evidence: Evidence, problem: Problem) -> float:
+def nis(belief: ImmPosterior, evidence: Evidence, problem: Problem) -> float:
     """Squared distance of a window from what was expected, under the model that takes it best: χ² of 2 free degrees."""
-    _, foretold, innovation = _foretold(belief, evidence, problem)
+    _, foretold, innovation = _innovation(belief, evidence, problem)
     return float(np.einsum("mi,mij,mj->m", innovation, np.linalg.inv(foretold), innovation).min())
 
 
-def rebased(belief: Belief, problem: Problem, other: Problem) -> Belief:
+def remap_parameters(belief: ImmPosterior, problem: Problem, other: Problem) -> ImmPosterior:
     """The belief for another choice of free parameters: what both have is kept, and nothing known of what is new."""
-    fresh, (mean, covariance) = begin_belief(other), _moments(belief)
+    fresh, (mean, covariance) = initial_posterior(other), _moments(belief)
     order = {entry.label: index for index, entry in enumerate(problem.free)}  # slots may have changed their places
     both = [(order[entry.label], index) for index, entry in enumerate(other.free) if entry.label in order]
     old, new = (np.array(part, dtype=np.int64) for part in (zip(*both, strict=True) if both else ((), ())))
@@ -171,17 +171,17 @@ def rebased(belief: Belief, problem: Problem, other: Problem) -> Belief:
     begun_covariance[new, :] = begun_covariance[:, new] = 0.0
     begun_covariance[np.ix_(new, new)] = covariance[np.ix_(old, old)] * np.outer(ratio, ratio)
     count = len(level)
-    return Belief(
+    return ImmPosterior(
         level,
         np.tile(begun_mean, (count, 1)),
         np.tile(begun_covariance, (count, 1, 1)),
         np.full(count, 1.0 / count),
         belief.end,
-        belief.scatter,
+        belief.variance_ratio,
     )
 
 
-def pinned(belief: Belief, at: int, sd: float, value: float | None = None) -> Belief:
+def reset_marginal(belief: ImmPosterior, at: int, sd: float, value: float | None = None) -> ImmPosterior:
     """The belief where of number ``at`` (in shares) no more is known than ``sd``, nor of what goes with it."""
     mean, covariance = belief.mean.copy(), belief.covariance.copy()
     if value is not None:
@@ -191,16 +191,16 @@ def pinned(belief: Belief, at: int, sd: float, value: float | None = None) -> Be
     return replace(belief, mean=mean, covariance=covariance)
 
 
-def with_prior(belief: Belief, prior: Prior, problem: Problem) -> Belief:
+def set_all_modes(belief: ImmPosterior, prior: Prior, problem: Problem) -> ImmPosterior:
     """The belief with ``prior`` under every model of change."""
     size, models = _size(problem), len(belief.weight)
     mean = np.tile(prior.mean / size, (models, 1))
     return replace(belief, mean=mean, covariance=np.tile(prior.covariance / np.outer(size, size), (models, 1, 1)))
 
 
-def updated(belief: Belief, evidence: Evidence, problem: Problem) -> Belief:
+def update(belief: ImmPosterior, evidence: Evidence, problem: Problem) -> ImmPosterior:
     """The belief after a window; ``belief`` has been carried to its end."""
-    root, foretold, innovation = _foretold(belief, evidence, problem)
+    root, foretold, innovation = _innovation(belief, evidence, problem)
     inverse = np.linalg.inv(foretold)
     gain = belief.covariance @ root.T @ inverse
     distance = np.einsum("mi,mij,mj->m", innovation, inverse, innovation)
@@ -211,29 +211,31 @@ def updated(belief: Belief, evidence: Evidence, problem: Problem) -> Belief:
     likelihood = -0.5 * (distance + np.linalg.slogdet(foretold)[1])
     weight = belief.weight * np.exp(likelihood - likelihood.max())
     weight = np.maximum(weight / weight.sum(), LEAST_WEIGHT)
-    scatter = _scattered(belief.scatter, float(distance.min()) / len(root))
-    learned = Belief(belief.level, mean, covariance, weight / weight.sum(), belief.end, scatter)
+    variance_ratio = _scattered(belief.variance_ratio, float(distance.min()) / len(root))
+    learned = ImmPosterior(belief.level, mean, covariance, weight / weight.sum(), belief.end, variance_ratio)
     return _recentred(learned)
 
 
-def contradicted(belief: Belief, surprise_per_degree: float) -> Belief:
+def inflate_variance(belief: ImmPosterior, surprise_per_degree: float) -> ImmPosterior:
     """The belief after a window that disagreed with those before it and those after it: windows scatter that much."""
-    return replace(belief, scatter=belief.scatter * float(np.clip(surprise_per_degree / CLIPPED, 1.0, CONTRADICTION)))
+    return replace(
+        belief, variance_ratio=belief.variance_ratio * float(np.clip(surprise_per_degree / CLIPPED, 1.0, CONTRADICTION))
+    )
 
 
-def _foretold(belief: Belief, evidence: Evidence, problem: Problem) -> tuple[Array, Array, Array]:
+def _innovation(belief: ImmPosterior, evidence: Evidence, problem: Problem) -> tuple[Array, Array, Array]:
     """The window's root in shares, and per model its innovation's covariance and the innovation."""
     size = _size(problem)
-    grown = np.sqrt(belief.scatter)
+    grown = np.sqrt(belief.variance_ratio)
     root = evidence.root * size / grown
     foretold = np.eye(len(root)) + root @ belief.covariance @ root.T
     innovation = evidence.rest / grown + (belief.mean - evidence.point / size) @ root.T
     return root, foretold, innovation
 
 
-def _scattered(scatter: float, surprise_per_degree: float) -> float:
+def _scattered(variance_ratio: float, surprise_per_degree: float) -> float:
     change = 1.0 + SCATTER_MEMORY * (min(surprise_per_degree, CLIPPED) - 1.0)
-    return float(np.clip(scatter * change, 1.0, MOST_SCATTER))
+    return float(np.clip(variance_ratio * change, 1.0, MOST_SCATTER))
 
 
 def _per_parameter(block: Array, weight: Array) -> Array:
@@ -244,7 +246,7 @@ def _per_parameter(block: Array, weight: Array) -> Array:
     return found
 
 
-def _mixed(belief: Belief) -> Belief:
+def _mix(belief: ImmPosterior) -> ImmPosterior:
     """Models change into each other with a small probability, so that none dies out."""
     models = len(belief.weight)
     change = np.full((models, models), (1.0 - STAY) / (models - 1))

@@ -115,7 +115,7 @@ def inflation(residuals: Array, cost: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class AccuracyTarget:
     """What is asked of one parameter, and where its best value lies."""
 
     half_width: float
@@ -124,7 +124,9 @@ class Wanted:
     at_bound: bool
 
 
-def classify(found: Information, index: int, names: Sequence[str], wanted: Wanted) -> tuple[Identifiability, str]:
+def classify(
+    found: Information, index: int, names: Sequence[str], wanted: AccuracyTarget
+) -> tuple[Identifiability, str]:
     """The verdict on parameter ``index`` and what to say of it."""
     reach = QUANTILE * found.sd[index]
     if wanted.at_bound and reach <= PUSHED * wanted.half_width:

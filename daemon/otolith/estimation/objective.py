@@ -12,13 +12,15 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.augmented import driven, shifts
+from otolith.estimation.augmented import input_matrix, time_offsets
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import MOST_SUBSTEPS, Correction, Excitation, Kernel, Noise, kernel_of
+from otolith.twin.kernel import MOST_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
 
 
-def predictor(kernel: Kernel, parameters: Array, initial: Array, excitation: Excitation, noise: Noise) -> Correction:
+def predictor(
+    kernel: Kernel, parameters: Array, initial: Array, excitation: Excitation, noise: NoiseModel
+) -> InnovationModel:
     """Along the window, around ``parameters`` (parameters,) and the initial state (states,).
 
     A twin that diverges there, or that nothing disturbs, runs in open loop.
@@ -30,7 +32,7 @@ def predictor(kernel: Kernel, parameters: Array, initial: Array, excitation: Exc
     return open_loop(kernel, excitation, noise)
 
 
-def open_loop(kernel: Kernel, excitation: Excitation, noise: Noise) -> Correction:
+def open_loop(kernel: Kernel, excitation: Excitation, noise: NoiseModel) -> InnovationModel:
     """Nothing is corrected, and each innovation is as uncertain as its sensor."""
     if excitation.measured is None:
         raise ValueError("a predictor needs measurements")
@@ -38,13 +40,13 @@ def open_loop(kernel: Kernel, excitation: Excitation, noise: Noise) -> Correctio
     scales = np.where(present, 1.0 / noise.outputs, 1.0)
     whitening = scales[:, :, None] * np.eye(len(noise.outputs))
     gain = np.zeros((len(excitation.inputs), len(kernel.definition.states), len(noise.outputs)))
-    return Correction(gain, whitening, float(-2.0 * np.log(scales).sum()))
+    return InnovationModel(gain, whitening, float(-2.0 * np.log(scales).sum()))
 
 
 EXPLAINED = 1.5  # cost up to which the residual counts as noise: an explanation that leaves more explains too little
 INITIAL_STATE_REACH = 10.0  # standard deviations around the first record, in which the twin may start at least
 TRUNCATION = 1e-3  # of the noise: how large the integrator's error may be
-HOPELESS = 1e30  # the cost of a guess whose prediction is not finite: worse than any other, and finite
+PENALTY = 1e30  # the cost of a guess whose prediction is not finite: worse than any other, and finite
 MOST_WITH_COMPONENTS = 8  # substeps: no number of them makes the step of dry friction smooth
 WHOLE = 0.01  # of a quantum: how far the steps between values may be from whole multiples of it
 FEWEST_LEVELS = 4  # that tell a converter's steps from a signal's own
@@ -70,7 +72,7 @@ class Objective:
         if problem.components:  # where a sensor that lies would have shown it, had it been right
             wider = np.where(highest > lowest, np.abs(self._first) + highest - lowest, 0.0)
             lowest, highest = lowest - wider, highest + wider
-        given = dict(problem.known) | shifts(problem, window)
+        given = dict(problem.known) | time_offsets(problem, window)
         self._template = np.array([given.get(entry.name, entry.nominal) for entry in twin.parameters])
         order = [entry.name for entry in twin.parameters[: len(twin.parameters) - twin.settings]]
         self._places = [order.index(entry.name) for entry in problem.free]
@@ -83,7 +85,7 @@ class Objective:
         self._open_loop, self._states = problem.open_loop, len(twin.states)
         self._most = MOST_SUBSTEPS if twin.plain is None else MOST_WITH_COMPONENTS
         self._plain = twin.plain or twin
-        self._excitation = Excitation(driven(twin, window), window.sample_period)
+        self._excitation = Excitation(input_matrix(twin, window), window.sample_period)
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
         self.centre(start, self._first if initial is None else initial)
 
@@ -102,7 +104,7 @@ class Objective:
         self.correction = made
         self._excitation = corrected
 
-    def _correction(self, parameters: Array, initial: Array, free: Excitation) -> Correction:
+    def _correction(self, parameters: Array, initial: Array, free: Excitation) -> InnovationModel:
         """Of the plain twin: what components add hardly changes by how much a prediction may be off."""
         twin = self._plain
         made_for = replace(free, inputs=free.inputs[:, : len(twin.inputs)])
@@ -173,7 +175,7 @@ class Objective:
             jacobian = -np.matmul(self.whitening, slopes).reshape(len(residuals), -1)
         if np.isfinite(residuals).all() and np.isfinite(jacobian).all():
             return residuals, jacobian
-        return np.full(len(residuals), HOPELESS / len(residuals)), np.zeros(jacobian.shape)
+        return np.full(len(residuals), PENALTY / len(residuals)), np.zeros(jacobian.shape)
 
     def predict(self, guesses: Array) -> Array:
         """(particles, guess) -> (particles, records, outputs), one step ahead, in the units of the twin."""
@@ -204,7 +206,7 @@ class Objective:
         with np.errstate(over="ignore", invalid="ignore"):
             errors = self.residuals(self.predict(guesses))
             cost = np.sqrt(np.einsum("pro,pro->p", errors, errors) / self.count)
-        return np.where(np.isfinite(cost), np.minimum(cost, HOPELESS), HOPELESS)
+        return np.where(np.isfinite(cost), np.minimum(cost, PENALTY), PENALTY)
 
     def rmse(self, predicted: Array) -> Array:
         """(records, outputs) -> (outputs,), each in its own unit, over the records that were measured."""
@@ -212,18 +214,18 @@ class Objective:
         counts = np.maximum(self.present.sum(axis=0), 1.0)
         return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
 
-    def _noise(self, problem: Problem) -> Noise:
+    def _noise(self, problem: Problem) -> NoiseModel:
         twin = problem.twin.plain or problem.twin
         columns = zip(self.measured.T, self.present.T, strict=True)
-        quanta = np.array([quantum(values[there]) for values, there in columns])
-        return Noise(
+        quanta = np.array([adc_step(values[there]) for values, there in columns])
+        return NoiseModel(
             outputs=np.sqrt(np.array(problem.noise) ** 2 + quanta**2 / 12.0),
             inputs=np.array(problem.input_noise or [0.0] * len(twin.inputs)),
             states=np.array(problem.process_noise or [0.0] * len(twin.states)),
         )
 
 
-def quantum(values: Array) -> float:
+def adc_step(values: Array) -> float:
     """The step of a converter behind ``values`` (n,), as its rounding adds a twelfth of its square; 0 if none is seen.
 
     (B. Widrow, I. Kollar, Quantization Noise, section 4.4.)

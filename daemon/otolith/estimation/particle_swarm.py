@@ -18,7 +18,7 @@ WIDE = 10.0  # ratio of the bounds from which on a parameter is searched for by 
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class SwarmResult:
     """Where a swarm came to rest."""
 
     places: Array
@@ -40,7 +40,7 @@ class _Bounded(PymooProblem):  # type: ignore[misc]  # pymoo has no types
         out["F"] = self._objective.cost_of_parameters(x)
 
 
-def search(objective: Objective, options: SwarmOptions, start: Array, seed: int) -> Found:
+def particle_swarm(objective: Objective, options: SwarmOptions, start: Array, seed: int) -> SwarmResult:
     """Where a swarm comes to rest within the bounds; ``start`` (free parameters,) is one of the first particles.
 
     The initial state is left to the polish: here every particle starts at the first record. The inertia weight adapts
@@ -63,7 +63,7 @@ def search(objective: Objective, options: SwarmOptions, start: Array, seed: int)
     costs = algorithm.pop.get("F")[:, 0]  # pymoo's population is each particle's best so far
     order = np.argsort(costs, kind="stable")
     places: Array = algorithm.pop.get("X")[order].copy()
-    return Found(places, float(costs[order[0]]), generations, algorithm.evaluator.n_eval, converged)
+    return SwarmResult(places, float(costs[order[0]]), generations, algorithm.evaluator.n_eval, converged)
 
 
 def scattered(low: Array, high: Array, count: int, seed: int) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.twin.component_families import MetaModel, metamodel
+from otolith.twin.component_families import ComponentFamily, family_of
 from otolith.twin.definition import Definition, Parameter
 
 
@@ -37,9 +37,9 @@ class Component:
         return key_of(self.site, self.family, self.source)
 
     @property
-    def model(self) -> MetaModel:
+    def model(self) -> ComponentFamily:
         """Its family."""
-        return metamodel(self.family)
+        return family_of(self.family)
 
     @property
     def repeats(self) -> bool:

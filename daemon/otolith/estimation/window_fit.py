@@ -5,21 +5,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.estimation.arrival_cost import Evidence, Informed, Prior, vague
-from otolith.estimation.augmented import places
-from otolith.estimation.gauss_newton import Polished, polish
+from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior, initial_prior
+from otolith.estimation.augmented import indices
+from otolith.estimation.gauss_newton import FitResult, gauss_newton
 from otolith.estimation.information import (
+    AccuracyTarget,
     Identifiability,
     Information,
     Outcome,
     ParameterEstimate,
-    Wanted,
     classify,
     inflation,
     information,
 )
 from otolith.estimation.objective import EXPLAINED, Objective
-from otolith.estimation.particle_swarm import Found, scattered, search
+from otolith.estimation.particle_swarm import SwarmResult, particle_swarm, scattered
 from otolith.estimation.problem import Problem
 
 AT_BOUND = 1e-4  # of the width of the bounds
@@ -71,7 +71,7 @@ def estimate(
     only looks for a better one if the floor does not explain the window. The same problem, window, start and prior give
     the same estimate, bit for bit.
     """
-    return _Fit(problem, window, start, prior or vague(problem)).run(warm=warm)
+    return _Fit(problem, window, start, prior or initial_prior(problem)).run(warm=warm)
 
 
 def refine(problem: Problem, window: Window, start: Array, prior: Prior) -> WindowEstimate:
@@ -85,7 +85,7 @@ class _Fit:
     def __init__(self, problem: Problem, window: Window, start: Array, prior: Prior) -> None:
         self._problem, self._window = problem, window
         self._objective = Objective(problem, window, start)
-        self._informed = Informed(self._objective, problem, prior)
+        self._informed = MapObjective(self._objective, problem, prior)
         self._generations = self._evaluations = 0
         first = self._objective.guess(start)
         self._fit = self._polish(self._informed.guess(start, first[len(start) :]))
@@ -103,8 +103,8 @@ class _Fit:
             outcome = Outcome.UNFINISHED
         return self._result(outcome)
 
-    def _polish(self, guess: Array) -> Polished:
-        found = polish(self._informed, guess)
+    def _polish(self, guess: Array) -> FitResult:
+        found = gauss_newton(self._informed, guess)
         self._evaluations += found.evaluations
         return found
 
@@ -113,13 +113,13 @@ class _Fit:
         best = min(self._alone.chi_square, self._informed.chi_square(self._fit))
         return float(np.sqrt(best / self._objective.count))
 
-    def _still(self, fit: Polished) -> Array:
+    def _still(self, fit: FitResult) -> Array:
         """A guess of the window alone: the parameters at its end, taken to hold throughout."""
         free = self._objective.free
         return np.concatenate([fit.guess[:free], fit.guess[2 * free :]])
 
-    def _window_alone(self) -> Polished:
-        found = polish(self._objective, self._still(self._fit), ALONE_STEPS)
+    def _window_alone(self) -> FitResult:
+        found = gauss_newton(self._objective, self._still(self._fit), ALONE_STEPS)
         self._evaluations += found.evaluations
         return found
 
@@ -141,7 +141,7 @@ class _Fit:
     def _search(self) -> Outcome:
         problem, objective, known = self._problem, self._objective, self._fit
         free = objective.free
-        searched = search(objective, problem.swarm, known.guess[:free], seed=problem.seed + self._window.index)
+        searched = particle_swarm(objective, problem.swarm, known.guess[:free], seed=problem.seed + self._window.index)
         self._generations = searched.generations
         self._evaluations += searched.evaluations
         found = self._best_of(searched)
@@ -159,7 +159,7 @@ class _Fit:
             return Outcome.AMBIGUOUS
         return Outcome.SWARM_WAS_BETTER if self._fit is found else Outcome.POLISH_WAS_BETTER
 
-    def _best_of(self, searched: Found) -> Polished:
+    def _best_of(self, searched: SwarmResult) -> FitResult:
         """The polished best of where the swarm came to rest and of starts all over the bounds.
 
         A swarm looks at parameters alone, from the first record on; where an initial state is not measured, or the
@@ -169,7 +169,7 @@ class _Fit:
         count = min(SCATTERED, SCATTERED * WORTH // max(objective.work, 1))
         spread = scattered(*problem.bounds, count, problem.seed + self._window.index)
         starts = (*searched.places[: PARTICLES if count else 1], *spread)
-        polished = [polish(objective, objective.guess(start), GLANCE) for start in starts]
+        polished = [gauss_newton(objective, objective.guess(start), GLANCE) for start in starts]
         self._evaluations += sum(found.evaluations for found in polished)
         best = min(polished, key=lambda found: found.chi_square)
         free = objective.free
@@ -198,7 +198,7 @@ class _Fit:
     def _bare(self, guess: Array) -> Array:
         """A guess without components: their amplitudes are zero."""
         problem, bare = self._problem, guess.copy()
-        bare[[places(problem, slot)[0] for slot in range(len(problem.components))]] = 0.0
+        bare[[indices(problem, slot)[0] for slot in range(len(problem.components))]] = 0.0
         return bare
 
     def _parameters(self, outcome: Outcome) -> tuple[ParameterEstimate, ...]:
@@ -208,7 +208,7 @@ class _Fit:
         found = []
         allowed = self._problem.determined_within * self._problem.scale
         for index, entry in enumerate(self._problem.free):
-            wanted = Wanted(float(allowed[index]), entry.unit, bool(at_bound[index]))
+            wanted = AccuracyTarget(float(allowed[index]), entry.unit, bool(at_bound[index]))
             verdict, reason = classify(self._told, index, objective.names, wanted)
             if outcome is Outcome.AMBIGUOUS and verdict is Identifiability.DETERMINED:
                 verdict, reason = Identifiability.WEAK, outcome.value

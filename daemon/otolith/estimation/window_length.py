@@ -18,7 +18,7 @@ SHORTENED = 0.5  # after a window in which something happened that the twin cann
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Need:
+class WindowExcitation:
     """What a window showed."""
 
     sd: Array
@@ -29,7 +29,7 @@ class Need:
     """Whether the twin leaves nothing but noise."""
 
 
-def next_records(options: WindowOptions, records: int, sample_period: float, need: Need) -> int:
+def next_records(options: WindowOptions, records: int, sample_period: float, need: WindowExcitation) -> int:
     """Records of the next window, after one of ``records`` that showed ``need``."""
     sd, trend, explained = need.sd, need.trend, need.explained
     if options.shortest >= options.longest:

@@ -11,10 +11,10 @@ from typing import Literal
 
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.discovery.adopted import Approval
-from otolith.discovery.hypotheses import Reason
-from otolith.discovery.sequential_test import Lesson
+from otolith.discovery.hypotheses import FaultType
+from otolith.discovery.sequential_test import WindowDecision
 from otolith.estimation.information import Identifiability, Outcome
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 
 
 class ComponentStatus(StrEnum):
@@ -26,7 +26,7 @@ class ComponentStatus(StrEnum):
     """It can hardly be seen any more."""
 
 
-class NumberDocument(Closed):
+class NumberDocument(StrictModel):
     """A number of a component."""
 
     value: float
@@ -37,15 +37,15 @@ class NumberDocument(Closed):
     unit: str
 
 
-class AlternativeDocument(Closed):
+class AlternativeDocument(StrictModel):
     """Another explanation, and how probable it is."""
 
-    reason: Reason
+    reason: FaultType
     text: str
     probability: float
 
 
-class ComponentDocument(Closed):
+class ComponentDocument(StrictModel):
     """A component that the twin lacked."""
 
     id: str
@@ -80,7 +80,7 @@ class Severity(StrEnum):
     FAULT = "fault"
 
 
-class FindingDocument(Closed):
+class FindingDocument(StrictModel):
     """What an operator should read."""
 
     id: str
@@ -108,7 +108,7 @@ class Status(StrEnum):
     """The windows contradict the twin or the bounds, and the reason says how; the value is the last that did not."""
 
 
-class QualityDocument(Closed):
+class QualityDocument(StrictModel):
     """How well the window was sampled."""
 
     verdict: Verdict
@@ -119,7 +119,7 @@ class QualityDocument(Closed):
     reasons: tuple[str, ...] = ()
 
 
-class WindowDocument(Closed):
+class WindowDocument(StrictModel):
     """Which stretch of time the report is about; start and end in Unix seconds."""
 
     index: int
@@ -129,7 +129,7 @@ class WindowDocument(Closed):
     quality: QualityDocument
 
 
-class ParameterDocument(Closed):
+class ParameterDocument(StrictModel):
     """One parameter: value, unit, uncertainty, status, reason."""
 
     value: float | None = None
@@ -154,7 +154,7 @@ class ParameterDocument(Closed):
     """What move of the machine would pin it down, if it is not."""
 
 
-class FitDocument(Closed):
+class FitDocument(StrictModel):
     """How well the twin explains the window; root mean square errors per output, in the output's unit."""
 
     rmse_configured: dict[str, float]
@@ -165,14 +165,14 @@ class FitDocument(Closed):
     """Whether the estimated twin leaves nothing but noise."""
     cost: float
     """RMSE of all outputs in units of their noise."""
-    scatter: float
+    variance_ratio: float
     """How much more windows differ from each other than each of them says, as a ratio of variances: one if all is well.
     """
     outcome: Outcome
     """How the search ended."""
 
 
-class CostDocument(Closed):
+class CostDocument(StrictModel):
     """What the report took."""
 
     seconds: float = 0.0
@@ -185,19 +185,19 @@ class CostDocument(Closed):
     """Whether it was asked what else could have happened: components, moved parameters, lying sensors."""
 
 
-class DriverDocument(Closed):
+class DriverDocument(StrictModel):
     """How the connection to the machine fares."""
 
     up: bool
     reason: str = ""
     """Why it is down."""
-    complaints: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     """What is wrong although it is up, a line each."""
     plan: str = ""
     """What is asked of the machine and what is achieved, where it is asked."""
 
 
-class CountersDocument(Closed):
+class CountersDocument(StrictModel):
     """What was received and what was lost since the daemon started: nothing is lost silently."""
 
     received: int = 0
@@ -218,7 +218,7 @@ class CountersDocument(Closed):
     """Windows that the recorder did not take in time."""
 
 
-class ReportDocument(Closed):
+class ReportDocument(StrictModel):
     """The document itself."""
 
     schema_: Literal["otolith.report/1"] = SCHEMA
@@ -228,7 +228,7 @@ class ReportDocument(Closed):
     model: str = "DT"
     """``DT`` the twin as configured, ``DT'`` with estimated parameters (the paper's names)."""
     window: WindowDocument
-    lesson: Lesson
+    decision: WindowDecision
     """What was made of the window."""
     parameters: dict[str, ParameterDocument]
     components: tuple[ComponentDocument, ...] = ()

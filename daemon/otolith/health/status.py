@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from otolith.discovery.sequential_test import TEACHING, Lesson
+from otolith.discovery.sequential_test import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE, Identifiability, ParameterEstimate
 from otolith.health.schema import ParameterDocument, Status
 from otolith.twin.definition import Parameter
@@ -17,7 +17,7 @@ HOUR = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Fused:
+class MarginalPosterior:
     """What all windows together say of a parameter at the end of the last."""
 
     value: float
@@ -30,7 +30,7 @@ class Fused:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class PreviousStatus:
     """What was said of a parameter last."""
 
     known: bool = False
@@ -39,16 +39,16 @@ class Standing:
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class WindowEvidence:
     """What a window brought."""
 
     estimate: ParameterEstimate | None = None
     """What it alone says; None for one that was not estimated from."""
-    lesson: Lesson = Lesson.BAD
+    decision: WindowDecision = WindowDecision.BAD
     """What was made of it."""
     contradictions: int = 0
     """Windows in a row that contradict twin or belief, this one included."""
-    scatter: float = 1.0
+    variance_ratio: float = 1.0
     """How much more windows differ from each other than each of them says (variance)."""
     reason: str = ""
     """What there is to say of the window as a whole."""
@@ -61,12 +61,12 @@ class Heard:
     @property
     def taught(self) -> bool:
         """Whether what is known has changed by it."""
-        return self.estimate is not None and self.lesson in TEACHING
+        return self.estimate is not None and self.decision in ACCEPTED
 
 
 def publish(
-    parameter: Parameter, allowed: float, fused: Fused, heard: Heard, before: Standing
-) -> tuple[Standing, ParameterDocument]:
+    parameter: Parameter, allowed: float, fused: MarginalPosterior, heard: WindowEvidence, before: PreviousStatus
+) -> tuple[PreviousStatus, ParameterDocument]:
     """What is said of a parameter, whose 95 % interval is to reach ``allowed`` to each side at most."""
     reach = QUANTILE * fused.sd
     width = parameter.high - parameter.low
@@ -79,7 +79,7 @@ def publish(
     alone = estimate if estimate is not None and _says_something(estimate, width) else None
     value = min(max(fused.value, parameter.low), parameter.high)
     shown = known and math.isfinite(value + reach + HOUR * (fused.trend + fused.trend_sd))
-    return Standing(known, status), ParameterDocument(
+    return PreviousStatus(known, status), ParameterDocument(
         value=value if shown else None,
         unit=parameter.unit,
         sd=fused.sd if shown else None,
@@ -87,7 +87,7 @@ def publish(
         high=value + reach if shown else None,
         nominal=parameter.nominal,
         raw=None if alone is None else alone.value,
-        raw_sd=None if alone is None else alone.sd * math.sqrt(heard.scatter),
+        raw_sd=None if alone is None else alone.sd * math.sqrt(heard.variance_ratio),
         trend_per_hour=HOUR * fused.trend if shown else None,
         trend_sd_per_hour=HOUR * fused.trend_sd if shown else None,
         status=status,
@@ -97,8 +97,10 @@ def publish(
     )
 
 
-def _status(known: bool, allowed: float, fused: Fused, heard: Heard, before: Standing) -> Status:
-    if heard.contradictions >= INVALID_AFTER and heard.lesson in (Lesson.SUSPECTED, Lesson.REFUSED):
+def _status(
+    known: bool, allowed: float, fused: MarginalPosterior, heard: WindowEvidence, before: PreviousStatus
+) -> Status:
+    if heard.contradictions >= INVALID_AFTER and heard.decision in (WindowDecision.SUSPECTED, WindowDecision.REFUSED):
         return Status.INVALID
     estimate = heard.estimate
     if heard.at_bound:

@@ -16,7 +16,7 @@ def summary(document: ReportDocument) -> str:
     parts += [f"{finding.severity}: {finding.text}" for finding in document.findings]
     if document.driver is not None:
         parts += [] if document.driver.up else [f"no connection: {document.driver.reason}"]
-        parts += document.driver.complaints[:1]
-        more = len(document.driver.complaints) - 1
+        parts += document.driver.warnings[:1]
+        more = len(document.driver.warnings) - 1
         parts += [f"and {more} more like that"] if more > 0 else []
     return ", ".join(parts)

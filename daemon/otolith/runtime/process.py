@@ -39,7 +39,7 @@ def _enter(connection: Any, main: str, arguments: Sequence[Any]) -> None:
         getattr(import_module(module), function)(connection, *arguments)
 
 
-class Companion:
+class ChildProcess:
     """Runs ``main``, written ``module:function``, as ``function(connection, *arguments)`` in a process.
 
     Only the companion imports the module. At most ``room`` messages wait for it.

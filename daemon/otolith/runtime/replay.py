@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 from otolith.acquisition.playback import OUTAGE, Playback, usual_step
 from otolith.acquisition.window import Array, Verdict, Window
-from otolith.adaptation.state import State, begin
+from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.health.schema import CountersDocument, Report
-from otolith.machine import NamedDriver, Plan, named_driver
+from otolith.machine import LoadedMachine, NamedDriver, named_driver
 from otolith.runtime.worker import Task, perform
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from otolith.publishing.recorder import Recording
 
 
-def open_recorded(plan: Plan, data: Path) -> Reader:
+def open_recorded(plan: LoadedMachine, data: Path) -> Reader:
     """The signals of the twin of ``plan`` in ``data``.
 
     A log of a bus is decoded by what the machine file says of it; a table and a recording need no more than the names
@@ -55,13 +55,13 @@ def open_recorded(plan: Plan, data: Path) -> Reader:
         return format_of(data).open_log(data, driver.setup, driver.options)
 
 
-def _by_name(plan: Plan, data: Path) -> Reader:
+def _by_name(plan: LoadedMachine, data: Path) -> Reader:
     format_ = format_of(data)
     signals = tuple(Signal(name, plan.twin.unit_of(name), format_.Source()) for name in plan.twin.signals)
     return format_.open_log(data, Setup(signals, plan.path.parent, plan.file.window.sample_period), None)
 
 
-def _as_replayed(driver: NamedDriver, plan: Plan, data: Path) -> Reader:
+def _as_replayed(driver: NamedDriver, plan: LoadedMachine, data: Path) -> Reader:
     from otolith_drivers.replay.driver import opener  # noqa: PLC0415 - only for a machine file that names it
 
     if format_of(data) is not format_of(driver.options.file) and not holds_frames(data):
@@ -73,7 +73,7 @@ def _as_replayed(driver: NamedDriver, plan: Plan, data: Path) -> Reader:
 TICK = 0.1  # s; how late a stop can be noticed
 
 
-class Pace:
+class RealTimePacer:
     """The data's clock beside the computer's. A long silence is passed over here, too."""
 
     def __init__(self, stopped: Callable[[], bool]) -> None:
@@ -102,7 +102,7 @@ class Replay:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: LoadedMachine,
         data: Reader,
         stopped: Stopped = lambda: False,
         wait: Callable[[Window], None] | None = None,
@@ -113,7 +113,7 @@ class Replay:
         self._wait = wait
         self._length = window.length
         self._playback = Playback(plan.twin.signals, plan.records, window.sample_period, plan.limits)
-        self._state = begin(machine.name, machine.site, plan.problem)
+        self._state = initial_state(machine.name, machine.site, plan.problem)
         self._windows = self._windows_bad = self._missed = 0
 
     def reports(self) -> Iterator[Report]:
@@ -181,24 +181,24 @@ class Replay:
         )
 
     @property
-    def state(self) -> State:
+    def state(self) -> AdaptationState:
         """After the last window."""
         return self._state
 
     def summary(self) -> str:
         """How much was read."""
         counts = self._playback.counts
-        first, *rest = self._data.found()
+        first, *rest = self._data.summary_lines()
         parts = ", ".join([first, f"{counts.reordered} reordered", *rest])
         return f"{parts}; {counts.received} samples, {counts.lost + self._data.lost} lost"
 
-    def complaints(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What a user should know of the file before trusting the reports, a line each."""
         counts, place = self._playback.counts, self._data.place
         lines = []
         if self._stopped():
             lines.append(f"interrupted after {self._data.progress:.0%} of the file")
-        lines += self._data.complaints()
+        lines += self._data.warnings()
         if counts.first_late is not None:
             line, time, latest = counts.first_late
             first = f"the first in {place} {line}, with t = {time:.12g} after t = {latest:.12g} above"
@@ -214,13 +214,13 @@ class Replay:
     def _why_none(self) -> str:
         rows = self._playback.counts.rows
         what = f"{rows} {'row makes' if rows == 1 else 'rows make'} no window of {self._length:g} s"
-        return "; ".join([f"{what}: record for longer, or shorten [window] length", *self.complaints()])
+        return "; ".join([f"{what}: record for longer, or shorten [window] length", *self.warnings()])
 
 
 class ReplayRecorder:
     """The ``.rrd`` file, begun with the first report; nothing without a path."""
 
-    def __init__(self, path: Path | None, plan: Plan) -> None:
+    def __init__(self, path: Path | None, plan: LoadedMachine) -> None:
         self._path = path
         self._plan = plan
         self._recording: Recording | None = None

@@ -21,13 +21,20 @@ from types import FrameType
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
-from otolith.adaptation.state import Decisions, begin, decided, kept, regridded, restored
+from otolith.adaptation.state import (
+    OperatorDecisions,
+    apply_decisions,
+    component_records,
+    initial_state,
+    restore_components,
+    with_sample_grid,
+)
 from otolith.health.schema import CountersDocument, DriverDocument, Report
 from otolith.health.text import summary
-from otolith.machine import Plan, recording_folder
+from otolith.machine import LoadedMachine, recording_folder
 from otolith.publishing.zenoh_session import Publisher
-from otolith.runtime.process import SIGNALS, Companion
-from otolith.runtime.state_store import Housekeeper, Keeper
+from otolith.runtime.process import SIGNALS, ChildProcess
+from otolith.runtime.state_store import StateStore, WriterThread
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILING, Supervisor
 from otolith_drivers.errors import OtolithError
@@ -52,7 +59,9 @@ THRIVES = 60.0  # s after which a recorder counts as healthy
 class Service:
     """One machine, from :meth:`run` to the signal that stops it."""
 
-    def __init__(self, plan: Plan, listen: tuple[str, ...] | None = None, recording: Path | None = None) -> None:
+    def __init__(
+        self, plan: LoadedMachine, listen: tuple[str, ...] | None = None, recording: Path | None = None
+    ) -> None:
         machine = plan.file.machine
         self._plan = plan
         self._listen = plan.file.zenoh.listen if listen is None else listen
@@ -60,19 +69,19 @@ class Service:
         period, sampling = plan.file.window.sample_period, plan.driver.sampling
         self._windower = Windower(plan.twin.signals, plan.records, period, plan.limits, sampling)
         longest = plan.problem.window.longest * period
-        keeper = Keeper(machine.site, machine.name, plan.twin, heard=plan.heard)
-        self._housekeeper = Housekeeper(keeper, keeper.stamp())
-        state = begin(machine.name, machine.site, plan.problem)
-        decisions = Decisions()
+        keeper = StateStore(machine.site, machine.name, plan.twin, signal_fingerprint=plan.signal_fingerprint)
+        self._housekeeper = WriterThread(keeper, keeper.stamp())
+        state = initial_state(machine.name, machine.site, plan.problem)
+        decisions = OperatorDecisions()
         try:
-            state, decisions = restored(state, keeper.components()), keeper.decisions()
+            state, decisions = restore_components(state, keeper.components()), keeper.decisions()
         except OtolithError as error:  # a file that cannot be read is no reason not to watch the machine
             log.warning("begun without components: %s", error)
         self._kept, self._kept_at = tuple(entry.component.key for entry in state.catalogue), 0.0
         if self._kept:
             log.info("begun with what was found earlier: %s; %s", ", ".join(map(str, self._kept)), FORGET)
-        self._supervisor = Supervisor(decided(state, decisions), longest)
-        self._recorder = Companion("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
+        self._supervisor = Supervisor(apply_decisions(state, decisions), longest)
+        self._recorder = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
         self._recording = recording if plan.file.recording.enabled else None
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
@@ -158,14 +167,14 @@ class Service:
         state = self._supervisor.state
         found = tuple(entry.component.key for entry in state.catalogue)
         if found != self._kept or (found and now - self._kept_at >= KEEP_EVERY):
-            self._housekeeper.keep(kept(state))
+            self._housekeeper.keep(component_records(state))
             self._kept, self._kept_at = found, now
 
     def _listen_to_specialist(self) -> None:
         """What has been said about components since it was last looked at."""
-        decisions = self._housekeeper.heard()
+        decisions = self._housekeeper.new_decisions()
         if decisions is not None:
-            self._supervisor.revise(lambda state: decided(state, decisions))
+            self._supervisor.revise(lambda state: apply_decisions(state, decisions))
 
     def _regrid(self) -> None:
         """Where the machine gives less than was asked, windows are made of what it gives."""
@@ -174,7 +183,7 @@ class Service:
             return
         plan = self._plan
         ratio = period / plan.file.window.sample_period
-        self._supervisor.revise(lambda state: regridded(state, plan.problem.window, ratio))
+        self._supervisor.revise(lambda state: with_sample_grid(state, plan.problem.window, ratio))
         self._windower.regrid(self._supervisor.records, period)
         found = f"the machine gives a sample every {period * 1e3:.4g} ms, not every {now * 1e3:.4g} ms"
         size = f"{self._windower.records} records in {self._windower.length:.4g} s"
@@ -193,7 +202,7 @@ class Service:
         latency = max(0.0, time.time() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         link = self._plan.driver.link()
-        driver = DriverDocument(up=link.up, reason=link.reason, complaints=link.complaints, plan=link.plan)
+        driver = DriverDocument(up=link.up, reason=link.reason, warnings=link.warnings, plan=link.plan)
         document = document.model_copy(update={"cost": cost, "counters": self._counters(), "driver": driver})
         if self._publisher is not None:
             self._publisher.publish(document)

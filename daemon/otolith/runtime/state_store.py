@@ -16,31 +16,31 @@ from typing import Annotated, TypeVar
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from otolith.adaptation.state import Decisions, Kept
+from otolith.adaptation.state import ComponentRecord, OperatorDecisions
 from otolith.twin.augmentation import SLOTS, sites, sources
 from otolith.twin.component_families import NAMES
 from otolith.twin.definition import Definition
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.user_dirs import state_directory, writable
 
 log = logging.getLogger(__name__)
 
 VERSION = 1
-Page = TypeVar("Page", bound=Closed)
+Page = TypeVar("Page", bound=StrictModel)
 
 
-class _File(Closed):
+class _StateFile(StrictModel):
     """The daemon's file."""
 
     version: int = VERSION
     twin: str
-    heard: str = ""
-    """See :attr:`otolith.machine.Plan.heard`."""
-    components: tuple[Kept, ...] = ()
+    signal_fingerprint: str = ""
+    """See :attr:`otolith.machine.LoadedMachine.signal_fingerprint`."""
+    components: tuple[ComponentRecord, ...] = ()
 
 
-class _Said(Closed):
+class _Said(StrictModel):
     """The specialist's file."""
 
     version: int = VERSION
@@ -49,35 +49,37 @@ class _Said(Closed):
     forgotten: Annotated[dict[str, float], Field(default_factory=dict)]
 
 
-class Keeper:
+class StateStore:
     """The two files of one machine."""
 
-    def __init__(self, site: str, machine: str, twin: Definition, folder: Path | None = None, heard: str = "") -> None:
+    def __init__(
+        self, site: str, machine: str, twin: Definition, folder: Path | None = None, signal_fingerprint: str = ""
+    ) -> None:
         """``heard`` is how the signals are: what was found in others is none of this machine's."""
-        self._heard = heard
+        self._signal_fingerprint = signal_fingerprint
         folder = folder or state_directory() / "components"
         self._twin = twin
         self.known = folder / f"{site}.{machine}.json"
         self.said = folder / f"{site}.{machine}.specialist.json"
 
-    def components(self) -> tuple[Kept, ...]:
+    def components(self) -> tuple[ComponentRecord, ...]:
         """Those that are kept and that this twin can have, found in signals that are said as they are now.
 
         Raises:
             ConfigurationError: the file is not one of ours.
         """
-        file = _read(self.known, _File)
+        file = _read(self.known, _StateFile)
         if file is None or file.twin != self._twin.name:
             return ()
-        if file.heard and self._heard and file.heard != self._heard:
+        if file.signal_fingerprint and self._signal_fingerprint and file.signal_fingerprint != self._signal_fingerprint:
             log.warning("begun without the components of earlier runs: since then [signals] have changed")
             return ()
         usable = [entry for entry in file.components if self._is_possible(entry)]
         return tuple(usable[:SLOTS])
 
-    def _is_possible(self, kept: Kept) -> bool:
+    def _is_possible(self, kept: ComponentRecord) -> bool:
         """Whether this version and this twin can have such a component."""
-        component = kept.entry.component
+        component = kept.adopted.component
         if component.family not in NAMES or component.amplitude == 0.0:
             return False
         numbers = 1 + (component.model.inner is not None) + component.repeats
@@ -88,15 +90,18 @@ class Keeper:
             and all(map(math.isfinite, (*kept.values, *kept.deviations)))
         )
 
-    def keep(self, components: tuple[Kept, ...]) -> None:
+    def keep(self, components: tuple[ComponentRecord, ...]) -> None:
         """Write what is known of components, all or nothing.
 
         Raises:
             ServiceError: the disk does not take it.
         """
-        _write(self.known, _File(twin=self._twin.name, heard=self._heard, components=components))
+        _write(
+            self.known,
+            _StateFile(twin=self._twin.name, signal_fingerprint=self._signal_fingerprint, components=components),
+        )
 
-    def decisions(self) -> Decisions:
+    def decisions(self) -> OperatorDecisions:
         """What the specialist has said.
 
         Raises:
@@ -104,10 +109,10 @@ class Keeper:
         """
         file = _read(self.said, _Said)
         if file is None:
-            return Decisions()
-        return Decisions(frozenset(file.approved), frozenset(file.rejected), file.forgotten)
+            return OperatorDecisions()
+        return OperatorDecisions(frozenset(file.approved), frozenset(file.rejected), file.forgotten)
 
-    def decide(self, decisions: Decisions) -> None:
+    def decide(self, decisions: OperatorDecisions) -> None:
         """Write what the specialist says; a running daemon hears it with its next window.
 
         Raises:
@@ -142,7 +147,7 @@ def _read(path: Path, kind: type[Page]) -> Page | None:
         ) from error
 
 
-def _write(path: Path, page: Closed) -> None:
+def _write(path: Path, page: StrictModel) -> None:
     try:
         writable(path.parent)
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".new")
@@ -164,16 +169,16 @@ EVERY = 0.5  # s between two looks at the specialist's file
 AGAIN = 30.0  # s after which what the disk did not take is tried once more
 
 
-class Housekeeper:
+class WriterThread:
     """Of one machine. Others exchange values with it and never wait; a newer value takes the place of an older one."""
 
-    def __init__(self, keeper: Keeper, stamp: float) -> None:
+    def __init__(self, keeper: StateStore, stamp: float) -> None:
         """``stamp`` is of the specialist's word that is known already."""
         self._keeper, self._stamp = keeper, stamp
-        self._to_keep: deque[tuple[Kept, ...]] = deque(maxlen=1)
-        self._heard: deque[Decisions] = deque(maxlen=1)
+        self._to_keep: deque[tuple[ComponentRecord, ...]] = deque(maxlen=1)
+        self._decisions: deque[OperatorDecisions] = deque(maxlen=1)
         self._wake, self._ends = threading.Event(), threading.Event()
-        self._unsaved: tuple[Kept, ...] | None = None
+        self._unsaved: tuple[ComponentRecord, ...] | None = None
         self._try_at, self._complaint = 0.0, ""
         self._thread = threading.Thread(target=self._run, name="housekeeper", daemon=True)
 
@@ -181,14 +186,14 @@ class Housekeeper:
         """Start the thread."""
         self._thread.start()
 
-    def keep(self, components: tuple[Kept, ...]) -> None:
+    def keep(self, components: tuple[ComponentRecord, ...]) -> None:
         """Have ``components`` written in place of those that are on disk."""
         self._to_keep.append(components)
         self._wake.set()
 
-    def heard(self) -> Decisions | None:
+    def new_decisions(self) -> OperatorDecisions | None:
         """What the specialist has said since this was last asked; None for nothing."""
-        return self._heard.popleft() if self._heard else None
+        return self._decisions.popleft() if self._decisions else None
 
     def stop(self, seconds: float) -> None:
         """Have what is to be kept written for up to ``seconds``, and end the thread."""
@@ -212,7 +217,7 @@ class Housekeeper:
                 return
             self._listen()
 
-    def _write(self, components: tuple[Kept, ...]) -> None:
+    def _write(self, components: tuple[ComponentRecord, ...]) -> None:
         try:
             self._keeper.keep(components)
         except OtolithError as error:  # a full disk must not end the watching
@@ -228,6 +233,6 @@ class Housekeeper:
             return
         self._stamp = stamp
         try:
-            self._heard.append(self._keeper.decisions())
+            self._decisions.append(self._keeper.decisions())
         except OtolithError as error:
             log.warning("%s", error)

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.state import State
+from otolith.adaptation.state import AdaptationState
 from otolith.health.schema import Report
-from otolith.runtime.process import Companion
+from otolith.runtime.process import ChildProcess
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ REHEARSED = 80  # records
 class Task:
     """A window to adapt to, from a state."""
 
-    state: State
+    state: AdaptationState
     window: Window
 
 
@@ -40,13 +40,13 @@ class Result:
     """What came of a task; the state it began with and no report where the heart failed."""
 
     window_index: int
-    state: State
+    state: AdaptationState
     report: Report | None
     seconds: float
     failure: str = ""
 
 
-def main(connection: Any, state: State) -> None:
+def main(connection: Any, state: AdaptationState) -> None:
     """Serve tasks until the connection closes or None comes."""
     _warm_up(state)
     while (task := connection.recv()) is not None:
@@ -67,7 +67,7 @@ def perform(task: Task) -> Result:
     return Result(task.window.index, state, report, time.perf_counter() - begun)
 
 
-def _warm_up(state: State) -> None:
+def _warm_up(state: AdaptationState) -> None:
     """Load and compile what the first window would have to wait for."""
     signals = state.problem.twin.signals
     values = np.random.default_rng(state.problem.seed).standard_normal((REHEARSED, len(signals)))  # nothing explains it
@@ -87,13 +87,13 @@ NOT_READY = (
 class Supervisor:
     """Times are seconds on the monotonic clock, given by the caller."""
 
-    def __init__(self, state: State, window_length: float) -> None:
+    def __init__(self, state: AdaptationState, window_length: float) -> None:
         self.missed = 0
         self.finished = 0
         self._state = state
-        self._changes: list[Callable[[State], State]] = []
+        self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
         self._patience = PATIENCE + 2 * window_length
-        self._companion = Companion("otolith-worker", "otolith.runtime.worker:main", room=1)
+        self._companion = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
         self._waiting: deque[Window] = deque()
         self._at_hand: Window | None = None
         self._retried: int | None = None
@@ -119,7 +119,7 @@ class Supervisor:
         return self._companion.waitables
 
     @property
-    def state(self) -> State:
+    def state(self) -> AdaptationState:
         """After the last window that was finished."""
         return self._state
 
@@ -128,7 +128,7 @@ class Supervisor:
         """S that the window at hand may take."""
         return self._patience + (0.0 if self.finished else COMPILING)
 
-    def revise(self, change: Callable[[State], State]) -> None:
+    def revise(self, change: Callable[[AdaptationState], AdaptationState]) -> None:
         """Change the state before the next window, whatever becomes of the one at hand."""
         self._changes.append(change)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from otolith.twin.component_families import Kind
-from otolith.twin.definition import Definition, Input, Parameter, Role, Site, State
+from otolith.twin.definition import Definition, Input, Parameter, Role, Site, StateVariable
 from otolith.twin.dimensions import dimension_of
 
 SLOTS = 3
@@ -127,7 +127,7 @@ def with_slots(definition: Definition) -> Definition:
     entering = (Input(enters(index), site.unit, "", "foh") for index, site in enumerate(sites(definition)))
     return replace(
         definition,
-        states=(*definition.states, *(State(_angle(name), unit, "", 0.0, 0.0, 0.0) for name, unit in speeds)),
+        states=(*definition.states, *(StateVariable(_angle(name), unit, "", 0.0, 0.0, 0.0) for name, unit in speeds)),
         inputs=(*definition.inputs, Input(ELAPSED, "s", "", "foh"), *entering),
         parameters=(*definition.parameters, *found, *settings),
         equations=(*definition.equations, *((f"der({_angle(name)})", name) for name, _ in speeds)),

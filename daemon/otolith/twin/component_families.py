@@ -38,7 +38,7 @@ class Inner:
 
 
 @dataclass(frozen=True, slots=True)
-class MetaModel:
+class ComponentFamily:
     """A family of components."""
 
     name: str
@@ -123,38 +123,39 @@ def _near_zero(x: Array) -> tuple[float, float]:
 
 RATE = Inner("rate", "1/{x}", _bends, 2)
 
-METAMODELS: tuple[MetaModel, ...] = (
-    MetaModel("constant", "a", "{a}", "offset, constant load, leak", "everywhere", frozenset({Kind.NOTHING}),
+COMPONENT_FAMILIES: tuple[ComponentFamily, ...] = (
+    ComponentFamily("constant", "a", "{a}", "offset, constant load, leak", "everywhere", frozenset({Kind.NOTHING}),
               lambda x: True),
-    MetaModel("linear", "a*x", "{a}·{x}", "friction, misalignment, backlash", "everywhere", ANY, _moves),
-    MetaModel("exponential", "a*exp(b*x)", "{a}·exp({b}·{x})",
+    ComponentFamily("linear", "a*x", "{a}·{x}", "friction, misalignment, backlash", "everywhere", ANY, _moves),
+    ComponentFamily("exponential", "a*exp(b*x)", "{a}·exp({b}·{x})",
               "current leaking, deterioration, wear and tear, corrosion",
               "everywhere", ANY, _can_bend, RATE),
-    MetaModel("negative exponential", "a*exp(-b*x)", "{a}·exp(−{b}·{x})", "ageing, degradation, fatigue, crack growth",
+    ComponentFamily("negative exponential", "a*exp(-b*x)", "{a}·exp(−{b}·{x})",
+              "ageing, degradation, fatigue, crack growth",
               "everywhere", ANY, _can_bend, RATE),
-    MetaModel("power", f"a*sign(x)*exp(b*log(Max(absolute(x), {FLOOR})))", "{a}·{x}^{b}",
+    ComponentFamily("power", f"a*sign(x)*exp(b*log(Max(absolute(x), {FLOOR})))", "{a}·{x}^{b}",
               "hard stops, overloading, mechanical shock", "mirrored for negative inputs", ANY, _moves,
               Inner("exponent", "1", lambda x: (0.3, 4.0), 2)),
-    MetaModel("logarithmic", f"a*log(Max(absolute(x), {FLOOR}))", "{a}·ln({x})",
+    ComponentFamily("logarithmic", f"a*log(Max(absolute(x), {FLOOR}))", "{a}·ln({x})",
               "saturation, memory effects, hysteresis", "inputs of one sign", ANY, _keeps_its_sign),
-    MetaModel("periodic", "a*sin(b*x + c)", "{a}·sin({b}·{x} {c})",
+    ComponentFamily("periodic", "a*sin(b*x + c)", "{a}·sin({b}·{x} {c})",
               "unbalanced shaft, shaft misalignment, machine unsteadiness",
               "time, angles and positions: a sine of anything else could follow whatever it likes",
               frozenset({Kind.TIME, Kind.PLACE}), _turns, Inner("frequency", "rad/{x}", _orders, 0),
               phases=(0.0, 0.5 * math.pi)),
-    MetaModel("Coulomb", "a*tanh(x/b)", "{a}·sign({x})", "dry friction", "inputs that change their sign",
+    ComponentFamily("Coulomb", "a*tanh(x/b)", "{a}·sign({x})", "dry friction", "inputs that change their sign",
               frozenset({Kind.PLACE, Kind.SIGNAL}), _changes_its_sign, holds=True, given=_turnover),
-    MetaModel("Stribeck", f"a*tanh(x/({TURNOVER}*b))*exp(-(x/b)**2)", "{a}·sign({x})·exp(−({x}/{b})²)",
+    ComponentFamily("Stribeck", f"a*tanh(x/({TURNOVER}*b))*exp(-(x/b)**2)", "{a}·sign({x})·exp(−({x}/{b})²)",
               "friction that falls with the speed",
               "inputs that come near zero", frozenset({Kind.PLACE, Kind.SIGNAL}), _comes_near_zero,
               Inner("Stribeck speed", "{x}", _near_zero, 4)),
 )  # fmt: skip
-NAMES = tuple(row.name for row in METAMODELS)
+NAMES = tuple(row.name for row in COMPONENT_FAMILIES)
 
 
-def metamodel(name: str) -> MetaModel:
+def family_of(name: str) -> ComponentFamily:
     """The row of that name."""
-    return METAMODELS[NAMES.index(name)]
+    return COMPONENT_FAMILIES[NAMES.index(name)]
 
 
 def code_of(name: str) -> float:

@@ -45,7 +45,7 @@ class Constant:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class StateVariable:
     """What the machine remembers from one instant to the next."""
 
     name: str
@@ -106,7 +106,7 @@ class Definition:
     title: str
     source: str
     validity: str
-    states: tuple[State, ...]
+    states: tuple[StateVariable, ...]
     inputs: tuple[Input, ...]
     outputs: tuple[Output, ...]
     parameters: tuple[Parameter, ...]

@@ -27,7 +27,7 @@ PARTNER = 0.05  # of the largest coefficient
 
 
 @dataclass(frozen=True, slots=True)
-class Structure:
+class StructuralIdentifiability:
     """Of one parameter."""
 
     name: str
@@ -35,10 +35,10 @@ class Structure:
     reason: str
 
 
-def structure_of(definition: Definition, seed: int = 1) -> list[Structure]:
+def structure_of(definition: Definition, seed: int = 1) -> list[StructuralIdentifiability]:
     """Whether each parameter could be estimated if all of them and the initial state were unknown."""
     random = np.random.default_rng(seed)
-    trials: list[list[Structure]] = []
+    trials: list[list[StructuralIdentifiability]] = []
     for period in PERIODS:
         # Each at parameters of its own, judged alone: a combination that acts alone differs from point to point.
         found = [_sensitivities(definition, period, random) for _ in range(TRIALS)]
@@ -48,7 +48,10 @@ def structure_of(definition: Definition, seed: int = 1) -> list[Structure]:
             if np.isfinite(columns).all()
         ]
     if not trials:
-        return [Structure(entry.name, identifiable=False, reason=NOT_FINITE) for entry in definition.parameters]
+        return [
+            StructuralIdentifiability(entry.name, identifiable=False, reason=NOT_FINITE)
+            for entry in definition.parameters
+        ]
     best = max(trials, key=lambda found: sum(entry.identifiable - (entry.reason == DEAD) for entry in found))
     return [_unless_threshold(definition, entry) if entry.reason == DEAD else entry for entry in best]
 
@@ -74,7 +77,7 @@ def _sensitivities(definition: Definition, period: float, random: np.random.Gene
     return found
 
 
-def _unless_threshold(definition: Definition, entry: Structure) -> Structure:
+def _unless_threshold(definition: Definition, entry: StructuralIdentifiability) -> StructuralIdentifiability:
     """A parameter without a slope may still act, as the threshold of a ``where``."""
     excitation = _excitation(definition, THRESHOLD_PERIOD, np.random.default_rng(1))
     initial = np.array([[state.initial for state in definition.states]])
@@ -83,7 +86,7 @@ def _unless_threshold(definition: Definition, entry: Structure) -> Structure:
         parameters = [value if e.name == entry.name else e.nominal for e in definition.parameters]
         outputs.append(kernel_of(definition).simulate(np.array([parameters]), initial, excitation))
     acts = not np.array_equal(outputs[0], outputs[1], equal_nan=True)
-    return Structure(entry.name, identifiable=False, reason=THRESHOLD) if acts else entry
+    return StructuralIdentifiability(entry.name, identifiable=False, reason=THRESHOLD) if acts else entry
 
 
 def _excitation(definition: Definition, period: float, random: np.random.Generator) -> Excitation:
@@ -98,18 +101,18 @@ def _telegraph(low: float, high: float, random: np.random.Generator) -> Array:
     return np.asarray(levels[changes])
 
 
-def _judge(definition: Definition, columns: Array, index: int) -> Structure:
+def _judge(definition: Definition, columns: Array, index: int) -> StructuralIdentifiability:
     name = definition.parameters[index].name
     lengths = np.linalg.norm(columns, axis=0)
     if lengths[index] <= NOTHING * lengths.max():
-        return Structure(name, identifiable=False, reason=DEAD)
+        return StructuralIdentifiability(name, identifiable=False, reason=DEAD)
     unit = columns / np.where(lengths > 0.0, lengths, 1.0)
     others = np.delete(unit, index, axis=1)
     shares, *_ = np.linalg.lstsq(others, unit[:, index], rcond=1e-12)
     if np.linalg.norm(unit[:, index] - others @ shares) > DEPENDENT:
-        return Structure(name, identifiable=True, reason="")
+        return StructuralIdentifiability(name, identifiable=True, reason="")
     names = [entry.name for entry in definition.parameters] + [f"initial {entry.name}" for entry in definition.states]
     del names[index]
     weights = abs(shares)
     partners = [other for other, weight in zip(names, weights, strict=True) if weight > PARTNER * weights.max()]
-    return Structure(name, identifiable=False, reason=f"only together with {', '.join(partners)}")
+    return StructuralIdentifiability(name, identifiable=False, reason=f"only together with {', '.join(partners)}")

@@ -41,7 +41,7 @@ class Excitation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Noise:
+class NoiseModel:
     """Standard deviations, each in the unit of its signal or state."""
 
     outputs: Array
@@ -52,7 +52,7 @@ class Noise:
     """(states,) per square root of a second, of what strays in the machine itself."""
 
 
-class Correction(NamedTuple):
+class InnovationModel(NamedTuple):
     """How a disturbed twin is corrected on its way, and how far off each prediction may then be."""
 
     gain: Array
@@ -134,7 +134,9 @@ class Kernel:
         found: Array = self._call("euler", parameters, initial, inputs, period, max(1, round(period / step)))
         return found
 
-    def correction(self, parameters: Array, initial: Array, excitation: Excitation, noise: Noise) -> Correction:
+    def correction(
+        self, parameters: Array, initial: Array, excitation: Excitation, noise: NoiseModel
+    ) -> InnovationModel:
         """The extended Kalman filter along ``excitation.measured``; shapes (parameters,), (states,).
 
         Entries are not finite where the filter diverges.
@@ -142,7 +144,7 @@ class Kernel:
         inputs, period, substeps, measured, _ = self._drive(replace(excitation, gain=self._open_loop))
         noises = (noise.outputs**2, noise.states**2, noise.inputs)
         found = self._call("kalman", parameters, initial, inputs, period, substeps, measured, *noises)
-        return Correction(*found)
+        return InnovationModel(*found)
 
     def along(self, parameters: Array, initial: Array, excitation: Excitation, nudge: Array) -> Linear:
         """The linear system along a window, by differences of ``nudge`` (sites,) in the units of the sites."""
@@ -156,7 +158,9 @@ class Kernel:
         found: Array = self._call("curves", families, x, sources, inner, phases)
         return found
 
-    def respond(self, linear: Linear, correction: Correction, present: Mask, curves: Array, sites: Numbers) -> Array:
+    def respond(
+        self, linear: Linear, correction: InnovationModel, present: Mask, curves: Array, sites: Numbers
+    ) -> Array:
         """(records * outputs, curves) whitened innovations, as each of ``curves`` (records, curves) changes them.
 
         ``sites`` (curves,) are the numbers of the sites at which they enter.
@@ -234,10 +238,10 @@ def identity_of(definition: Definition) -> str:
 
 
 def _source(definition: Definition) -> str:
-    from otolith.twin.kernel_sources import source_of  # noqa: PLC0415 - loads SymPy, which a cached kernel does not need
+    from otolith.twin.kernel_sources import kernel_source  # noqa: PLC0415 - loads SymPy, which a cached kernel does not need
 
     try:
-        return source_of(definition)
+        return kernel_source(definition)
     except Exception as error:
         text = f"twin {definition.name!r}: its equations cannot be turned into code: {type(error).__name__}: {error}"
         raise ConfigurationError(text) from error

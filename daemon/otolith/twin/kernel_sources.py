@@ -25,7 +25,7 @@ import sympy
 
 from otolith.twin.augmentation import entrances
 from otolith.twin.codegen import PRINTER, Fragments, added, indent, record_loop, unpacked
-from otolith.twin.component_families import METAMODELS, code_of
+from otolith.twin.component_families import COMPONENT_FAMILIES, code_of
 from otolith.twin.definition import Definition
 from otolith.twin.symbolic import absolute, sign
 
@@ -341,7 +341,7 @@ def curves(family, x, sources, b, c):
 def metacode() -> list[str]:
     """The functions ``component``, its derivatives by each of its arguments, and ``curves``."""
     known = {symbol.name: symbol for symbol in ARGUMENTS} | {"absolute": absolute, "sign": sign}
-    formulas = [(code_of(row.name), sympy.sympify(row.formula, locals=known)) for row in METAMODELS]
+    formulas = [(code_of(row.name), sympy.sympify(row.formula, locals=known)) for row in COMPONENT_FAMILIES]
     lines = _function("component", formulas)
     for symbol in ARGUMENTS:
         slopes = [(code, sympy.diff(formula, symbol)) for code, formula in formulas]
@@ -485,7 +485,7 @@ class _Writer(Fragments):
         ]  # fmt: skip
 
 
-def source_of(definition: Definition) -> str:
+def kernel_source(definition: Definition) -> str:
     """The text of the kernel module: ``simulate``, both kinds of sensitivities, ``kalman`` and ``euler``.
 
     Of the page only names of quantities enter it, each behind a prefix, and they are letters, digits and underscores.

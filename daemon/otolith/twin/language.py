@@ -11,10 +11,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, State
+from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, StateVariable
 from otolith.twin.dimensions import NONE, describe, dimension_of, measure
 from otolith.twin.expressions import ExpressionError, check_known, check_name, names, parse
-from otolith_drivers.config_files import Closed, Location, Page, expect, validate
+from otolith_drivers.config_files import Location, SourceFile, StrictModel, expect, validate
 from otolith_drivers.config_files import parse as parse_toml
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import Quantity, to_base
@@ -238,34 +238,34 @@ Number = Annotated[float | str, BeforeValidator(_no_flag)]
 Bounds = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
 
 
-class _Head(Closed):
+class _Head(StrictModel):
     name: Annotated[str, AfterValidator(_twin_name)]
     title: str
     source: str
     validity: str = ""
 
 
-class _State(Closed):
+class _StateTable(StrictModel):
     unit: Unit
     meaning: str
     initial: Number = 0.0
     bounds: Bounds = (-1000.0, 1000.0)
 
 
-class _Input(Closed):
+class _Input(StrictModel):
     unit: Unit
     meaning: str
     hold: Literal["zoh", "foh"]
     range: Bounds = (-1.0, 1.0)
 
 
-class _Output(Closed):
+class _Output(StrictModel):
     unit: Unit
     meaning: str
     noise: Number
 
 
-class _Parameter(Closed):
+class _Parameter(StrictModel):
     unit: Unit
     nominal: Number
     bounds: Bounds
@@ -273,18 +273,18 @@ class _Parameter(Closed):
     role: Role = Role.INSTRUMENTED
 
 
-class _Constant(Closed):
+class _Constant(StrictModel):
     unit: Unit
     value: Number
     meaning: str
 
 
-class _Definition(Closed):
+class _Definition(StrictModel):
     expression: str
     meaning: str = ""
 
 
-class _Site(Closed):
+class _Site(StrictModel):
     unit: Unit
     meaning: str
     into: str
@@ -292,9 +292,9 @@ class _Site(Closed):
     through: str = "1"
 
 
-class _File(Closed):
+class _TwinFile(StrictModel):
     twin: _Head
-    states: dict[str, _State]
+    states: dict[str, _StateTable]
     inputs: Annotated[dict[str, _Input], Field(default_factory=dict)]
     outputs: dict[str, _Output]
     parameters: dict[str, _Parameter]
@@ -304,7 +304,7 @@ class _File(Closed):
     sites: Annotated[dict[str, _Site], Field(default_factory=dict)]
 
 
-def read_twin(page: Page) -> Definition:
+def read_twin(page: SourceFile) -> Definition:
     """The twin on ``page``.
 
     Raises:
@@ -312,7 +312,7 @@ def read_twin(page: Page) -> Definition:
     """
     data = parse_toml(page)
     expect(page, data, "equations")
-    file = validate(data, _File, page)
+    file = validate(data, _TwinFile, page)
     reader = _Reader(page, file)
     definition = reader.definition()
     if reader.faults:
@@ -323,7 +323,7 @@ def read_twin(page: Page) -> Definition:
 class _Reader:
     """Collects faults, so that an author sees all of them at once."""
 
-    def __init__(self, page: Page, file: _File) -> None:
+    def __init__(self, page: SourceFile, file: _TwinFile) -> None:
         self.faults: list[str] = []
         self._page = page
         self._file = file
@@ -404,12 +404,12 @@ class _Reader:
             self._fault(location, f"the lower bound {low:g} is not under the upper {high:g} {unit}")
         return low, high
 
-    def _state(self, name: str, entry: _State) -> State:
+    def _state(self, name: str, entry: _StateTable) -> StateVariable:
         low, high = self._bounds(("states", name, "bounds"), entry.unit, entry.bounds)
         initial = self._number(("states", name, "initial"), entry.unit, entry.initial)
         if initial < low < high or initial > high > low:
             self._fault(("states", name), f"initial {initial:g} is outside the bounds {low:g} to {high:g} {entry.unit}")
-        return State(name, entry.unit, entry.meaning, initial, low, high)
+        return StateVariable(name, entry.unit, entry.meaning, initial, low, high)
 
     def _input(self, name: str, entry: _Input) -> Input:
         low, high = self._bounds(("inputs", name, "range"), entry.unit, entry.range)

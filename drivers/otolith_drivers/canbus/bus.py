@@ -17,7 +17,7 @@ from typing import Annotated, Any, Self
 import can
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import DeviceError
 from otolith_drivers.units import Quantity
 
@@ -102,7 +102,7 @@ class Drops:
             self.total += count - self._of_this_bus
             self._of_this_bus, self._at = count, now
 
-    def complaints(self, now: float) -> list[str]:
+    def warnings(self, now: float) -> list[str]:
         """A line for a while after it happened."""
         if not self.total or now - self._at > RECENT:
             return []
@@ -115,7 +115,7 @@ MOST_BAD_IN_A_ROW = 50  # frames that cannot be unpacked; more are no accident
 GROUP = re.compile(r"239\.\d{1,3}\.\d{1,3}\.\d{1,3}")
 
 
-class BusOptions(Closed):
+class BusOptions(StrictModel):
     """Which CAN bus."""
 
     interface: str = "auto"

@@ -30,14 +30,14 @@ from cantools.database.conversion import BaseConversion
 
 from otolith_drivers.base import Signal
 from otolith_drivers.canbus.options import CLASSIC_BITS, MOST_PDOS, OBJECT, MappedObject, PdoTable
-from otolith_drivers.canbus.signals import EXTENDED_LIMIT, STANDARD_LIMIT, Source, Wanted, wanted_of
+from otolith_drivers.canbus.signals import EXTENDED_LIMIT, STANDARD_LIMIT, SignalRequest, Source, wanted_of
 from otolith_drivers.errors import nearest
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary, ODVariable
 from collections.abc import Callable
 
-from otolith_drivers.canbus.monitoring import Pace, period_text
+from otolith_drivers.canbus.monitoring import PeriodEstimator, period_text
 
 Sections = dict[str, dict[str, str]]
 
@@ -171,7 +171,7 @@ class Pdo:
     enabled: bool = True
 
 
-class Drive:
+class CanopenDrive:
     """A node: what it sends, as far as its sheet and the machine file say."""
 
     def __init__(self, node: int, sheet: Path | None, tables: tuple[PdoTable, ...]) -> None:
@@ -192,7 +192,7 @@ class Drive:
                 f"node {node}: nothing says what it sends: set eds in [driver], or [[driver.pdo]]", ("driver",)
             )
 
-    def find(self, signal: Signal) -> Wanted:
+    def find(self, signal: Signal) -> SignalRequest:
         """``signal`` in what the drive sends.
 
         Raises:
@@ -390,13 +390,13 @@ class NodeWatch:
         self._code = 0
         self._at = 0.0
         self._state: int | None = None
-        self._beat = Pace()
+        self._beat = PeriodEstimator()
 
     def frames(self) -> dict[int, Note]:
         """Which frames it is to be shown."""
         return {self._emergency: self._note_emergency, HEARTBEAT + self.node: self._note_heartbeat}
 
-    def complaints(self, now: float) -> list[str]:
+    def warnings(self, now: float) -> list[str]:
         """What is wrong at ``now`` (s), a line each."""
         lines = []
         if self._code:

@@ -40,7 +40,7 @@ logging.getLogger("cantools").setLevel(logging.ERROR)  # what it warns of is nam
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class DatabaseFault:
     """Something wrong in a database that can still be read."""
 
     text: str
@@ -54,7 +54,7 @@ class Loaded:
 
     path: Path
     messages: tuple[Message, ...]
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[DatabaseFault, ...] = ()
     unread: dict[str, str] = field(default_factory=dict)
     """Names of the messages that could not be read at all, and why."""
 
@@ -62,7 +62,7 @@ class Loaded:
         """What is wrong with the file, a line each."""
         return list(dict.fromkeys(f"{self.path.name}: {fault.text}" for fault in self.faults))
 
-    def faults_of(self, message: Message, signal: str) -> list[Fault]:
+    def faults_of(self, message: Message, signal: str) -> list[DatabaseFault]:
         """What is wrong with one signal."""
         return [fault for fault in self.faults if fault.message == message.name and fault.signal == signal]
 
@@ -102,19 +102,19 @@ def load_database(path: Path) -> Loaded:
                 raise ConfigurationError(
                     f"{path}: not a CAN database: {_cause(strictly)}", ("driver", "dbc")
                 ) from error
-            faults.append(Fault(f"only its messages could be read: {_cause(error)}"))
-            faults += [Fault(f"message {name} cannot be read: {why}", name) for name, why in unread.items()]
+            faults.append(DatabaseFault(f"only its messages could be read: {_cause(error)}"))
+            faults += [DatabaseFault(f"message {name} cannot be read: {why}", name) for name, why in unread.items()]
     for message in list(messages):
         if why := _without_sense(message):
             messages.remove(message)
             unread[str(message.name)] = why
-            faults.append(Fault(f"message {message.name} cannot be used: {why}"))
+            faults.append(DatabaseFault(f"message {message.name} cannot be used: {why}"))
         else:
             faults += _faults_of_layout(message)
     return Loaded(path, tuple(messages), (*faults, *_duplicates(messages)), unread)
 
 
-def _text(path: Path) -> tuple[str, list[Fault]]:
+def _text(path: Path) -> tuple[str, list[DatabaseFault]]:
     data = content(path, SIZE_LIMIT, ("driver", "dbc"))
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data.decode("utf-16", errors="replace"), []
@@ -124,7 +124,7 @@ def _text(path: Path) -> tuple[str, list[Fault]]:
             return data.decode(encoding), []
         except UnicodeDecodeError as error:
             place = error.start
-    return data.decode("cp1252", errors="replace"), [Fault(f"neither UTF-8 nor Windows-1252 (byte {place})")]
+    return data.decode("cp1252", errors="replace"), [DatabaseFault(f"neither UTF-8 nor Windows-1252 (byte {place})")]
 
 
 def _refuse_excess(text: str, path: Path) -> None:
@@ -208,28 +208,28 @@ def _without_sense(message: Message) -> str:
     return ""
 
 
-def _faults_of_layout(message: Message) -> list[Fault]:
+def _faults_of_layout(message: Message) -> list[DatabaseFault]:
     """Signals that do not fit into ``message``, or lie upon each other in the same frame."""
     name = message.name
     try:
         message.refresh(strict=True)
     except Exception as error:  # noqa: BLE001 - which is what is to be told more precisely
         found = _signal_faults(message)
-        return found or [Fault(f"message {name}: {_cause(error)}", name)]
+        return found or [DatabaseFault(f"message {name}: {_cause(error)}", name)]
     return []
 
 
-def _signal_faults(message: Message) -> list[Fault]:
+def _signal_faults(message: Message) -> list[DatabaseFault]:
     name, found = message.name, []
     masks = [(signal, bits_of(signal)) for signal in message.signals]
     for place, (signal, mask) in enumerate(masks):
         if mask >> (8 * message.length):
             text = f"{name}.{signal.name} lies beyond the {message.length} bytes of its frame"
-            found.append(Fault(text, name, signal.name))
+            found.append(DatabaseFault(text, name, signal.name))
         for other, taken in masks[:place]:
             if mask & taken and not _never_together(signal, other):
                 text = f"{name}.{signal.name} and {name}.{other.name} overlap"
-                found += [Fault(text, name, signal.name), Fault(text, name, other.name)]
+                found += [DatabaseFault(text, name, signal.name), DatabaseFault(text, name, other.name)]
     return found
 
 
@@ -239,12 +239,12 @@ def _never_together(one: CanSignal, other: CanSignal) -> bool:
     return not set(one.multiplexer_ids or ()) & set(other.multiplexer_ids or ())
 
 
-def _duplicates(messages: list[Message]) -> list[Fault]:
+def _duplicates(messages: list[Message]) -> list[DatabaseFault]:
     by_frame: dict[tuple[int, bool], list[str]] = defaultdict(list)
     for message in messages:
         by_frame[message.frame_id, message.is_extended_frame].append(message.name)
     return [
-        Fault(f"frame 0x{frame:X} is described {len(names)} times: {', '.join(names)}", names[0])
+        DatabaseFault(f"frame 0x{frame:X} is described {len(names)} times: {', '.join(names)}", names[0])
         for (frame, _), names in by_frame.items()
         if len(names) > 1
     ]

@@ -18,13 +18,21 @@ from otolith_drivers.canbus.monitoring import (
     BusFaults,
     Checksum,
     FrameCounter,
-    Pace,
+    PeriodEstimator,
     checksum_of,
     counter_by_name,
     period_text,
 )
 from otolith_drivers.canbus.options import FrameOptions, MessageTable
-from otolith_drivers.canbus.signals import BitField, Bits, Wanted, bytes_needed, field, find_in_databases, raw_signal
+from otolith_drivers.canbus.signals import (
+    BitField,
+    BitRange,
+    SignalRequest,
+    bytes_needed,
+    field,
+    find_in_databases,
+    raw_signal,
+)
 from otolith_drivers.errors import ConfigurationError, nearest
 
 NO_READING = float("nan")
@@ -63,7 +71,7 @@ class _Group:
         self.title = title
         self.condition = condition
         self.rows: list[Row] = []
-        self.pace = Pace()
+        self.pace = PeriodEstimator()
         self.lost = 0
 
     def is_in(self, data: bytes | bytearray) -> bool:
@@ -73,13 +81,13 @@ class _Group:
 class MessageReader:
     """Takes the frames of one arbitration ID, in the order of their arrival."""
 
-    def __init__(self, messages: Sequence[Message], wanted: Sequence[Wanted], rules: Rules) -> None:
+    def __init__(self, messages: Sequence[Message], wanted: Sequence[SignalRequest], rules: Rules) -> None:
         """``messages`` are all descriptions of the frame in which something is ``wanted``."""
         self.wanted = tuple(wanted)
         self.title = f"{messages[0].name} (0x{messages[0].frame_id:X})"
         if messages[0].name == f"0x{messages[0].frame_id:X}":
             self.title = messages[0].name
-        self.pace = Pace(rules.period)
+        self.pace = PeriodEstimator(rules.period)
         self.received = self.bad = 0
         self._lost = 0
         self._rules, self._counter, self._checksum = rules, rules.counter, rules.checksum
@@ -120,7 +128,7 @@ class MessageReader:
         self.received += len(samples)
         return samples
 
-    def complaints(self, now: float, begun: float, *, unused: bool = True) -> list[str]:
+    def warnings(self, now: float, begun: float, *, unused: bool = True) -> list[str]:
         """What is wrong at ``now``, a line each; listening began at ``begun`` (s).
 
         With ``unused`` also what came lately and could not be used.
@@ -154,7 +162,7 @@ class MessageReader:
         held = [f"frames {self.title} are {', '.join(rules)}"] if rules else []
         return [*(entry.describe() for entry in self.wanted), *held]
 
-    def _add(self, entry: Wanted) -> None:
+    def _add(self, entry: SignalRequest) -> None:
         message, signal = entry.message, entry.signal
         self._length = max(self._length, bytes_needed(signal))
         unit = entry.target_unit
@@ -274,7 +282,7 @@ class FrameDecoder:
         self._readers = dict(readers)
         self._watches = tuple(watches)
         self._notes: dict[int, Note] = {key: note for watch in watches for key, note in watch.frames().items()}
-        self.warnings = tuple(warnings)
+        self.configuration_warnings = tuple(warnings)
         """What is wrong with the files that say what is in the frames, a line each."""
         self._unreadable = 0
         self._begun: float | None = None
@@ -314,18 +322,18 @@ class FrameDecoder:
             lost=max(sum(reader.lost for reader in readers), self.faults.overflows),
         )
 
-    def complaints(self, now: float, *, unused: bool = True) -> list[str]:
+    def warnings(self, now: float, *, unused: bool = True) -> list[str]:
         """What is wrong at ``now`` (s, of the clock of :meth:`decode`), a line each.
 
         With ``unused`` also what came lately and could not be used.
         """
         if self._begun is None:
             self._begun = now
-        lines = self.faults.complaints(now)
+        lines = self.faults.warnings(now)
         for reader in self._readers.values():
-            lines += reader.complaints(now, self._begun, unused=unused)
+            lines += reader.warnings(now, self._begun, unused=unused)
         for watch in self._watches:
-            lines += watch.complaints(now)
+            lines += watch.warnings(now)
         return lines
 
     def slowest_period(self) -> float | None:
@@ -340,7 +348,7 @@ class FrameDecoder:
     def describe(self) -> list[str]:
         """What will be read from where, and what is wrong with the files that say so, a line each."""
         lines = [line for reader in self._readers.values() for line in reader.describe()]
-        return [*lines, *(f"warning: {line}" for line in self.warnings)]
+        return [*lines, *(f"warning: {line}" for line in self.configuration_warnings)]
 
 
 class _Drives:
@@ -350,14 +358,14 @@ class _Drives:
         nodes = sorted({signal.source.node for signal in setup.signals if signal.source.node is not None})
         self._drives = {}
         if nodes:
-            from otolith_drivers.canbus.canopen import Drive  # noqa: PLC0415 - only CANopen drives cost its imports
+            from otolith_drivers.canbus.canopen import CanopenDrive  # noqa: PLC0415 - only CANopen drives cost its imports
 
             for node in nodes:
                 sheet = options.data_sheet(node)
                 tables = tuple(table for table in options.pdo if table.node == node)
-                self._drives[node] = Drive(node, setup.folder / sheet if sheet is not None else None, tables)
+                self._drives[node] = CanopenDrive(node, setup.folder / sheet if sheet is not None else None, tables)
 
-    def find(self, signal: Signal) -> Wanted:
+    def find(self, signal: Signal) -> SignalRequest:
         return self._drives[signal.source.node].find(signal)
 
     def warnings(self) -> list[str]:
@@ -367,7 +375,7 @@ class _Drives:
         return [NodeWatch(node, drive.emergency) for node, drive in self._drives.items()]
 
 
-def _find(signal: Signal, databases: Sequence[Loaded], drives: _Drives) -> Wanted:
+def _find(signal: Signal, databases: Sequence[Loaded], drives: _Drives) -> SignalRequest:
     if signal.source.node is not None:
         return drives.find(signal)
     if signal.source.id is not None:
@@ -382,7 +390,7 @@ def _key(message: Message) -> int:
 @dataclass(slots=True)
 class _Frame:
     messages: list[Message]
-    wanted: list[Wanted]
+    wanted: list[SignalRequest]
 
     def is_called(self, name: str) -> bool:
         try:
@@ -393,7 +401,10 @@ class _Frame:
 
 
 def _readers(
-    wanted: Sequence[Wanted], tables: Mapping[str, MessageTable], databases: Sequence[Loaded], warnings: list[str]
+    wanted: Sequence[SignalRequest],
+    tables: Mapping[str, MessageTable],
+    databases: Sequence[Loaded],
+    warnings: list[str],
 ) -> dict[int, MessageReader]:
     frames: dict[int, _Frame] = {}
     for entry in wanted:
@@ -440,9 +451,9 @@ def _rules(frame: _Frame, table: MessageTable) -> Rules:
     return Rules(counter, checksum, table.period, needed)
 
 
-def _signal(frame: _Frame, said: str | Bits, what: str) -> CanSignal:
+def _signal(frame: _Frame, said: str | BitRange, what: str) -> CanSignal:
     """The signal called ``said`` in any description of the frame, or where it says."""
-    if isinstance(said, Bits):
+    if isinstance(said, BitRange):
         return said.as_signal(what)
     names = []
     for message in frame.messages:

@@ -69,7 +69,7 @@ class CanReceiver:
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         bus = self._connect()
-        for line in self._decoder.warnings:
+        for line in self._decoder.configuration_warnings:
             log.warning("%s", line)
         self._heard = self._opened
         self._decoder.begin(self._opened)
@@ -103,8 +103,8 @@ class CanReceiver:
         now = time.monotonic()
         silence = now - self._heard
         alone = [f"nothing at all has come for {silence:.1f} s"] if silence > self._silence_limit() else []
-        complaints = (*alone, *self._drops.complaints(now), *self._decoder.complaints(now))
-        return replace(link, complaints=complaints)
+        warnings = (*alone, *self._drops.warnings(now), *self._decoder.warnings(now))
+        return replace(link, warnings=warnings)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""

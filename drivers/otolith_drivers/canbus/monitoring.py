@@ -149,7 +149,7 @@ class BusFaults:
             self.bus_off, self._state = False, ""
         self._latest, self._at = ", ".join(names), time
 
-    def complaints(self, now: float) -> list[str]:
+    def warnings(self, now: float) -> list[str]:
         """What is wrong at ``now`` (s), a line each."""
         if not self.total:
             return []
@@ -198,7 +198,7 @@ NOT_OF_MESSAGES = re.compile(
 )
 
 
-class Pace:
+class PeriodEstimator:
     """How often something comes, learned from when it came, unless it is declared."""
 
     def __init__(self, declared: float | None = None) -> None:
@@ -339,7 +339,7 @@ class FrameCounter:
         """A frame came whose counter cannot be believed: it will be missing in the count, but it is not lost."""
         self._spoiled += 1
 
-    def missing(self, data: bytes | bytearray, time: float, pace: Pace) -> int:
+    def missing(self, data: bytes | bytearray, time: float, pace: PeriodEstimator) -> int:
         """Frames lost before this one; -1 where it is the one before once more."""
         count = int(self._read(data)) % self.modulo
         last, self._last = self._last, count

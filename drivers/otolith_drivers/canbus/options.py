@@ -6,8 +6,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.canbus.signals import Bits, Identifier
-from otolith_drivers.config_files import Closed
+from otolith_drivers.canbus.signals import BitRange, Identifier
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.units import Quantity
 
 Period = Annotated[float, BeforeValidator(Quantity("s", 1e-4, 3600.0))]
@@ -19,10 +19,10 @@ CLASSIC_BITS = 64
 MOST_PDOS = 512
 
 
-class ChecksumTable(Closed):
+class ChecksumTable(StrictModel):
     """The checksum of a message."""
 
-    signal: str | Bits
+    signal: str | BitRange
     """Its name in the database, or where it is."""
     kind: ChecksumKind
     over: tuple[int, int] | None = None
@@ -32,10 +32,10 @@ class ChecksumTable(Closed):
     """Bytes, as hexadecimal digits, that are reckoned in before or after those of the frame (AUTOSAR's data ID)."""
 
 
-class MessageTable(Closed):
+class MessageTable(StrictModel):
     """``[driver.messages.Name]``: what is known of a message beyond its database."""
 
-    counter: str | Bits | Literal[False] | None = None
+    counter: str | BitRange | Literal[False] | None = None
     """The signal that counts the frames, or where it is; ``false`` where one only looks like that by its name."""
     modulo: Annotated[int, Field(ge=2, le=1 << 32)] | None = None
     """One more than the highest count."""
@@ -44,7 +44,7 @@ class MessageTable(Closed):
     """How often it comes; without it that is learned."""
 
 
-class MappedObject(Closed):
+class MappedObject(StrictModel):
     """An object in a PDO, written as ``"0x6078:00 i16"``; what follows the space may be left to the EDS."""
 
     index: int
@@ -71,7 +71,7 @@ class MappedObject(Closed):
         return cls(index=int(match[1], 16), subindex=int(match[2] or "0", 16), type=kind, length=length)
 
 
-class PdoTable(Closed):
+class PdoTable(StrictModel):
     """``[[driver.pdo]]``: what a drive sends, where that is not what its EDS says."""
 
     node: Annotated[int, Field(ge=1, le=127)]
@@ -98,7 +98,7 @@ class PdoTable(Closed):
 Node = Annotated[str, Field(pattern=r"^(?:0[xX][0-9A-Fa-f]{1,2}|\d{1,3})$")]
 
 
-class FrameOptions(Closed):
+class FrameOptions(StrictModel):
     """What describes the frames."""
 
     dbc: Path | tuple[Path, ...] = ()

@@ -19,7 +19,7 @@ from cantools.database.can.database import Database
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import STATES
 from otolith_drivers.canbus.monitoring import classes_of
-from otolith_drivers.number_inference import FRAMES, Layout, Part, Verdict, number_text, parts, quoted, spread
+from otolith_drivers.number_inference import FRAMES, Layout, LayoutVerdict, Part, number_text, parts, quoted, spread
 
 MOST_IDENTIFIERS = 2048  # that are kept apart; a standard bus has no more
 MOST_FRAMES = 500  # of each that are kept
@@ -55,7 +55,7 @@ class Value:
 
 
 @dataclass(slots=True)
-class Heard:
+class ObservedFrames:
     """All frames of one arbitration ID."""
 
     identifier: int
@@ -156,7 +156,7 @@ class Picture:
             for message in (database.messages if database else [])
             if not message.is_container
         }
-        self.heard: dict[tuple[int, bool], Heard] = {}
+        self.observed: dict[tuple[int, bool], ObservedFrames] = {}
         self.errors: Counter[str] = Counter()
         """Error frames by kind."""
         self.error_frames = 0
@@ -173,7 +173,7 @@ class Picture:
     @property
     def frames(self) -> int:
         """Frames of all kinds but error frames."""
-        return sum(heard.count for heard in self.heard.values()) + self.left_out
+        return sum(heard.count for heard in self.observed.values()) + self.left_out
 
     def take(self, frame: can.Message, time: float) -> None:
         """A frame, which came at ``time`` (s, of any clock that goes on steadily)."""
@@ -182,23 +182,23 @@ class Picture:
             self.errors.update(classes_of(frame))
             return
         key = (frame.arbitration_id, bool(frame.is_extended_id))
-        heard = self.heard.get(key)
+        heard = self.observed.get(key)
         if heard is None:
-            if len(self.heard) >= MOST_IDENTIFIERS:
+            if len(self.observed) >= MOST_IDENTIFIERS:
                 self.left_out += 1
                 return
-            heard = self.heard[key] = Heard(*key, self._messages.get(key))
+            heard = self.observed[key] = ObservedFrames(*key, self._messages.get(key))
         heard.take(frame, time)
 
-    def ordered(self) -> list[Heard]:
+    def ordered(self) -> list[ObservedFrames]:
         """By their arbitration IDs, standard ones first."""
-        return [self.heard[key] for key in sorted(self.heard, key=lambda key: (key[1], key[0]))]
+        return [self.observed[key] for key in sorted(self.observed, key=lambda key: (key[1], key[0]))]
 
     def missing(self) -> list[Message]:
         """Messages of the database that have not come."""
-        return [message for key, message in self._messages.items() if key not in self.heard]
+        return [message for key, message in self._messages.items() if key not in self.observed]
 
-    def signals(self) -> Iterator[tuple[Heard, CanSignal, Value]]:
+    def signals(self) -> Iterator[tuple[ObservedFrames, CanSignal, Value]]:
         """Every signal of the database that was heard."""
         for heard in self.ordered():
             for signal in heard.message.signals if heard.message else ():
@@ -213,10 +213,10 @@ class Picture:
             and 0x701 <= heard.identifier <= 0x77F
             and heard.lengths == {1}
             and heard.latest[0] & 0x7F in STATES
-            for heard in self.heard.values()
+            for heard in self.observed.values()
         )
 
-    def guess(self, heard: Heard) -> str:
+    def guess(self, heard: ObservedFrames) -> str:
         """What a frame would be that no database knows, by its arbitration ID; empty where that says nothing."""
         if heard.extended:
             group = heard.identifier >> 8 & (0x3FFFF if heard.identifier >> 16 & 0xFF >= 0xF0 else 0x3FF00)
@@ -248,7 +248,7 @@ COUNTERS = re.compile(r"count|alive|rolling|sequence|checksum|crc|^(?:mc|bz|cnt|
 class Field:
     """Some bytes of a frame that move as a number does."""
 
-    heard: Heard
+    observed: ObservedFrames
     part: Part
     layout: Layout
 
@@ -263,7 +263,7 @@ def start_bit(byte: int, layout: Layout) -> int:
     return 8 * byte + (7 if layout.order == "big" else 0)
 
 
-def parts_of(heard: Heard) -> list[Part]:
+def parts_of(heard: ObservedFrames) -> list[Part]:
     """What is in the frames of one arbitration ID, as far as it changes."""
     history = [data for data in heard.history if len(data) == len(heard.latest)]
     if len(history) < FEWEST_FRAMES or not heard.latest:
@@ -271,12 +271,12 @@ def parts_of(heard: Heard) -> list[Part]:
     return parts(np.frombuffer(b"".join(history), dtype=np.uint8).reshape(len(history), -1), FRAMES, 1)
 
 
-def fields_of(heard: Heard) -> list[Field]:
+def fields_of(heard: ObservedFrames) -> list[Field]:
     """The numbers in them that move, without counters and what jumps."""
     return [
         Field(heard, part, part.layout)
         for part in parts_of(heard)
-        if part.layout is not None and part.verdict in (Verdict.TOLD, Verdict.LIKELY)
+        if part.layout is not None and part.verdict in (LayoutVerdict.TOLD, LayoutVerdict.LIKELY)
     ]
 
 
@@ -289,9 +289,9 @@ def can_driver_lines(options: BusOptions, picture: Picture, database: str | None
             lines.append(f"{key} = {quoted(value)}")
     if options.bitrate is not None:
         lines.append(f'bitrate = "{options.bitrate:g} bit/s"')
-    if any(heard.fd for heard in picture.heard.values()):
+    if any(heard.fd for heard in picture.observed.values()):
         lines.append("fd = true")
-    knows = any(heard.message is not None for heard in picture.heard.values())
+    knows = any(heard.message is not None for heard in picture.observed.values())
     return lines + ([f"dbc = {quoted(database)}"] if database and knows else [])
 
 
@@ -333,7 +333,7 @@ def value_text(signal: CanSignal, number: float) -> str:
 
 
 def _raw(field: Field) -> str:
-    heard, layout = field.heard, field.layout
+    heard, layout = field.observed, field.layout
     extended = ", extended = true" if heard.extended else ""
     fd = ", fd = true" if len(heard.latest) > CLASSIC else ""
     kind = "float = true" if layout.is_float else f"signed = {'true' if layout.signed else 'false'}"

@@ -21,7 +21,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Signal
 from otolith_drivers.canbus.database import Loaded
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import factor
 
@@ -114,7 +114,7 @@ def whole_number(written: object) -> object:
 Identifier = Annotated[int, BeforeValidator(whole_number), Field(ge=0, le=EXTENDED_LIMIT)]
 
 
-class Bits(Closed):
+class BitRange(StrictModel):
     """Where some bits lie, in the words of a DBC."""
 
     start: Annotated[int, Field(ge=0, lt=8 * FD_LENGTH)]
@@ -144,7 +144,7 @@ class Bits(Closed):
         )
 
 
-BITS = tuple(Bits.model_fields)
+BITS = tuple(BitRange.model_fields)
 KINDS: dict[str, tuple[str, ...]] = {
     "signal": ("message",),
     "id": ("extended", "fd", *BITS),
@@ -153,7 +153,7 @@ KINDS: dict[str, tuple[str, ...]] = {
 """The key that says where a signal is, and the keys that go with it alone."""
 
 
-class Source(Closed):
+class Source(StrictModel):
     """``signal`` of a database, bits of the frames with ``id``, or ``object`` of the CANopen ``node``."""
 
     signal: str | None = None
@@ -203,7 +203,7 @@ class Source(Closed):
             self.bits()
         return self
 
-    def bits(self) -> Bits:
+    def bits(self) -> BitRange:
         """Where the bits of ``id`` are.
 
         Raises:
@@ -214,7 +214,7 @@ class Source(Closed):
             raise ValueError("'start' and 'length' (bits) are missing beside 'id'")
         if self.id > STANDARD_LIMIT and not self.extended:
             raise ValueError(f"id 0x{self.id:X} needs 29 bits: set extended = true")
-        found = Bits(
+        found = BitRange(
             start=self.start, length=self.length, byte_order=self.byte_order, signed=self.signed, float=self.float
         )
         size = FD_LENGTH if self.fd else CLASSIC_LENGTH
@@ -230,7 +230,7 @@ ROUNDING = 1e-6  # of a bound: 0.1 in a frame of 32-bit floats is above 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class SignalRequest:
     """A signal of the machine as the frames carry it."""
 
     name: str
@@ -251,7 +251,7 @@ class Wanted:
         return f"{self.name} [{self.target_unit}] from {self.origin}"
 
 
-def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -> Wanted:
+def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -> SignalRequest:
     """What ``signal`` is in ``message``, of which it is ``found``.
 
     Raises:
@@ -275,7 +275,7 @@ def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -
     else:
         low, high = _raw_ends(found.minimum, found.maximum, *inner)
     limit = LARGEST / max(1.0, abs(scale * slope))  # beyond the largest float there is no value, in a frame or scaled
-    return Wanted(
+    return SignalRequest(
         name=signal.name,
         target_unit=signal.unit,
         message=message,
@@ -302,7 +302,7 @@ def _times(source: Source) -> str:
     return scale if source.offset == 0.0 else f"{scale} {source.offset:+g}"
 
 
-def find_in_databases(signal: Signal, databases: Sequence[Loaded]) -> Wanted:
+def find_in_databases(signal: Signal, databases: Sequence[Loaded]) -> SignalRequest:
     """``signal`` in the databases.
 
     Raises:
@@ -402,7 +402,7 @@ def _layout(message: Message, found: CanSignal) -> tuple[object, ...]:
     return (*where, *what, found.multiplexer_signal, tuple(found.multiplexer_ids or ()))
 
 
-def raw_signal(signal: Signal) -> Wanted:
+def raw_signal(signal: Signal) -> SignalRequest:
     """``signal`` by the bits that its source names.
 
     Raises:

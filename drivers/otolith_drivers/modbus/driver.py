@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
 from otolith_drivers.modbus.client import Line
 from otolith_drivers.modbus.options import Item, Options, Source, item_of
-from otolith_drivers.modbus.plausibility import Freshness, OrderWatch
+from otolith_drivers.modbus.plausibility import OrderWatch, StalenessMonitor
 from otolith_drivers.modbus.protocol import Broken, Refused, Silent
-from otolith_drivers.modbus.schedule import Pace, Request, Requests, plan, summary
+from otolith_drivers.modbus.schedule import PollSchedule, Request, Requests, plan, summary
 
 __all__ = ["ModbusPoller", "Options", "Source", "build"]
 
@@ -41,10 +41,10 @@ class ModbusPoller:
         self._items = items
         self._line = Line(options)
         self._requests = Requests(plan(items, options.max_gap, options.max_registers))
-        self._pace = Pace(period)
+        self._pace = PollSchedule(period)
         self._watch = OrderWatch(items)
         self._held_back: dict[str, list[Sample]] = {}
-        self._freshness = Freshness()
+        self._freshness = StalenessMonitor()
         self._received = self._bad = self._lost = self._reconnects = 0
         self._told = False
         self._up, self._was_up, self._reason = False, False, "not opened yet"
@@ -70,11 +70,11 @@ class ModbusPoller:
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
-        complaints = [*self._requests.complaints(time.monotonic()), *self._watch.complaints()]
-        complaints += self._freshness.complaints(self._requests.requests, self._pace.period)
+        warnings = [*self._requests.warnings(time.monotonic()), *self._watch.warnings()]
+        warnings += self._freshness.warnings(self._requests.requests, self._pace.period)
         described = f"{summary(self._requests.requests)}, {self._pace.describe()}"
         period = self._pace.period if self._pace.known or self._pace.period > self._pace.asked else None
-        return Link(self._up, self._reason, tuple(complaints), described, period)
+        return Link(self._up, self._reason, tuple(warnings), described, period)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""

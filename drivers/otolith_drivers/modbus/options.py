@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Signal
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.modbus.protocol import Order, TypeName, bits, reader, registers_of
 from otolith_drivers.units import Quantity, factor
@@ -22,7 +22,7 @@ Table = Literal["holding", "input"]
 Device = Annotated[int, Field(ge=0, le=255)]
 
 
-class LineOptions(Closed):
+class LineOptions(StrictModel):
     """Which line: a host, or a serial port."""
 
     host: str | None = None
@@ -75,7 +75,7 @@ class Options(LineOptions):
     """That the device gives at once."""
 
 
-class Source(Closed):
+class Source(StrictModel):
     """Where a signal is: ``{ register = 100, type = "float32", unit = "V" }``."""
 
     register_: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1, alias="register")]

@@ -199,7 +199,7 @@ class OrderWatch:
         if found.plausible and (size := usual_size(history, item.kind, item.order)) > 0.0:
             self._usual[name] = size
 
-    def complaints(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What is withheld and why, a line each."""
         lines = []
         for name, judgement in list(self._judgements.items()):
@@ -225,7 +225,7 @@ COARSE_SHARE = 0.5  # share of readings that move by so few, above which registe
 MOST_IN_A_ROW = 100  # old images; what says the same for longer stands still
 
 
-class Freshness:
+class StalenessMonitor:
     """Of all requests of a driver."""
 
     def __init__(self) -> None:
@@ -253,7 +253,7 @@ class Freshness:
             self._beats[request] = beats + MEMORY * (repeated - beats)
         return repeated, 1 < in_a_row <= MOST_IN_A_ROW and beats < SELDOM and coarse < COARSE_SHARE
 
-    def complaints(self, requests: Sequence[Request], period: float) -> list[str]:
+    def warnings(self, requests: Sequence[Request], period: float) -> list[str]:
         """Which of ``requests`` say the same too often to be read every ``period`` s, a line each."""
         shares = {entry: self._shares[entry] for entry in requests if self._readings.get(entry, 0) >= SETTLED}
         return [

@@ -27,8 +27,8 @@ from otolith_drivers.number_inference import (
     REGISTERS,
     Bytes,
     Layout,
+    LayoutVerdict,
     Part,
-    Verdict,
     number_text,
     parts,
     quoted,
@@ -40,11 +40,11 @@ MOST_TIMES = 1000  # kept of each length of request
 BUSY, MOST_BUSY, BUSY_PAUSE = (5, 6), 5, 0.1  # exceptions that say "later"; how often; s
 Stopped = Callable[[], bool]
 """Whether the user has seen enough."""
-Told = Callable[[str], None]
+ProgressCallback = Callable[[str], None]
 """Takes what is being done, for a line of progress."""
 
 
-class Asker:
+class Client:
     """One table of one device, asked again and again; counts and times the answers."""
 
     def __init__(self, line: Line, options: LineOptions, device: int, table: Table) -> None:
@@ -118,7 +118,7 @@ def open_line(line: Line, options: LineOptions) -> None:
 
 
 @contextmanager
-def opened(options: LineOptions, told: Told) -> Iterator[Line]:
+def opened(options: LineOptions, told: ProgressCallback) -> Iterator[Line]:
     """The line, open, and closed at the end.
 
     Raises:
@@ -153,11 +153,13 @@ class Answer:
     """What a device says to a single question."""
 
     device: int
-    said: str
+    reply: str
     """Why it does not give the register; empty if it does."""
 
 
-def scan(asker: Asker, devices: Sequence[int], register: int, stopped: Stopped, told: Told) -> list[Answer]:
+def scan(
+    asker: Client, devices: Sequence[int], register: int, stopped: Stopped, told: ProgressCallback
+) -> list[Answer]:
     """Those of ``devices`` that answer when asked for one register.
 
     Raises:
@@ -224,7 +226,7 @@ class Survey:
         return lines + [f"{spans(addresses)} refused: {reason}" for reason, addresses in by_reason]
 
 
-def survey(asker: Asker, first: int, last: int, stopped: Stopped, told: Told) -> Survey:
+def survey(asker: Client, first: int, last: int, stopped: Stopped, told: ProgressCallback) -> Survey:
     """Find out which of the registers ``first`` to ``last`` can be read; what is refused is split, down to one.
 
     Raises:
@@ -245,7 +247,7 @@ def survey(asker: Asker, first: int, last: int, stopped: Stopped, told: Told) ->
     return _joined(asker, found, stopped)
 
 
-def _reason_against(asker: Asker, block: Block) -> str | None:
+def _reason_against(asker: Client, block: Block) -> str | None:
     """Why ``block`` cannot be read; None if it can.
 
     Raises:
@@ -265,7 +267,7 @@ def _reason_against(asker: Asker, block: Block) -> str | None:
     return None
 
 
-def _say_dead_unless_one_answers(asker: Asker, block: Block) -> None:
+def _say_dead_unless_one_answers(asker: Client, block: Block) -> None:
     """Some devices keep silent where they should refuse, so a single register is asked for before they are given up."""
     try:
         asker.read(block.address, 1)
@@ -288,7 +290,7 @@ def _halves(block: Block) -> list[Block]:
     return [Block(block.address, half), Block(block.address + half, block.count - half)]
 
 
-def _joined(asker: Asker, found: Survey, stopped: Stopped) -> Survey:
+def _joined(asker: Client, found: Survey, stopped: Stopped) -> Survey:
     """Neighbours in one request where the device allows it; where not, that is the most it gives at once."""
     joined: list[Block] = []
     for block in found.blocks:
@@ -315,7 +317,9 @@ def spans(addresses: Sequence[int], noun: str = "register") -> str:
     return f"{noun}{'s' * (len(ordered) > 1)} {text}"
 
 
-def watch(asker: Asker, blocks: Sequence[Block], seconds: float, stopped: Stopped, told: Told) -> dict[Block, Words]:
+def watch(
+    asker: Client, blocks: Sequence[Block], seconds: float, stopped: Stopped, told: ProgressCallback
+) -> dict[Block, Words]:
     """Readings (rounds by registers) of every block, again and again for so many seconds; at least one round."""
     readings: dict[Block, list[list[int]]] = {block: [] for block in blocks}
     period = max(SHORTEST_PERIOD, seconds / MOST_READINGS)
@@ -356,7 +360,7 @@ class Speed:
         )
 
 
-def speeds(asker: Asker, blocks: Sequence[Block]) -> list[Speed]:
+def speeds(asker: Client, blocks: Sequence[Block]) -> list[Speed]:
     """Of the requests that the blocks take, in their order."""
     return [Speed.of(block.count, trips) for block in blocks if (trips := list(asker.round_trips.get(block.count, ())))]
 
@@ -369,11 +373,11 @@ def possible_rate(found: Sequence[Speed]) -> float:
 
 # A device that has one order for some numbers hardly ever has another for others: bits, once and for each reading.
 OTHER_ORDER, OTHER_ORDER_OF_EACH = 8.0, 1.5
-VOTES = {Verdict.TOLD: 3, Verdict.LIKELY: 1}  # for the order of all
+VOTES = {LayoutVerdict.TOLD: 3, LayoutVerdict.LIKELY: 1}  # for the order of all
 COLUMNS: tuple[TypeName, ...] = ("int16", "uint16", "int32", "float32")
 REMARKS = {
-    Verdict.STILL: "cannot be told, as nothing changes there: move the machine and probe again",
-    Verdict.WILD: "jumps over its whole range: part of something larger, or noise",
+    LayoutVerdict.STILL: "cannot be told, as nothing changes there: move the machine and probe again",
+    LayoutVerdict.WILD: "jumps over its whole range: part of something larger, or noise",
 }
 WIDE_COLUMNS: tuple[TypeName, ...] = ("int64", "float64")
 
@@ -493,7 +497,7 @@ def modbus_signal_lines(place: Place, numbers: Sequence[Number]) -> list[str]:
     lines = ["[signals]"]
     for number in numbers:
         layout, part = number.part.layout, number.part
-        if layout is None or part.verdict is Verdict.WILD:
+        if layout is None or part.verdict is LayoutVerdict.WILD:
             continue
         order = f', order = "{layout.order}"' if layout.width > 2 or layout.order != "ABCD" else ""
         table = f', table = "{place.table}"' if place.table != "holding" else ""

@@ -105,7 +105,7 @@ def reader(kind: TypeName, order: Order) -> Callable[[Sequence[int]], float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Bits:
+class RegisterBits:
     """Some bits of an integer, the lowest counted as 0."""
 
     low: int
@@ -116,7 +116,7 @@ class Bits:
         return (int(value) >> self.low) & ((1 << (self.high - self.low + 1)) - 1)
 
 
-def bits(written: str, kind: TypeName) -> Bits:
+def bits(written: str, kind: TypeName) -> RegisterBits:
     """``"3"`` or ``"4..7"`` understood.
 
     Raises:
@@ -130,4 +130,4 @@ def bits(written: str, kind: TypeName) -> Bits:
     if is_float(kind) or not low <= high < width:
         allowed = "none, as it has no bits of its own" if is_float(kind) else f"0 to {width - 1}, the lower one first"
         raise ValueError(f"bits {written!r}: of {kind} there are {allowed}")
-    return Bits(low, high)
+    return RegisterBits(low, high)

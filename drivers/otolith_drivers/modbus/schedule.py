@@ -171,7 +171,7 @@ class Requests:
         devices = {request.device for request in self.requests}
         return all(self._devices.get(device, Rest()).resting for device in devices)
 
-    def complaints(self, now: float) -> list[str]:
+    def warnings(self, now: float) -> list[str]:
         """What is left alone and why, a line each."""
         lines = [
             f"device {number} does not answer for {now - rest.since:.0f} s: {rest.fault}; tried again"
@@ -206,7 +206,7 @@ QUARTERS = 4  # of the period: steps away from the beat
 MOST_BEATS = 64  # hundreds of rounds between two steps away from the beat, where steps do not help
 
 
-class Pace:
+class PollSchedule:
     """The grid of rounds."""
 
     def __init__(self, asked: float) -> None:

@@ -12,8 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.config_files import Closed
-from otolith_drivers.plant.faults import Array, Seconds, Tick, Unbalance, shaking
+from otolith_drivers.config_files import StrictModel
+from otolith_drivers.plant.faults import Array, PlantSample, Seconds, Unbalance, shaking
 from otolith_drivers.plant.scenario import POSITIVE, Scenario, Stretch, stretches
 from otolith_drivers.units import Quantity
 
@@ -36,7 +36,7 @@ SIGNALS = {"ArmatureVoltage": "V", "ArmatureCurrent": "A", "RotorSpeed": "rad/s"
 UNITS = {"R_a": "ohm", "L_a": "H", "J": "kg*m^2", "K_e": "V*s/rad", "K_t": "N*m/A", "D": "N*m*s/rad"}
 
 
-class Parameters(Closed):
+class MotorParameters(StrictModel):
     """The motor's parameters at time zero; the default values are Table 3 of the paper."""
 
     R_a: Annotated[float, BeforeValidator(Quantity(UNITS["R_a"], POSITIVE))] = 6.5
@@ -47,7 +47,7 @@ class Parameters(Closed):
     D: Annotated[float, BeforeValidator(Quantity(UNITS["D"], 0.0))] = 0.00143
 
 
-class Controller(Closed):
+class SpeedController(StrictModel):
     """The drive's speed controller, a PI with the gains of the paper."""
 
     K_p: Annotated[float, BeforeValidator(Quantity("V*s/rad", 0.0))] = 0.3
@@ -55,14 +55,14 @@ class Controller(Closed):
     voltage_limit: Annotated[float, BeforeValidator(Quantity("V", POSITIVE))] = 48.0
 
 
-class SetPoint(Closed):
+class SetPoint(StrictModel):
     """The speed asked for, from a moment on."""
 
     at: Seconds
     speed: Annotated[float, BeforeValidator(Quantity("rad/s", -1e4, 1e4))]
 
 
-class Noise(Closed):
+class MotorNoise(StrictModel):
     """Standard deviation of each sensor; what the controller sees is as noisy as what the bus carries."""
 
     current: Annotated[float, BeforeValidator(Quantity("A", 0.0))] = 0.0
@@ -78,14 +78,14 @@ class MotorScenario(Scenario):
     HAS_SHAFT: ClassVar[bool] = True
 
     plant: Literal["dc_motor"]
-    parameters: Parameters = Parameters()
+    parameters: MotorParameters = MotorParameters()
     load: Annotated[float, BeforeValidator(Quantity("N*m*s/rad", 0.0))] = 0.006
     """Load torque per speed."""
-    controller: Controller = Controller()
+    controller: SpeedController = SpeedController()
     set_points: Annotated[tuple[SetPoint, ...], Field(min_length=1)]
     repeat_every: Seconds | None = None
     """The set-points start again after this time; without it the last one stays."""
-    noise: Noise = Noise()
+    noise: MotorNoise = MotorNoise()
 
     @model_validator(mode="after")
     def _set_points_fit(self) -> Self:
@@ -100,7 +100,7 @@ class MotorScenario(Scenario):
 SCENARIO = MotorScenario
 
 
-def simulate(scenario: Any) -> Iterator[Tick]:
+def simulate(scenario: Any) -> Iterator[PlantSample]:
     """The machine from rest, one tick per sample period, without end; the same for the same seed."""
     noise, euler = scenario.noise, scenario.integrator == "euler"
     steps = max(1, round(scenario.sample_period / (EULER_STEP if euler else RUNGE_KUTTA_STEP)))
@@ -119,7 +119,9 @@ def simulate(scenario: Any) -> Iterator[Tick]:
                 "RotorSpeed": seen,
                 "LoadTorque": scenario.load * speed + noise.load_torque * errors[2],
             }
-            yield Tick(stretch.times.item(index), measured, stretch.truth[index] | {"i": current, "omega": speed})
+            yield PlantSample(
+                stretch.times.item(index), measured, stretch.truth[index] | {"i": current, "omega": speed}
+            )
             state = advance(index, state, voltage)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.plant.faults import IN_PROCESS
 from otolith_drivers.plant.realtime import Summary, Turn, in_real_time, refuse_unfit
@@ -21,14 +21,14 @@ __all__ = ["Options", "PlantDriver", "Source", "build"]
 log = logging.getLogger(__name__)
 
 
-class Options(Closed):
+class Options(StrictModel):
     """``[driver]`` with ``type = "plant"``."""
 
     scenario: Path
     """What happens to the machine; relative to the machine file."""
 
 
-class Source(Closed):
+class Source(StrictModel):
     """Which of its signals."""
 
     signal: str

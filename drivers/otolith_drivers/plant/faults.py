@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.modbus.protocol import Order
 from otolith_drivers.units import Quantity
 
 
 @dataclass(frozen=True, slots=True)
-class Tick:
+class PlantSample:
     """One sampling instant."""
 
     time: float
@@ -47,7 +47,7 @@ Share = Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))]
 """Of ticks, each by its own throw of the dice."""
 
 
-class Span(Closed):
+class Span(StrictModel):
     """From ``start`` on, and before ``until``."""
 
     start: Seconds
@@ -141,7 +141,7 @@ class Spikes(_OfASignal):
 SensorFault = Frozen | Gain | Offset | Spikes
 
 
-def distorted(ticks: Iterable[Tick], faults: list[tuple[SensorFault, Distortion]]) -> Iterator[Tick]:
+def distorted(ticks: Iterable[PlantSample], faults: list[tuple[SensorFault, Distortion]]) -> Iterator[PlantSample]:
     """``ticks`` as the bus carries them; several faults of a signal act one after the other."""
     for tick in ticks:
         measured = dict(tick.measured)
@@ -215,7 +215,7 @@ class Jitter(Span):
         return replace(effect, delay=effect.delay + lateness)
 
 
-class ClockStep(Closed):
+class ClockStep(StrictModel):
     """The node's clock is set: from ``start`` on ticks come later by ``by``, or earlier if that is below zero.
 
     Those that come earlier come in a burst at first, as a node does that makes up for time it believes to have lost.
@@ -289,7 +289,7 @@ class Refusal(Span):
 BusFault = Dropouts | Gone | Jitter | ClockStep | WordOrder | Garbage | Refusal
 
 
-class Interference:
+class FaultInjector:
     """All faults of the bus of one scenario, each with random numbers of its own."""
 
     def __init__(self, faults: Sequence[object], seed: int) -> None:
@@ -316,7 +316,7 @@ def _first(before: int | None, number: int) -> int:
 Array = NDArray[np.float64]
 
 
-class Drift(Closed):
+class Drift(StrictModel):
     """``amount * (exp(rate * (t - start)) - 1)`` added to a parameter: wear that feeds on itself."""
 
     kind: Literal["drift"]
@@ -333,7 +333,7 @@ class Drift(Closed):
         return amount * np.expm1(self.rate * np.maximum(np.minimum(times, self.until) - self.start, 0.0))
 
 
-class Step(Closed):
+class Step(StrictModel):
     """``amount`` added to a parameter from ``start`` on: a sudden fault."""
 
     kind: Literal["step"]
@@ -346,7 +346,7 @@ class Step(Closed):
         return np.where(times > self.start, amount, 0.0)
 
 
-class Unbalance(Closed):
+class Unbalance(StrictModel):
     """A sinusoidal angular acceleration of the shaft (Eq. 13), of a fixed frequency or an order of the shaft angle."""
 
     kind: Literal["unbalance"]

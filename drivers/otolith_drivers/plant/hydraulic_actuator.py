@@ -15,8 +15,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator
 
-from otolith_drivers.config_files import Closed
-from otolith_drivers.plant.faults import Tick
+from otolith_drivers.config_files import StrictModel
+from otolith_drivers.plant.faults import PlantSample
 from otolith_drivers.plant.scenario import POSITIVE, Scenario, Stretch, stretches
 from otolith_drivers.units import Quantity
 
@@ -33,7 +33,7 @@ UNITS = {
 }
 
 
-class Parameters(Closed):
+class LiftParameters(StrictModel):
     """The lift's parameters at time zero; the default values are Table 4 of the paper."""
 
     k_spring: Annotated[float, BeforeValidator(Quantity(UNITS["k_spring"], 0.0))] = 200.0
@@ -46,7 +46,7 @@ class Parameters(Closed):
     """C of Eq. 18: the pressure is (1 + C) times that without a leak."""
 
 
-class Controller(Closed):
+class PositionController(StrictModel):
     """The valve's PID controller, Eq. 17 with the gains of the paper."""
 
     K_p: Annotated[float, BeforeValidator(Quantity("m", 0.0))] = 0.000346
@@ -55,14 +55,14 @@ class Controller(Closed):
     N: Annotated[float, BeforeValidator(Quantity("1/s", 0.0))] = 2.076743
 
 
-class Reference(Closed):
+class Reference(StrictModel):
     """The position asked for, a sine."""
 
     amplitude: Annotated[float, BeforeValidator(Quantity("m", 0.0, 10.0))] = 0.45
     frequency: Annotated[float, BeforeValidator(Quantity("Hz", 0.0, 10.0))] = 0.005
 
 
-class Noise(Closed):
+class LiftNoise(StrictModel):
     """Standard deviation of each sensor."""
 
     position: Annotated[float, BeforeValidator(Quantity("m", 0.0))] = 0.0
@@ -77,17 +77,17 @@ class LiftScenario(Scenario):
     SIGNALS: ClassVar[dict[str, str]] = SIGNALS
 
     plant: Literal["hydraulic_actuator"]
-    parameters: Parameters = Parameters()
+    parameters: LiftParameters = LiftParameters()
     load: Annotated[float, BeforeValidator(Quantity("N", 0.0))] = 1000.0 * 9.80665
-    controller: Controller = Controller()
+    controller: PositionController = PositionController()
     reference: Reference = Reference()
-    noise: Noise = Noise()
+    noise: LiftNoise = LiftNoise()
 
 
 SCENARIO = LiftScenario
 
 
-def simulate(scenario: Any) -> Iterator[Tick]:
+def simulate(scenario: Any) -> Iterator[PlantSample]:
     """The lift from its lowest reference on, one tick per sample period, without end; the same for the same seed."""
     noise = scenario.noise
     for stretch, index, position, pressure, valve in _run(scenario):
@@ -98,7 +98,7 @@ def simulate(scenario: Any) -> Iterator[Tick]:
             "PistonPosition": position + noise.position * errors[1],
             "SystemPressure": pressure + noise.pressure * errors[2],
         }
-        yield Tick(stretch.times.item(index), measured, stretch.truth[index] | {"x": position, "p": pressure})
+        yield PlantSample(stretch.times.item(index), measured, stretch.truth[index] | {"x": position, "p": pressure})
 
 
 def _run(scenario: LiftScenario) -> Iterator[tuple[Stretch, int, float, float, float]]:

@@ -38,20 +38,20 @@ UNREADABLE = 0  # stands for the function of a request that cannot be decoded
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
+class _ConnectionState:
     """What the device is between two ticks; put in place of the one before as a whole."""
 
     registers: list[int]
     effect: Effect
 
 
-class Drive:
+class ModbusDrive:
     """The device. Its ticks come from one thread and its requests from another, the only one that counts requests."""
 
     def __init__(self, options: ModbusOptions, registers: RegisterMap, *, alone: bool) -> None:
         """``alone``: who asks for another device hears that there is none; else it is for others on the line to say."""
         self._options, self._map, self._alone = options, registers, alone
-        self._state = _State([0] * registers.size, Effect())
+        self._state = _ConnectionState([0] * registers.size, Effect())
         self._done = Summary({})
 
     def begin(self, done: Summary) -> None:
@@ -62,7 +62,7 @@ class Drive:
         """Take over a tick, all registers at once."""
         order = turn.effect.order or self._options.order
         registers = self._map.encode(turn.tick.measured, turn.index, order)
-        self._state = _State(registers, turn.effect)
+        self._state = _ConnectionState(registers, turn.effect)
 
     def device(self) -> SimDevice:
         """For pymodbus, which asks :meth:`answer` before it looks here."""
@@ -105,7 +105,7 @@ class Drive:
         """Another answer is on its way."""
         self._done.answers += 1
 
-    def _heard(self, device: int, function: int) -> _State | None:
+    def _heard(self, device: int, function: int) -> _ConnectionState | None:
         """The state that answers a request; None if it stays unanswered. Either is counted."""
         state = self._state
         if device != self._options.device and not self._alone:
@@ -154,7 +154,7 @@ class Conversation(ServerRequestHandler):
 class Server(ModbusTcpServer):
     """A server of pymodbus that answers what ``drive`` does, on whatever ``attach`` makes."""
 
-    def __init__(self, drive: Drive, framer: FramerType) -> None:
+    def __init__(self, drive: ModbusDrive, framer: FramerType) -> None:
         """To be made where its event loop runs."""
         super().__init__(drive.device(), framer=framer)
         self.drive = drive
@@ -188,7 +188,7 @@ class _ModbusNode(ABC):
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would say of requests is counted
         self._scenario = scenario
         self._map = RegisterMap(scenario.modbus, scenario.SIGNALS)
-        self._drive = Drive(scenario.modbus, self._map, alone=alone)
+        self._drive = ModbusDrive(scenario.modbus, self._map, alone=alone)
         self._server: Server | None = None
 
     def title(self) -> str:

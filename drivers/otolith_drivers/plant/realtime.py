@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from otolith_drivers.errors import ConfigurationError, ServiceError
-from otolith_drivers.plant.faults import CAN, MODBUS_RTU, MODBUS_TCP, BusFault, Effect, Interference, Tick
+from otolith_drivers.plant.faults import CAN, MODBUS_RTU, MODBUS_TCP, BusFault, Effect, FaultInjector, PlantSample
 from otolith_drivers.plant.scenario import Scenario, simulate
 
 
@@ -94,7 +94,7 @@ class Turn:
     """A tick whose moment has come."""
 
     index: int
-    tick: Tick
+    tick: PlantSample
     lived: float
     """When the machine was so, in s on this computer's monotonic clock; a delay of its bus does not change that."""
     due: float
@@ -123,7 +123,7 @@ def in_real_time(
 
     One that its delay puts before another that has been sent comes at once.
     """
-    interference = Interference(scenario.faults, scenario.seed)
+    interference = FaultInjector(scenario.faults, scenario.seed)
     start = latest = time.monotonic()
     for index, tick in enumerate(simulate(scenario)):
         effect = interference.at(tick.time)

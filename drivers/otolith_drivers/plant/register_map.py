@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.modbus.protocol import BYTES_SWAPPED, LETTERS, WORDS_SWAPPED, Order
 from otolith_drivers.units import Quantity
 
@@ -23,7 +23,7 @@ RANGES: dict[Type, tuple[float, float]] = {
 }
 
 
-class ModbusOptions(Closed):
+class ModbusOptions(StrictModel):
     """``[modbus]`` of a scenario."""
 
     host: str = "127.0.0.1"

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BeforeValidator, model_validator
 
 from otolith_drivers.canbus.bus import BusOptions
-from otolith_drivers.config_files import Closed, expect, parse, read, validate
+from otolith_drivers.config_files import StrictModel, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.plant.faults import (
     Array,
@@ -22,10 +22,10 @@ from otolith_drivers.plant.faults import (
     Drift,
     Fault,
     Offset,
+    PlantSample,
     SensorFault,
     Spikes,
     Step,
-    Tick,
     Unbalance,
     distorted,
     generator,
@@ -39,7 +39,7 @@ STRETCH_PERIODS = 256  # numpy's overhead is shared by so many, and a node in re
 STRETCH_STEPS = 32768  # at most, however many a sample period has
 
 
-class Scenario(Closed):
+class Scenario(StrictModel):
     """The part of a scenario file that all machines share."""
 
     UNITS: ClassVar[dict[str, str]]
@@ -187,12 +187,12 @@ def load_scenario(path: Path) -> Scenario:
     return scenario.model_copy(update={"dbc": path.parent / scenario.dbc, "modbus": modbus})
 
 
-def simulate(scenario: Scenario) -> Iterator[Tick]:
+def simulate(scenario: Scenario) -> Iterator[PlantSample]:
     """The machine of ``scenario``, one tick per sample period, without end; the same for the same seed.
 
     What is measured is as its sensors say it, faults included; what happens on the bus is not in it.
     """
-    ticks: Iterator[Tick] = _module(scenario.plant).simulate(scenario)
+    ticks: Iterator[PlantSample] = _module(scenario.plant).simulate(scenario)
     distortions = scenario.distortions()
     return distorted(ticks, distortions) if distortions else ticks
 

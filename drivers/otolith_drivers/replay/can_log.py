@@ -33,7 +33,7 @@ OBJECT = struct.Struct("<4sHHLL")  # of a BLF file: signature, size of header, v
 logging.getLogger("can.io").setLevel(logging.ERROR)  # what it would say of single lines is counted here
 
 
-class Fault(NamedTuple):
+class LogFault(NamedTuple):
     """Where a frame should have been, and what was there."""
 
     place: int
@@ -51,7 +51,7 @@ class FrameSource(Protocol):
     def passed(self) -> int:
         """Lines that are no frames, and no faults either, like comments."""
 
-    def frames(self) -> Iterator[tuple[int, can.Message | Fault]]:
+    def frames(self) -> Iterator[tuple[int, can.Message | LogFault]]:
         """All of them, in the order of the file; once."""
 
 
@@ -143,7 +143,7 @@ class TextFrames:
         """See :class:`FrameSource`."""
         return self._lines.number - self._taken
 
-    def frames(self) -> Iterator[tuple[int, can.Message | Fault]]:
+    def frames(self) -> Iterator[tuple[int, can.Message | LogFault]]:
         """See :class:`FrameSource`."""
         lines = self._lines
         reader = self._kind.reader(lines)
@@ -173,9 +173,9 @@ class TextFrames:
                 f"{self._path}: its times count from frame to frame ('timestamps relative'): export them absolute"
             )
 
-    def _fault(self, what: str) -> Fault:
+    def _fault(self, what: str) -> LogFault:
         text = self._lines.line.strip()
-        return Fault(self._lines.number, f"{text[:60] + '...' if len(text) > 60 else text!r} {what}")
+        return LogFault(self._lines.number, f"{text[:60] + '...' if len(text) > 60 else text!r} {what}")
 
 
 class BinaryFrames:
@@ -195,7 +195,7 @@ class BinaryFrames:
                 "nothing can be read; a candump (.log) does not lose what was written"
             ) from error
 
-    def frames(self) -> Iterator[tuple[int, can.Message | Fault]]:
+    def frames(self) -> Iterator[tuple[int, can.Message | LogFault]]:
         """See :class:`FrameSource`."""
         number = 0
         try:
@@ -206,7 +206,7 @@ class BinaryFrames:
             place = number + 1
             yield (
                 place,
-                Fault(
+                LogFault(
                     place,
                     f"the file is damaged or cut off here, and not read any further ({error or type(error).__name__})",
                 ),
@@ -286,7 +286,7 @@ class CanLog:
         self.place = self._source.place
         self._signals = signals
         self._channels = set[str]()
-        self._first_bad: Fault | None = None
+        self._first_bad: LogFault | None = None
         self._frames = self._others = self._unreadable = self._undecoded = 0
         self._latest = -math.inf
 
@@ -316,7 +316,7 @@ class CanLog:
         wanted = set(self._decoder.identifiers())
         batch = _Batch(self._signals)
         for place, frame in self._source.frames():
-            if isinstance(frame, Fault):
+            if isinstance(frame, LogFault):
                 self._unreadable += 1
                 self._note(frame)
                 continue
@@ -340,14 +340,14 @@ class CanLog:
         time = frame.timestamp
         if not abs(time) <= LATEST:
             self._unreadable += 1
-            self._note(Fault(place, f"its time is {time:g} s"))
+            self._note(LogFault(place, f"its time is {time:g} s"))
             return []
         samples = self._decoder.decode(frame, time)
         if not samples or any(math.isnan(sample.value) for sample in samples):
             bad = self._decoder.counters.bad
             if bad > self._undecoded:
                 what = f"frame 0x{frame.arbitration_id:X} with data {bytes(frame.data).hex(' ') or 'of no length'}"
-                self._note(Fault(place, f"{what} is too short, or has a value out of its range"))
+                self._note(LogFault(place, f"{what} is too short, or has a value out of its range"))
             self._undecoded = bad
         if samples:
             self._latest = max(self._latest, time)
@@ -355,7 +355,7 @@ class CanLog:
                 self._channels.add(str(frame.channel))
         return samples
 
-    def _note(self, fault: Fault) -> None:
+    def _note(self, fault: LogFault) -> None:
         if self._first_bad is None:
             self._first_bad = fault
 
@@ -363,12 +363,12 @@ class CanLog:
         """See :meth:`otolith_drivers.replay.readers.Reader.describe`."""
         return self._decoder.describe()
 
-    def found(self) -> list[str]:
+    def summary_lines(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.found`."""
         parts = [f"{self._frames} frames read", f"{self._others} of other messages", f"{self.bad} bad"]
         return parts + ([f"{self._source.passed} {self.place}s without a frame"] if self._source.passed else [])
 
-    def complaints(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.complaints`."""
         lines = []
         if self._first_bad is not None:
@@ -379,7 +379,7 @@ class CanLog:
         lines += [f"cut off: {self._opened.torn}"] if self._opened.torn else []
         lines += self._source.notes
         # What could not be used is told above, by its place in the file.
-        return lines + (self._decoder.complaints(self._latest, unused=False) if self._frames else [])
+        return lines + (self._decoder.warnings(self._latest, unused=False) if self._frames else [])
 
     def _why_none(self) -> str:
         if self._first_bad is not None:

@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import ConfigDict
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
-from otolith_drivers.config_files import Closed, fitted
+from otolith_drivers.config_files import StrictModel, validated
 from otolith_drivers.errors import ConfigurationError, DeviceError, OtolithError
 from otolith_drivers.replay.readers import Array, Reader, Rows, format_of, holds_frames
 
@@ -73,7 +73,7 @@ LONGEST_WAIT = 0.2  # s; how late a stop can be noticed
 LONG_SILENCE = 60.0  # s without a row in the file, after which it is worth a word
 
 
-class Options(Closed):
+class Options(StrictModel):
     """``[driver]`` with ``type = "replay"``."""
 
     file: Path
@@ -85,7 +85,7 @@ class Options(Closed):
     """For a log of a CAN bus: what ``[driver]`` with ``type = "can"`` would say of its frames."""
 
 
-class Source(Closed):
+class Source(StrictModel):
     """Depends on the file: ``column`` and ``unit`` for a table, what the CAN driver takes for a log of a bus."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
@@ -120,9 +120,9 @@ def opener(path: Path, options: Options, setup: Setup) -> Callable[[], Reader]:
                 "missing: what is in the frames of the log: can = { dbc = ... }", ("driver", "can")
             )
         said = {key: value for key, value in options.can.items() if key != "type"}
-        can = fitted(said, CanOptions, ("driver", "can"))
+        can = validated(said, CanOptions, ("driver", "can"))
     signals = tuple(
-        Signal(entry.name, entry.unit, fitted(entry.source.model_dump(), kind.Source, ("signals", entry.name)))
+        Signal(entry.name, entry.unit, validated(entry.source.model_dump(), kind.Source, ("signals", entry.name)))
         for entry in setup.signals
     )
     wanted = Setup(signals, setup.folder, setup.sample_period)
@@ -181,11 +181,11 @@ class Replayer:
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
         reader = self._reader
-        lines = [] if reader is None else reader.complaints()
+        lines = [] if reader is None else reader.warnings()
         silence = self._clock - time.monotonic()
         if self._paced and not self._down and silence > LONG_SILENCE:
             lines.append(f"the file has nothing for another {silence:.0f} s")
-        return Link(up=not self._down, reason=self._down, complaints=tuple(lines))
+        return Link(up=not self._down, reason=self._down, warnings=tuple(lines))
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""

@@ -25,7 +25,7 @@ from importlib import import_module
 from typing import Any, cast
 
 from otolith_drivers.base import Setup
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -85,10 +85,10 @@ class Reader(Protocol):
     def describe(self) -> list[str]:
         """What is read from where, a line per signal."""
 
-    def found(self) -> list[str]:
+    def summary_lines(self) -> list[str]:
         """How much was read and what was wrong with it, in a few words each; first of what, and how much."""
 
-    def complaints(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What a user should know of the file before trusting what was made of it, a line each."""
 
     def __enter__(self) -> "Reader": ...
@@ -181,7 +181,7 @@ TABLE = "otolith_drivers.replay.tables"
 class Format(Protocol):
     """What a row of the table points to: a module with these two names."""
 
-    Source: type[Closed]
+    Source: type[StrictModel]
     """Where in such a file a signal is."""
 
     def open_log(self, path: Path, setup: Setup, can: Any | None) -> Reader:

@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
 from otolith_drivers.base import Setup
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.replay.readers import Array, Integers, Mask, Rows
 from otolith_drivers.units import factor
@@ -30,7 +30,7 @@ FOLDER, WINDOWS = "/signals/", "/windows"
 NAME = re.compile(r".* measured \[(.*)\]")
 
 
-class Source(Closed):
+class Source(StrictModel):
     """Signals are found under their own names."""
 
 
@@ -184,11 +184,11 @@ class Recorded:
         """See :meth:`otolith_drivers.replay.readers.Reader.describe`."""
         return [f"{name} [{unit}] from {FOLDER}{name}" for name, unit in self._units.items()]
 
-    def found(self) -> list[str]:
+    def summary_lines(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.found`."""
         return [f"{self._records} records read", f"{self.bad} bad"]
 
-    def complaints(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.complaints`."""
         lines = [] if self._closed else ["never closed by the recorder: its last moments may be missing"]
         if self._bad_windows:

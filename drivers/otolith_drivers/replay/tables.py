@@ -26,7 +26,7 @@ from typing import NamedTuple, TextIO
 import numpy as np
 
 from otolith_drivers.base import Setup
-from otolith_drivers.config_files import Closed
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.replay.readers import LATEST, Array, Integers, Mask, Opened, Rows
 from otolith_drivers.units import factor
@@ -94,7 +94,7 @@ class Column(NamedTuple):
     offset: float = 0.0
 
 
-class Wanted(NamedTuple):
+class ColumnRequest(NamedTuple):
     """A signal that is to be found: its column, its unit, and the one of the column if somebody else said it."""
 
     column: str
@@ -137,7 +137,7 @@ def _encoding(head: bytes) -> str:
     return "utf-8-sig"
 
 
-def read_heading(path: Path, file: TextIO, wanted: Mapping[str, Wanted]) -> Heading:
+def read_heading(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -> Heading:
     """The heading of ``file``, read up to the end of that line.
 
     Raises:
@@ -146,7 +146,7 @@ def read_heading(path: Path, file: TextIO, wanted: Mapping[str, Wanted]) -> Head
     number, line, separator = _heading_line(path, file)
     cells = [cell.strip() for cell in split_line(line, separator)]
     place = f"{path}:{number}"
-    wanted = {TIME: Wanted(TIME, SECONDS), **wanted}
+    wanted = {TIME: ColumnRequest(TIME, SECONDS), **wanted}
     known = list(dict.fromkeys(entry.column for entry in wanted.values()))
     if any(cells) and all(NUMBER.fullmatch(cell.replace(",", ".")) for cell in cells if cell):
         raise ConfigurationError(f"{place}: numbers, where the names of the columns must stand: {', '.join(known)}")
@@ -200,7 +200,7 @@ def _column(index: int, unit: str | None, target: str, place: str) -> Column:
         raise ConfigurationError(f"{place}: {error}") from error
 
 
-def _missing(entry: Wanted, others: list[str], cells: list[str]) -> str:
+def _missing(entry: ColumnRequest, others: list[str], cells: list[str]) -> str:
     what = f"no column {entry.column!r} ({'seconds' if entry.column == TIME else entry.unit})"
     if len(cells) < 2:
         return f"{what}, and no ',', ';' or tab between columns"
@@ -328,7 +328,7 @@ class _Stretch:
 CHUNK = 1 << 20  # characters read at once
 
 
-class Source(Closed):
+class Source(StrictModel):
     """Which column a signal is."""
 
     column: str | None = None
@@ -359,7 +359,9 @@ class Table:
         self.counts = TableCounts()
         self._opened = Opened(path)
         found = {name: (sources or {}).get(name, Source()) for name in units}
-        self._wanted = {name: Wanted(source.column or name, units[name], source.unit) for name, source in found.items()}
+        self._wanted = {
+            name: ColumnRequest(source.column or name, units[name], source.unit) for name, source in found.items()
+        }
         try:
             self._file = as_text(path, self._opened)
             self._heading = read_heading(path, self._file, self._wanted)
@@ -392,13 +394,13 @@ class Table:
         """See :meth:`otolith_drivers.replay.readers.Reader.describe`."""
         return [f"{name} [{entry.unit}] from column {entry.column!r}" for name, entry in self._wanted.items()]
 
-    def found(self) -> list[str]:
+    def summary_lines(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.found`."""
         counts = self.counts
         parts = [f"{counts.rows} rows read", f"{counts.bad_rows} bad rows", f"{counts.bad_cells} bad cells"]
         return [*parts, f"{counts.blank} cells blank"]
 
-    def complaints(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.complaints`."""
         counts, lines = self.counts, []
         if counts.first_bad is not None:

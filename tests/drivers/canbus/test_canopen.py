@@ -103,20 +103,20 @@ def test_emergencies_are_told_until_they_are_taken_back(tmp_path: Path) -> None:
     assert (0x85, False) in found.identifiers()
     found.decode(frame(0x185, bytes(4)), 0.9)
     found.decode(frame(0x85, struct.pack("<HB5x", 0x2310, 1)), 0.5)
-    assert found.complaints(1.0) == ["drive 5 reports emergency 0x2310 (current at the output), 0.5 s ago"]
+    assert found.warnings(1.0) == ["drive 5 reports emergency 0x2310 (current at the output), 0.5 s ago"]
     found.decode(frame(0x85, bytes(8)), 1.5)
-    assert found.complaints(1.6) == []
+    assert found.warnings(1.6) == []
 
 
 def test_a_drive_that_is_not_operational_is_told(tmp_path: Path) -> None:
     found = drive(tmp_path, wishes={"i": WISHES["i"]})
     found.decode(frame(0x185, bytes(4)), 0.9)
     found.decode(frame(0x705, b"\x7f"), 1.0)
-    assert found.complaints(1.1) == ["drive 5 is not operational, but pre-operational: it sends no process data"]
+    assert found.warnings(1.1) == ["drive 5 is not operational, but pre-operational: it sends no process data"]
     for place in range(10):
         found.decode(frame(0x705, b"\x05"), 2.0 + place)
-    assert all("operational" not in line for line in found.complaints(12.0))
-    assert any("the heartbeat of drive 5 has been away for 19.0 s" in line for line in found.complaints(30.0))
+    assert all("operational" not in line for line in found.warnings(12.0))
+    assert any("the heartbeat of drive 5 has been away for 19.0 s" in line for line in found.warnings(30.0))
 
 
 @pytest.mark.parametrize(
@@ -156,4 +156,4 @@ def test_a_mutated_sheet_is_read_or_refused_in_one_line(tmp_path: Path, data: st
     for identifier, extended in found.identifiers():
         for content in (b"", bytes(8), bytes([255] * 8)):
             found.decode(frame(identifier, content, extended=extended), 0.0)
-    assert all("\n" not in line for line in found.complaints(1.0))
+    assert all("\n" not in line for line in found.warnings(1.0))

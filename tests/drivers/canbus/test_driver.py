@@ -93,7 +93,7 @@ def test_bus_off_is_a_link_that_is_down_until_frames_come(
     bus.send(frame(0x181, bytes(8)))
     assert until(lambda: driver.link().up)
     assert until(lambda: len(got) == 1)
-    assert any("bus off" in line for line in driver.link().complaints)
+    assert any("bus off" in line for line in driver.link().warnings)
 
 
 def test_what_is_no_frame_in_long_runs_opens_the_bus_anew(
@@ -144,8 +144,8 @@ def test_frames_of_any_make_do_not_end_the_thread(
 def test_complaints_come_through_the_link(bus_options: dict[str, Any]) -> None:
     driver = receiver(**bus_options, messages=COUNTED)
     driver.open(lambda _: None)
-    assert driver.link().complaints == ()
-    assert until(lambda: any("0x181 has not come once" in line for line in driver.link().complaints))
+    assert driver.link().warnings == ()
+    assert until(lambda: any("0x181 has not come once" in line for line in driver.link().warnings))
     driver.close()
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers.canbus.decoder import FrameDecoder
-from otolith_drivers.canbus.monitoring import COUNTER_NAMES, NOT_OF_MESSAGES, Pace
+from otolith_drivers.canbus.monitoring import COUNTER_NAMES, NOT_OF_MESSAGES, PeriodEstimator
 from otolith_drivers.errors import ConfigurationError
 from tests.drivers.can_frames import dbc, decoder, frame
 
@@ -69,7 +69,7 @@ def test_lost_frames_are_counted_exactly_as_lost_samples(tmp_path: Path, options
 )
 def test_jitter_and_many_gaps_leave_the_count_exact(gaps: list[int], jitter: float, seed: int) -> None:
     random = Random(seed)  # noqa: S311 - jitter, not a secret
-    pace, lost, place = Pace(), 0, 0.0
+    pace, lost, place = PeriodEstimator(), 0, 0.0
     for index in range(60 + 20 * len(gaps)):
         place += 1 + (gaps[(index - 60) // 20] if index >= 60 and index % 20 == 0 else 0)
         lost += pace.note((place + jitter * random.random()) * PERIOD)
@@ -93,7 +93,7 @@ def test_whatever_comes_every_frame_is_delivered_or_bad(
         delivered += len(samples)
         assert after.bad - before.bad == (0 if samples else 1)
         assert after.lost >= before.lost
-        assert all("\n" not in line for line in found.complaints(time))
+        assert all("\n" not in line for line in found.warnings(time))
     assert found.counters.received == delivered
 
 
@@ -147,9 +147,9 @@ def test_a_counter_that_stands_still_delivers_nothing_new_and_is_told(tmp_path: 
     given = [send(found, index, count=49) for index in range(50, 60)]
     assert given == [0] * 10
     assert (found.counters.received, found.counters.bad, found.counters.lost) == (100, 10, 0)
-    assert found.complaints(0.6) == ["the counter AliveCounter of Motor (0x181) stands still since 10 frames"]
+    assert found.warnings(0.6) == ["the counter AliveCounter of Motor (0x181) stands still since 10 frames"]
     send_all(found, range(60, 61))
-    assert found.complaints(0.61) == []
+    assert found.warnings(0.61) == []
     assert found.counters.lost == 2 * 10  # what came in between was not what should have come
 
 
@@ -158,7 +158,7 @@ def test_a_signal_that_is_only_called_like_a_counter_must_count_first(tmp_path: 
     for index in range(100):
         assert send(found, index, count=7) == 2
     assert found.counters.bad == 0
-    assert found.complaints(1.0) == []
+    assert found.warnings(1.0) == []
 
 
 def test_a_recognised_counter_says_how_to_be_rid_of_it(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_a_recognised_counter_says_how_to_be_rid_of_it(tmp_path: Path) -> None:
     send_all(found, range(50))
     for index in range(50, 55):
         assert send(found, index, count=49) == 0
-    assert "set driver.messages.Motor.counter = false" in found.complaints(0.55)[0]
+    assert "set driver.messages.Motor.counter = false" in found.warnings(0.55)[0]
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_a_wrong_checksum_is_bad_and_nothing_is_delivered(tmp_path: Path, kind: 
         samples = found.decode(frame(385, bytes(data)), index * PERIOD)
         assert len(samples) == (0 if index in (5, 6) else 2)
     assert (found.counters.received, found.counters.bad, found.counters.lost) == (36, 2, 0)
-    assert found.complaints(0.2) == ["Motor (0x181): a frame with a wrong checksum; 2 in all, the last 0.1 s ago"]
+    assert found.warnings(0.2) == ["Motor (0x181): a frame with a wrong checksum; 2 in all, the last 0.1 s ago"]
 
 
 def test_known_checksums_are_what_the_standards_say() -> None:
@@ -262,26 +262,26 @@ def test_a_counter_of_a_raw_message_is_said_by_its_bits(tmp_path: Path) -> None:
 def test_silence_is_told_with_the_pace_that_there_was(tmp_path: Path) -> None:
     found = motor(tmp_path)
     send_all(found, range(100))
-    assert found.complaints(1.4) == []
-    assert found.complaints(0.99 + 3.2) == ["Motor (0x181) silent for 3.2 s; it came every 10.0 ms"]
+    assert found.warnings(1.4) == []
+    assert found.warnings(0.99 + 3.2) == ["Motor (0x181) silent for 3.2 s; it came every 10.0 ms"]
     send_all(found, range(419, 421))
-    assert found.complaints(4.21) == []
+    assert found.warnings(4.21) == []
 
 
 def test_silence_is_told_even_before_a_pace_is_known(tmp_path: Path) -> None:
     found = motor(tmp_path)
     send_all(found, range(3))
-    assert found.complaints(5.0) == []
-    assert found.complaints(12.02) == ["Motor (0x181) silent for 12.0 s; it came at a pace that is not known"]
+    assert found.warnings(5.0) == []
+    assert found.warnings(12.02) == ["Motor (0x181) silent for 12.0 s; it came at a pace that is not known"]
 
 
 def test_what_never_came_is_told_after_a_few_seconds(tmp_path: Path) -> None:
     found = motor(tmp_path)
-    assert found.complaints(2.0) == []
-    assert found.complaints(4.0) == ["Motor (0x181) has not come once in 4.0 s"]
+    assert found.warnings(2.0) == []
+    assert found.warnings(4.0) == ["Motor (0x181) has not come once in 4.0 s"]
     cycle = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_ "GenMsgCycleTime" BO_ 385 900;'
     seldom = decoder(tmp_path, WISHES, MOTOR + cycle)
-    assert (seldom.complaints(0.0), seldom.complaints(8.9), len(seldom.complaints(9.1))) == ([], [], 1)
+    assert (seldom.warnings(0.0), seldom.warnings(8.9), len(seldom.warnings(9.1))) == ([], [], 1)
     slow = motor(tmp_path, messages={"Motor": {"period": "2 s"}})
-    assert slow.complaints(19.0) == []
-    assert slow.complaints(21.0) == ["Motor (0x181) has not come once in 21.0 s"]
+    assert slow.warnings(19.0) == []
+    assert slow.warnings(21.0) == ["Motor (0x181) has not come once in 21.0 s"]

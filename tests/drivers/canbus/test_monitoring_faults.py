@@ -35,8 +35,8 @@ def test_each_class_has_a_name(identifier: int, data: bytes, word: str) -> None:
     faults.note(error(identifier, data), 1.0)
     assert faults.total == 1
     assert faults.counts[word] == 1
-    assert any(word in line for line in faults.complaints(2.0))
-    assert faults.complaints(1000.0) == []
+    assert any(word in line for line in faults.warnings(2.0))
+    assert faults.warnings(1000.0) == []
 
 
 def test_bus_off_lasts_until_something_comes(tmp_path: Path) -> None:
@@ -57,11 +57,11 @@ def test_what_the_controller_had_no_room_for_is_lost(tmp_path: Path) -> None:
 def test_error_passive_is_told_until_it_is_over() -> None:
     faults = BusFaults()
     faults.note(error(0x04, bytes([0, 0x20])), 0.0)
-    assert faults.complaints(30.0) == [
+    assert faults.warnings(30.0) == [
         "the CAN controller is error passive (sending): look at cable, termination and bit rate"
     ]
     faults.note(error(0x04, bytes([0, 0x40])), 31.0)
-    assert all("controller is" not in line for line in faults.complaints(32.0))
+    assert all("controller is" not in line for line in faults.warnings(32.0))
 
 
 @given(st.lists(st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8)), max_size=50))
@@ -70,5 +70,5 @@ def test_any_error_frame_is_counted_once(frames: list[tuple[int, bytes]]) -> Non
     for place, (identifier, data) in enumerate(frames):
         faults.note(error(identifier, data), float(place))
     assert faults.total == len(frames)
-    assert all("\n" not in line for line in faults.complaints(len(frames) + 0.5))
+    assert all("\n" not in line for line in faults.warnings(len(frames) + 0.5))
     assert len(faults.counts) < 32

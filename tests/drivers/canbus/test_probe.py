@@ -140,7 +140,7 @@ def test_a_bus_of_any_number_of_identifiers_takes_bounded_memory() -> None:
     picture = Picture()
     for identifier in range(MOST_IDENTIFIERS + 100):
         picture.take(frame(identifier, b"", extended=True), 0.0)
-    assert len(picture.heard) == MOST_IDENTIFIERS
+    assert len(picture.observed) == MOST_IDENTIFIERS
     assert picture.left_out == 100
     assert picture.frames == MOST_IDENTIFIERS + 100
 
@@ -181,5 +181,5 @@ def test_any_frames_make_tables_and_lines(
         console.print(table)
     assert picture.frames + picture.error_frames == len(came)
     said = can_document(picture, BusOptions(), None, 1.0)
-    assert len(said["frames"]) == len(picture.heard)
+    assert len(said["frames"]) == len(picture.observed)
     tomllib.loads("\n".join(can_driver_lines(BusOptions(), picture, None)))

@@ -105,7 +105,7 @@ def test_a_float_that_is_not_finite_is_no_reading(tmp_path: Path, value: float) 
     got = found.decode(frame(20, struct.pack("<ff", 0.0, value)), 1.0)
     assert [math.isnan(sample.value) for sample in got] == [True]
     assert (found.counters.received, found.counters.bad) == (1, 1)
-    assert "i_q of" in found.complaints(2.0)[0]
+    assert "i_q of" in found.warnings(2.0)[0]
 
 
 def test_a_range_holds_to_its_very_ends_and_can_be_said_otherwise(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_multiplexer_value_that_stays_away_is_told(tmp_path: Path) -> None:
     for index in range(2000):
         which = index % 2 if index < 1000 else 0
         found.decode(frame(100, bytes([which] + [0] * 7)), index * 0.01)
-    assert found.complaints(20.0) == ["Values (0x64) with Which = 1 silent for 10.0 s; it came every 20.0 ms"]
+    assert found.warnings(20.0) == ["Values (0x64) with Which = 1 silent for 10.0 s; it came every 20.0 ms"]
 
 
 def test_nested_multiplexers_are_followed(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_short_frames_are_bad_and_told(tmp_path: Path) -> None:
     for time in (0.0, 0.1):
         assert found.decode(frame(0x181, bytes(3)), time) == []
     assert found.counters.bad == 2
-    assert found.complaints(1.1) == [
+    assert found.warnings(1.1) == [
         "0x181: a frame of 3 bytes, of which there should be 4; 2 in all, the last 1.0 s ago"
     ]
 
@@ -219,7 +219,7 @@ def test_nothing_that_comes_ends_the_decoder_or_gives_a_value_without_a_flag(
     unusable = sum(not math.isfinite(sample.value) for sample in got)
     assert after.bad - before.bad >= unusable
     assert all(abs(sample.value) < 1e301 for sample in got if math.isfinite(sample.value))
-    assert all("\n" not in line for line in found.complaints(time))
+    assert all("\n" not in line for line in found.warnings(time))
 
 
 def test_the_options_of_a_bus_know_one_database_or_several() -> None:

@@ -66,7 +66,7 @@ def test_a_swapped_word_order_is_withheld_and_named() -> None:
     behaviour.spoil = moving
     sources = [source(register=0), source(register=2, order="CDAB")]
     with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
-        listener.wait(lambda link: any('set order = "ABCD", unless register' in line for line in link.complaints))
+        listener.wait(lambda link: any('set order = "ABCD", unless register' in line for line in link.warnings))
         wait_for(lambda: len(listener.of("s0")) > 20)
         assert not listener.of("s1")
         assert listener.driver.counters().bad >= 20
@@ -77,7 +77,7 @@ def test_an_order_that_the_user_vouches_for_is_not_doubted() -> None:
     sources = [source(register=0, order="CDAB", trusted=True)]
     with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
         wait_for(lambda: len(listener.of("s0")) > 40)
-        assert not listener.driver.link().complaints
+        assert not listener.driver.link().warnings
 
 
 def test_a_device_that_comes_late_is_judged_before_anything_of_it_is_believed() -> None:
@@ -94,7 +94,7 @@ def test_a_device_that_comes_late_is_judged_before_anything_of_it_is_believed() 
     with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
         wait_for(lambda: len(listener.of("s0")) > 100)
         behaviour.refuse = lambda _, __, ___: None
-        listener.wait(lambda link: any('set order = "ABCD"' in line for line in link.complaints))
+        listener.wait(lambda link: any('set order = "ABCD"' in line for line in link.warnings))
         assert not listener.of("s1")
 
 

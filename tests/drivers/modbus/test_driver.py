@@ -22,7 +22,7 @@ def test_only_function_codes_3_and_4_are_ever_sent() -> None:
     port = free_port(socket.SOCK_STREAM)
     sources = [source(register=0), source(register=2, table="input"), source(register=50)]
     with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
-        listener.wait(lambda link: any("refused" in line for line in link.complaints))
+        listener.wait(lambda link: any("refused" in line for line in link.warnings))
         behaviour.silent = lambda _: True
         listener.wait(lambda link: not link.up)
         behaviour.silent = lambda _: False
@@ -57,7 +57,7 @@ def test_a_refused_register_costs_only_itself() -> None:
     behaviour = Behaviour(floats(24.0, 1.5, 7.0), refuse=lambda _, at, count: 2 if at <= 2 < at + count else None)
     port = free_port(socket.SOCK_STREAM)
     with odd_server(behaviour, port), Listener(poller(port, [*TWO, source(register=4)])) as listener:
-        listener.wait(lambda link: any("s1" in line and "illegal data address" in line for line in link.complaints))
+        listener.wait(lambda link: any("s1" in line and "illegal data address" in line for line in link.warnings))
         count = len(listener.of("s2"))
         wait_for(lambda: len(listener.of("s2")) > count + 20)
         assert {sample.value for sample in listener.of("s0")} == {24.0}
@@ -65,7 +65,7 @@ def test_a_refused_register_costs_only_itself() -> None:
         assert not listener.of("s1")
         behaviour.refuse = lambda *_: None
         wait_for(lambda: bool(listener.of("s1")), 15.0)
-        listener.wait(lambda link: not link.complaints)
+        listener.wait(lambda link: not link.warnings)
 
 
 def test_a_device_that_gives_fewer_registers_is_asked_for_fewer() -> None:
@@ -74,7 +74,7 @@ def test_a_device_that_gives_fewer_registers_is_asked_for_fewer() -> None:
     port = free_port(socket.SOCK_STREAM)
     with odd_server(behaviour, port), Listener(poller(port, sources, 0.02)) as listener:
         wait_for(lambda: all(listener.of(f"s{index}") for index in range(20)))
-        listener.wait(lambda link: not link.complaints)
+        listener.wait(lambda link: not link.warnings)
 
 
 def test_one_dead_device_does_not_stop_another() -> None:
@@ -82,13 +82,13 @@ def test_one_dead_device_does_not_stop_another() -> None:
     behaviour, port = Behaviour(floats(24.0, 1.5), silent=lambda device: device == 2), free_port(socket.SOCK_STREAM)
     sources = [source(register=0, device=1), source(register=2, device=2)]
     with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
-        listener.wait(lambda link: any("device 2 does not answer" in line for line in link.complaints))
+        listener.wait(lambda link: any("device 2 does not answer" in line for line in link.warnings))
         assert listener.driver.link().up
         count = len(listener.of("s0"))
         wait_for(lambda: len(listener.of("s0")) > count + 50)
         behaviour.silent = lambda _: False
         wait_for(lambda: bool(listener.of("s1")), 15.0)
-        listener.wait(lambda link: not link.complaints)
+        listener.wait(lambda link: not link.warnings)
 
 
 def test_times_are_those_of_the_middle_of_the_round_trip() -> None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from otolith_drivers.modbus.plausibility import MOST_IN_A_ROW, Freshness, OrderWatch, judge
+from otolith_drivers.modbus.plausibility import MOST_IN_A_ROW, OrderWatch, StalenessMonitor, judge
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, orders_of, registers_of
 from otolith_drivers.modbus.schedule import plan
 from tests.drivers.registers import KINDS, item, registers
@@ -97,7 +97,7 @@ def test_a_machine_at_rest_is_plausible(kind: TypeName) -> None:
 
 
 def test_an_old_image_among_new_ones_is_none() -> None:
-    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    freshness, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
     for index in range(500):
         assert freshness.take(request, [100 * index, 0]) == (False, False)
     assert freshness.take(request, [49900, 0]) == (True, False)  # the beat of two clocks
@@ -113,12 +113,12 @@ STEPS = {
 
 @pytest.mark.parametrize("name", STEPS)
 def test_coarse_registers_repeat_by_chance(name: str) -> None:
-    freshness, request = Freshness(), plan([item("a", type="uint16")], 0, 125)[0]
+    freshness, request = StalenessMonitor(), plan([item("a", type="uint16")], 0, 125)[0]
     assert not any(freshness.take(request, [int(word)])[1] for word in STEPS[name])
 
 
 def test_a_machine_that_stops_is_soon_believed() -> None:
-    freshness, request = Freshness(), plan([item("a", type="uint16")], 0, 125)[0]
+    freshness, request = StalenessMonitor(), plan([item("a", type="uint16")], 0, 125)[0]
     for word in RANDOM.permutation(1000):
         freshness.take(request, [int(word)])
     assert sum(freshness.take(request, [0])[1] for _ in range(1000)) <= MOST_IN_A_ROW
@@ -126,14 +126,14 @@ def test_a_machine_that_stops_is_soon_believed() -> None:
 
 def test_registers_that_often_say_the_same_are_believed_and_told() -> None:
     """A machine that stands still is no fault; nor is a coarse register."""
-    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    freshness, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
     stale = [freshness.take(request, [index // 5, 0])[1] for index in range(1000)]
     assert not any(stale)
-    assert "80% of the readings" in freshness.complaints([request], 0.01)[0]
+    assert "80% of the readings" in freshness.warnings([request], 0.01)[0]
 
 
 def test_registers_that_never_say_the_same_are_not_complained_of() -> None:
-    freshness, request = Freshness(), plan([item("a")], 0, 125)[0]
+    freshness, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
     for index in range(300):
         freshness.take(request, [index, 0])
-        assert not freshness.complaints([request], 0.01)
+        assert not freshness.warnings([request], 0.01)

@@ -11,8 +11,8 @@ from otolith_drivers.errors import DeviceError
 from otolith_drivers.modbus.client import Line
 from otolith_drivers.modbus.options import LineOptions
 from otolith_drivers.modbus.probe import (
-    Asker,
     Block,
+    Client,
     Speed,
     open_line,
     possible_rate,
@@ -27,13 +27,13 @@ from tests.drivers.modbus_servers import Behaviour, odd_server
 
 
 @contextmanager
-def asking(behaviour: Behaviour, timeout: str = "0.1 s") -> Iterator[Asker]:
+def asking(behaviour: Behaviour, timeout: str = "0.1 s") -> Iterator[Client]:
     port = free_port(socket.SOCK_STREAM)
     options = LineOptions.model_validate({"host": "127.0.0.1", "port": port, "timeout": timeout})
     line = Line(options)
     with odd_server(behaviour, port):
         open_line(line, options)
-        yield Asker(line, options, 1, "holding")
+        yield Client(line, options, 1, "holding")
         line.close()
 
 
@@ -149,7 +149,7 @@ def test_a_scan_lists_those_that_answer_also_with_an_exception() -> None:
     )
     with asking(behaviour, "0.05 s") as asker:
         found = scan(asker, range(1, 12), 0, never, quiet)
-    assert [(answer.device, answer.said) for answer in found] == [(3, ""), (7, "illegal data address")]
+    assert [(answer.device, answer.reply) for answer in found] == [(3, ""), (7, "illegal data address")]
 
 
 def test_addresses_in_words() -> None:

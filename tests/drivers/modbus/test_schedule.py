@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from otolith_drivers.modbus.options import Item, Options
 from otolith_drivers.modbus.protocol import Refused, TypeName
-from otolith_drivers.modbus.schedule import EASY, LONGEST_REST, ROUNDS, Pace, Requests, plan, split
+from otolith_drivers.modbus.schedule import EASY, LONGEST_REST, ROUNDS, PollSchedule, Requests, plan, split
 from tests.drivers.registers import KINDS, item
 
 places = st.lists(
@@ -61,7 +61,7 @@ def test_splitting_ends_with_single_registers_and_loses_none(found: list[tuple[i
 
 
 def test_a_pace_that_fits_is_kept_and_one_that_does_not_is_lengthened_evenly() -> None:
-    pace, now = Pace(0.01), 100.0
+    pace, now = PollSchedule(0.01), 100.0
     pace.start(now)
     for _ in range(3 * ROUNDS):
         now = max(now, pace.due)
@@ -88,7 +88,7 @@ def test_a_pace_that_fits_is_kept_and_one_that_does_not_is_lengthened_evenly() -
 
 
 def test_a_computer_that_was_busy_for_a_moment_does_not_change_the_grid() -> None:
-    pace, now = Pace(0.01), 0.0
+    pace, now = PollSchedule(0.01), 0.0
     pace.start(now)
     for index in range(10 * ROUNDS):
         now = max(now, pace.due)
@@ -100,7 +100,7 @@ def test_a_computer_that_was_busy_for_a_moment_does_not_change_the_grid() -> Non
 
 @given(st.lists(st.floats(0.0, 3.0), min_size=1, max_size=50))
 def test_every_slot_is_begun_or_told_as_left_out(pauses: list[float]) -> None:
-    pace, now = Pace(0.01), 0.0
+    pace, now = PollSchedule(0.01), 0.0
     pace.start(now)
     begun = missed = 0
     for pause in pauses:
@@ -114,7 +114,7 @@ def test_every_slot_is_begun_or_told_as_left_out(pauses: list[float]) -> None:
 
 
 def test_reading_moves_away_from_the_moment_at_which_the_device_renews_its_registers() -> None:
-    pace, now = Pace(0.01), 0.0
+    pace, now = PollSchedule(0.01), 0.0
     pace.start(now)
     phases = set()
     for index in range(500):
@@ -127,7 +127,7 @@ def test_reading_moves_away_from_the_moment_at_which_the_device_renews_its_regis
 
 def test_a_beat_that_stays_wherever_one_reads_is_not_run_away_from_for_ever() -> None:
     """It is a coarse register, and every step is a disturbance of the grid."""
-    pace, now, steps = Pace(0.1), 0.0, 0
+    pace, now, steps = PollSchedule(0.1), 0.0, 0
     pace.start(now)
     for index in range(20_000):
         before, now = now, pace.due
@@ -162,7 +162,7 @@ def test_a_busy_device_is_asked_again_at_once_and_left_alone_only_after_a_while(
         assert requests.due(1.0) == [only]
     requests.refused(only, Refused(6), 1.0)
     assert requests.due(1.0) == []
-    assert "server device busy" in requests.complaints(1.0)[0]
+    assert "server device busy" in requests.warnings(1.0)[0]
 
 
 def test_the_lines_least_time_is_that_of_its_characters() -> None:

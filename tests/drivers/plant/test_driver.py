@@ -11,7 +11,7 @@ import pytest
 from otolith_drivers.base import Driver, Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.driver import Options, Source, build
-from otolith_drivers.plant.faults import Interference
+from otolith_drivers.plant.faults import FaultInjector
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES
 
@@ -63,7 +63,7 @@ def test_what_it_delivers_and_loses_is_the_scenario(scenario: Callable[[str], Pa
     got = hear(driver, lambda got: len(got) >= 200)
     counters, loaded = driver.counters(), load_scenario(path)
     assert (counters.received, counters.bad, counters.reconnects) == (len(got), 0, 0)
-    interference = Interference(loaded.faults, loaded.seed)
+    interference = FaultInjector(loaded.faults, loaded.seed)
     ticks = list(islice(simulate(loaded), (counters.received + counters.lost) // 2))
     sent = [tick for tick in ticks if interference.at(tick.time).withheld is None]
     assert counters.lost == 2 * (len(ticks) - len(sent)) > 0
@@ -80,7 +80,7 @@ def test_a_tick_is_late_as_the_scenario_says_and_never_early(scenario: Callable[
     times = [sample.time for sample in hear(driver_of(path), lambda got: len(got) >= 300)[::2]]
     assert times == sorted(times)
     loaded = load_scenario(path)
-    interference = Interference(loaded.faults, loaded.seed)
+    interference = FaultInjector(loaded.faults, loaded.seed)
     due = [index * TICK + interference.at(index * TICK).delay for index in range(len(times))]
     assert all(moment - begun >= earliest for moment, earliest in zip(times, due, strict=True))
     assert times[50] - begun >= 0.8

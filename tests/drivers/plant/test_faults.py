@@ -20,17 +20,17 @@ from otolith_drivers.plant.faults import (
     Dropouts,
     Effect,
     Fault,
+    FaultInjector,
     Frozen,
     Gain,
     Garbage,
     Gone,
-    Interference,
     Jitter,
     Offset,
+    PlantSample,
     Refusal,
     SensorFault,
     Spikes,
-    Tick,
     WordOrder,
 )
 from otolith_drivers.plant.realtime import NODES, refuse_unfit
@@ -52,12 +52,12 @@ OTHERS = (
 FAULTS = st.lists(st.sampled_from([HALF, AWAY, *OTHERS]), max_size=4)
 
 
-def ticks(scenario: MotorScenario, *faults: Fault) -> list[Tick]:
+def ticks(scenario: MotorScenario, *faults: Fault) -> list[PlantSample]:
     changed = scenario.model_copy(update={"faults": (*scenario.faults, *faults)})
     return list(islice(simulate(changed), round(SECONDS / PERIOD)))
 
 
-def column(found: list[Tick], name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def column(found: list[PlantSample], name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     return np.array([tick.measured[name] for tick in found])
 
 
@@ -101,7 +101,7 @@ def test_a_frozen_sensor_may_lie_as_well(scenario: MotorScenario) -> None:
 
 
 def effects(faults: Sequence[BusFault], seed: int = 1, count: int = 400) -> list[Effect]:
-    interference = Interference(faults, seed)
+    interference = FaultInjector(faults, seed)
     return [interference.at(index * PERIOD) for index in range(count)]
 
 

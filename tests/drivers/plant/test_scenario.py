@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from otolith_drivers.plant.dc_motor import MotorScenario, SetPoint
-from otolith_drivers.plant.faults import Drift, Fault, Step, Tick, Unbalance, shaking
+from otolith_drivers.plant.faults import Drift, Fault, PlantSample, Step, Unbalance, shaking
 from otolith_drivers.plant.hydraulic_actuator import LiftScenario
 from otolith_drivers.plant.scenario import Scenario, load_scenario, simulate
 from tests.conftest import EXAMPLES
@@ -26,7 +26,7 @@ def names(value: object) -> str | None:
     return "-".join(fault.kind for fault in value) or "healthy" if isinstance(value, tuple) else None
 
 
-def run(scenario: Scenario, seconds: float) -> list[Tick]:
+def run(scenario: Scenario, seconds: float) -> list[PlantSample]:
     return list(islice(simulate(scenario), round(seconds / scenario.sample_period) + 1))
 
 

@@ -37,7 +37,7 @@ def read(path: Path) -> tuple[list[Rows], str, list[str]]:
     """All rows, what was found, and the complaints."""
     with opened(path) as log:
         rows = list(log.stretches())
-        return rows, ", ".join(log.found()), log.complaints()
+        return rows, ", ".join(log.summary_lines()), log.warnings()
 
 
 def windows_of(stretches: list[Rows]) -> list[Window]:
@@ -49,7 +49,7 @@ def windows_of(stretches: list[Rows]) -> list[Window]:
 def test_what_was_logged_is_what_the_driver_would_have_said(
     tmp_path: Path, frames: list[can.Message], suffix: str
 ) -> None:
-    rows, found, complaints = read(written(tmp_path, frames, suffix))
+    rows, found, warnings = read(written(tmp_path, frames, suffix))
     heard = live(frames)
     assert samples_of(rows) == [(sample.signal, sample.value) for sample in heard]
     times = np.concatenate([part.times for part in rows])
@@ -58,7 +58,7 @@ def test_what_was_logged_is_what_the_driver_would_have_said(
     if not suffix.startswith(".asc"):  # whose times begin with the log
         assert times == pytest.approx(expected, abs=2e-6)
     assert f"{len(frames)} frames read, {TICKS} of other messages, 0 bad" in found
-    assert complaints == []
+    assert warnings == []
 
 
 def cut_live(frames: list[can.Message]) -> list[Window]:
@@ -118,8 +118,8 @@ def test_where_a_log_goes_back_in_time_is_said(tmp_path: Path, frames: list[can.
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_message_that_is_not_in_it_is_told(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
     electrical = [frame for frame in frames if frame.arbitration_id != 0x281]
-    _, _, complaints = read(written(tmp_path, electrical, suffix))
-    assert any("0x281) has not come once" in line for line in complaints)
+    _, _, warnings = read(written(tmp_path, electrical, suffix))
+    assert any("0x281) has not come once" in line for line in warnings)
 
 
 @pytest.mark.parametrize(
@@ -145,11 +145,11 @@ def test_a_line_that_is_torn_is_counted_and_located(
     first = next(index for index, line in enumerate(lines) if FRAME.search(line))
     lines.insert(first + 150, torn if torn.endswith("\n") else torn + "\n")
     path.write_text("".join(lines), encoding="utf-8")
-    rows, found, complaints = read(path)
+    rows, found, warnings = read(path)
     assert samples_of(rows) == [(sample.signal, sample.value) for sample in live(frames[:300])]
     assert "1 bad" in found
-    assert len(complaints) == 1
-    assert f"bad: 1, the first in line {first + 151}: " in complaints[0]
+    assert len(warnings) == 1
+    assert f"bad: 1, the first in line {first + 151}: " in warnings[0]
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".trc"])
@@ -159,24 +159,24 @@ def test_the_last_line_of_a_writer_that_was_killed_is_not_believed(
     path = written(tmp_path, frames[:300], suffix)
     text = path.read_text(encoding="utf-8").rstrip()
     path.write_text(text.removesuffix("End TriggerBlock").rstrip()[:-7], encoding="utf-8")
-    _, found, complaints = read(path)
+    _, found, warnings = read(path)
     assert "300 frames read" in found or "299 frames read" in found
     assert "1 bad" in found
-    assert "line" in complaints[0]
+    assert "line" in warnings[0]
 
 
 def test_what_is_cut_off_is_said(tmp_path: Path, frames: list[can.Message]) -> None:
     whole = written(tmp_path, frames, ".blf").read_bytes()
     path = tmp_path / "cut.blf"
     path.write_bytes(whole[: len(whole) // 2])
-    rows, _, complaints = read(path)
+    rows, _, warnings = read(path)
     assert 100 < len(samples_of(rows)) < 4 * TICKS
-    assert any("cut off" in line for line in complaints)
+    assert any("cut off" in line for line in warnings)
     packed = written(tmp_path, frames, ".log.gz")
     packed.write_bytes(packed.read_bytes()[:-1000])
-    rows, _, complaints = read(packed)
+    rows, _, warnings = read(packed)
     assert 100 < len(samples_of(rows)) < 4 * TICKS
-    assert any("cut off" in line for line in complaints)
+    assert any("cut off" in line for line in warnings)
 
 
 def test_a_blf_of_a_writer_that_was_killed_is_refused_with_the_reason(tmp_path: Path) -> None:
@@ -201,8 +201,8 @@ def test_a_log_without_these_frames_names_them(tmp_path: Path) -> None:
 def test_two_machines_in_one_log_are_noticed(tmp_path: Path, frames: list[can.Message]) -> None:
     for frame in frames[1::2]:
         frame.channel = 1
-    _, _, complaints = read(written(tmp_path, frames, ".blf"))
-    assert any("channels 0, 1" in line for line in complaints)
+    _, _, warnings = read(written(tmp_path, frames, ".blf"))
+    assert any("channels 0, 1" in line for line in warnings)
 
 
 def check_any(path: Path) -> None:

@@ -77,7 +77,7 @@ def test_the_spacing_is_the_datas_and_every_cell_is_counted(tmp_path: Path, pace
     assert begun <= got[0].time <= begun + 1.0
     counters = driver.counters()
     assert (counters.received, counters.bad, counters.lost) == (len(got), 2, 0) == (118, 2, 0)
-    assert any("bad cells: 1, bad rows: 1" in line for line in driver.link().complaints)
+    assert any("bad cells: 1, bad rows: 1" in line for line in driver.link().warnings)
 
 
 def test_in_real_time_no_sample_comes_before_its_time(tmp_path: Path) -> None:
