@@ -84,7 +84,7 @@ def test_what_belongs_to_the_machine_is_learned_and_obeyed(data: Path) -> None:
     assert "approved" in listed.stdout
     document = json.loads(otolith("components", "list", MACHINE, "--json").stdout)
     assert document["approved"] == [KEY]
-    assert document["components"][0]["entry"]["component"]["family"] == "periodic"
+    assert document["components"][0]["adopted"]["component"]["family"] == "periodic"
 
     plan = load_machine(MACHINE, with_driver=False)
     state = apply_decisions(
