@@ -44,7 +44,7 @@ def bound(problem: Problem, record: Window, initial: Array) -> Array:
     """(free,) the Cramer-Rao bound of the standard deviations, at the truth; the initial state is unknown."""
     truth = np.array([TRUTH[entry.name] for entry in problem.free])
     objective = Objective(problem, record, truth)
-    _, jacobian = objective.linearised(np.concatenate([truth, initial]))
+    _, jacobian = objective.linearise(np.concatenate([truth, initial]))
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))[: len(truth)])
 
 

@@ -20,7 +20,7 @@ from otolith.adaptation.state import (
 )
 from otolith.discovery.adopted import Approval
 from otolith.discovery.hypotheses import FaultType
-from otolith.discovery.sequential_test import WindowDecision
+from otolith.discovery.decision import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin

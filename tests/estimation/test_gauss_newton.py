@@ -14,7 +14,7 @@ class Linear:
     def __init__(self, rows: Array, told: Array, low: Array, high: Array) -> None:
         self._rows, self._told, self.low, self.high = rows, told, low, high
 
-    def linearised(self, guess: Array) -> tuple[Array, Array]:
+    def linearise(self, guess: Array) -> tuple[Array, Array]:
         return self._told - self._rows @ guess, -self._rows
 
 

@@ -77,7 +77,7 @@ class Service:
             state, decisions = restore_components(state, keeper.components()), keeper.decisions()
         except OtolithError as error:  # a file that cannot be read is no reason not to watch the machine
             log.warning("begun without components: %s", error)
-        self._kept, self._kept_at = tuple(entry.component.key for entry in state.catalogue), 0.0
+        self._kept, self._kept_at = tuple(entry.component.key for entry in state.adopted), 0.0
         if self._kept:
             log.info("begun with what was found earlier: %s; %s", ", ".join(map(str, self._kept)), FORGET)
         self._supervisor = Supervisor(apply_decisions(state, decisions), longest)
@@ -165,7 +165,7 @@ class Service:
     def _keep(self, now: float) -> None:
         """Have components written down that are new, gone, or known better than a while ago."""
         state = self._supervisor.state
-        found = tuple(entry.component.key for entry in state.catalogue)
+        found = tuple(entry.component.key for entry in state.adopted)
         if found != self._kept or (found and now - self._kept_at >= KEEP_EVERY):
             self._housekeeper.keep(component_records(state))
             self._kept, self._kept_at = found, now

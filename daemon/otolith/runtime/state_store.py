@@ -82,7 +82,7 @@ class StateStore:
         component = kept.adopted.component
         if component.family not in NAMES or component.amplitude == 0.0:
             return False
-        numbers = 1 + (component.model.inner is not None) + component.repeats
+        numbers = 1 + (component.model.inner is not None) + component.periodic
         return (
             component.site in {entry.name for entry in sites(self._twin)}
             and component.source in {entry.name for entry in sources(self._twin)}

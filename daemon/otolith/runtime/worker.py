@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.state import AdaptationState
+from otolith.adaptation.state import AdaptationState, with_problem
 from otolith.health.schema import Report
 from otolith.runtime.process import ChildProcess
 
@@ -73,7 +73,7 @@ def _warm_up(state: AdaptationState) -> None:
     values = np.random.default_rng(state.problem.seed).standard_normal((REHEARSED, len(signals)))  # nothing explains it
     window = Window.whole(0, 0.0, 0.01, signals, values)
     short = replace(state.problem, swarm=replace(state.problem.swarm, generations=2))
-    perform(Task(replace(state, problem=short), window))
+    perform(Task(with_problem(state, short), window))
 
 
 ROOM = 2  # windows that wait for a busy worker; older ones are missed
