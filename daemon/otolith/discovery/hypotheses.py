@@ -160,7 +160,7 @@ class TrackedHypothesis:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class HypothesisStep:
     """One tracked hypothesis on its way through one window."""
 
     tracked: TrackedHypothesis

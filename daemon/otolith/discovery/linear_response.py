@@ -225,8 +225,8 @@ class LinearResponse:
 
     def is_parameter(self, curves: BasisFunctions, amplitudes: Array) -> Mask:
         """Return which curves (curves,) of these ``amplitudes`` a parameter within its bounds would produce as well."""
-        entries = base_model(self.problem).parameters
-        names = [parameter.name for parameter in entries]
+        parameters_of_twin = base_model(self.problem).parameters
+        names = [parameter.name for parameter in parameters_of_twin]
         parameters, responses = self._parameter_responses(names), self._responses(curves)
         size, response_size = np.linalg.norm(parameters, axis=0), np.linalg.norm(responses, axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -236,8 +236,8 @@ class LinearResponse:
         order = [parameter.name for parameter in self.problem.twin.parameters]
         values = self.objective.parameters(self._guess[None, : len(self.problem.free)])[0]
         now = values[[order.index(name) for name in names]][:, None]
-        low = np.array([[parameter.low] for parameter in entries])
-        high = np.array([[parameter.high] for parameter in entries])
+        low = np.array([[parameter.low] for parameter in parameters_of_twin])
+        high = np.array([[parameter.high] for parameter in parameters_of_twin])
         within = (low <= now + step) & (now + step <= high)
         return np.asarray(((cosine > SAME_DIRECTION) & (difference < MAX_DIFFERENCE) & within).any(axis=0))
 

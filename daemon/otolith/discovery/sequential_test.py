@@ -16,8 +16,8 @@ from otolith.discovery.candidates import DECISIVE
 from otolith.discovery.hypotheses import (
     FaultType,
     FittedHypothesis,
+    HypothesisStep,
     Proposal,
-    Step,
     TrackedHypothesis,
     complexity_penalty,
     prune,
@@ -165,7 +165,7 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     return replace(test, hypotheses=hypotheses, leading=leading, last=last)
 
 
-def _steps(test: SequentialTest, window: Window) -> list[Step]:
+def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
     """Return each hypothesis with its prediction, its fit and its evidence; a twin that diverges is dropped."""
     predicted = [item.posterior.predict(window) for item in test.hypotheses]
     proposals = []
@@ -174,10 +174,10 @@ def _steps(test: SequentialTest, window: Window) -> list[Step]:
         proposals.append(Proposal(replace(item.hypothesis, added=0), posterior.problem, prior, prior.mean))
     rows = list(zip(test.hypotheses, predicted, fit_hypotheses(proposals, window), strict=True))
     rows = [row for row in rows if row[2].chi_square < DIVERGED] or rows[:1]
-    return [Step(item, posterior, fitted, fitted.fit.evidence()) for item, posterior, fitted in rows]
+    return [HypothesisStep(item, posterior, fitted, fitted.fit.evidence()) for item, posterior, fitted in rows]
 
 
-def _with_deviances(steps: list[Step]) -> tuple[list[Step], FitSummary]:
+def _with_deviances(steps: list[HypothesisStep]) -> tuple[list[HypothesisStep], FitSummary]:
     """Return the steps with their deviances, and a summary of the best."""
     records = steps[0].fitted.fit.count
     variance_factor = residual_variance_factor([step.fitted.chi_square for step in steps], records)
@@ -193,7 +193,7 @@ def _with_deviances(steps: list[Step]) -> tuple[list[Step], FitSummary]:
     return steps, FitSummary(chi_square, best.deviance - chi_square / variance_factor, records)
 
 
-def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[Step]) -> tuple[TrackedHypothesis, ...]:
+def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[HypothesisStep]) -> tuple[TrackedHypothesis, ...]:
     """Return the hypotheses with the screening test of what the best one leaves of the window.
 
     A best hypothesis that has just lost a component is not tested: it was not fitted in this form.
