@@ -6,7 +6,7 @@ import queue
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -66,12 +66,12 @@ class _JournalFormatter(logging.Formatter):
 
 
 @contextmanager
-def progress_line(first: str) -> Iterator[Callable[[str], None]]:
-    """A function that shows a text on a line of standard error; it shows nothing unless that is a terminal."""
+def progress_line(first: str, *, enabled: bool = True) -> Iterator[Callable[[str], None]]:
+    """A function that shows a text on a line of standard error, if that is a terminal and ``enabled``."""
     from rich.console import Console
 
     console = Console(stderr=True)
-    console.quiet = not console.is_terminal
+    console.quiet = not (enabled and console.is_terminal)
     with console.status(first) as status:
         yield status.update
 
@@ -85,6 +85,12 @@ def drain(texts: "queue.Queue[str]", timeout: float) -> list[str]:
             drained.append(texts.get_nowait())
     except queue.Empty:
         return drained
+
+
+def echo_warnings(data: Path, lines: Iterable[str]) -> None:
+    """Print what a replay of ``data`` warns of, to standard error."""
+    for line in lines:
+        click.echo(f"{data}: {line}", err=True)
 
 
 def local_time(seconds: float) -> str:

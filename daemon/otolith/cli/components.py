@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, local_time
+from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, local_time
 
 if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
@@ -183,8 +183,7 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
     identified = identified_noise(machine, data, windows)
     if not state.catalogue:  # the file's noise levels may have hidden a component, so search again with these
         state = _replayed(replace(machine, problem=with_noise(machine.problem, identified)), data)
-    for line in noise_lines(machine, identified):
-        click.echo(line)
+    click.echo("\n".join(noise_lines(machine, identified)))
     if state.catalogue:
         click.echo("# this process noise contains the components below: keep that of the file if you approve them")
     click.echo("# put these tables into the machine file in place of its own", err=True)
@@ -200,8 +199,7 @@ def _replayed(machine: "LoadedMachine", data: Path) -> "AdaptationState":
         for report in run.reports():
             for finding in report.document.findings:
                 click.echo(f"window {report.document.window.index}: {finding.text}", err=True)
-        for line in run.warnings():
-            click.echo(f"{data}: {line}", err=True)
+        echo_warnings(data, run.warnings())
         return run.state
 
 
@@ -217,13 +215,8 @@ def _review(machine: "LoadedMachine", store: "StateStore", state: "AdaptationSta
         (approved if approve_all or _is_healthy() else rejected).add(_key(record))
     decisions = store.decisions()
     store.keep(tuple(record for record in records if _key(record) in approved))
-    store.decide(
-        replace(
-            decisions,
-            approved=decisions.approved | approved,
-            rejected=(decisions.rejected | rejected) - approved,
-        )
-    )
+    rejected = {*decisions.rejected, *rejected} - approved
+    store.decide(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))
     if not records:
         click.echo("no component was found: the twin explains the machine up to the noise", err=True)
     posterior = moment_match(state.memory.belief, state.problem)

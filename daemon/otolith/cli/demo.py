@@ -327,11 +327,6 @@ def _refuse_busy(endpoints: Sequence[str]) -> None:
 
 def _read_columns(path: Path) -> dict[str, list[float]]:
     """The columns of a CSV file; an incomplete last line, of a process that was ended, is left out."""
-    columns: dict[str, list[float]] = {"t": []}
     with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            if None in row.values() or None in row:
-                continue
-            for name, value in row.items():
-                columns.setdefault(name, []).append(float(value))
-    return columns
+        rows = [row for row in csv.DictReader(file) if None not in row and None not in row.values()]
+    return {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else ("t",))}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, progress_line
+from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, progress_line
 
 if TYPE_CHECKING:
     from otolith.acquisition.window import Window
@@ -42,9 +42,8 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
     identified = identified_noise(machine, data, windows)
     if as_json:
         click.echo(json.dumps(_document(machine, identified), indent=2, ensure_ascii=False))
-        return
-    for line in noise_lines(machine, identified):
-        click.echo(line)
+    else:
+        click.echo("\n".join(noise_lines(machine, identified)))
 
 
 def identified_noise(machine: "LoadedMachine", data: Path, count: int) -> "IdentifiedNoise":
@@ -87,9 +86,7 @@ def _good_windows(machine: "LoadedMachine", data: Path, count: int) -> list["Win
     with open_recorded(machine, data) as recorded:
         run = Replay(machine, recorded)
         chosen = evenly_spread(good(run.windows()), count)
-        warnings = run.warnings()
-    for line in warnings:
-        click.echo(f"{data}: {line}", err=True)
+        echo_warnings(data, run.warnings())
     if not chosen:
         length = f"no window of {machine.file.window.length:g} s can be used"
         raise ConfigurationError(f"{data}: {length}: {'; '.join(reasons) or 'the data is too short'}")

@@ -4,7 +4,7 @@ import contextlib
 import json
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,6 @@ DEVICES = (1, 247)  # device numbers that the Modbus specification allows
 RECEIVE_TIMEOUT = 0.1  # s; how late a stop is noticed
 REFRESH = 4.0  # Hz of the live table
 Span = tuple[int, int]
-Stopped = Callable[[], bool]
 
 
 class Range(click.ParamType[Span]):
@@ -134,14 +133,14 @@ def modbus(
                   first_address)  # fmt: skip
     stop = StopSignal()
     if scan:
-        answers = _scan(place, devices, first - first_address, stop.received)
+        answers = _scan(place, devices, first - first_address, stop)
         if as_json:
             rows = [{"device": answer.device, "refused": answer.reply} for answer in answers]
             click.echo(json.dumps({"devices": rows}))
         else:
-            _print_lines(_scan_lines(place, devices, answers))
+            click.echo("\n".join(_scan_lines(place, devices, answers)))
         return stop.code() or (0 if answers else NOTHING_THERE)
-    probed = _read(place, (first - first_address, last - first_address), seconds, stop.received)
+    probed = _read(place, (first - first_address, last - first_address), seconds, stop)
     if as_json:
         click.echo(json.dumps(modbus_document(probed), ensure_ascii=False))
     else:
@@ -160,7 +159,7 @@ def _address(target: str) -> dict[str, Any]:
     return {"host": match[1] or match[2], "port": port}
 
 
-def _scan(place: "Place", devices: Span, address: int, stopped: Stopped) -> "list[Answer]":
+def _scan(place: "Place", devices: Span, address: int, stop: StopSignal) -> "list[Answer]":
     """The devices on a line that answer a request for the register at ``address`` (on the wire).
 
     Raises:
@@ -170,7 +169,7 @@ def _scan(place: "Place", devices: Span, address: int, stopped: Stopped) -> "lis
 
     with progress_line("opening") as show, opened(place.options, show) as line:
         client = Client(line, place.options, devices[0], place.table)
-        return scan(client, range(devices[0], devices[1] + 1), address, stopped, show)
+        return scan(client, range(devices[0], devices[1] + 1), address, stop.received, show)
 
 
 def _scan_lines(place: "Place", devices: Span, answers: "list[Answer]") -> Iterator[str]:
@@ -189,7 +188,7 @@ def _scan_lines(place: "Place", devices: Span, answers: "list[Answer]") -> Itera
         yield "is it the right host, or is it a gateway with framing = rtu?"
 
 
-def _read(place: "Place", addresses: Span, seconds: float, stopped: Stopped) -> "DeviceProbe":
+def _read(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> "DeviceProbe":
     """What the registers at ``addresses`` (on the wire) of a device hold over ``seconds`` s.
 
     Raises:
@@ -204,10 +203,10 @@ def _read(place: "Place", addresses: Span, seconds: float, stopped: Stopped) -> 
         first, last = addresses
         if first == last:
             last = min(first + MAX_NUMBER_REGISTERS - 1, HIGHEST_ADDRESS)
-        surveyed = survey(client, first, last, stopped, show)
+        surveyed = survey(client, first, last, stop.received, show)
         client.round_trips.clear()  # the first requests take longer
         begun = time.monotonic()
-        readings = watch(client, surveyed.blocks, seconds, stopped, show)
+        readings = watch(client, surveyed.blocks, seconds, stop.received, show)
         elapsed = time.monotonic() - begun
         show("comparing")
         times = speeds(client, surveyed.blocks)
@@ -254,18 +253,18 @@ def can_(
     options = validated({"interface": interface, "channel": channel, "port": port, "fd": fd} | rate, BusOptions, ())
     stop = StopSignal()
     begun = time.monotonic()
-    picture = _listen(options, database, seconds, stop.received, live=not as_json)
+    picture = _listen(options, database, seconds, stop, live=not as_json)
     elapsed = time.monotonic() - begun
     if as_json:
         click.echo(json.dumps(can_document(picture, options, database, elapsed), ensure_ascii=False))
     else:
         show_bus(picture, options, database, elapsed, stdout_console())
         if not picture.frames:
-            _print_lines((*remarks(picture), *_hints(options, picture)))
+            click.echo("\n".join((*remarks(picture), *_hints(options, picture))))
     return stop.code() or (0 if picture.frames else NOTHING_THERE)
 
 
-def _listen(options: "BusOptions", database: Path | None, seconds: float, stopped: Stopped, *, live: bool) -> "Picture":
+def _listen(options: "BusOptions", database: Path | None, seconds: float, stop: StopSignal, *, live: bool) -> "Picture":
     """What came in ``seconds`` s; ``live`` shows it meanwhile if standard output is a terminal. Nothing is sent.
 
     Raises:
@@ -290,19 +289,19 @@ def _listen(options: "BusOptions", database: Path | None, seconds: float, stoppe
     shown = Live(get_renderable=draw, console=console, refresh_per_second=REFRESH, transient=True)
     try:
         with shown if live and console.is_terminal else contextlib.nullcontext():
-            _receive(bus, options, picture, seconds, stopped)
+            _receive(bus, options, picture, seconds, stop)
     finally:
         with contextlib.suppress(Exception):  # the frames that came matter more than a clean end
             bus.shutdown()
     return picture
 
 
-def _receive(bus: Any, options: "BusOptions", picture: "Picture", seconds: float, stopped: Stopped) -> None:
+def _receive(bus: Any, options: "BusOptions", picture: "Picture", seconds: float, stop: StopSignal) -> None:
     from otolith_drivers.canbus.bus import MOST_BAD_IN_A_ROW, is_gone
     from otolith_drivers.errors import DeviceError
 
     end, bad = time.monotonic() + seconds, 0
-    while (left := end - time.monotonic()) > 0.0 and not stopped():
+    while (left := end - time.monotonic()) > 0.0 and not stop.received():
         try:
             frame = bus.recv(min(left, RECEIVE_TIMEOUT))
         except Exception as error:  # python-can passes on whatever the vendor's library raises
@@ -334,8 +333,3 @@ def _hints(options: "BusOptions", picture: "Picture") -> Iterator[str]:
         yield "- another bit rate: --bitrate 250000, 500000 or 1000000"
     yield "- termination: 60 ohm between CAN-H and CAN-L while everything is switched off"
     yield "- does any node send? A CANopen drive only sends heartbeats until a master starts it"
-
-
-def _print_lines(lines: Iterable[str]) -> None:
-    for line in lines:
-        click.echo(line)

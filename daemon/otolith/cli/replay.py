@@ -1,6 +1,5 @@
 """``otolith replay``: recorded data through the code of the daemon, and a summary of the reports."""
 
-import contextlib
 import re
 import sys
 from collections import Counter
@@ -10,10 +9,10 @@ from pathlib import Path
 
 import click
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from otolith.cli.common import echo_warnings, progress_line
 from otolith.cli.live_table import STYLES, parameter_table, title
 from otolith.discovery.sequential_test import WindowDecision
 from otolith.health.schema import ReportDocument, Status
@@ -25,7 +24,6 @@ PLAIN_WIDTH = 110  # columns of a summary that goes into a file
 MAX_REASONS = 5  # kinds of bad windows that the summary lists
 UNIX_TIMES = (1e8, 1e11)  # s; between March 1973 and the year 5138 a time is a date, below it counts from zero
 FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")
-Stopped = Callable[[], bool]
 
 
 def time_text(seconds: float) -> str:
@@ -101,7 +99,13 @@ class ReplaySummary:
 
 
 def replay(
-    file: Path, data: Path, recording: Path | None, *, as_json: bool, stopped: Stopped, real_time: bool = False
+    file: Path,
+    data: Path,
+    recording: Path | None,
+    *,
+    as_json: bool,
+    stopped: Callable[[], bool],
+    real_time: bool = False,
 ) -> None:
     """Print the daemon's reports on ``data`` for the machine in ``file``: as JSON Lines, or as a summary.
 
@@ -114,28 +118,17 @@ def replay(
         if recorded.ignored:
             click.echo(f"{data}: columns not used: {', '.join(recorded.ignored)}", err=True)
         run = Replay(machine, recorded, stopped, RealTimePacer(stopped).wait if real_time else None)
-        with ReplayRecorder(recording, machine) as recorder, _bar(enabled=not as_json) as bar:
-            task = bar.add_task("", total=1.0)
+        with ReplayRecorder(recording, machine) as recorder, progress_line("reading", enabled=not as_json) as show:
             for report in run.reports():
                 summary.add(report.document)
                 recorder.add(report)
-                bar.update(task, completed=recorded.progress, description=f"window {report.document.window.index}")
+                show(f"window {report.document.window.index}, {recorded.progress:.0%} of the data")
                 if as_json:
                     click.echo(report.document.to_json())
     if as_json:
-        for line in run.warnings():
-            click.echo(f"{data}: {line}", err=True)
+        echo_warnings(data, run.warnings())
         return
     console = Console(highlight=False, width=None if sys.stdout.isatty() else PLAIN_WIDTH)
     console.print(summary)
     for line in (run.summary(), *run.warnings()):
         console.print(line, markup=False, soft_wrap=True)
-
-
-@contextlib.contextmanager
-def _bar(*, enabled: bool) -> Iterator[Progress]:
-    """A progress bar on standard error, shown only on a terminal."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not (enabled and console.is_terminal)) as bar:
-        yield bar
