@@ -18,7 +18,7 @@ def main() -> None:
     """Run the command line and exit. An error is printed as one line per fault, never as a traceback."""
     import click  # noqa: PLC0415 - after the lines above
 
-    from otolith.cli.common import INTERRUPTED, ClosedOutputError  # noqa: PLC0415
+    from otolith.cli.common import INTERRUPTED  # noqa: PLC0415
     from otolith.cli.main import cli  # noqa: PLC0415
     from otolith_drivers.errors import OtolithError  # noqa: PLC0415
 
@@ -33,9 +33,6 @@ def main() -> None:
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = INTERRUPTED
-    except ClosedOutputError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
-        code = 0
     except OSError as error:  # such as a full disk or a file that was removed: a traceback would explain nothing
         click.echo(f"Error: {error}", err=True)
         code = 2

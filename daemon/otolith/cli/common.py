@@ -20,10 +20,6 @@ DATA_FILE = click.argument("data", type=FILE)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 
 
-class ClosedOutputError(Exception):
-    """The reader of standard output has closed it. Not an OSError, which click would turn into exit code 1."""
-
-
 class StopSignal:
     """Remembers the signal that asks this command to end."""
 

@@ -160,8 +160,7 @@ def _store(file: Path) -> "tuple[LoadedMachine, StateStore]":
 @MACHINE_FILE
 @DATA_FILE
 @click.option("--yes", is_flag=True, help="Approve every component that is found.")
-@click.option("--windows", type=click.IntRange(1, 1000), default=30, show_default=True,
-              help="At most so many windows for the noise.")  # fmt: skip
+@click.option("--windows", type=click.IntRange(1, 1000), default=30, help="At most so many windows for the noise.")
 def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
     """Identify what is normal for the machine in FILE.
 

@@ -1,8 +1,10 @@
 """The group ``otolith`` and its simple commands. Each command imports what it needs, so that help is quick."""
 
 import math
+import os
 import re
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +18,6 @@ from otolith.cli.common import (
     FILE,
     INTERRUPTED,
     MACHINE_FILE,
-    ClosedOutputError,
     StopSignal,
     examples_directory,
     log_to_stderr,
@@ -60,10 +61,12 @@ def _machine_name(_: click.Context, __: click.Parameter, name: str) -> str:
 
 @contextmanager
 def _output_may_close() -> Iterator[None]:
+    """Exit code 0 where the reader of standard output has closed it, as ``head`` does; click would exit with 1."""
     try:
         yield
     except BrokenPipeError as error:
-        raise ClosedOutputError from error
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still buffered
+        raise click.exceptions.Exit(0) from error
 
 
 class _Commands(click.Group):
@@ -76,7 +79,9 @@ class _Commands(click.Group):
         return super().invoke(ctx)
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]}, epilog=EXIT_CODES)
+@click.group(
+    cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}, epilog=EXIT_CODES
+)
 @click.version_option(__version__, prog_name="otolith")
 def cli() -> None:
     """Otolith estimates the physical parameters of a machine while it runs.
@@ -100,7 +105,9 @@ def cli() -> None:
               help="Record into this file instead of a new one in the state directory.")  # fmt: skip
 @click.option("-v", "--verbose", is_flag=True, help="Log more.")
 def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bool) -> int:
-    """Run the daemon for the machine in FILE until SIGTERM or Ctrl-C.
+    """Run the daemon for the machine in FILE.
+
+    It runs until SIGTERM or Ctrl-C.
 
     \b
     Examples:
@@ -159,12 +166,12 @@ def replay(file: Path, data: Path, as_json: bool, recording: Path | None, real_t
 
 
 @cli.command()
-@click.option("--connect", multiple=True, default=["tcp/127.0.0.1:7447"], show_default=True, callback=_endpoints,
+@click.option("--connect", multiple=True, default=["tcp/127.0.0.1:7447"], callback=_endpoints,
               metavar="ENDPOINT", help="Where daemons publish; may be repeated.")  # fmt: skip
 @click.option("--machine", default="*", callback=_machine_name, metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
 def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
-    """Show the live table of a running daemon, from any process that reaches it.
+    """Show the live table of running daemons, over Zenoh.
 
     \b
     Examples:
@@ -182,7 +189,7 @@ def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
 @click.argument("file", type=FILE, required=False)
 @click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
 def view(file: Path | None, only_list: bool) -> int:
-    """Open the recording FILE in the Rerun viewer; without FILE, the newest one.
+    """Open FILE, or the newest recording, in the Rerun viewer.
 
     \b
     Examples:
@@ -199,11 +206,12 @@ def view(file: Path | None, only_list: bool) -> int:
 
 @cli.command()
 @click.argument("scenario", type=FILE)
-@click.option("--as", "transport", type=click.Choice(TRANSPORTS), default="can", show_default=True,
+@click.option("--as", "transport", type=click.Choice(TRANSPORTS), default="can",
               help="A node on the CAN bus, or a Modbus drive on its own port or serial line.")  # fmt: skip
 @click.option("--truth", type=FILE, help="Write the true parameters and states into this CSV file.")
 @click.option("--summary", type=FILE, help="At the end, write counts of frames and requests into this JSON file.")
-@click.option("--duration", type=click.FloatRange(0.1), default=math.inf, metavar="SECONDS", help="End after that.")
+@click.option("--duration", type=click.FloatRange(0.1), default=math.inf, show_default=False, metavar="SECONDS",
+              help="End after so many seconds.")  # fmt: skip
 def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | None, duration: float) -> int:
     """Simulate the machine of SCENARIO in real time, on its bus.
 
@@ -234,12 +242,12 @@ def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | No
 
 
 @cli.command()
-@click.option("--duration", type=click.FloatRange(8, 3600), default=90.0, show_default=True, help="Seconds.")
+@click.option("--duration", type=click.FloatRange(8, 3600), default=90.0, help="Seconds.")
 @click.option("--machine", type=FILE, help="Machine file.  [default: dc-motor.toml]")
 @click.option("--scenario", type=FILE, help="What happens to the machine.  [default: scenarios/demo.toml]")
 @click.option("--json", "as_json", is_flag=True, help="Print the verdict as JSON, and no table.")
 def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: bool) -> int:
-    """Run plant and daemon, and compare the estimates with the truth.
+    """Run plant and daemon, and compare estimates with the truth.
 
     \b
     Examples:

@@ -21,8 +21,7 @@ Item = TypeVar("Item")
 @click.command()
 @MACHINE_FILE
 @DATA_FILE
-@click.option("--windows", type=click.IntRange(1, 1000), default=30, show_default=True,
-              help="Use at most so many, spread over the data.")  # fmt: skip
+@click.option("--windows", type=click.IntRange(1, 1000), default=30, help="Use at most so many, spread over the data.")
 @AS_JSON
 def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
     """Identify the noise of the machine in FILE from DATA.

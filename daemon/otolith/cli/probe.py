@@ -38,8 +38,6 @@ class Range(click.ParamType[Span]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Span:
         """First and last."""
-        if isinstance(value, tuple):
-            return value
         match = re.fullmatch(r"(\d{1,5})(?:\.\.(\d{1,5}))?", str(value).strip())
         if match is None:
             self.fail(f"{value!r}: write one number like 7, or the first and the last like 0..63", param, ctx)
@@ -72,18 +70,16 @@ def probe() -> None:
               help="Device number (unit, slave); with --scan a range.  [default: 1]")  # fmt: skip
 @click.option("--registers", type=Range(0, 65536, MAX_REGISTERS),
               help="Which, or one to show in every type and order.  [default: the first 64]")  # fmt: skip
-@click.option("--table", type=click.Choice(["holding", "input"]), default="holding", show_default=True)
-@click.option("--first-address", type=click.IntRange(0, 1), default=0, show_default=True,
-              help="What the manual calls the first register.")  # fmt: skip
-@click.option("--baudrate", type=click.IntRange(300, 4_000_000), default=19200, show_default=True,
-              help="Of a serial line.")  # fmt: skip
-@click.option("--parity", type=click.Choice(["N", "E", "O"]), default="E", show_default=True, help="Of a serial line.")
-@click.option("--stop-bits", type=click.Choice(["1", "2"]), default="1", show_default=True, help="Of a serial line.")
-@click.option("--framing", type=click.Choice(["tcp", "rtu"]), default="tcp", show_default=True,
+@click.option("--table", type=click.Choice(["holding", "input"]), default="holding")
+@click.option("--first-address", type=click.IntRange(0, 1), default=0, help="What the manual calls the first register.")
+@click.option("--baudrate", type=click.IntRange(300, 4_000_000), default=19200, help="Of a serial line.")
+@click.option("--parity", type=click.Choice(["N", "E", "O"]), default="E", help="Of a serial line.")
+@click.option("--stop-bits", type=click.Choice(["1", "2"]), default="1", help="Of a serial line.")
+@click.option("--framing", type=click.Choice(["tcp", "rtu"]), default="tcp",
               help="Of a host; rtu for a gateway that passes serial frames on.")  # fmt: skip
 @click.option("--timeout", type=click.FloatRange(0.01, 10.0), metavar="SECONDS",
               help="How long a device may take.  [default: 0.5; with --scan 0.2]")  # fmt: skip
-@click.option("--seconds", type=click.FloatRange(0.0, 3600.0), default=3.0, show_default=True, help="How long to read.")
+@click.option("--seconds", type=click.FloatRange(0.0, 3600.0), default=3.0, help="How long to read.")
 @click.option("--wide", is_flag=True, help="Show numbers of 64 bits as well.")
 @click.option("--scan", is_flag=True, help="Ask all devices of a line for one register, and list those that answer.")
 @AS_JSON
@@ -214,14 +210,13 @@ def _read(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> 
 
 
 @probe.command("can")
-@click.option("--interface", default="auto", show_default=True,
-              help="Of python-can: socketcan, pcan, kvaser, slcan ...")  # fmt: skip
+@click.option("--interface", default="auto", help="Of python-can: socketcan, pcan, kvaser, slcan ...")
 @click.option("--channel", help="As 'ip link' or python-can names it.  [default: vcan0]")
-@click.option("--port", type=click.IntRange(1024, 65535), default=43113, show_default=True, help="Of udp_multicast.")
+@click.option("--port", type=click.IntRange(1024, 65535), default=43113, help="Of udp_multicast.")
 @click.option("--bitrate", type=click.IntRange(1000, 1_000_000), help="For interfaces that set it themselves.")
 @click.option("--fd", is_flag=True, help="Receive frames of CAN FD as well.")
 @click.option("--database", type=FILE, help="A CAN database (DBC, KCD, SYM, ARXML) that describes the frames.")
-@click.option("--seconds", type=click.FloatRange(0.1, 86400.0), default=3.0, show_default=True, help="How long.")
+@click.option("--seconds", type=click.FloatRange(0.1, 86400.0), default=3.0, help="How long.")
 @AS_JSON
 def can_(
     interface: str,
