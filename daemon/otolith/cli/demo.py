@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -211,10 +211,14 @@ class Demo:
         with Listener(endpoints, key, texts.put), shown:
             while time.monotonic() < end and not stopped():
                 self._refuse_ended()
-                for report in filter(None, map(table.add, drain(texts, PAUSE))):
-                    self._reports.append(report)
-                    if not live and not self._as_json:
-                        self._print(summary(report))
+                self._add(map(table.add, drain(texts, PAUSE)), echo=not live and not self._as_json)
+        self._add(map(table.add, drain(texts, PAUSE)), echo=not live and not self._as_json)
+
+    def _add(self, reports: Iterable[ReportDocument | None], *, echo: bool) -> None:
+        for report in filter(None, reports):
+            self._reports.append(report)
+            if echo:
+                self._print(summary(report))
 
     def _refuse_ended(self) -> None:
         for name, process in self._processes.items():
