@@ -89,7 +89,7 @@ def test_the_database_gives_names_values_and_ranges() -> None:
     assert (speed.low, speed.beyond) == (-2.0, 1)
     assert speed.high == pytest.approx(327.67)
     assert [message.name for message in picture.missing()] == ["MotorElectrical"]
-    assert "in the database, but not heard: MotorElectrical" in list(remarks(picture))
+    assert "in the database, but not received: MotorElectrical" in list(remarks(picture))
     lines = list(can_signal_lines(picture))
     assert 'NAME = { signal = "RotorSpeed" }  # rad/s, 327.67 now' in lines
     assert not any("Alive" in line for line in lines)
