@@ -206,7 +206,7 @@ def check_any(path: Path) -> None:
     plan = load_machine(machine, with_driver=False)
     said = str(path)
     try:
-        with table.Table(path, {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
+        with table.TableReader(path, {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
             for index, report in enumerate(Replay(plan, opened).reports()):
                 document = report.document
                 assert document.window.index == index

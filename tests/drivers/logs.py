@@ -16,7 +16,7 @@ from otolith_drivers.canbus.driver import Options, Source
 from otolith_drivers.plant.can_node import ALIVE_COUNTER
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import simulate
-from otolith_drivers.replay.can_log import CanLog, open_log
+from otolith_drivers.replay.can_log import CanLogReader, open_log
 from otolith_drivers.replay.readers import Rows
 from otolith_drivers.units import factor
 from tests.conftest import EXAMPLES, SIGNALS
@@ -87,7 +87,7 @@ def written(folder: Path, frames: list[can.Message], suffix: str) -> Path:
     return packed
 
 
-def opened(path: Path) -> CanLog:
+def opened(path: Path) -> CanLogReader:
     return open_log(path, SETUP, FRAMES)
 
 

@@ -36,7 +36,7 @@ def frames(scenario: MotorScenario) -> list[can.Message]:
 def read(path: Path) -> tuple[list[Rows], str, list[str]]:
     """All rows, what was found, and the complaints."""
     with opened(path) as log:
-        rows = list(log.stretches())
+        rows = list(log.chunks())
         return rows, ", ".join(log.summary_lines()), log.warnings()
 
 
@@ -107,7 +107,7 @@ def test_where_a_log_goes_back_in_time_is_said(tmp_path: Path, frames: list[can.
         place = first + 1971
     playback = Playback(tuple(UNITS), RECORDS, PERIOD, Limits())
     with opened(path) as log:
-        for rows in log.stretches():
+        for rows in log.chunks():
             list(playback.windows(rows))
     assert playback.counts.reordered == playback.counts.late == 2
     assert playback.counts.first_late is not None
@@ -183,7 +183,7 @@ def test_a_blf_of_a_writer_that_was_killed_is_refused_with_the_reason(tmp_path: 
     path = tmp_path / "killed.blf"
     for content in (b"", b"LOGG", b"\0" * 4096, b"no BLF at all, but long enough for the head of one" * 10):
         path.write_bytes(content)
-        with pytest.raises(ConfigurationError, match=r"killed\.blf: no BLF file, or one whose writer was killed"):
+        with pytest.raises(ConfigurationError, match=r"killed\.blf: is not a BLF file, or its writer was killed"):
             opened(path)
     writer = can.BLFWriter(path)
     writer.file.flush()

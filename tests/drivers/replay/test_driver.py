@@ -13,7 +13,7 @@ from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import tables as table
-from otolith_drivers.replay.driver import Options, Replayer, Source, build
+from otolith_drivers.replay.driver import Options, ReplayDriver, Source, build
 from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import UNITS, frames_of, live, written
 
@@ -38,7 +38,7 @@ def written_table(folder: Path, rows: int) -> Path:
     return path
 
 
-def driver_of(path: Path, sources: dict[str, dict[str, Any]] | None = None, **options: Any) -> Replayer:
+def driver_of(path: Path, sources: dict[str, dict[str, Any]] | None = None, **options: Any) -> ReplayDriver:
     named = sources if sources is not None else {"i": {}, "omega": {}}
     return build(Options.model_validate({"file": path, **options}), setup(named))
 
@@ -50,7 +50,7 @@ def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
         time.sleep(0.005)
 
 
-def played(driver: Replayer) -> list[Sample]:
+def played(driver: ReplayDriver) -> list[Sample]:
     """Everything, up to the end of the file."""
     got: list[Sample] = []
     driver.open(got.extend)
@@ -67,8 +67,8 @@ def test_the_spacing_is_the_datas_and_every_cell_is_counted(tmp_path: Path, pace
     assert (driver.link().up, driver.link().reason) == (False, "not opened yet")
     begun = time.monotonic()
     got = played(driver)
-    with table.Table(path, {"i": "A", "omega": "rad/s"}) as opened:
-        (rows,) = opened.stretches()
+    with table.TableReader(path, {"i": "A", "omega": "rad/s"}) as opened:
+        (rows,) = opened.chunks()
     for name, values in rows.columns.items():
         there = np.isfinite(values)
         assert [sample.value for sample in got if sample.signal == name] == values[there].tolist()
@@ -146,7 +146,7 @@ def test_what_the_file_does_not_have_is_said_with_its_key(tmp_path: Path, scenar
         ({"file": "none.csv"}, {"i": {}}, "No such file", ("driver", "file")),
         ({"file": path}, {"i": {"column": "I"}}, "no column 'I'", ("driver", "file")),
         ({"file": path}, {"i": {"signal": "x"}}, "unknown key 'signal'", ("signals", "i", "signal")),
-        ({"file": log}, {"i": {"signal": "x"}}, "what is in the frames", ("driver", "can")),
+        ({"file": log}, {"i": {"signal": "x"}}, "the description of the frames", ("driver", "can")),
         ({"file": log, "can": {"dcb": 1}}, {"i": {}}, "did you mean 'dbc'", ("driver", "can", "dcb")),
         ({"file": log, "can": {"dbc": "none.dbc"}}, {"i": {"signal": "x"}}, "No such file", ("driver", "can", "dbc")),
         (
