@@ -62,7 +62,7 @@ def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | No
         done = node.run(true, lambda: stop.number is not None, duration)
     if summary is not None:
         write_summary(summary, loaded, transport, done)
-    click.echo(node.say(done), err=True)
+    click.echo(node.summary_line(done), err=True)
     return stop.code(clean=signal.SIGTERM)
 
 

@@ -15,10 +15,10 @@ from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.modbus.protocol import Order
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.faults import (
+    BusEffect,
     BusFault,
     ClockStep,
     Dropouts,
-    Effect,
     Fault,
     FaultInjector,
     Frozen,
@@ -34,7 +34,7 @@ from otolith_drivers.plant.faults import (
     WordOrder,
 )
 from otolith_drivers.plant.realtime import NODES, refuse_unfit
-from otolith_drivers.plant.register_map import ModbusOptions, RegisterMap
+from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES
 
@@ -100,7 +100,7 @@ def test_a_frozen_sensor_may_lie_as_well(scenario: MotorScenario) -> None:
     assert column(ticks(scenario, doubled, frozen), "RotorSpeed")[799] == 2.0 * right[500]
 
 
-def effects(faults: Sequence[BusFault], seed: int = 1, count: int = 400) -> list[Effect]:
+def effects(faults: Sequence[BusFault], seed: int = 1, count: int = 400) -> list[BusEffect]:
     interference = FaultInjector(faults, seed)
     return [interference.at(index * PERIOD) for index in range(count)]
 
@@ -157,8 +157,8 @@ def test_every_fault_and_every_default_is_in_the_docs() -> None:
         said = set(each.model_fields) - {"kind", "start", "until"}
         assert {name for name in said if f"`{name}`" not in rows[kind]} == set()
     written = tomllib.loads(page.split("```toml")[1].split("```")[0])["modbus"]
-    assert ModbusOptions.model_validate(written) == ModbusOptions()
-    assert {"scale", "line", *written} == set(ModbusOptions.model_fields)
+    assert NodeModbusOptions.model_validate(written) == NodeModbusOptions()
+    assert {"scale", "line", *written} == set(NodeModbusOptions.model_fields)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ BYTES = {"ABCD": [0, 1, 2, 3], "DCBA": [3, 2, 1, 0], "BADC": [1, 0, 3, 2], "CDAB
     st.sampled_from(sorted(BYTES)),
 )
 def test_float_registers_in_any_order(one: float, other: float, index: int, order: Order) -> None:
-    registers = RegisterMap(ModbusOptions(), SIGNALS).encode({"speed": one, "current": other}, index, order)
+    registers = RegisterMap(NodeModbusOptions(), SIGNALS).encode({"speed": one, "current": other}, index, order)
     assert registers[4] == index % 65536
     data = np.array(registers[:4], ">u2").view("u1").reshape(2, 4)[:, np.argsort(BYTES[order])]
     assert np.array_equal(np.ascontiguousarray(data).view(">f4").ravel(), np.array([one, other], np.float32))
@@ -200,7 +200,7 @@ def test_float_registers_in_any_order(one: float, other: float, index: int, orde
 
 @pytest.mark.parametrize(("kind", "low", "high"), [("int16", -(2**15), 2**15 - 1), ("int32", -(2**31), 2**31 - 1)])
 def test_integer_registers_count_and_saturate(kind: str, low: int, high: int) -> None:
-    options = ModbusOptions.model_validate({"type": kind, "scale": {"speed": "1 rpm", "current": "1 mA"}})
+    options = NodeModbusOptions.model_validate({"type": kind, "scale": {"speed": "1 rpm", "current": "1 mA"}})
     registers = RegisterMap(options, SIGNALS)
 
     def read(current: float) -> int:
@@ -222,4 +222,4 @@ def test_integer_registers_count_and_saturate(kind: str, low: int, high: int) ->
 )
 def test_a_wrong_register_map_is_refused(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RegisterMap(ModbusOptions.model_validate(options), SIGNALS)
+        RegisterMap(NodeModbusOptions.model_validate(options), SIGNALS)

@@ -150,7 +150,7 @@ def test_no_bytes_of_a_client_bring_the_drive_down(drive: Callable[..., Drive]) 
 
 
 @pytest.mark.parametrize(
-    ("transport", "message"), [("modbus-tcp", "Address already in use"), ("modbus-rtu", "is there already")]
+    ("transport", "message"), [("modbus-tcp", "Address already in use"), ("modbus-rtu", "exists already")]
 )
 def test_a_second_drive_in_the_same_place_is_one_line(
     drive: Callable[..., Drive], transport: str, message: str
