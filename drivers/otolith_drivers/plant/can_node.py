@@ -14,7 +14,7 @@ from otolith_drivers.plant.scenario import Scenario
 from otolith_drivers.units import factor
 
 ALIVE_COUNTER = "AliveCounter"  # end of the name of a signal that counts the frames of its message
-# Engineering choice: ten sample periods of the shipped scenarios and a half. Guarded by tests/system.
+# Engineering choice: fifteen sample periods of the shipped scenarios. Guarded by tests/system/test_plant.py.
 LISTEN_BEFORE_SEND = 0.15  # s
 STANDARD_IDENTIFIERS = 2048
 MAX_DATA = 8  # bytes of a classical CAN frame

@@ -35,7 +35,7 @@ from otolith_drivers.plant.scenario import Scenario
 READ_FUNCTIONS = frozenset({3, 4})  # holding and input registers: the functions that are answered
 UNDECODABLE = 0  # function code under which requests are counted that cannot be decoded
 # Engineering choice: 1/25 of Python's default, so that the simulation delays an answer by less than a millisecond.
-# Guarded by the timing tests of test_modbus_node.py.
+# No test guards it.
 SWITCH_INTERVAL = 2e-4  # s
 SERVER_TIMEOUT = 30.0  # s; engineering choice; a hanging server thread ends with an error instead of a hanging node
 

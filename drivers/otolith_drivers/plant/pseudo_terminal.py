@@ -16,7 +16,7 @@ BITS_PER_BYTE = 10  # 8N1: start, eight of data, stop
 # End of a frame by the Modbus serial line specification: a silence of 3.5 characters, 1.75 ms above 19200 baud.
 SILENCE = 3.5  # bytes
 MIN_SILENCE = 1.75e-3  # s
-# Engineering choices, guarded by test_modbus_node.py.
+# Engineering choices; test_modbus_node.py guards the second.
 UNPACED_SILENCE = 0.05  # s; end of a frame on a line without timing: longer than a pause within a write
 WRITE_INTERVAL = 1e-3  # s; bytes are written in pieces of this length, the resolution of the event loop's clock
 MAX_READ = 4096  # bytes; the kernel buffers no more for a terminal

@@ -22,7 +22,7 @@ NODES = {
     MODBUS_TCP: ("otolith_drivers.plant.modbus_node", "TcpNode"),
     MODBUS_RTU: ("otolith_drivers.plant.modbus_node", "RtuNode"),
 }
-# Engineering choices; the first concerns suspend and resume, which no test does.
+# Engineering choices. No test guards the first, which concerns suspend and resume.
 CATCH_UP_LIMIT = 1.0  # s; after a longer stall the node continues from now instead of sending a burst
 MAX_SLEEP = 0.1  # s; delay of a stop
 TRUTH_INTERVAL = 10  # samples from line to line of the truth file

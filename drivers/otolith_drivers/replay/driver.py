@@ -23,7 +23,7 @@ from otolith_drivers.config_files import StrictModel, validated
 from otolith_drivers.errors import ConfigurationError, DeviceError, OtolithError
 from otolith_drivers.replay.readers import Array, Reader, Rows, format_of, holds_frames
 
-# Engineering choices, guarded by test_driver.py.
+# Engineering choices. The driver contract guards the delays of a stop, test_driver.py the chunks and rows at once.
 PREFETCHED_CHUNKS = 2  # read before they are needed; more would only take memory
 QUEUE_POLL = 0.1  # s; delay of a stop while a chunk is awaited
 MAX_WAIT = 0.2  # s; delay of a stop while the next row is awaited: a driver must close within 1 s
