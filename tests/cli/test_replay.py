@@ -68,7 +68,7 @@ def test_a_binary_or_missing_file_is_refused(tmp_path: Path) -> None:
     for content in ("t,V_a\n0,1\n".encode("utf-16"), b"PK\3\4\0\0", b"x" * 300_000):
         path = tmp_path / "data.csv"
         path.write_bytes(content)
-        with pytest.raises(ConfigurationError, match=r"is no text|is this a CSV file\?"):
+        with pytest.raises(ConfigurationError, match=r"is not text|is this a CSV file\?"):
             replay(MACHINE, path, None, as_json=True, stopped=lambda: False)
     with pytest.raises(ConfigurationError, match="No such file"):
         replay(MACHINE, tmp_path / "none.csv", None, as_json=True, stopped=lambda: False)
@@ -91,7 +91,7 @@ def test_reports_equal_those_of_windows_without_a_file(
     state = initial_state("motor", "site", machine.problem)
     documents = reports(written(tmp_path, rows), capsys)
     assert len(documents) == 5
-    with table.Table(tmp_path / "data.csv", {name: machine.twin.unit_of(name) for name in SIGNALS}) as opened:
+    with table.TableReader(tmp_path / "data.csv", {name: machine.twin.unit_of(name) for name in SIGNALS}) as opened:
         windows = list(Replay(machine, opened).windows())
     for index, (window, document) in enumerate(zip(windows, documents, strict=True)):
         own = np.array([row[1:] for row in rows[index * RECORDS : (index + 1) * RECORDS]], dtype=np.float64)

@@ -16,7 +16,7 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.replay import open_recorded
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay.recording import Recorded
+from otolith_drivers.replay.recording import RecordingReader
 from tests.cli.replays import MACHINE, PERIOD, RECORDS, Lines, recorded, reports, summed_up, written
 
 UNITS = {"V_a": "V", "T_load": "N*m", "i": "A", "omega": "rad/s"}
@@ -86,7 +86,7 @@ def test_a_recording_of_a_recording_is_no_worse(tmp_path: Path, rows: Lines, pla
     second = tmp_path / "again.rrd"
     replay(MACHINE, first, second, as_json=True, stopped=lambda: False)
     with open_recorded(plan, first) as one, open_recorded(plan, second) as other:
-        for left, right in zip(one.stretches(), other.stretches(), strict=True):
+        for left, right in zip(one.chunks(), other.chunks(), strict=True):
             assert left.times == pytest.approx(right.times, abs=2e-9)
             assert all(np.array_equal(left.columns[name], right.columns[name]) for name in UNITS)
 
@@ -116,9 +116,9 @@ def test_a_recording_whose_writer_was_killed_is_read_and_a_torn_one_has_a_way_ou
     assert reports(killed, capsys) == reports(path, capsys)
     assert "never closed by the recorder" in summed_up(killed, capsys)
     torn.write_bytes(path.read_bytes()[:-20_000])
-    with pytest.raises(ConfigurationError, match=r"torn\.rrd: torn, .*'rerun rrd optimize --continue-on-error") as said:
+    with pytest.raises(ConfigurationError, match=r"torn\.rrd: damaged, .*'rerun rrd optimize --continue") as info:
         summed_up(torn, capsys)
-    command = str(said.value).split("'")[1].replace("whole.rrd", str(tmp_path / "whole.rrd"))
+    command = str(info.value).split("'")[1].replace("whole.rrd", str(tmp_path / "whole.rrd"))
     subprocess.run([RERUN.with_name(command.split()[0]), *command.split()[1:]], capture_output=True, check=True)
     assert len(reports(tmp_path / "whole.rrd", capsys)) >= 2
 
@@ -126,24 +126,24 @@ def test_a_recording_whose_writer_was_killed_is_read_and_a_torn_one_has_a_way_ou
 def test_other_recordings_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.rrd"
     with pytest.raises(ConfigurationError, match="No such file"):
-        Recorded(path, UNITS)
+        RecordingReader(path, UNITS)
     stream = rr.RecordingStream("somebody_else", recording_id="x")
     stream.save(path)
     stream.log("signals/i", rr.Scalars([1.0]))
     stream.disconnect()
     with pytest.raises(ConfigurationError, match="of application 'somebody_else': one of Otolith is needed"):
-        Recorded(path, UNITS)
+        RecordingReader(path, UNITS)
 
 
 def test_a_signal_that_was_not_recorded_is_named(tmp_path: Path, rows: Lines) -> None:
     path = record(tmp_path, rows)
     with pytest.raises(ConfigurationError, match=r"no signal 'p' \(Pa\) was recorded: it has T_load, V_a, i, omega"):
-        Recorded(path, {**UNITS, "p": "Pa"})
+        RecordingReader(path, {**UNITS, "p": "Pa"})
     with pytest.raises(ConfigurationError, match=r"signal 'i': unit 'A' does not measure what 'V' does"):
-        Recorded(path, {**UNITS, "i": "V"})
-    with Recorded(path, {**UNITS, "i": "mA"}) as milli, Recorded(path, UNITS) as plain:
-        ampere = np.concatenate([part.columns["i"] for part in plain.stretches()])
-        assert np.concatenate([part.columns["i"] for part in milli.stretches()]) == pytest.approx(1e3 * ampere)
+        RecordingReader(path, {**UNITS, "i": "V"})
+    with RecordingReader(path, {**UNITS, "i": "mA"}) as milli, RecordingReader(path, UNITS) as plain:
+        ampere = np.concatenate([part.columns["i"] for part in plain.chunks()])
+        assert np.concatenate([part.columns["i"] for part in milli.chunks()]) == pytest.approx(1e3 * ampere)
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -160,7 +160,7 @@ def test_a_damaged_recording_is_refused_or_read(
     path = tmp_path / "damaged.rrd"
     path.write_bytes(content[: int(end * len(content))])
     try:
-        with Recorded(path, UNITS) as damaged:
-            assert all(len(part.times) for part in damaged.stretches())
+        with RecordingReader(path, UNITS) as damaged:
+            assert all(len(part.times) for part in damaged.chunks())
     except ConfigurationError as error:
         assert str(path) in str(error)  # noqa: PT017 - either is right

@@ -237,7 +237,7 @@ def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | No
         counts = node.run(truth_file, stop.received, duration)
     if summary is not None:
         write_summary(summary, loaded, transport, counts)
-    click.echo(node.say(counts), err=True)
+    click.echo(node.summary_line(counts), err=True)
     return stop.code(clean=signal.SIGTERM)
 
 

@@ -106,7 +106,7 @@ def _ends(moved: Input, present: float, size: float) -> tuple[float, float]:
 
 
 def _parameter_values(problem: Problem, mean: Array) -> tuple[Array, list[int]]:
-    """Return all parameters of the twin (parameters,), with the free ones of ``mean`` (free, ...), and their columns."""
+    """Return all parameters of the twin (parameters,) and the columns of the free ones, which take ``mean``."""
     order, given = [parameter.name for parameter in problem.twin.parameters], dict(problem.known)
     values = np.array([given.get(parameter.name, parameter.nominal) for parameter in problem.twin.parameters])
     columns = [order.index(parameter.name) for parameter in problem.free]

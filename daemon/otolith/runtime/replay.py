@@ -26,7 +26,6 @@ from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.replay.readers import Reader, format_of, holds_frames
-from otolith_drivers.replay.tables import Table
 from otolith_drivers.user_dirs import writable
 
 if TYPE_CHECKING:
@@ -137,10 +136,10 @@ class Replay:
 
     def windows(self) -> Iterator[Window]:
         """The windows of the file as the daemon would cut them; see :meth:`reports`."""
-        for rows in self._data.stretches():
+        for rows in self._data.chunks():
             if self._stopped():
                 return
-            if isinstance(self._data, Table) and not self._playback.counts.rows:
+            if self._data.is_table and not self._playback.counts.rows:
                 self._check_pace(rows.times)
             yield from self._playback.windows(rows)
         counts = self._playback.counts
