@@ -9,14 +9,14 @@ import can
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import FrameOptions
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 
 Wishes = Mapping[str, tuple[str, dict[str, Any]]]
 """Name of each signal, its unit, and its source as in a machine file."""
 
 
 def signals(wishes: Wishes) -> tuple[Signal, ...]:
-    return tuple(Signal(name, unit, Source.model_validate(source)) for name, (unit, source) in wishes.items())
+    return tuple(Signal(name, unit, CanSource.model_validate(source)) for name, (unit, source) in wishes.items())
 
 
 def decoder(folder: Path, wishes: Wishes, text: str = "", suffix: str = "dbc", **options: Any) -> FrameDecoder:

@@ -12,7 +12,7 @@ import pytest
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 from tests.conftest import EXAMPLES, OwnMachine
 
 DRIVERS = Path(can_receiver.__file__).parents[1]
@@ -20,11 +20,11 @@ WRITES = {
     *("send", "send_periodic", "sendto", "sendall", "sdo", "nmt", "write_coil", "write_coils", "write_register"),
     *("write_registers", "mask_write_register", "readwrite_registers", "write_file_record"),
 }
-SOURCES = [Source(signal="ArmatureCurrent"), Source(id=0x281, start=0, length=16, unit="A")]
+SOURCES = [CanSource(signal="ArmatureCurrent"), CanSource(id=0x281, start=0, length=16, unit="A")]
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=["database", "bits"])
-def test_a_tap_on_the_bus_hears_nobody_but_the_machine(source: Source, own_machine: OwnMachine) -> None:
+def test_a_tap_on_the_bus_hears_nobody_but_the_machine(source: CanSource, own_machine: OwnMachine) -> None:
     """Through opening, frames that are good and bad, a bus that breaks, opening anew, and closing."""
     place = BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)
     options = can_receiver.Options(**place.model_dump(), dbc=Path("dc-motor.dbc"))

@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from otolith_drivers.canbus.bus import MOST_BAD_IN_A_ROW, BusOptions, is_gone, open_bus
+from otolith_drivers.canbus.bus import MAX_CONSECUTIVE_BAD, BusOptions, is_gone, open_bus
 from otolith_drivers.canbus.database import load_dbc
 from otolith_drivers.canbus.probe import (
     ObservedFrames,
@@ -404,7 +404,7 @@ def _receive(bus: Any, options: BusOptions, picture: Picture, seconds: float, st
         except Exception as error:  # interfaces raise whatever their vendor's library does
             bad += 1
             picture.unreadable += 1
-            if is_gone(error) or bad > MOST_BAD_IN_A_ROW:
+            if is_gone(error) or bad > MAX_CONSECUTIVE_BAD:
                 raise DeviceError(f"CAN bus {options.title()}: {error}; was the interface taken down?") from error
             continue
         bad = 0
