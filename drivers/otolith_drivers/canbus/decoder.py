@@ -17,10 +17,10 @@ from otolith_drivers.canbus.database import CanDatabase, load_database
 from otolith_drivers.canbus.monitoring import (
     MIN_STUCK_FRAMES,
     BusFaults,
-    Checksum,
+    ChecksumTest,
     FrameCounter,
     PeriodEstimator,
-    checksum_of,
+    checksum_test,
     counter_by_name,
     period_text,
 )
@@ -54,7 +54,7 @@ class MessageRules:
     """What the frames of a message are checked against."""
 
     counter: FrameCounter | None = None
-    checksum: Checksum | None = None
+    checksum: ChecksumTest | None = None
     period: float | None = None
     """s, declared."""
     length: int = 0
@@ -103,17 +103,9 @@ class MessageReader:
         self._rejections: dict[str, _Rejection] = {}
         for request in requests:
             self._length = max(self._length, bytes_needed(request.signal))
-            self._rows_of(request).append(
-                (
-                    request.name,
-                    raw_reader(request.signal),
-                    request.raw_low,
-                    request.raw_high,
-                    request.scale,
-                    request.offset,
-                    request.target_unit,
-                )
-            )
+            read, limits = raw_reader(request.signal), (request.raw_low, request.raw_high)
+            row = (request.name, read, *limits, request.scale, request.offset, request.target_unit)
+            self._rows_of(request).append(row)
 
     @property
     def lost(self) -> int:
@@ -122,7 +114,7 @@ class MessageReader:
 
     def take(self, data: bytes | bytearray, time: float) -> list[Sample]:
         """The samples of a frame of ``time`` (s); none if it is corrupted or repeats the last one."""
-        if len(data) < self._length or (self._checksum is not None and not self._checksum.matches(data)):
+        if len(data) < self._length or (self._checksum is not None and not self._checksum(data)):
             return self._reject(data, time)
         if self._counter is None:
             lost = self.periods.lost_before(time)
@@ -445,7 +437,7 @@ def _rules(content: _FrameContent, table: MessageTable) -> MessageRules:
         signal = _signal(content, table.checksum.signal, "checksum")
         needed = max(needed, bytes_needed(signal))
         try:
-            checksum = checksum_of(signal, table.checksum, max(length, needed))
+            checksum = checksum_test(signal, table.checksum, max(length, needed))
         except ValueError as error:
             raise ConfigurationError(str(error), ("driver", "messages", message.name, "checksum")) from error
     return MessageRules(counter, checksum, table.period, needed)

@@ -7,7 +7,6 @@ import re
 import statistics
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 
@@ -84,15 +83,15 @@ class PeriodEstimator:
             return 0
         lateness = interval / self.period
         if EARLY <= lateness <= LATE:
-            self._track(interval)
-            return self._confirm()
+            return self._accept(interval)
         if lateness < EARLY and self._unconfirmed:
             self._unconfirmed -= 1
             return 0
         starts_anew = self._count_outlier()
         if starts_anew or lateness < EARLY:
             return 0
-        return self._confirm(round(lateness) - 1 if interval < MAX_OUTAGE else 0)
+        confirmed, self._unconfirmed = self._unconfirmed, round(lateness) - 1 if interval < MAX_OUTAGE else 0
+        return confirmed
 
     def sent_since_last(self, time: float, step: int, modulo: int) -> int:
         """Number of frames sent since the last new one, this one included; 0 if this frame repeats the last one.
@@ -103,21 +102,35 @@ class PeriodEstimator:
         if self.last is None:
             self.last = time
             return 1
-        sent = self._sent_in(time - self.last, step, modulo)
-        if sent:  # a repeated frame does not end the interval
-            self.last = time
-        return sent
+        interval = time - self.last
+        period = self.period if self.regular else None
+        expected = interval / period if period is not None and interval < MAX_OUTAGE else 0.0
+        step, in_cycles = _add_cycles(step, modulo, expected)
+        if step == 0:
+            return 0
+        self.last = time
+        per_frame = interval / (step + in_cycles)
+        if period is None:
+            self._learn(per_frame)
+            return step
+        lateness = per_frame / period
+        if EARLY <= lateness <= LATE:
+            return step + self._accept(per_frame, in_cycles)
+        if lateness < EARLY:
+            self._take_burst(step)
+            return step
+        confirmed, self._unconfirmed = self._unconfirmed, 0
+        self._held_up = int(expected) - step  # the counter excludes that these are lost
+        self._count_outlier()
+        return step + confirmed
 
     def silence(self, now: float) -> float | None:
         """Seconds without a frame at ``now`` (s), or None while that is no longer than normal."""
         if self.last is None:
             return None
-        normal = max(
-            MIN_SILENCE if self.regular else MIN_IRREGULAR_SILENCE,
-            SILENT_PERIODS * (self.period or 0.0),
-        )
+        shortest = MIN_SILENCE if self.regular else MIN_IRREGULAR_SILENCE
         silence = now - self.last
-        return silence if silence > normal else None
+        return silence if silence > max(shortest, SILENT_PERIODS * (self.period or 0.0)) else None
 
     def describe(self) -> str:
         """The period, as a clause."""
@@ -125,41 +138,21 @@ class PeriodEstimator:
             return "its period is not known"
         return f"it came every {period_text(self.period)}" + ("" if self.regular else " or so, not regularly")
 
-    def _sent_in(self, interval: float, step: int, modulo: int) -> int:
-        if self.period is None or not self.regular:
-            if step:
-                self._learn(interval / step)
-            return step
-        expected = interval / self.period if interval < MAX_OUTAGE else 0.0
-        step, in_cycles = _add_cycles(step, modulo, expected)
-        if step == 0:
-            return 0
-        per_frame = interval / (step + in_cycles)
-        lateness = per_frame / self.period
-        if EARLY <= lateness <= LATE:
-            self._track(per_frame)
-            return step + self._confirm(in_cycles)
-        if lateness > LATE:  # the counter excludes a loss, so the rest is held up
-            confirmed = self._confirm()
-            self._held_up = int(expected) - step
-            self._count_outlier()
-            return step + confirmed
-        self._unconfirmed = 0  # a burst: the cycles were not lost, but held up
+    def _take_burst(self, frames: int) -> None:
+        """Take ``frames`` that came early: what was unconfirmed was held up, and not lost."""
+        self._unconfirmed = 0
         if self._held_up > 0:
-            self._held_up -= step
+            self._held_up -= frames
         else:
             self._count_outlier()
-        return step
 
-    def _confirm(self, unconfirmed: int = 0) -> int:
-        """Frames that were unconfirmed and count as lost now; ``unconfirmed`` replaces them."""
-        confirmed, self._unconfirmed = self._unconfirmed, unconfirmed
-        return confirmed
-
-    def _track(self, interval: float) -> None:
+    def _accept(self, interval: float, unconfirmed: int = 0) -> int:
+        """Track an interval that is on time; returns the frames that it confirms as lost."""
         self._outliers = 0
         if not self._declared and self.period is not None:
             self.period += TRACKING_GAIN * (interval - self.period)
+        confirmed, self._unconfirmed = self._unconfirmed, unconfirmed
+        return confirmed
 
     def _count_outlier(self) -> bool:
         """Count an interval that is not on time; True if the estimate starts anew because of it."""
@@ -275,6 +268,9 @@ CRCS: dict[str, tuple[str, int]] = {
 }
 """Class in crccheck, and bits. The SAE polynomial with initial value 0 is that of AUTOSAR's profile 1."""
 
+ChecksumTest = Callable[[bytes | bytearray], bool]
+"""Whether the checksum in the data of a frame is that of the bytes it covers."""
+
 
 def checksum_algorithm(kind: ChecksumKind) -> tuple[Callable[[bytes], int], int]:
     """The function that calculates a checksum, and the number of its bits."""
@@ -288,26 +284,8 @@ def checksum_algorithm(kind: ChecksumKind) -> tuple[Callable[[bytes], int], int]
     return getattr(crccheck.crc, name).calc, bits
 
 
-@dataclass(frozen=True, slots=True)
-class Checksum:
-    """The checksum in a message."""
-
-    read: RawReader
-    calculate: Callable[[bytes], int]
-    covered: tuple[slice, ...]
-    """The bytes of the frame that it covers."""
-    prefix: bytes = b""
-    suffix: bytes = b""
-    """Bytes that sender and receiver know and the frame does not contain: AUTOSAR's data ID."""
-
-    def matches(self, data: bytes | bytearray) -> bool:
-        """Whether the checksum in ``data`` is that of the bytes it covers."""
-        covered = b"".join(bytes(data[part]) for part in self.covered)
-        return self.calculate(self.prefix + covered + self.suffix) == self.read(data)
-
-
-def checksum_of(signal: CanSignal, table: ChecksumTable, length: int) -> Checksum:
-    """The checksum that ``table`` describes, in ``signal`` of a frame of ``length`` bytes.
+def checksum_test(signal: CanSignal, table: ChecksumTable, length: int) -> ChecksumTest:
+    """The test for the checksum that ``table`` describes, in ``signal`` of a frame of ``length`` bytes.
 
     Raises:
         ValueError: the signal has not the bits of such a checksum, or the covered bytes exceed the frame.
@@ -322,7 +300,12 @@ def checksum_of(signal: CanSignal, table: ChecksumTable, length: int) -> Checksu
     around = (slice(first, min(own, last + 1)), slice(max(own + bits // 8, first), last + 1))
     covered = tuple(part for part in around if part.start < part.stop)
     prefix, suffix = (bytes.fromhex(text.replace(":", " ")) for text in (table.prefix, table.suffix))
-    return Checksum(raw_reader(signal), calculate, covered, prefix, suffix)
+    read = raw_reader(signal)
+
+    def matches(data: bytes | bytearray) -> bool:
+        return calculate(prefix + b"".join(bytes(data[part]) for part in covered) + suffix) == read(data)
+
+    return matches
 
 
 # Bits of the arbitration ID of an error frame, and of its second data byte: linux/can/error.h.

@@ -241,28 +241,18 @@ def canopen_name(identifier: int) -> str:
     return f"{what} of node {node}" if node and what else ""
 
 
-@dataclass(frozen=True, slots=True)
-class NumberField:
-    """Some bytes of a frame that change as a number does."""
+def fields_of(observed: ObservedFrames) -> list[tuple[Part, Layout]]:
+    """The numbers in the frames of one arbitration ID, without counters and without what jumps.
 
-    observed: ObservedFrames
-    part: Part
-    layout: Layout
-
-
-def parts_of(observed: ObservedFrames) -> list[Part]:
-    """The parts of the frames of one arbitration ID that change; none if there are too few frames."""
+    There are none before ``MIN_FRAMES`` frames.
+    """
     history = [data for data in observed.history if len(data) == len(observed.latest)]
     if len(history) < MIN_FRAMES or not observed.latest:
         return []
-    return parts(np.frombuffer(b"".join(history), dtype=np.uint8).reshape(len(history), -1), FRAMES, 1)
-
-
-def fields_of(observed: ObservedFrames) -> list[NumberField]:
-    """The parts that are numbers, without counters and without what jumps."""
+    data = np.frombuffer(b"".join(history), dtype=np.uint8).reshape(len(history), -1)
     return [
-        NumberField(observed, part, part.layout)
-        for part in parts_of(observed)
+        (part, part.layout)
+        for part in parts(data, FRAMES, 1)
         if part.layout is not None and part.verdict in (LayoutVerdict.TOLD, LayoutVerdict.LIKELY)
     ]
 
@@ -299,7 +289,7 @@ def can_signal_lines(picture: Picture) -> Iterator[str]:
         yield f"NAME = {{ {keys} }}  # {unit}{value_text(signal, value.latest)} now"
     for observed in picture.ordered():
         if observed.message is None:
-            yield from map(_field_line, fields_of(observed))
+            yield from (_field_line(observed, part, layout) for part, layout in fields_of(observed))
 
 
 def value_text(signal: CanSignal, number: float) -> str:
@@ -312,19 +302,18 @@ def value_text(signal: CanSignal, number: float) -> str:
     return f"{number:.5g}" if signal.conversion.is_float or decimals > 12 else f"{number:.{decimals}f}"
 
 
-def _field_line(number: NumberField) -> str:
-    observed, layout = number.observed, number.layout
+def _field_line(observed: ObservedFrames, part: Part, layout: Layout) -> str:
     extended = ", extended = true" if observed.extended else ""
     fd = ", fd = true" if len(observed.latest) > CLASSIC_LENGTH else ""
     kind = "float = true" if layout.is_float else f"signed = {'true' if layout.signed else 'false'}"
-    start = _start_bit(number.part.start, layout)
+    start = _start_bit(part.start, layout)
     bits = f'start = {start}, length = {8 * layout.width}, byte_order = "{layout.order}", {kind}'
     others = ", ".join(
         f"{other.layout.name} from bit {_start_bit(other.start, other.layout)} "
         f"({number_text(other.latest, other.layout)})"
-        for other in number.part.others
+        for other in part.others
     )
-    comment = spread(number.part) + (f"; or {others}" if others else "")
+    comment = spread(part) + (f"; or {others}" if others else "")
     name = f'"0x{observed.identifier:X}"'
     return f'NAME = {{ id = {name}{extended}{fd}, {bits}, scale = 1.0, unit = "?" }}  # {comment}'
 
