@@ -1,4 +1,4 @@
-"""What the page "Signals from a CAN bus" shows can be written as it shows it."""
+"""The examples on the page "Signals from a CAN bus" are valid options and sources."""
 
 import re
 import tomllib
@@ -18,12 +18,12 @@ SIGNALS = re.findall(r"^    (?!checksum)\w+ = \{ (?:signal|id|node) = .*\}", PAG
 
 
 @pytest.mark.parametrize("line", SIGNALS)
-def test_signals(line: str) -> None:
+def test_signal_examples_are_valid(line: str) -> None:
     (source,) = tomllib.loads(line.strip()).values()
     CanSource.model_validate(source)
 
 
-def test_options() -> None:
+def test_driver_examples_are_valid() -> None:
     shown = 0
     for block in BLOCKS:
         table = tomllib.loads(re.sub(r"^# (?=[a-z_]+ = )", "", block, flags=re.MULTILINE))
