@@ -129,6 +129,12 @@ def test_signal_beyond_frame_is_an_error_only_if_requested(tmp_path: Path) -> No
         decoder(tmp_path, {"U": ("V", {"signal": "One"})}, text)
 
 
+def test_warnings_of_a_faulty_database_are_limited(tmp_path: Path) -> None:
+    others = [f'BO_ {700 + n} Other{n}: 1 Drive\n SG_ S{n} : 8|8@1+ (1,0) [0|0] "V" Monitor' for n in range(30)]
+    warnings = decoder(tmp_path, SPEED, dbc(MOTOR, *others)).configuration_warnings
+    assert (len(warnings), warnings[-1]) == (21, "... and 10 more")
+
+
 def test_a_frame_described_twice_needs_the_message(tmp_path: Path) -> None:
     text = dbc(MOTOR, 'BO_ 385 Rival: 8 Drive\n SG_ Power : 0|16@1- (1,0) [0|0] "W" Monitor')
     with pytest.raises(ConfigurationError, match="frame 0x181 is both Motor and Rival: set 'message' to the right one"):

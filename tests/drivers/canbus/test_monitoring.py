@@ -141,6 +141,43 @@ def test_a_changed_period_is_estimated_anew(tmp_path: Path) -> None:
     assert (before, frame_decoder.counters.lost - before) == (0, 2 * 50)
 
 
+def received(intervals: list[float]) -> tuple[PeriodEstimator, int]:
+    """An estimator after frames with these intervals (s), and the number of frames that it counts as lost."""
+    periods, time, lost = PeriodEstimator(), 0.0, 0
+    for interval in (0.0, *intervals):
+        time += interval
+        lost += periods.lost_before(time)
+    return periods, lost
+
+
+def test_a_drifting_period_is_tracked() -> None:
+    periods, lost = received([0.01 * (1.0 + 0.0005 * index) for index in range(2000)])
+    assert periods.period == pytest.approx(0.02, rel=0.05)
+    assert lost == 0
+
+
+def test_a_burst_at_the_start_gives_no_wrong_period() -> None:
+    periods, lost = received([1e-4] * 20 + [0.01] * 200)
+    assert periods.period == pytest.approx(0.01, rel=0.05)
+    assert (periods.regular, lost) == (True, 0)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "regular"), [([0.01] * 9 + [0.02], True), ([0.01, 0.01, 0.02], False)], ids=["1 of 10", "1 of 3"]
+)
+def test_a_message_is_regular_if_most_intervals_are(pattern: list[float], regular: bool) -> None:
+    assert received(pattern * 20)[0].regular is regular
+
+
+def test_gaps_at_the_start_do_not_change_the_estimate() -> None:
+    periods, _ = received([0.6, 0.6, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3])
+    assert (periods.period, periods.regular) == (pytest.approx(0.3), True)
+
+
+def test_several_gaps_in_a_row_keep_the_period() -> None:
+    assert received([0.01] * 100 + [0.02] * 10 + [0.01] * 20)[1] == 10
+
+
 def test_a_stuck_counter_delivers_nothing_and_is_a_warning(tmp_path: Path) -> None:
     frame_decoder = motor(tmp_path, **COUNTED)
     send_all(frame_decoder, range(50))

@@ -150,6 +150,23 @@ def test_a_silent_multiplexer_value_is_a_warning(tmp_path: Path) -> None:
     assert frame_decoder.warnings(20.0) == ["Values (0x64) with Which = 1 silent for 10.0 s; it came every 20.0 ms"]
 
 
+def test_a_float_at_the_bound_of_its_range_is_a_reading(tmp_path: Path) -> None:
+    """The 32-bit number next to 0.1 is above 0.1."""
+    source = {"id": 5, "start": 0, "length": 32, "float": True, "unit": "V", "range": [0, 0.1]}
+    frame_decoder = decoder(tmp_path, {"U": ("V", source)})
+    assert values(frame_decoder.decode(frame(5, struct.pack("<f", 0.1)), 0.0)) == {"U": pytest.approx(0.1)}
+
+
+def test_a_multiplexer_value_that_never_comes_is_a_warning(tmp_path: Path) -> None:
+    """After a hundred periods of the message, since not every frame has it."""
+    frame_decoder = decoder(tmp_path, {"heat": ("degC", {"signal": "Heat"})}, MULTIPLEXED)
+    frame_decoder.begin(0.0)
+    for index in range(121):
+        frame_decoder.decode(frame(100, bytes(8)), index * 0.1)
+    assert frame_decoder.warnings(9.9) == []
+    assert frame_decoder.warnings(10.5) == ["Values (0x64) with Which = 1 has not come once in 10.5 s"]
+
+
 def test_nested_multiplexers_are_decoded(tmp_path: Path) -> None:
     text = dbc(
         """BO_ 100 Values: 8 Drive
