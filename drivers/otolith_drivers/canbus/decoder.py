@@ -116,21 +116,22 @@ class MessageReader:
         """The samples of a frame of ``time`` (s); none if it is corrupted or repeats the last one."""
         if len(data) < self._length or (self._checksum is not None and not self._checksum(data)):
             return self._reject(data, time)
-        if self._counter is None:
-            lost = self.periods.lost_before(time)
-        elif (lost_or_repeated := self._counter.lost_before(data, time, self.periods)) is not None:
-            lost = lost_or_repeated
+        if self._counter is not None:
+            lost = self._counter.lost_before(data, time, self.periods)
         else:
+            lost = self.periods.lost_before(time)
+        if lost is None:
             self.bad += 1
             return NO_SAMPLES
         if lost:
             self._lost += lost * len(self._rows)
-        samples = self._samples(self._rows, data, time)
-        if self._groups:
-            for group in self._groups.values():
-                if group.is_in(data):
-                    group.lost += group.periods.lost_before(time) * len(group.rows)
-                    samples += self._samples(group.rows, data, time)
+        rows = self._rows if not self._groups else self._rows + self._multiplexed_rows(data, time)
+        samples = [
+            Sample(name, time, scale * raw + offset)
+            if low <= (raw := read(data)) <= high
+            else self._no_reading(name, time, scale * raw + offset, unit)
+            for name, read, low, high, scale, offset, unit in rows
+        ]
         self.received += len(samples)
         return samples
 
@@ -181,13 +182,14 @@ class MessageReader:
             self._groups[key] = _MultiplexedGroup(f"{self.title} with {when}", condition)
         return self._groups[key].rows
 
-    def _samples(self, rows: list[Row], data: bytes | bytearray, time: float) -> list[Sample]:
-        return [
-            Sample(name, time, scale * raw + offset)
-            if low <= (raw := read(data)) <= high
-            else self._no_reading(name, time, scale * raw + offset, unit)
-            for name, read, low, high, scale, offset, unit in rows
-        ]
+    def _multiplexed_rows(self, data: bytes | bytearray, time: float) -> list[Row]:
+        """The rows that a frame of ``time`` (s) has because of its multiplexers; counts what they have lost."""
+        rows: list[Row] = []
+        for group in self._groups.values():
+            if group.is_in(data):
+                group.lost += group.periods.lost_before(time) * len(group.rows)
+                rows += group.rows
+        return rows
 
     def _no_reading(self, name: str, time: float, value: float, unit: str) -> Sample:
         self._count_rejection(name, time, f"{name} of {value:.6g} {unit} is out of its range")

@@ -105,7 +105,9 @@ class PeriodEstimator:
         interval = time - self.last
         period = self.period if self.regular else None
         expected = interval / period if period is not None and interval < MAX_OUTAGE else 0.0
-        step, in_cycles = _add_cycles(step, modulo, expected)
+        in_cycles = 0
+        if step == 0 or expected > LATE:  # otherwise no cycle fits into the interval
+            step, in_cycles = _add_cycles(step, modulo, expected)
         if step == 0:
             return 0
         self.last = time
@@ -189,10 +191,10 @@ def _add_cycles(step: int, modulo: int, expected: float) -> tuple[int, int]:
 
     ``expected`` is the number of frames that fit into the interval. A step of 0 after whole cycles is one full cycle.
     """
-    cycles = max(0, round((expected - step) / modulo))
-    if cycles and not step:
-        return modulo, (cycles - 1) * modulo
-    return step, cycles * modulo
+    cycles = round((expected - step) / modulo)
+    if cycles <= 0:
+        return step, 0
+    return (step, cycles * modulo) if step else (modulo, (cycles - 1) * modulo)
 
 
 def period_text(period: float) -> str:
@@ -233,8 +235,11 @@ class FrameCounter:
         if sent == 0:
             self.repeated += 1
             return None
-        corrupted, self._corrupted, self.repeated = self._corrupted, 0, 0
-        return max(0, sent - 1 - corrupted)
+        self.repeated = 0
+        lost = sent - 1
+        if self._corrupted:
+            lost, self._corrupted = max(0, lost - self._corrupted), 0
+        return lost
 
 
 def _modulo(signal: CanSignal) -> int:

@@ -334,14 +334,12 @@ def request_from_databases(signal: Signal, databases: Sequence[CanDatabase]) -> 
     if not holders:
         raise ConfigurationError(f"{paths}: {_why_missing(source, databases)}", key)
     database, message, layout = holders[0]
-    if why := _why_ambiguous(source, holders):
+    if why := _why_ambiguous(source, holders, databases):
         raise ConfigurationError(f"{paths}: {why}", key)
     if message.is_container:
         raise ConfigurationError(f"{paths}: {message.name} is a container message, which is not supported", key)
     if why := _why_faulty(database, message, layout):
         raise ConfigurationError(f"{database.path}: {why}: {WAY_OUT}", key)
-    if source.message is None:
-        _refuse_shared_frame(message, databases, key)
     try:
         return request_for(signal, message, layout, f"{message.name}.{layout.name}")
     except ConfigurationError as error:
@@ -363,18 +361,27 @@ def _why_missing(source: CanSource, databases: Sequence[CanDatabase]) -> str:
     return f"no signal {source.signal!r}: {nearest(str(source.signal), names)}{more}"
 
 
-def _why_ambiguous(source: CanSource, holders: Sequence[Holder]) -> str:
+def _why_ambiguous(source: CanSource, holders: Sequence[Holder], databases: Sequence[CanDatabase]) -> str:
     names = sorted({message.name for _, message, _ in holders})
     if len(names) > 1:
         return f"signal {source.signal!r} is in {', '.join(names)}: set 'message' beside it"
     if len({_layout_key(message, layout) for _, message, layout in holders}) > 1:
         return f"{names[0]}.{source.signal} is described {len(holders)} times, and differently: {WAY_OUT}"
+    frame = _frame_key(holders[0][1])
+    messages = [message for database in databases for message in database.messages if _frame_key(message) == frame]
+    others = [message.name for message in messages if message.name != names[0]]
+    if others and source.message is None:
+        return f"frame 0x{frame[0]:X} is both {names[0]} and {others[0]}: set 'message' to the right one"
     return ""
+
+
+def _frame_key(message: Message) -> tuple[int, bool]:
+    return message.frame_id, message.is_extended_frame
 
 
 def _layout_key(message: Message, layout: CanSignal) -> tuple[object, ...]:
     conversion = layout.conversion
-    where = (message.frame_id, message.is_extended_frame, layout.start, layout.length, layout.byte_order)
+    where = (*_frame_key(message), layout.start, layout.length, layout.byte_order)
     what = (layout.is_signed, conversion.is_float, conversion.scale, conversion.offset, layout.unit)
     return (*where, *what, layout.multiplexer_signal, tuple(layout.multiplexer_ids or ()))
 
@@ -385,16 +392,3 @@ def _why_faulty(database: CanDatabase, message: Message, layout: CanSignal) -> s
     if layout.conversion.is_float and layout.length not in FLOAT_CODES:
         return f"{message.name}.{layout.name} is a floating-point number of {layout.length} bits"
     return ""
-
-
-def _refuse_shared_frame(message: Message, databases: Sequence[CanDatabase], key: tuple[str, ...]) -> None:
-    """Refuse a frame that another message describes as well, since only one description can be right."""
-    for database in databases:
-        for other in database.messages:
-            same = (other.frame_id, other.is_extended_frame) == (message.frame_id, message.is_extended_frame)
-            if same and other.name != message.name:
-                raise ConfigurationError(
-                    f"{database.path}: frame 0x{message.frame_id:X} is both {message.name} and {other.name}: "
-                    "set 'message' to the right one",
-                    key,
-                )
