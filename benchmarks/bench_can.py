@@ -17,8 +17,8 @@ import can
 from otolith.acquisition.ring import Rings
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.canbus.bus import BusOptions, enlarge_buffer, open_bus
-from otolith_drivers.canbus.driver import Options, build
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.driver import CanOptions, build
+from otolith_drivers.canbus.signals import CanSource
 
 RATE, MESSAGES, FIRST_ID = 8000.0, 10, 0x180  # frames/s
 SETTLE = 0.5  # s after the last frame
@@ -110,8 +110,8 @@ def ours(seconds: float) -> Result:
     rings = Rings(names, int(4 * RATE / MESSAGES))
     with TemporaryDirectory() as folder:
         (Path(folder) / "bench.dbc").write_text(database(), encoding="utf-8")
-        signals = tuple(Signal(name, "rad/s", Source(signal=f"Speed{index}")) for index, name in enumerate(names))
-        options = Options(dbc=Path("bench.dbc"), **BUS.model_dump(exclude_unset=True))
+        signals = tuple(Signal(name, "rad/s", CanSource(signal=f"Speed{index}")) for index, name in enumerate(names))
+        options = CanOptions(dbc=Path("bench.dbc"), **BUS.model_dump(exclude_unset=True))
         driver = build(options, Setup(signals, Path(folder), MESSAGES / RATE))
     driver.open(rings.deliver)
     thread = next(thread for thread in threading.enumerate() if thread.name == "can-receive")

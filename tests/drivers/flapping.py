@@ -15,7 +15,7 @@ import can
 from otolith_drivers.base import Driver, Setup, Signal
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 from otolith_drivers.modbus import driver as modbus_poller
 from tests.conftest import EXAMPLES, free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
@@ -36,7 +36,7 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
 
     vars(can_receiver).update(open_bus=remembered, BACKOFF_FIRST=SHORT)
     options = can_receiver.Options(**place.model_dump(), dbc=Path("dc-motor.dbc"))
-    signals = (Signal("i", "A", Source(signal="ArmatureCurrent")),)
+    signals = (Signal("i", "A", CanSource(signal="ArmatureCurrent")),)
     sender, stop = open_bus(place), threading.Event()
 
     def speak() -> None:

@@ -11,7 +11,7 @@ import can
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 from otolith_drivers.conformance import Rig
 from otolith_drivers.modbus import driver as modbus_poller
 from otolith_drivers.plant import driver as in_process
@@ -20,8 +20,8 @@ from tests.conftest import EXAMPLES, OwnMachine
 from tests.drivers.modbus_servers import library_server
 
 SIGNALS = (
-    Signal("i", "A", Source(signal="ArmatureCurrent")),
-    Signal("omega", "rpm", Source(signal="RotorSpeed")),
+    Signal("i", "A", CanSource(signal="ArmatureCurrent")),
+    Signal("omega", "rpm", CanSource(signal="RotorSpeed")),
 )
 SETUP = Setup(SIGNALS, EXAMPLES, 0.01)
 EXPECTED = {"i": 2.0, "omega": 10.0 * 60 / (2 * 3.141592653589793)}

@@ -12,7 +12,7 @@ import pytest
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 from tests.conftest import EXAMPLES, OwnMachine
 
 DRIVERS = Path(can_receiver.__file__).parents[1]
@@ -20,22 +20,22 @@ WRITES = {
     *("send", "send_periodic", "sendto", "sendall", "sdo", "nmt", "write_coil", "write_coils", "write_register"),
     *("write_registers", "mask_write_register", "readwrite_registers", "write_file_record"),
 }
-SOURCES = [Source(signal="ArmatureCurrent"), Source(id=0x281, start=0, length=16, unit="A")]
+SOURCES = [CanSource(signal="ArmatureCurrent"), CanSource(id=0x281, start=0, length=16, unit="A")]
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=["database", "bits"])
-def test_a_tap_on_the_bus_hears_nobody_but_the_machine(source: Source, own_machine: OwnMachine) -> None:
-    """Through opening, frames that are good and bad, a bus that breaks, opening anew, and closing."""
+def test_a_bus_tap_receives_only_frames_of_the_machine(source: CanSource, own_machine: OwnMachine) -> None:
+    """From opening to closing the driver, with complete and with short frames."""
     place = BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)
     options = can_receiver.Options(**place.model_dump(), dbc=Path("dc-motor.dbc"))
     driver = can_receiver.build(options, Setup((Signal("i", "A", source),), EXAMPLES, 0.01))
-    tap, machine, heard, sent = open_bus(place), open_bus(place), list[can.Message](), 0
+    tap, machine, tapped, sent = open_bus(place), open_bus(place), list[can.Message](), 0
     done = threading.Event()
 
     def listen() -> None:
         while not done.is_set():
             if (frame := tap.recv(0.05)) is not None:
-                heard.append(frame)
+                tapped.append(frame)
 
     listener = threading.Thread(target=listen)
     listener.start()
@@ -47,20 +47,20 @@ def test_a_tap_on_the_bus_hears_nobody_but_the_machine(source: Source, own_machi
             machine.send(frame)
             sent += 1
     deadline = time.monotonic() + 5.0
-    while (not got or len(heard) < sent) and time.monotonic() < deadline:
+    while (not got or len(tapped) < sent) and time.monotonic() < deadline:
         time.sleep(0.01)
     driver.close()
-    time.sleep(0.1)  # what would come would have come
+    time.sleep(0.1)  # a frame of the driver would have arrived by now
     done.set()
     listener.join()
     tap.shutdown()
     machine.shutdown()
     assert got
-    assert len(heard) == sent
+    assert len(tapped) == sent
 
 
-def test_an_adapter_that_can_is_told_to_listen_only(own_machine: OwnMachine) -> None:
-    """Over a serial line that is tapped: an slcan adapter gets the commands to set it up, and not one frame."""
+def test_an_slcan_adapter_gets_commands_but_no_frame(own_machine: OwnMachine) -> None:
+    """On its serial line there are the commands to set it up and to listen only, and not one frame to send."""
     adapter, line = os.openpty()
     options = can_receiver.Options(
         interface="slcan", channel=os.ttyname(line), bitrate="500 kbit/s", dbc=own_machine.dbc

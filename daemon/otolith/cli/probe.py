@@ -292,7 +292,7 @@ def _listen(options: "BusOptions", database: Path | None, seconds: float, stop: 
 
 
 def _receive(bus: Any, options: "BusOptions", picture: "Picture", seconds: float, stop: StopSignal) -> None:
-    from otolith_drivers.canbus.bus import MOST_BAD_IN_A_ROW, is_gone
+    from otolith_drivers.canbus.bus import MAX_CONSECUTIVE_BAD, is_gone
     from otolith_drivers.errors import DeviceError
 
     end, bad = time.monotonic() + seconds, 0
@@ -302,7 +302,7 @@ def _receive(bus: Any, options: "BusOptions", picture: "Picture", seconds: float
         except Exception as error:  # python-can passes on whatever the vendor's library raises
             bad += 1
             picture.unreadable += 1
-            if is_gone(error) or bad > MOST_BAD_IN_A_ROW:
+            if is_gone(error) or bad > MAX_CONSECUTIVE_BAD:
                 raise DeviceError(f"CAN bus {options.title()}: {error}; was the interface taken down?") from error
             continue
         bad = 0

@@ -305,7 +305,7 @@ def marked(frames: canbus.ObservedFrames) -> str:
     return " ".join(runs)
 
 
-def _signal_row(frames: canbus.ObservedFrames, signal: Signal, value: canbus.Value) -> Row:
+def _signal_row(frames: canbus.ObservedFrames, signal: Signal, value: canbus.ObservedValue) -> Row:
     low, high = signal.minimum, signal.maximum
     name = f"{frames.message.name if frames.message else frames.name}.{signal.name}"
     return {
