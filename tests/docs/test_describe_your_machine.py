@@ -12,7 +12,7 @@ from otolith.adaptation.state import initial_state
 from otolith.cli.check import describe
 from otolith.machine import load_machine, load_twin
 from otolith.twin.expressions import FUNCTIONS
-from otolith.twin.identifiability import structure_of
+from otolith.twin.identifiability import structural_identifiability
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.errors import ConfigurationError
 
@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_its_files_are_read_and_all_can_be_estimated(folder: Path) -> None:
-    assert all(entry.identifiable for entry in structure_of(load_twin(folder / "fan.toml")))
+    assert all(entry.identifiable for entry in structural_identifiability(load_twin(folder / "fan.toml")))
     plan = load_machine(folder / "fan-3.toml")
     assert [entry.name for entry in plan.problem.free] == ["T_c", "k"]
     assert any("MotorSpeed [rpm]" in line for line in describe(plan))

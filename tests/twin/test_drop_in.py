@@ -10,7 +10,7 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import Status
 from otolith.machine import load_machine, load_twin
-from otolith.twin.identifiability import structure_of
+from otolith.twin.identifiability import structural_identifiability
 from otolith.twin.kernel import Excitation, kernel_of
 
 PAGE = """
@@ -86,7 +86,7 @@ def verdicts(tmp_path: Path, page: str) -> dict[str, str]:
     """Of each parameter: why it could not be estimated, or nothing."""
     path = tmp_path / "twin.toml"
     path.write_text(page, encoding="utf-8")
-    return {entry.name: entry.reason for entry in structure_of(load_twin(path))}
+    return {entry.name: entry.reason for entry in structural_identifiability(load_twin(path))}
 
 
 KNOWN_HEAT = PAGE.replace(
@@ -150,5 +150,5 @@ C = { unit = "nF", nominal = 100, bounds = [10, 1000], meaning = "capacitance" }
 """,
         encoding="utf-8",
     )
-    found = {entry.name: entry.reason for entry in structure_of(load_twin(path))}
+    found = {entry.name: entry.reason for entry in structural_identifiability(load_twin(path))}
     assert found == {"R": "only together with C", "C": "only together with R"}

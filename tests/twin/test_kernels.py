@@ -174,7 +174,7 @@ def test_the_gain_is_that_of_an_extended_kalman_filter() -> None:
     measured = kernel.simulate(nominal(twin)[None], initial(twin)[None], drive)[0] + random.normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
     noise = NoiseModel(np.array([0.5, 1.0]), np.array([0.0, 0.01]), np.array([0.2, 3.0]))
-    found = kernel.correction(nominal(twin), initial(twin), replace(drive, measured=measured), noise)
+    found = kernel.innovation_model(nominal(twin), initial(twin), replace(drive, measured=measured), noise)
     state, covariance, log_determinant = initial(twin), np.zeros((2, 2)), 0.0
     for record in range(RECORDS):
         seen = np.flatnonzero(np.isfinite(measured[record]))

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from otolith.machine import LIBRARY, find_twin, load_twin
 from otolith.machine import names as library
-from otolith.twin.dimensions import describe, dimension_of, measure
-from otolith.twin.expressions import FUNCTIONS, ExpressionError, names, parse
+from otolith.twin.dimensions import describe, dimension_of, infer_dimension
+from otolith.twin.expressions import FUNCTIONS, ExpressionError, names_in, parse
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twin.kernel_sources import kernel_source
 from otolith.twin.language import read_twin
@@ -74,8 +74,8 @@ def test_any_expression_is_refused_or_is_one_of_the_language(text: str) -> None:
     allowed = (ast.Constant, ast.Name, ast.UnaryOp, ast.BinOp, ast.Call, ast.Compare, ast.operator, ast.unaryop,
                ast.cmpop, ast.expr_context)  # fmt: skip
     assert all(isinstance(node, allowed) for node in ast.walk(tree))
-    known = dict.fromkeys(names(tree), dimension_of("1"))
-    measure(tree, known)
+    known = dict.fromkeys(names_in(tree), dimension_of("1"))
+    infer_dimension(tree, known)
     to_sympy(tree, {name: to_sympy(parse("1 + 1"), {}) for name in known})
 
 
@@ -144,7 +144,7 @@ def test_the_position_is_that_of_the_fault(text: str, column: int) -> None:
 )
 def test_dimensions(text: str, unit: str | None) -> None:
     known = {"R": dimension_of("ohm"), "i": dimension_of("A"), "L": dimension_of("H")}
-    found = measure(parse(text), known)
+    found = infer_dimension(parse(text), known)
     assert found == (dimension_of("W") ** 0.5 if unit is None else dimension_of(unit))
 
 
@@ -234,5 +234,5 @@ def test_nothing_but_checked_names_reaches_the_generated_code() -> None:
     page = BASE.replace('title = "', 'title = "\\"\\"\\"\\nINJECTED ').replace('source = "', 'source = "INJECTED ')
     assert "INJECTED" not in kernel_source(read_twin(SourceFile(Path("any.toml"), page)))
     for name in ('x\\"\\"\\"\\nimport os', "a b", "a.b", "1a", ""):
-        with pytest.raises(ConfigurationError, match="is no name"):
+        with pytest.raises(ConfigurationError, match="is not a name"):
             read_twin(SourceFile(Path("any.toml"), BASE.replace('name = "dc_motor"', f'name = "{name}"', 1)))

@@ -37,7 +37,7 @@ from otolith.health.schema import (
     window_document,
 )
 from otolith.health.status import MarginalPosterior, PreviousStatus, WindowEvidence, publish
-from otolith.twin.component_families import Kind
+from otolith.twin.component_families import SourceKind
 
 
 def component_documents(
@@ -82,7 +82,7 @@ def numbers_of(problem: Problem, known: Prior, slot: int) -> dict[str, NumberDoc
     """Amplitude, and inner number and phase as far as the component has them."""
     component = problem.components[slot]
     periodic = component.repeats
-    place = source_of(base_model(problem), component.source).kind is Kind.PLACE
+    place = source_of(base_model(problem), component.source).kind is SourceKind.PLACE
     inner = component.model.inner
     names = ["amplitude", "order" if periodic and place else "inner" if inner is None else inner.meaning, "phase"]
     deviations = np.sqrt(np.maximum(np.diag(known.covariance), 0.0))

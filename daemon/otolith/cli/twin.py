@@ -84,16 +84,16 @@ def check(file: Path) -> None:
 def _document(definition: Any) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from otolith.twin.identifiability import structure_of
+    from otolith.twin.identifiability import structural_identifiability
 
-    return asdict(definition) | {"structure": [asdict(entry) for entry in structure_of(definition)]}
+    return asdict(definition) | {"structure": [asdict(entry) for entry in structural_identifiability(definition)]}
 
 
 def _print(definition: Any) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from otolith.twin.identifiability import structure_of
+    from otolith.twin.identifiability import structural_identifiability
     from otolith.twin.symbolic import unicode_page
 
     console = Console(width=max(Console().width, 100), highlight=False)
@@ -105,7 +105,7 @@ def _print(definition: Any) -> None:
     say("")
     say(unicode_page(definition), markup=False, soft_wrap=True)
     say("")
-    structure = {entry.name: entry for entry in structure_of(definition)}
+    structure = {entry.name: entry for entry in structural_identifiability(definition)}
     table = Table("parameter", "nominal", "bounds", "unit", "role", "could be estimated", "meaning")
     for entry in definition.parameters:
         found = structure[entry.name]

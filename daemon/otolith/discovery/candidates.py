@@ -22,7 +22,7 @@ from otolith.discovery.linear_response import (
 )
 from otolith.estimation.augmented import base_model
 from otolith.estimation.problem import Component, Problem, SwarmOptions
-from otolith.twin.augmentation import SLOTS, sites, sources
+from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
 
 PARTICLES, GENERATIONS = 10, 12
 CALMED = 0.3  # the inertia weight falls to it: held at the paper's 0.9 a swarm does not come to rest
@@ -88,7 +88,7 @@ def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     looked for, the errors of sensors are.
     """
     twin = base_model(problem)
-    if len(problem.components) >= SLOTS:
+    if len(problem.components) >= MAX_COMPONENTS:
         return []
     taken = problem.excluded | {entry.key for entry in problem.components}
     own = len(twin.sites)
@@ -213,7 +213,7 @@ def threshold_like(problem: Problem, rest: list[Settled]) -> list[Settled]:
     found: dict[int, Settled] = {}
     for entry in rest:
         structure = entry[0][0]
-        if structure.model.holds and sources(base_model(problem))[structure.source].name in states:
+        if structure.model.threshold_like and sources(base_model(problem))[structure.source].name in states:
             found.setdefault(structure.site, entry)
     return list(found.values())
 

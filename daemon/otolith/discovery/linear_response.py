@@ -16,10 +16,10 @@ from otolith.estimation.arrival_cost import MapObjective, Prior
 from otolith.estimation.augmented import base_model, input_matrix
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem, key_of
-from otolith.twin.augmentation import Source, sites, sources, with_slots
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, Kind, code_of
+from otolith.twin.augmentation import ComponentSource, augmented_model, sites, sources
+from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import Excitation, InnovationModel, Linear, Numbers, kernel_of
+from otolith.twin.kernel import Excitation, Indices, InnovationModel, LinearisedModel, kernel_of
 
 SENSOR_FAMILIES = frozenset({"constant", "linear"})  # an offset and a gain
 
@@ -43,9 +43,9 @@ class BasisFunctions:
 
     families: Array
     """(curves,)."""
-    sources: Numbers
+    sources: Indices
     """(curves,)."""
-    sites: Numbers
+    sites: Indices
     """(curves,)."""
     inner: Array
     """(curves,)."""
@@ -75,16 +75,16 @@ def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozen
 
 
 def _bounds(model: ComponentFamily, x: Array) -> tuple[float, float]:
-    if model.given is not None:
-        return model.given(x), model.given(x)
+    if model.fixed_inner is not None:
+        return model.fixed_inner(x), model.fixed_inner(x)
     return (0.0, 0.0) if model.inner is None else model.inner.bounds(x)
 
 
-def _lies_so(model: ComponentFamily, source: Source, signal: str) -> bool:
+def _lies_so(model: ComponentFamily, source: ComponentSource, signal: str) -> bool:
     """A sensor has an offset, or a gain that is off."""
     if model.name not in SENSOR_FAMILIES:
         return False
-    return source.kind is Kind.NOTHING or source.name == signal
+    return source.kind is SourceKind.NOTHING or source.name == signal
 
 
 def grid(structure: CandidateForm, x: Array, fineness: float) -> Array:
@@ -103,7 +103,7 @@ def grid(structure: CandidateForm, x: Array, fineness: float) -> Array:
 def basis_functions(guesses: Iterator[tuple[CandidateForm, float]]) -> BasisFunctions:
     """One curve for each guess, or two where the phase is free."""
     rows = [
-        (code_of(entry.model.name), entry.source, entry.site, inner, phase)
+        (family_code(entry.model.name), entry.source, entry.site, inner, phase)
         for entry, inner in guesses
         for phase in entry.model.phases
     ]
@@ -152,9 +152,9 @@ class LinearResponse:
         self._problem, self._window, self._guess = problem, window, guess
         self._linear, self._correction = self._linearise(guess)
 
-    def _linearise(self, guess: Array) -> tuple[Linear, InnovationModel]:
+    def _linearise(self, guess: Array) -> tuple[LinearisedModel, InnovationModel]:
         twin, objective, free = base_model(self._problem), self.objective, len(self._problem.free)
-        slotted = with_slots(twin)
+        slotted = augmented_model(twin)
         self._kernel = kernel_of(slotted)
         parameters = np.zeros(len(slotted.parameters))
         values = objective.parameters(guess[None, :free])[0]
@@ -165,7 +165,7 @@ class LinearResponse:
         extra = len(slotted.states) - len(states)
         gain = np.pad(objective.correction.gain, ((0, 0), (0, extra), (0, 0)))
         excitation = replace(objective.excitation, inputs=input_matrix(slotted, self._window), gain=gain)
-        linear = self._kernel.along(parameters, initial, excitation, self._nudge(parameters, initial, excitation))
+        linear = self._kernel.linearise(parameters, initial, excitation, self._nudge(parameters, initial, excitation))
         inputs = [self._window.column(entry.name) for entry in twin.inputs]
         shown = [entry.name for entry in twin.outputs]
         states_of = [entry.name for entry in slotted.states]
@@ -187,9 +187,9 @@ class LinearResponse:
         if extra:  # angles that no component depends on do nothing
             count = len(states)
             linear = linear._replace(
-                moves=np.ascontiguousarray(linear.moves[:, :count, :count]),
-                early=np.ascontiguousarray(linear.early[:, :count]),
-                late=np.ascontiguousarray(linear.late[:, :count]),
+                transition=np.ascontiguousarray(linear.transition[:, :count, :count]),
+                input_now=np.ascontiguousarray(linear.input_now[:, :count]),
+                input_next=np.ascontiguousarray(linear.input_next[:, :count]),
                 output=np.ascontiguousarray(linear.output[:, :, :count]),
             )
         return linear, objective.correction
@@ -209,11 +209,11 @@ class LinearResponse:
             measured=None if excitation.measured is None else excitation.measured[:FEW],
             gain=None if excitation.gain is None else excitation.gain[:FEW],
         )
-        tried = self._kernel.along(parameters, initial, few, np.full(count, 1e-3))
+        tried = self._kernel.linearise(parameters, initial, few, np.full(count, 1e-3))
         size = np.maximum(np.abs(tried.trajectory).max(axis=0), 1e-3)[:, None]
-        effect = (np.abs(tried.early + tried.late).max(axis=0) / size).max(axis=0)
+        effect = (np.abs(tried.input_now + tried.input_next).max(axis=0) / size).max(axis=0)
         noise = self.objective.noise.outputs[:, None]
-        effect = np.maximum(effect, (np.abs(tried.through).max(axis=0) * SLIGHT / noise).max(axis=0))
+        effect = np.maximum(effect, (np.abs(tried.feedthrough).max(axis=0) * SLIGHT / noise).max(axis=0))
         return np.asarray(SLIGHT / np.maximum(effect, 1e-12))
 
     def responses(self, shapes: BasisFunctions) -> Array:

@@ -40,8 +40,8 @@ from otolith.estimation.arrival_cost import Prior, initial_prior
 from otolith.estimation.augmented import base_model
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.problem import Problem
-from otolith.twin.augmentation import SLOTS, sources
-from otolith.twin.component_families import Kind
+from otolith.twin.augmentation import MAX_COMPONENTS, sources
+from otolith.twin.component_families import SourceKind
 
 LOOKED_AT = 4  # windows, in one of which families are tried that the linear picture underrates
 
@@ -61,7 +61,7 @@ def screening_test(problem: Problem, window: Window, prior: Prior, start: Array)
     """A coarse look at what a component would gain, around ``start`` (free parameters, ...)."""
     landscape = LinearResponse(problem, window, prior, start[: len(problem.free)])
     # Lines of the spectrum cost most: those over time are looked at in one window, those over angles in the next.
-    turn = (Kind.TIME, Kind.PLACE)[window.index % 2]
+    turn = (SourceKind.TIME, SourceKind.PLACE)[window.index % 2]
     found = [
         entry
         for entry in allowed_forms(problem, landscape.x)
@@ -80,7 +80,7 @@ def _held(problem: Problem, window: Window, landscape: LinearResponse) -> float:
     """What a family would gain that the linear picture underrates, whatever was known of the parameters."""
     found = allowed_forms(problem, landscape.x)
     rivals = rivals_of(problem, found)
-    guesses = [(entry, entry.bounds[0]) for entry in found if entry.model.holds and not rivals.lies(entry)]
+    guesses = [(entry, entry.bounds[0]) for entry in found if entry.model.threshold_like and not rivals.lies(entry)]
     gains = evaluated(landscape, guesses)
     settled = [
         (guess, pair, 0.0)
@@ -116,7 +116,7 @@ def search(problem: Problem, window: Window, prior: Prior, seen: ScreeningResult
     found += _one_moved(problem, window, prior, seen.landscape)
     found += [with_candidate(problem, window, prior, entry) for entry in candidates(problem, seen.landscape, window)]
     best = min((entry for entry in found if entry.reason is FaultType.COMPONENT), key=_left, default=None)
-    while best is not None and len(best.problem.components) < SLOTS:
+    while best is not None and len(best.problem.components) < MAX_COMPONENTS:
         more = _further(best, window)
         if more is None:
             break

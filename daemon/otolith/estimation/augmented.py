@@ -9,18 +9,18 @@ from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Component, Problem
 from otolith.twin.augmentation import (
     ELAPSED,
-    SLOTS,
-    Source,
-    family,
-    numbers,
-    place,
-    shift,
+    MAX_COMPONENTS,
+    ComponentSource,
+    augmented_model,
+    component_parameters,
+    family_setting,
+    shift_setting,
+    site_setting,
     sites,
+    source_setting,
     sources,
-    weight,
-    with_slots,
 )
-from otolith.twin.component_families import code_of
+from otolith.twin.component_families import family_code
 from otolith.twin.definition import Definition, Parameter, Site
 
 REACH = 10.0  # times what was found: how large an amplitude may become
@@ -33,14 +33,14 @@ def site_of(twin: Definition, name: str) -> Site:
     return next(entry for entry in sites(twin) if entry.name == name)
 
 
-def source_of(twin: Definition, name: str) -> Source:
+def source_of(twin: Definition, name: str) -> ComponentSource:
     """By its name; ``twin`` is the author's."""
     return next(entry for entry in sources(twin) if entry.name == name)
 
 
 def base_model(problem: Problem) -> Definition:
     """The author's twin."""
-    return problem.twin.plain or problem.twin
+    return problem.twin.base or problem.twin
 
 
 def augment(problem: Problem, components: Sequence[Component]) -> Problem:
@@ -50,15 +50,15 @@ def augment(problem: Problem, components: Sequence[Component]) -> Problem:
         ValueError: there are more than a twin has slots.
     """
     twin, together = base_model(problem), (*problem.components, *components)
-    if len(together) > SLOTS:
-        raise ValueError(f"{len(together)} components: a twin has {SLOTS} slots")
+    if len(together) > MAX_COMPONENTS:
+        raise ValueError(f"{len(together)} components: a twin has {MAX_COMPONENTS} slots")
     free = [entry for entry in problem.free if not entry.name.startswith("_")]
     kept = {entry.name: entry for entry in problem.free if entry.name.startswith("_")}
     known = [entry for entry in problem.known if not entry[0].startswith("_")]
     for slot, component in enumerate(together):
         known += _settings(twin, slot, component).items()
         free += [kept.get(entry.name, entry) for entry in _numbers(twin, slot, component)]
-    return replace(problem, twin=with_slots(twin), free=tuple(free), known=tuple(known), components=together)
+    return replace(problem, twin=augmented_model(twin), free=tuple(free), known=tuple(known), components=together)
 
 
 def without(problem: Problem, gone: Component) -> Problem:
@@ -76,15 +76,15 @@ def without(problem: Problem, gone: Component) -> Problem:
 
 def _settings(twin: Definition, slot: int, component: Component) -> dict[str, float]:
     at = [entry.name for entry in sites(twin)].index(component.site)
-    found = {family(slot): code_of(component.family), place(slot, at): 1.0}
+    found = {family_setting(slot): family_code(component.family), site_setting(slot, at): 1.0}
     source = [entry.name for entry in sources(twin)].index(component.source)
-    given = {numbers(slot)[1]: component.inner} if component.model.given is not None else {}
-    return found | given | ({weight(slot, source): 1.0} if source else {})
+    given = {component_parameters(slot)[1]: component.inner} if component.model.fixed_inner is not None else {}
+    return found | given | ({source_setting(slot, source): 1.0} if source else {})
 
 
 def _numbers(twin: Definition, slot: int, component: Component) -> list[Parameter]:
     """The free numbers of a component as parameters."""
-    amplitude, inner, phase = numbers(slot)
+    amplitude, inner, phase = component_parameters(slot)
     unit, row = site_of(twin, component.site).unit, component.model
     reach = REACH * abs(component.amplitude)
     low = 0.0 if component.repeats else -reach
@@ -101,7 +101,7 @@ def _numbers(twin: Definition, slot: int, component: Component) -> list[Paramete
 def indices(problem: Problem, slot: int) -> list[int]:
     """Where in a guess the numbers of a slot are: amplitude, then inner number and phase if it has them."""
     names = [entry.name for entry in problem.free]
-    return [names.index(name) for name in numbers(slot) if name in names]
+    return [names.index(name) for name in component_parameters(slot) if name in names]
 
 
 def time_offsets(problem: Problem, window: Window) -> dict[str, float]:
@@ -109,7 +109,7 @@ def time_offsets(problem: Problem, window: Window) -> dict[str, float]:
     found = {}
     for slot, component in enumerate(problem.components):
         if component.source == "t" and not component.repeats:
-            found[shift(slot)] = window.start - component.origin
+            found[shift_setting(slot)] = window.start - component.origin
     return found
 
 

@@ -15,7 +15,7 @@ from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.augmented import input_matrix, time_offsets
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import MOST_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
+from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
 
 
 def predictor(
@@ -26,7 +26,7 @@ def predictor(
     A twin that diverges there, or that nothing disturbs, runs in open loop.
     """
     if noise.inputs.any() or noise.states.any():
-        found = kernel.correction(parameters, initial, excitation, noise)
+        found = kernel.innovation_model(parameters, initial, excitation, noise)
         if np.isfinite(found.gain).all() and np.isfinite(found.whitening).all():
             return found
     return open_loop(kernel, excitation, noise)
@@ -83,8 +83,8 @@ class Objective:
         self.low, self.high = np.concatenate([low, lowest]), np.concatenate([high, highest])
         self.names = (*(entry.label for entry in problem.free), *(f"initial {state.name}" for state in twin.states))
         self._open_loop, self._states = problem.open_loop, len(twin.states)
-        self._most = MOST_SUBSTEPS if twin.plain is None else MOST_WITH_COMPONENTS
-        self._plain = twin.plain or twin
+        self._most = MAX_SUBSTEPS if twin.base is None else MOST_WITH_COMPONENTS
+        self._plain = twin.base or twin
         self._excitation = Excitation(input_matrix(twin, window), window.sample_period)
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
         self.centre(start, self._first if initial is None else initial)
@@ -215,7 +215,7 @@ class Objective:
         return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
 
     def _noise(self, problem: Problem) -> NoiseModel:
-        twin = problem.twin.plain or problem.twin
+        twin = problem.twin.base or problem.twin
         columns = zip(self.measured.T, self.present.T, strict=True)
         quanta = np.array([adc_step(values[there]) for values, there in columns])
         return NoiseModel(
