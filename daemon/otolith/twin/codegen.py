@@ -5,7 +5,7 @@ setting; ``h_`` an expression of parameters alone; ``t_`` a shared subexpression
 ``k1_`` to ``k4_`` the rates at the Runge-Kutta stages. docs/explanation/kernels.md reads one kernel line by line.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from string import Template
 from typing import Any
@@ -17,6 +17,11 @@ from otolith.twin.definition import Definition
 from otolith.twin.symbolic import system_of
 
 DECORATOR = '@njit(error_model="numpy", fastmath={"contract"})'
+
+
+# Step of a central difference by a state, in its unit. Its truncation error grows with the square of the step, its
+# rounding error with the inverse: 1e-6 of the value is near the cube root of the floating-point resolution.
+DIFFERENCE = "1e-6 * abs({name}) + 1e-9"
 
 
 class Printer(PythonCodePrinter):  # type: ignore[misc]  # sympy has no types
@@ -49,10 +54,6 @@ class Printer(PythonCodePrinter):  # type: ignore[misc]  # sympy has no types
 
     def _print_Heaviside(self, expr: Any) -> str:  # noqa: N802
         return f"(1.0 if {self._print(expr.args[0])} > 0.0 else 0.0)"
-
-    def _print_DiracDelta(self, expr: Any) -> str:  # noqa: N802 - the derivative of a step is taken beside the step
-        del expr
-        return "0.0"
 
     def _print_Float(self, expr: Any) -> str:  # noqa: N802
         return repr(float(expr))
@@ -201,7 +202,6 @@ class KernelCode:
         return ", ".join([*states, *inputs, *self.constants])
 
     def _shared_blocks(self) -> Blocks:
-        measured = enumerate(zip(self.y, numbered("e", len(self.y)), numbered("m", len(self.y)), strict=True))
         return {
             "arguments": self.arguments(self.x, self.u),
             "n_states": str(len(self.x)),
@@ -210,12 +210,7 @@ class KernelCode:
             "linearised_y": unpacked([*self.y, *self.c.names("c"), *self.d.names("d")]),
             "read_parameters": self.read_parameters(""),
             "read_inputs": [f"{name} = inputs[record, {index}]" for index, name in enumerate(self.u)],
-            "innovations": [
-                line
-                for index, (y, e, m) in measured  # a missing measurement has no innovation
-                for line in (f"{e} = measured[record, {index}] - {y}", f"{m} = 1.0", f"if {e} != {e}:",
-                             f"    {e} = {m} = 0.0")
-            ],
+            "innovations": self._innovations(),
             "correct_state": [
                 f"{x} += {total([f'gain[record, {row}, {index}] * e_{index}' for index in range(len(self.y))])}"
                 for row, x in enumerate(self.x)
@@ -230,7 +225,18 @@ class KernelCode:
                 for row, x in enumerate(self.x)
             ],
             "advance_inputs": [f"{u} = end_{u}" for u in self.ramps],
+            "read_next_inputs": [f"w_{index} = inputs[record + 1, {index}]" for index in range(len(self.u))],
+            "next_state": [self.advanced(numbered("n", len(self.x)), {})],
+            "move_to_next": [f"{x} = n_{row}" for row, x in enumerate(self.x)],
         }  # fmt: skip
+
+    def _innovations(self) -> list[str]:
+        """``e`` is measured minus predicted and ``m`` is 1; both are 0 for a missing measurement, which is NaN."""
+        lines = []
+        for index, y in enumerate(self.y):
+            e, m = f"e_{index}", f"m_{index}"
+            lines += [f"{e} = measured[record, {index}] - {y}", f"{m} = 1.0", f"if {e} != {e}:", f"    {e} = {m} = 0.0"]
+        return lines
 
     def read_parameters(self, row: str) -> list[str]:
         """Parameters, hoisted expressions and the initial state; ``row`` selects the particle of a swarm."""
@@ -256,6 +262,24 @@ class KernelCode:
             results += [name for prefix, jacobian in jacobians for name in jacobian.names(f"{prefix}{stage.number}")]
             inputs = [stage.input_prefix + name if name in self.ramps else name for name in self.u]
             lines.append(f"{unpacked(results)} = {function}({self.arguments(stage.advanced(self.x, 'k'), inputs)})")
+        return lines
+
+    def advanced(self, names: list[str], changed: Mapping[str, str]) -> str:
+        """An assignment of the states at the next record to ``names``, with some arguments of ``advance_`` replaced."""
+        given = [changed.get(name, name) for name in (*self.x, *self.u, *numbered("w", len(self.u)))]
+        return f"{unpacked(names)} = advance_({', '.join(['step', 'substeps', *given, *self.constants])})"
+
+    def transition(self, element: str) -> list[str]:
+        """The next state by this one, by central differences, into ``element`` of row and column."""
+        states = range(len(self.x))
+        lines = []
+        for column, x in enumerate(self.x):
+            lines += [
+                f"delta = {DIFFERENCE.format(name=x)}",
+                self.advanced(numbered("up", len(self.x)), {x: f"{x} + delta"}),
+                self.advanced(numbered("down", len(self.x)), {x: f"{x} - delta"}),
+                *(f"{element.format(row, column)} = (up_{row} - down_{row}) / (2.0 * delta)" for row in states),
+            ]
         return lines
 
 
