@@ -21,7 +21,7 @@ from otolith.discovery.search import ScreeningResult
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.augmented import base_model
 from otolith.twin.augmentation import sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, Kind, code_of
+from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
 
 SECONDS = 2.0
 LEAST, MOST = 3.0, 30.0  # of the detection limit
@@ -98,7 +98,7 @@ def _chosen(
     found: dict[int, list[CandidateForm]] = {}
     for entry in candidate_library(twin, landscape.x):
         source = sources(twin)[entry.source]
-        still = kind == "constant" and source.kind is Kind.SIGNAL  # only its noise moves
+        still = kind == "constant" and source.kind is SourceKind.SIGNAL  # only its noise moves
         own = entry.model is model and entry.site < len(twin.sites)
         if own and not still and not is_a_parameter(sites(twin)[entry.site].name, model.name, source.name):
             found.setdefault(entry.site, []).append(entry)
@@ -151,7 +151,7 @@ def detection_limit(structure: CandidateForm, inner: float, phase: float, landsc
 def _information(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:
     """Of the amplitude: what a fit gains by the square of what it finds, whatever the noise happens to be."""
     curve = BasisFunctions(
-        np.array([code_of(structure.model.name)]),
+        np.array([family_code(structure.model.name)]),
         np.array([structure.source]),
         np.array([structure.site]),
         np.array([inner]),

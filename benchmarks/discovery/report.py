@@ -10,7 +10,7 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from benchmarks.discovery.judge import Judged
-from otolith.twin.component_families import NAMES
+from otolith.twin.component_families import FAMILY_NAMES
 
 FIRST_AT_LEAST, NAMED_AT_LEAST, COVERED = 0.90, 0.98, (0.93, 0.97)
 OTHERS = ("two or more", "sensor", "parameter", "nothing")  # that a family may be taken for
@@ -77,11 +77,11 @@ def document(rows: Sequence[Judged], seed: int) -> dict[str, Any]:
 def _confusion(rows: Sequence[Judged]) -> Table:
     table = Table(title="true family down, family of the best explanation across", title_justify="left")
     table.add_column("")
-    for name in (*NAMES, *OTHERS):
+    for name in (*FAMILY_NAMES, *OTHERS):
         table.add_column(SHORT.get(name, name), justify="right")
     counts = Counter((row.family, row.best_family) for row in rows)
-    for family in NAMES:
-        cells = [counts[family, name] for name in (*NAMES, *OTHERS)]
+    for family in FAMILY_NAMES:
+        cells = [counts[family, name] for name in (*FAMILY_NAMES, *OTHERS)]
         table.add_row(family, *(str(cell) if cell else "·" for cell in cells))
     return table
 
@@ -90,7 +90,7 @@ def _by_family(rows: Sequence[Judged]) -> Table:
     table = Table(title="by true family", title_justify="left")
     for name in ("", "cases", "decided", "first of decided", "named", "polished", "covered", "detected", "noticed"):
         table.add_column(name, justify="right" if name else "left")
-    for family in NAMES:
+    for family in FAMILY_NAMES:
         own = [row for row in rows if row.family == family]
         decided, tried = [row for row in own if row.decided], [row for row in own if row.tried]
         table.add_row(

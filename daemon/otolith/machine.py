@@ -21,7 +21,7 @@ from otolith.acquisition.alignment import Limits
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
 from otolith.machine_file import DiscoveryTable, MachineFile, ParameterTable, WindowTable, Written
 from otolith.twin.augmentation import sources
-from otolith.twin.component_families import NAMES
+from otolith.twin.component_families import FAMILY_NAMES
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import read_twin
 from otolith_drivers.base import Driver, DriverType, Setup, Signal
@@ -87,7 +87,8 @@ def excluded(table: DiscoveryTable, twin: Definition, fail: Callable[[str, str],
     """Keys of components that are not to be looked for; ``fail`` is told the key of the table and what is wrong."""
     places = [entry.name for entry in twin.sites]
     inputs = [entry.name for entry in sources(twin) if entry.name]
-    asked = (("families", table.families, NAMES), ("sites", table.sites, places), ("inputs", table.inputs, inputs))
+    families = ("families", table.families, FAMILY_NAMES)
+    asked = (families, ("sites", table.sites, places), ("inputs", table.inputs, inputs))
     for key, names, known in asked:
         for name in names or ():
             if name not in known:
@@ -95,7 +96,7 @@ def excluded(table: DiscoveryTable, twin: Definition, fail: Callable[[str, str],
     return frozenset(
         key_of(site, family, source.name)
         for site in places
-        for family in NAMES
+        for family in FAMILY_NAMES
         for source in sources(twin)
         if (table.families is not None and family not in table.families)
         or (table.sites is not None and site not in table.sites)

@@ -56,7 +56,7 @@ def test_a_healthy_window_has_one_objective_and_one_kalman_pass(scenario: MotorS
     calls: list[str] = []
 
     def record(frame: FrameType, event: str, _: object) -> None:
-        if event == "call" and frame.f_code in (Objective.__init__.__code__, Kernel.correction.__code__):
+        if event == "call" and frame.f_code in (Objective.__init__.__code__, Kernel.innovation_model.__code__):
             calls.append(frame.f_code.co_qualname)
 
     sys.setprofile(record)
@@ -65,7 +65,7 @@ def test_a_healthy_window_has_one_objective_and_one_kalman_pass(scenario: MotorS
     finally:
         sys.setprofile(None)
     assert calls.count("Objective.__init__") == 1
-    assert calls.count("Kernel.correction") <= 2  # again if the first pass asks for finer sub-steps
+    assert calls.count("Kernel.innovation_model") <= 2  # again if the first pass asks for finer sub-steps
 
 
 def test_the_same_state_and_window_give_the_same_report(scenario: MotorScenario, windows: Cut) -> None:

@@ -37,7 +37,7 @@ from otolith.health.schema import (
     window_document,
 )
 from otolith.health.status import MarginalPosterior, PreviousStatus, WindowEvidence, publish
-from otolith.twin.component_families import Kind
+from otolith.twin.component_families import SourceKind
 
 MAX_VARIANCE_RATIO = 3.0  # ratio of variances above which windows disagree with each other
 DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
@@ -251,7 +251,7 @@ def _component_documents(
 def _component_values(problem: Problem, known: Prior, slot: int) -> dict[str, NumberDocument]:
     """Return amplitude, inner parameter and phase, as far as the component has them."""
     component = problem.components[slot]
-    place = source_of(base_model(problem), component.source).kind is Kind.PLACE
+    place = source_of(base_model(problem), component.source).kind is SourceKind.PLACE
     inner = component.model.inner
     inner_name = "order" if component.periodic and place else "inner" if inner is None else inner.meaning
     deviations = np.sqrt(np.maximum(np.diag(known.covariance), 0.0))

@@ -64,14 +64,14 @@ def show(name: str, latex: bool, as_json: bool) -> None:
     from dataclasses import asdict
 
     from otolith.machine import find_twin, load_twin
-    from otolith.twin.identifiability import structure_of
+    from otolith.twin.identifiability import structural_identifiability
     from otolith.twin.symbolic import latex_page
 
     definition = load_twin(Path(name)) if name.endswith(".toml") else find_twin(name)
     if latex:
         click.echo(latex_page(definition))
     elif as_json:
-        document = asdict(definition) | {"structure": [asdict(row) for row in structure_of(definition)]}
+        document = asdict(definition) | {"structure": [asdict(row) for row in structural_identifiability(definition)]}
         click.echo(json.dumps(document, indent=2, ensure_ascii=False))
     else:
         _print(definition)
@@ -95,7 +95,7 @@ def _print(definition: "Definition") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from otolith.twin.identifiability import structure_of
+    from otolith.twin.identifiability import structural_identifiability
     from otolith.twin.symbolic import unicode_page
 
     console = Console(width=max(Console().width, MIN_WIDTH), highlight=False)
@@ -104,7 +104,7 @@ def _print(definition: "Definition") -> None:
     if definition.validity:
         console.print(f"valid: {definition.validity}", markup=False)
     console.print(f"\n{unicode_page(definition)}\n", markup=False, soft_wrap=True)
-    structure = {row.name: row for row in structure_of(definition)}
+    structure = {row.name: row for row in structural_identifiability(definition)}
     table = Table("parameter", "nominal", "bounds", "unit", "role", "could be estimated", "meaning")
     for parameter in definition.parameters:
         row = structure[parameter.name]

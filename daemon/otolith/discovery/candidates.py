@@ -20,7 +20,7 @@ from otolith.discovery.linear_response import (
 from otolith.estimation.augmented import base_model
 from otolith.estimation.particle_swarm import SwarmRule, particle_swarm
 from otolith.estimation.problem import Component, Problem
-from otolith.twin.augmentation import SLOTS, sites, sources
+from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
 
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
 COARSE, FINE = 1.5, 0.5  # spectral lines between two frequencies, in the screening test and in a search
@@ -93,7 +93,7 @@ def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     only errors of sensors remain.
     """
     twin = base_model(problem)
-    if len(problem.components) >= SLOTS:
+    if len(problem.components) >= MAX_COMPONENTS:
         return []
     taken = problem.excluded | {component.key for component in problem.components}
     return [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
@@ -222,7 +222,7 @@ def threshold_like(problem: Problem, guesses: list[ScoredGuess]) -> list[ScoredG
     states = {state.name for state in twin.states}
     best: dict[int, ScoredGuess] = {}
     for guess in guesses:
-        if guess.form.model.holds and sources(twin)[guess.form.source].name in states:
+        if guess.form.model.threshold_like and sources(twin)[guess.form.source].name in states:
             best.setdefault(guess.form.site, guess)
     return list(best.values())
 

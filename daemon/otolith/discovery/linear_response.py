@@ -15,10 +15,10 @@ from otolith.acquisition.window import Array, Mask
 from otolith.estimation.augmented import base_model, input_matrix
 from otolith.estimation.problem import key_of
 from otolith.estimation.window_fit import Fit
-from otolith.twin.augmentation import Source, sites, sources, with_slots
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, Kind, code_of
+from otolith.twin.augmentation import ComponentSource, augmented_model, sites, sources
+from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import Excitation, Linear, Numbers, kernel_of
+from otolith.twin.kernel import Excitation, Indices, LinearisedModel, kernel_of
 
 SENSOR_FAMILIES = frozenset({"constant", "linear"})  # the errors of a sensor: an offset and a gain
 PROBE_RECORDS = 6  # from which the size of the finite difference is found
@@ -70,16 +70,16 @@ def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozen
 
 
 def _inner_bounds(model: ComponentFamily, x: Array) -> tuple[float, float]:
-    if model.given is not None:
-        return model.given(x), model.given(x)
+    if model.fixed_inner is not None:
+        return model.fixed_inner(x), model.fixed_inner(x)
     return (0.0, 0.0) if model.inner is None else model.inner.bounds(x)
 
 
-def _is_sensor_error(model: ComponentFamily, source: Source, signal: str) -> bool:
+def _is_sensor_error(model: ComponentFamily, source: ComponentSource, signal: str) -> bool:
     """Whether the form is an offset, or a gain error, of the sensor of ``signal``."""
     if model.name not in SENSOR_FAMILIES:
         return False
-    return source.kind is Kind.NOTHING or source.name == signal
+    return source.kind is SourceKind.NOTHING or source.name == signal
 
 
 def inner_grid(form: CandidateForm, x: Array, fineness: float) -> Array:
@@ -101,9 +101,9 @@ class BasisFunctions:
 
     families: Array
     """(curves,) codes."""
-    sources: Numbers
+    sources: Indices
     """(curves,) indices."""
-    sites: Numbers
+    sites: Indices
     """(curves,) indices."""
     inner: Array
     """(curves,)."""
@@ -114,7 +114,7 @@ class BasisFunctions:
 def basis_functions(guesses: Iterator[Guess]) -> BasisFunctions:
     """Return one curve for each guess, or two a quarter turn apart where the phase is free."""
     rows = [
-        (code_of(form.model.name), form.source, form.site, inner, phase)
+        (family_code(form.model.name), form.source, form.site, inner, phase)
         for form, inner in guesses
         for phase in form.model.phases
     ]
@@ -157,14 +157,14 @@ class LinearResponse:
     def _linearise_slots(self) -> None:
         """Linearise the twin with slots along the predicted trajectory, and evaluate the sources there."""
         free, objective = len(self.problem.free), self.objective
-        slotted = with_slots(base_model(self.problem))
+        slotted = augmented_model(base_model(self.problem))
         self._kernel = kernel_of(slotted)
         values, states = objective.parameters(self._guess[None, :free])[0], self._guess[2 * free :]
         parameters, initial = _padded(values, len(slotted.parameters)), _padded(states, len(slotted.states))
         gain = np.pad(objective.innovation_model.gain, ((0, 0), (0, len(initial) - len(states)), (0, 0)))
         excitation = replace(objective.excitation, inputs=input_matrix(slotted, self.window), gain=gain)
         differences = self._difference_sizes(parameters, initial, excitation)
-        linear = self._kernel.along(parameters, initial, excitation, differences)
+        linear = self._kernel.linearise(parameters, initial, excitation, differences)
         self.x = self._sources([state.name for state in slotted.states], linear.trajectory, states)
         """(sources, records)."""
         self._linear = _without_angles(linear, len(states))
@@ -178,11 +178,11 @@ class LinearResponse:
             measured=None if excitation.measured is None else excitation.measured[:PROBE_RECORDS],
             gain=None if excitation.gain is None else excitation.gain[:PROBE_RECORDS],
         )
-        trial = self._kernel.along(parameters, initial, few, np.full(count, 1e-3))
+        trial = self._kernel.linearise(parameters, initial, few, np.full(count, 1e-3))
         size = np.maximum(np.abs(trial.trajectory).max(axis=0), 1e-3)[:, None]
-        effect = (np.abs(trial.early + trial.late).max(axis=0) / size).max(axis=0)
+        effect = (np.abs(trial.input_now + trial.input_next).max(axis=0) / size).max(axis=0)
         noise = self.objective.noise.outputs[:, None]
-        effect = np.maximum(effect, (np.abs(trial.through).max(axis=0) * PROBE_EFFECT / noise).max(axis=0))
+        effect = np.maximum(effect, (np.abs(trial.feedthrough).max(axis=0) * PROBE_EFFECT / noise).max(axis=0))
         return np.asarray(PROBE_EFFECT / np.maximum(effect, 1e-12))
 
     def _sources(self, state_names: list[str], trajectory: Array, initial: Array) -> Array:
@@ -290,13 +290,13 @@ def _padded(values: Array, length: int) -> Array:
     return padded
 
 
-def _without_angles(linear: Linear, states: int) -> Linear:
+def _without_angles(linear: LinearisedModel, states: int) -> LinearisedModel:
     """Return the linearisation without the angles that no component depends on: they change nothing."""
     if linear.trajectory.shape[1] == states:
         return linear
     return linear._replace(
-        moves=np.ascontiguousarray(linear.moves[:, :states, :states]),
-        early=np.ascontiguousarray(linear.early[:, :states]),
-        late=np.ascontiguousarray(linear.late[:, :states]),
+        transition=np.ascontiguousarray(linear.transition[:, :states, :states]),
+        input_now=np.ascontiguousarray(linear.input_now[:, :states]),
+        input_next=np.ascontiguousarray(linear.input_next[:, :states]),
         output=np.ascontiguousarray(linear.output[:, :, :states]),
     )

@@ -40,8 +40,8 @@ from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, WindowEstimate, fit
-from otolith.twin.augmentation import SLOTS, sources
-from otolith.twin.component_families import Kind
+from otolith.twin.augmentation import MAX_COMPONENTS, sources
+from otolith.twin.component_families import SourceKind
 
 THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
 MAX_STEPS = 25  # of Gauss-Newton for a hypothesis
@@ -106,7 +106,7 @@ def screening_test(fitted: Fit) -> ScreeningResult:
     """
     problem, index = fitted.problem, fitted.window.index
     response = LinearResponse(fitted)
-    kind = (Kind.TIME, Kind.PLACE)[index % 2]
+    kind = (SourceKind.TIME, SourceKind.PLACE)[index % 2]
     source_kinds = [source.kind for source in sources(base_model(problem))]
     forms = [
         form
@@ -125,7 +125,7 @@ def _threshold_gain(response: LinearResponse) -> float:
     problem, fresh = response.problem, initial_prior(response.problem)
     forms = allowed_forms(problem, response.x)
     alternatives = Alternatives.among(problem, forms)
-    guesses = [(form, form.bounds[0]) for form in forms if form.model.holds and not alternatives.is_sensor(form)]
+    guesses = [(form, form.bounds[0]) for form in forms if form.model.threshold_like and not alternatives.is_sensor(form)]
     screening = Screening.of(response, guesses, alternatives)
     readable = [guess for guess in map(screening.__getitem__, range(len(guesses))) if guess.is_readable]
     proposals = [
@@ -152,7 +152,7 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     fitted = fit_hypotheses(proposals, window)
     components = [item for item in fitted if item.type is FaultType.COMPONENT]
     best = min(components, key=_chi_square, default=None)
-    while best is not None and len(best.problem.components) < SLOTS:
+    while best is not None and len(best.problem.components) < MAX_COMPONENTS:
         best = _with_another_component(best)
         fitted += [] if best is None else [best]
     if screening.always_lacking or not _is_convincing(fitted):

@@ -9,18 +9,18 @@ from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Component, Problem
 from otolith.twin.augmentation import (
     ELAPSED,
-    SLOTS,
-    Source,
-    family,
-    numbers,
-    place,
-    shift,
+    MAX_COMPONENTS,
+    ComponentSource,
+    augmented_model,
+    component_parameters,
+    family_setting,
+    shift_setting,
+    site_setting,
     sites,
+    source_setting,
     sources,
-    weight,
-    with_slots,
 )
-from otolith.twin.component_families import code_of
+from otolith.twin.component_families import family_code
 from otolith.twin.definition import Definition, Parameter, Site
 
 AMPLITUDE_BOUND = 10.0  # times the discovered amplitude
@@ -33,14 +33,14 @@ def site_of(twin: Definition, name: str) -> Site:
     return next(site for site in sites(twin) if site.name == name)
 
 
-def source_of(twin: Definition, name: str) -> Source:
+def source_of(twin: Definition, name: str) -> ComponentSource:
     """Return the source of that name; ``twin`` is the base model."""
     return next(source for source in sources(twin) if source.name == name)
 
 
 def base_model(problem: Problem) -> Definition:
     """Return the twin without slots for components."""
-    return problem.twin.plain or problem.twin
+    return problem.twin.base or problem.twin
 
 
 def augment(problem: Problem, components: Sequence[Component]) -> Problem:
@@ -50,15 +50,15 @@ def augment(problem: Problem, components: Sequence[Component]) -> Problem:
         ValueError: more components than the twin has slots.
     """
     twin, together = base_model(problem), (*problem.components, *components)
-    if len(together) > SLOTS:
-        raise ValueError(f"{len(together)} components: a twin has {SLOTS} slots")
+    if len(together) > MAX_COMPONENTS:
+        raise ValueError(f"{len(together)} components: a twin has {MAX_COMPONENTS} slots")
     free = [parameter for parameter in problem.free if not parameter.name.startswith("_")]
     kept = {parameter.name: parameter for parameter in problem.free if parameter.name.startswith("_")}
     known = [pair for pair in problem.known if not pair[0].startswith("_")]
     for slot, component in enumerate(together):
         known += _settings(twin, slot, component).items()
         free += [kept.get(parameter.name, parameter) for parameter in _free_values(twin, slot, component)]
-    return replace(problem, twin=with_slots(twin), free=tuple(free), known=tuple(known), components=together)
+    return replace(problem, twin=augmented_model(twin), free=tuple(free), known=tuple(known), components=together)
 
 
 def without(problem: Problem, removed: Component) -> Problem:
@@ -77,15 +77,15 @@ def without(problem: Problem, removed: Component) -> Problem:
 def _settings(twin: Definition, slot: int, component: Component) -> dict[str, float]:
     """Return the known parameters that select family, site and source of a slot."""
     at = [site.name for site in sites(twin)].index(component.site)
-    settings = {family(slot): code_of(component.family), place(slot, at): 1.0}
+    settings = {family_setting(slot): family_code(component.family), site_setting(slot, at): 1.0}
     source = [source.name for source in sources(twin)].index(component.source)
-    given = {numbers(slot)[1]: component.inner} if component.model.given is not None else {}
-    return settings | given | ({weight(slot, source): 1.0} if source else {})
+    given = {component_parameters(slot)[1]: component.inner} if component.model.fixed_inner is not None else {}
+    return settings | given | ({source_setting(slot, source): 1.0} if source else {})
 
 
 def _free_values(twin: Definition, slot: int, component: Component) -> list[Parameter]:
     """Return amplitude, inner parameter and phase as free parameters, as far as the family has them."""
-    amplitude, inner, phase = numbers(slot)
+    amplitude, inner, phase = component_parameters(slot)
     unit, model = site_of(twin, component.site).unit, component.model
     reach = AMPLITUDE_BOUND * abs(component.amplitude)
     low = 0.0 if component.periodic else -reach
@@ -103,7 +103,7 @@ def _free_values(twin: Definition, slot: int, component: Component) -> list[Para
 def indices(problem: Problem, slot: int) -> list[int]:
     """Return where the values of a slot stand among the free parameters: amplitude, inner parameter, phase."""
     names = [parameter.name for parameter in problem.free]
-    return [names.index(name) for name in numbers(slot) if name in names]
+    return [names.index(name) for name in component_parameters(slot) if name in names]
 
 
 def amplitude_indices(problem: Problem) -> list[int]:
@@ -120,7 +120,7 @@ def slot_of(problem: Problem, component: Component) -> int | None:
 def time_offsets(problem: Problem, window: Window) -> dict[str, float]:
     """Return the settings that count the time of a window from the origins of the components."""
     return {
-        shift(slot): window.start - component.origin
+        shift_setting(slot): window.start - component.origin
         for slot, component in enumerate(problem.components)
         if component.source == "t" and not component.periodic
     }

@@ -16,7 +16,7 @@ from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.augmented import input_matrix, time_offsets
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import MOST_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
+from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
 
 EXPLAINED = 1.5  # cost up to which the residual counts as noise
 INITIAL_STATE_REACH = 10.0  # standard deviations around the first record: least width of the bounds of a start
@@ -35,7 +35,7 @@ def predictor(
     A twin that diverges there, or that has no process noise, runs in open loop.
     """
     if noise.inputs.any() or noise.states.any():
-        model = kernel.correction(parameters, initial, excitation, noise)
+        model = kernel.innovation_model(parameters, initial, excitation, noise)
         if np.isfinite(model.gain).all() and np.isfinite(model.whitening).all():
             return model
     return open_loop(kernel, excitation, noise)
@@ -84,8 +84,8 @@ class Objective:
         states = (f"initial {state.name}" for state in twin.states)
         self.names = (*(parameter.label for parameter in problem.free), *states)
         self._open_loop, self._states = problem.open_loop, len(twin.states)
-        self._max_substeps = MOST_SUBSTEPS if twin.plain is None else MAX_SUBSTEPS_WITH_COMPONENTS
-        self._base = twin.plain or twin
+        self._max_substeps = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
+        self._base = twin.base or twin
         self._excitation = Excitation(input_matrix(twin, window), window.sample_period)
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
         self.set_predictor(start, self._first if initial is None else initial)
@@ -218,7 +218,7 @@ class Objective:
         return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
 
     def _noise_model(self, problem: Problem) -> NoiseModel:
-        twin = problem.twin.plain or problem.twin
+        twin = problem.twin.base or problem.twin
         columns = zip(self.measured.T, self.present.T, strict=True)
         steps = np.array([adc_step(values[present]) for values, present in columns])
         return NoiseModel(

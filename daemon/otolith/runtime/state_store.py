@@ -17,8 +17,8 @@ from typing import Annotated, TypeVar
 from pydantic import Field, TypeAdapter, ValidationError
 
 from otolith.adaptation.state import ComponentRecord, OperatorDecisions
-from otolith.twin.augmentation import SLOTS, sites, sources
-from otolith.twin.component_families import NAMES
+from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
+from otolith.twin.component_families import FAMILY_NAMES
 from otolith.twin.definition import Definition
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
@@ -75,12 +75,12 @@ class StateStore:
             log.warning("begun without the components of earlier runs: since then [signals] have changed")
             return ()
         usable = [entry for entry in file.components if self._is_possible(entry)]
-        return tuple(usable[:SLOTS])
+        return tuple(usable[:MAX_COMPONENTS])
 
     def _is_possible(self, kept: ComponentRecord) -> bool:
         """Whether this version and this twin can have such a component."""
         component = kept.adopted.component
-        if component.family not in NAMES or component.amplitude == 0.0:
+        if component.family not in FAMILY_NAMES or component.amplitude == 0.0:
             return False
         numbers = 1 + (component.model.inner is not None) + component.periodic
         return (
