@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.acquisition.alignment import Limits, align, align_polled, judge
+from otolith.acquisition.alignment import QualityLimits, align, align_polled, assess_quality
 from otolith.acquisition.window import Array, Verdict
 from otolith_drivers.base import Sampling
 
@@ -50,7 +50,7 @@ def test_anything_gives_finite_values_and_a_verdict(samples: list[tuple[float, f
     aligned = align(times, values, 0.0, records, PERIOD)
     assert np.isfinite(aligned.values).all()
     assert len(aligned.values) == len(aligned.missing) == records
-    quality = judge({"x": aligned}, PERIOD, Limits())
+    quality = assess_quality({"x": aligned}, PERIOD, QualityLimits())
     assert 0.0 <= quality.missing <= 1.0
     assert (quality.verdict is Verdict.GOOD) == (not quality.reasons)
 
@@ -62,15 +62,15 @@ def test_a_repeated_frame_moves_no_other(at: int, late: float) -> None:
     values = np.insert(ramp(200), at + 1, float(at))
     aligned = align(times, values, 0.0, 200, PERIOD)
     assert np.array_equal(aligned.values, ramp(200))
-    assert aligned.extra == 1
-    assert judge({"x": aligned}, PERIOD, Limits()).verdict is Verdict.GOOD
+    assert aligned.surplus == 1
+    assert assess_quality({"x": aligned}, PERIOD, QualityLimits()).verdict is Verdict.GOOD
 
 
 @pytest.mark.parametrize("apart", [0.001, 0.003])
 def test_two_nodes_that_send_the_same_are_a_bad_window(apart: float) -> None:
     times = np.sort(np.concatenate([ramp(200) * PERIOD, ramp(200) * PERIOD + apart]))
     values = np.where(np.arange(400) % 2 == 0, 5.0, 6.0)
-    quality = judge({"x": align(times, values, 0.0, 200, PERIOD)}, PERIOD, Limits())
+    quality = assess_quality({"x": align(times, values, 0.0, 200, PERIOD)}, PERIOD, QualityLimits())
     assert quality.verdict is Verdict.BAD
     assert "do two nodes send it?" in quality.reasons[0]
 
@@ -78,7 +78,7 @@ def test_two_nodes_that_send_the_same_are_a_bad_window(apart: float) -> None:
 def test_jitter_is_judged() -> None:
     late = np.random.default_rng(0).uniform(0.0, 0.0045, 200)
     aligned = align(ramp(200) * PERIOD + late, ramp(200), 0.0, 200, PERIOD)
-    quality = judge({"x": aligned}, PERIOD, Limits(jitter=0.002))
+    quality = assess_quality({"x": aligned}, PERIOD, QualityLimits(jitter=0.002))
     assert quality.jitter == pytest.approx(np.sqrt(np.mean(late**2)))
     assert quality.verdict is Verdict.BAD
     assert "ms of jitter" in quality.reasons[0]
@@ -88,15 +88,15 @@ def test_jitter_is_judged() -> None:
 def test_samples_that_come_twice_are_left_out_up_to_a_limit_and_never_an_exception(surplus: int) -> None:
     times = np.sort(np.concatenate([ramp(210) - 10.0, ramp(200)[-surplus:]])) * PERIOD
     aligned = align(times, times, 0.0, 200, PERIOD)
-    assert aligned.extra == min(surplus, 20)
+    assert aligned.surplus == min(surplus, 20)
     assert not aligned.missing.any()
-    verdict = judge({"x": aligned}, PERIOD, Limits()).verdict
+    verdict = assess_quality({"x": aligned}, PERIOD, QualityLimits()).verdict
     assert verdict is (Verdict.GOOD if surplus == 1 else Verdict.BAD)
 
 
 def test_skew_is_how_far_two_signals_are_apart() -> None:
     first, second = (align(ramp(200) * PERIOD + late, ramp(200), 0.0, 200, PERIOD) for late in (0.001, 0.003))
-    assert judge({"x": first, "y": second}, PERIOD, Limits()).skew == pytest.approx(0.002)
+    assert assess_quality({"x": first, "y": second}, PERIOD, QualityLimits()).skew == pytest.approx(0.002)
 
 
 def test_gaps_of_a_slower_signal_are_missing() -> None:
@@ -123,7 +123,7 @@ def test_a_slower_signal_is_interpolated() -> None:
 )
 def test_the_verdict_says_why(keep: slice, sentence: str) -> None:
     aligned = align((ramp(200) * PERIOD)[keep], ramp(200)[keep], 0.0, 200, PERIOD)
-    quality = judge({"x": aligned}, PERIOD, Limits())
+    quality = assess_quality({"x": aligned}, PERIOD, QualityLimits())
     assert quality.verdict is Verdict.BAD
     assert sentence in quality.reasons
 
@@ -146,5 +146,5 @@ def test_readings_that_never_came_are_missing(lost: set[int]) -> None:
 
 def test_a_round_of_requests_is_no_jitter() -> None:
     aligned = {"x": align_polled(ramp(200) * PERIOD + 0.004, ramp(200), 0.0, 200, PERIOD)}
-    assert judge(aligned, PERIOD, Limits(jitter=0.001), Sampling.POLLED).verdict is Verdict.GOOD
-    assert judge(aligned, PERIOD, Limits(jitter=0.001), Sampling.CYCLIC).verdict is Verdict.BAD
+    assert assess_quality(aligned, PERIOD, QualityLimits(jitter=0.001), Sampling.POLLED).verdict is Verdict.GOOD
+    assert assess_quality(aligned, PERIOD, QualityLimits(jitter=0.001), Sampling.CYCLIC).verdict is Verdict.BAD

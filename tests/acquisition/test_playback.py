@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.playback import Playback
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Array, Window
@@ -26,7 +26,7 @@ def test_the_windows_are_those_of_the_daemon() -> None:
     times = 0.1 + np.arange(1000.0) * PERIOD + random.uniform(0.0, 0.002, 1000)
     values = np.arange(1000.0)
     live = cut_all(Rings(("a", "b"), 400), list(zip(times.tolist(), values.tolist(), strict=True)), until=10.3)
-    replayed = played(Playback(("a", "b"), RECORDS, PERIOD, Limits()), rows(times, values))
+    replayed = played(Playback(("a", "b"), RECORDS, PERIOD, QualityLimits()), rows(times, values))
     assert len(live) == len(replayed) == 20
     for one, other in zip(live, replayed, strict=True):
         assert np.array_equal(one.values, other.values)
@@ -35,7 +35,7 @@ def test_the_windows_are_those_of_the_daemon() -> None:
 
 def test_windows_may_change_their_length_from_one_to_the_next() -> None:
     times = np.arange(1000.0) * PERIOD
-    playback = Playback(("a", "b"), RECORDS, PERIOD, Limits())
+    playback = Playback(("a", "b"), RECORDS, PERIOD, QualityLimits())
     lengths = iter([100, 20, 400, *[50] * 9])
     windows = []
     for window in playback.windows(rows(times, np.arange(1000.0))):
@@ -53,8 +53,8 @@ def test_where_rows_are_cut_into_stretches_does_not_matter() -> None:
     times[1500:] += 200.0
     times[random.integers(0, 2000, 20)] -= 0.1
     values = np.where(random.random(2000) < 0.02, np.nan, np.arange(2000.0))
-    whole = Playback(("a", "b"), RECORDS, PERIOD, Limits())
-    pieces = Playback(("a", "b"), RECORDS, PERIOD, Limits())
+    whole = Playback(("a", "b"), RECORDS, PERIOD, QualityLimits())
+    pieces = Playback(("a", "b"), RECORDS, PERIOD, QualityLimits())
     first = played(whole, rows(times, values))
     cuts = [0, *sorted(random.integers(1, 2000, 60).tolist()), 2000]
     parts = [rows(times[a:b], values[a:b]) for a, b in pairwise(cuts)]
@@ -64,4 +64,4 @@ def test_where_rows_are_cut_into_stretches_does_not_matter() -> None:
         assert (one.start, one.quality) == (other.start, other.quality)
         assert np.array_equal(one.values, other.values)
     assert (whole.counts.lost, whole.counts.reordered) == (pieces.counts.lost, pieces.counts.reordered)
-    assert whole.counts.outages == pieces.counts.outages == 1
+    assert whole.counts.silences == pieces.counts.silences == 1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.windower import Windower
 from otolith_drivers.base import Sampling, Setup, Signal
@@ -40,7 +40,7 @@ def read_window(sampling: Sampling) -> float:
     sources = [{"register": address, "type": "int16", "unit": "V"} for address in (0, 500)]
     signals = tuple(Signal(name, "V", Source.model_validate(s)) for name, s in zip("ab", sources, strict=True))
     rings = Rings(("a", "b"), 4 * RECORDS)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits(missing=1.0, gap=10.0, jitter=1.0), sampling)
+    windower = Windower(("a", "b"), RECORDS, PERIOD, QualityLimits(missing=1.0, gap=10.0, jitter=1.0), sampling)
     driver = build(Options(host="127.0.0.1", port=port), Setup(signals, Path(), PERIOD))
     with odd_server(Behaviour(Moving(), spoil=slow), port):
         driver.open(rings.deliver)

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict, Window
-from otolith.acquisition.windower import GRACE, Windower
+from otolith.acquisition.windower import GRACE_PERIOD, Windower
 from otolith_drivers.base import Sample
 
 PERIOD, RECORDS = 0.01, 50
@@ -23,7 +23,7 @@ def feed(rings: Rings, samples: list[tuple[float, float]]) -> None:
 
 def cut_all(rings: Rings, samples: list[tuple[float, float]], *, until: float) -> list[Window]:
     """Feed samples at their times and cut whatever is due, as the service does."""
-    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    windower = Windower(("a", "b"), RECORDS, PERIOD, QualityLimits())
     windows, now, queue = [], 0.0, list(samples)
     while now < until:
         arrived = [sample for sample in queue if sample[0] <= now]
@@ -75,7 +75,7 @@ def test_the_first_window_is_centred_though_its_first_sample_came_late() -> None
 
 def test_a_complete_window_is_not_waited_for() -> None:
     rings = Rings(("a", "b"), 400)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    windower = Windower(("a", "b"), RECORDS, PERIOD, QualityLimits())
     feed(rings, [(index * PERIOD, 1.0) for index in range(RECORDS + 1)])
     assert windower.begin(rings, 0.5, 0.5)
     assert windower.due(rings, windower.next_end)
@@ -99,7 +99,7 @@ def test_a_machine_that_never_speaks_gives_bad_windows() -> None:
 
 def test_a_signal_that_never_comes_is_named() -> None:
     rings = Rings(("a", "b", "c"), 400)
-    windower = Windower(("a", "b", "c"), RECORDS, PERIOD, Limits())
+    windower = Windower(("a", "b", "c"), RECORDS, PERIOD, QualityLimits())
     feed(rings, [(index * PERIOD, 1.0) for index in range(100)])
     assert not windower.begin(rings, 0.4, 0.4)
     assert windower.begin(rings, 1.0, 1.0)
@@ -108,15 +108,15 @@ def test_a_signal_that_never_comes_is_named() -> None:
 
 def test_a_window_is_not_waited_for_longer_than_the_grace() -> None:
     rings = Rings(("a", "b"), 400)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    windower = Windower(("a", "b"), RECORDS, PERIOD, QualityLimits())
     feed(rings, [(index * PERIOD, 1.0) for index in range(RECORDS - 3)])
     assert windower.begin(rings, 0.48, 0.48)
-    assert not windower.due(rings, windower.next_end + 0.9 * GRACE)
-    assert windower.due(rings, windower.next_end + GRACE)
+    assert not windower.due(rings, windower.next_end + 0.9 * GRACE_PERIOD)
+    assert windower.due(rings, windower.next_end + GRACE_PERIOD)
 
 
 def test_a_gap_counts_again_once_the_grid_is_fine_again() -> None:
-    windower, rings = Windower(("a", "b"), RECORDS, PERIOD, Limits()), Rings(("a", "b"), 400)
+    windower, rings = Windower(("a", "b"), RECORDS, PERIOD, QualityLimits()), Rings(("a", "b"), 400)
     windower.regrid(RECORDS, 1.0)
     windower.regrid(RECORDS, PERIOD)
     feed(rings, [(index * PERIOD, 1.0) for index in range(2 * RECORDS) if not 20 <= index < 40])

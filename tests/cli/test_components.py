@@ -47,10 +47,10 @@ def test_what_was_found_in_other_signals_is_not_believed(data: Path) -> None:
     plan = load_machine(MACHINE, with_driver=False)
     names, folder, found = (
         (plan.file.machine.site, plan.file.machine.name),
-        keeper().known.parent,
+        keeper().components_path.parent,
         keeper().components(),
     )
-    StateStore(*names, plan.twin, folder, "before").keep(found)
+    StateStore(*names, plan.twin, folder, "before").save_components(found)
     assert StateStore(*names, plan.twin, folder, "before").components() == found
     assert StateStore(*names, plan.twin, folder, "after").components() == ()
 
@@ -127,19 +127,19 @@ def test_a_machine_without_components_says_so() -> None:
 
 def test_a_file_that_is_not_ours_is_refused_by_name() -> None:
     one = keeper()
-    one.known.parent.mkdir(parents=True, exist_ok=True)
-    one.known.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
+    one.components_path.parent.mkdir(parents=True, exist_ok=True)
+    one.components_path.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
     with pytest.raises(ConfigurationError, match=r"components.0.adopted.*move it away"):
         one.components()
-    one.said.write_text("half a fi", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=one.said.name):
+    one.decisions_path.write_text("half a fi", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=one.decisions_path.name):
         one.decisions()
 
 
 @pytest.mark.parametrize(
     ("line", "word"),
     [
-        ('families = ["periodik"]', "'periodik' is none of them"),
+        ('families = ["periodik"]', "unknown name 'periodik'"),
         ('sites = ["shfat"]', "shaft"),
         ('inputs = ["angle(i)"]', "angle.omega."),
     ],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array
-from otolith.machine import find_twin, names
+from otolith.machine import find_twin, library_twins
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import Excitation, NoiseModel, kernel_of
 from tests.twin.reference import Reference
@@ -31,7 +31,7 @@ def excitation(definition: Definition, records: int = RECORDS, seed: int = 5) ->
     return Excitation(np.column_stack(columns), PERIODS[definition.name])
 
 
-@pytest.fixture(params=names())
+@pytest.fixture(params=library_twins())
 def twin(request: pytest.FixtureRequest) -> Definition:
     return find_twin(request.param)
 

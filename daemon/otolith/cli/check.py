@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 
-from otolith.machine import LoadedMachine, load_machine, recording_folder
+from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import prefix
 from otolith_drivers.base import Sample
 from otolith_drivers.user_dirs import complain_unless_writable
@@ -30,7 +30,7 @@ def check_machine(path: Path, say: Callable[[str], None], *, with_device: bool) 
     for line in describe(plan):
         say(line)
     if plan.file.recording.enabled:
-        complain_unless_writable(recording_folder(plan))
+        complain_unless_writable(plan.recording_folder)
     if not with_device:
         return True
     counts, lines = _listen(plan)
@@ -63,7 +63,7 @@ def describe(plan: LoadedMachine) -> list[str]:
         lines += [f"process noise of {state.name}: {noise:g} {state.unit} per square root of a second"] if noise else []
     endpoints = ", ".join(file.zenoh.listen) or "no endpoint"
     lines.append(f"reports on {endpoints}, keys {prefix(file.machine.site, file.machine.name)}/...")
-    lines.append(f"recordings into {recording_folder(plan)}" if file.recording.enabled else "no recordings")
+    lines.append(f"recordings into {plan.recording_folder}" if file.recording.enabled else "no recordings")
     return lines
 
 

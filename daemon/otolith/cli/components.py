@@ -103,7 +103,7 @@ def forget(file: Path, component: str) -> None:
 def _say(file: Path, component: str, word: str, more: "Callable[[OperatorDecisions], OperatorDecisions]") -> None:
     """Keep ``more`` in the place of what has been said of ``component``."""
     _, keeper = _keeper(file)
-    keeper.decide(more(_unsaid(keeper, component)))
+    keeper.save_decisions(more(_unsaid(keeper, component)))
     click.echo(f"{component} is {word}")
 
 
@@ -196,8 +196,10 @@ def _ask(plan: "LoadedMachine", keeper: "StateStore", state: "AdaptationState", 
         key = entry.adopted.component.key
         click.echo(f"found {key}: {_words(plan, entry)}", err=True)
         (approved if yes or _belongs() else rejected).add(key)
-    keeper.keep(tuple(entry for entry in found if entry.adopted.component.key in approved))
-    keeper.decide(replace(said, approved=said.approved | approved, rejected=(said.rejected | rejected) - approved))
+    keeper.save_components(tuple(entry for entry in found if entry.adopted.component.key in approved))
+    keeper.save_decisions(
+        replace(said, approved=said.approved | approved, rejected=(said.rejected | rejected) - approved)
+    )
     if not found:
         click.echo("no component was found: the twin explains the machine up to the noise", err=True)
     for name, parameter in _parameters(state):

@@ -30,9 +30,9 @@ def list_(as_json: bool) -> None:
     Example:
       otolith twin list
     """
-    from otolith.machine import find_twin, names
+    from otolith.machine import find_twin, library_twins
 
-    found = [find_twin(name) for name in names()]
+    found = [find_twin(name) for name in library_twins()]
     if as_json:
         click.echo(json.dumps([{"name": entry.name, "title": entry.title} for entry in found]))
         return
