@@ -129,7 +129,7 @@ def test_a_file_that_is_not_ours_is_refused_by_name() -> None:
     one = keeper()
     one.components_path.parent.mkdir(parents=True, exist_ok=True)
     one.components_path.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=r"components.0.adopted.*move it away"):
+    with pytest.raises(ConfigurationError, match=r"components.0.adopted.*move the file away"):
         one.components()
     one.decisions_path.write_text("half a fi", encoding="utf-8")
     with pytest.raises(ConfigurationError, match=one.decisions_path.name):

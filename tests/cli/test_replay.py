@@ -80,7 +80,7 @@ def test_only_a_replay_does_without_a_driver() -> None:
     file = MACHINE_FILES / "no-driver" / "machine.toml"
     with pytest.raises(ConfigurationError, match="loaded without its driver"):
         _ = load_machine(file, with_driver=False).driver
-    with pytest.raises(ConfigurationError, match="say where the signals come from"):
+    with pytest.raises(ConfigurationError, match=r"missing: write \[driver\]"):
         load_machine(file)
 
 
