@@ -31,11 +31,11 @@ MAX_INTERVAL = 2.5  # median intervals between two samples, beyond which interpo
 class QualityLimits:
     """Bounds that the worst signal of a window must keep for the window to be good."""
 
-    missing: float = 0.05
+    missing: float
     """Share of records without a sample, 0 to 1."""
-    gap: float = 0.05
+    gap: float
     """Longest time without a sample, s."""
-    jitter: float = 0.005
+    jitter: float
     """Root mean square lateness, s."""
 
 

@@ -41,7 +41,7 @@ def read(path: Path) -> tuple[list[Rows], str, list[str]]:
 
 
 def windows_of(stretches: list[Rows]) -> list[Window]:
-    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits())
+    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
     return [window for rows in stretches for window in playback.windows(rows)] + list(playback.rest())
 
 
@@ -64,7 +64,7 @@ def test_what_was_logged_is_what_the_driver_would_have_said(
 def cut_live(frames: list[can.Message]) -> list[Window]:
     """As the service does, while the frames come."""
     rings = Rings(tuple(UNITS), 4 * RECORDS)
-    windower = Windower(tuple(UNITS), RECORDS, PERIOD, QualityLimits())
+    windower = Windower(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
     samples, windows = live(frames), list[Window]()
     now, last = BEGUN, samples[-1].time
     while now < last + 0.5:
@@ -105,7 +105,7 @@ def test_where_a_log_goes_back_in_time_is_said(tmp_path: Path, frames: list[can.
         lines[first + 2000 : first + 2000] = lines[first : first + 3]
         path.write_text("".join(lines[:first] + lines[first + 30 :]), encoding="utf-8")
         place = first + 1971
-    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits())
+    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
     with opened(path) as log:
         for rows in log.stretches():
             list(playback.windows(rows))
