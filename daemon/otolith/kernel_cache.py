@@ -22,7 +22,7 @@ from types import ModuleType
 from otolith_drivers.errors import ServiceError
 from otolith_drivers.user_dirs import cache_directory
 
-MAX_KERNELS = 64  # folders in the cache, of about 1 MB each; the least recently used ones beyond are removed
+MAX_KERNELS = 64  # folders in the cache, at most 3 MB each; the least recently used beyond are removed
 GENERATOR = sorted((Path(__file__).parent / "twin").glob("*.py"))
 LIBRARIES = ("numba", "llvmlite", "numpy", "sympy")
 
