@@ -1,6 +1,6 @@
 """Schema of the machine file: typed, bounded, closed, every value with its unit.
 
-``docs/reference/machine-file.md`` lists every key with type, unit, bounds and default.
+``docs/reference/machine-file.md`` explains every key; paths are relative to the machine file.
 """
 
 import re
@@ -55,7 +55,6 @@ class TwinTable(StrictModel):
 
     name: str | None = None
     file: Path | None = None
-    """Relative to the machine file."""
 
 
 class ParameterTable(StrictModel):
@@ -98,7 +97,6 @@ class DiscoveryTable(StrictModel):
     families: tuple[str, ...] | None = None
     sites: tuple[str, ...] | None = None
     inputs: tuple[str, ...] | None = None
-    """``t``, ``angle(omega)``, or names of signals and states."""
 
 
 class SwarmTable(StrictModel):
@@ -124,7 +122,6 @@ class RecordingTable(StrictModel):
 
     enabled: bool = True
     folder: Path | None = None
-    """Relative to the machine file; without it, ``recordings`` in the state directory of the daemon."""
 
 
 class MachineFile(StrictModel):

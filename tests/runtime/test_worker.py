@@ -28,7 +28,7 @@ def supervisor() -> Iterator[Supervisor]:
     running = Supervisor(state_for("R_a"), window_length=LENGTH)
     running.start()
     yield running
-    running.stop()
+    running.worker.kill()
 
 
 def poll_for_report(supervisor: Supervisor) -> Report:
@@ -56,7 +56,7 @@ def test_a_window_whose_worker_died_is_tried_again(supervisor: Supervisor, batch
     supervisor.submit(batch[0], time.monotonic())
     poll_for_report(supervisor)
     supervisor.submit(batch[1], time.monotonic())
-    supervisor._worker.kill()
+    supervisor.worker.kill()
     assert poll_for_report(supervisor).document.window.index == 1
     assert (supervisor.missed, supervisor.restarts, supervisor.finished) == (0, 1, 2)
 
@@ -68,7 +68,7 @@ def test_a_window_that_kills_two_workers_is_missed(supervisor: Supervisor, batch
     assert supervisor.restarts == 0
     supervisor.submit(batch[1], time.monotonic())
     for _ in range(2):
-        supervisor._worker.kill()
+        supervisor.worker.kill()
         supervisor.poll(time.monotonic())
     poll_until_missed(supervisor, 2)
     supervisor.submit(batch[2], time.monotonic())
@@ -78,7 +78,7 @@ def test_a_window_that_kills_two_workers_is_missed(supervisor: Supervisor, batch
 def test_a_worker_that_hangs_is_killed(supervisor: Supervisor, batch: list[Window]) -> None:
     supervisor.submit(batch[0], time.monotonic())
     poll_for_report(supervisor)
-    os.kill(supervisor._worker._process.pid, signal.SIGSTOP)
+    os.kill(supervisor.worker._process.pid, signal.SIGSTOP)
     now = time.monotonic()
     supervisor.submit(batch[1], now)
     supervisor.poll(now + WINDOW_TIMEOUT + 2 * LENGTH + 0.1)

@@ -63,15 +63,13 @@ class Ring:
         self._read_up_to = max(self._read_up_to, end)
         return times[inside], values[inside]
 
-    @property
-    def last_time(self) -> float:
-        """Time of the newest sample, s; minus infinity if there is none."""
-        return float(self._times[(self._count - 1) % len(self._times)]) if self._count else -math.inf
-
-    @property
     def first_time(self) -> float:
-        """Time of the oldest sample still held, s; infinity if there is none."""
+        """Return the time of the oldest sample still held, s; infinity if there is none."""
         return float(self._times[: min(self._count, len(self._times))].min(initial=math.inf))
+
+    def last_time(self) -> float:
+        """Return the time of the newest sample, s; minus infinity if there is none."""
+        return float(self._times[(self._count - 1) % len(self._times)]) if self._count else -math.inf
 
 
 class Rings:
@@ -111,14 +109,14 @@ class Rings:
             return {signal: ring.between(start, end) for signal, ring in self._rings.items()}
 
     def first_times(self) -> list[float]:
-        """Return the time of the oldest sample of each signal, s; infinity for a signal without samples."""
+        """Return the result of :meth:`Ring.first_time` for every signal."""
         with self._lock:
-            return [ring.first_time for ring in self._rings.values()]
+            return [ring.first_time() for ring in self._rings.values()]
 
     def last_times(self) -> list[float]:
-        """Return the time of the newest sample of each signal, s; minus infinity for a signal without samples."""
+        """Return the result of :meth:`Ring.last_time` for every signal."""
         with self._lock:
-            return [ring.last_time for ring in self._rings.values()]
+            return [ring.last_time() for ring in self._rings.values()]
 
     def counters(self) -> RingCounters:
         """Return the counts since the start."""

@@ -135,7 +135,7 @@ class Service:
                 steps.callback(self._publisher.close)
             steps.callback(self._writer.stop, WRITER_FLUSH)
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
-            steps.callback(self._supervisor.stop)
+            steps.callback(self._supervisor.worker.kill)
             steps.callback(self._machine.driver.close)
             self._save_components(math.inf)
             self._notifier.send("STOPPING=1")
@@ -146,7 +146,7 @@ class Service:
         begun = self._windower.begin(self._rings, now, now - self._started_at)
         while begun and self._windower.due(self._rings, now):
             self._cut(now)
-        wait(self._supervisor.waitables, timeout=min(MAX_WAIT, max(MIN_WAIT, self._windower.next_end - now)))
+        wait(self._supervisor.worker.waitables, timeout=min(MAX_WAIT, max(MIN_WAIT, self._windower.next_end - now)))
         for report, seconds in self._supervisor.poll(time.monotonic()):
             self._publish(report, seconds)
             self._windower.records = self._supervisor.records
@@ -183,7 +183,19 @@ class Service:
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         link = self._machine.driver.link()
         driver = DriverDocument(up=link.up, reason=link.reason, warnings=link.warnings, plan=link.plan)
-        document = document.model_copy(update={"cost": cost, "counters": self._counters(), "driver": driver})
+        rings, driver_counters = self._rings.counters(), self._machine.driver.counters()
+        counters = CountersDocument(
+            received=rings.received,
+            bad=driver_counters.bad,
+            lost=driver_counters.lost + rings.overwritten,
+            reconnects=driver_counters.reconnects,
+            windows=self._windows,
+            windows_bad=self._windows_bad,
+            windows_missed=self._supervisor.missed,
+            worker_restarts=self._supervisor.restarts,
+            recordings_dropped=self._recordings_dropped,
+        )
+        document = document.model_copy(update={"cost": cost, "counters": counters, "driver": driver})
         if self._publisher is not None:
             self._publisher.publish(document)
         if self._machine.file.recording.enabled:
@@ -192,20 +204,6 @@ class Service:
         line = summary(document)
         self._notifier.send(f"STATUS={line}")
         log.info("%s", line)
-
-    def _counters(self) -> CountersDocument:
-        driver, rings, supervisor = self._machine.driver.counters(), self._rings.counters(), self._supervisor
-        return CountersDocument(
-            received=rings.received,
-            bad=driver.bad,
-            lost=driver.lost + rings.overwritten,
-            reconnects=driver.reconnects,
-            windows=self._windows,
-            windows_bad=self._windows_bad,
-            windows_missed=supervisor.missed,
-            worker_restarts=supervisor.restarts,
-            recordings_dropped=self._recordings_dropped,
-        )
 
     def _save_components(self, now: float) -> None:
         """Request a save if components were added or removed, or the last save is ``SAVE_INTERVAL`` ago."""

@@ -86,7 +86,7 @@ class Supervisor:
         self.finished = 0
         self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
         self._timeout = WINDOW_TIMEOUT + 2 * window_length
-        self._worker = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
+        self.worker = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
         self._waiting: deque[Window] = deque()
         self._current: Window | None = None
         self._retried: int | None = None
@@ -101,12 +101,7 @@ class Supervisor:
     @property
     def restarts(self) -> int:
         """Number of restarts of the worker."""
-        return max(0, self._worker.starts - 1)
-
-    @property
-    def waitables(self) -> list[Any]:
-        """See :attr:`otolith.runtime.process.ChildProcess.waitables`."""
-        return self._worker.waitables
+        return max(0, self.worker.starts - 1)
 
     @property
     def _allowed_seconds(self) -> float:
@@ -118,11 +113,7 @@ class Supervisor:
 
     def start(self) -> None:
         """Start the worker."""
-        self._worker.start(self.state)
-
-    def stop(self) -> None:
-        """Kill the worker; the current window is dropped."""
-        self._worker.kill()
+        self.worker.start(self.state)
 
     def submit(self, window: Window, now: float) -> None:
         """Queue a window, and dispatch it if the worker is free."""
@@ -133,14 +124,14 @@ class Supervisor:
 
     def poll(self, now: float) -> list[tuple[Report, float]]:
         """Return finished reports with their computing times in s; restart a worker that died or hangs."""
-        reports = [report for result in self._worker.replies() if (report := self._take(result)) is not None]
-        if not self._worker.alive:
+        reports = [report for result in self.worker.replies() if (report := self._take(result)) is not None]
+        if not self.worker.alive:
             self._requeue("died")
-            if self._worker.may_restart(now):
+            if self.worker.may_restart(now):
                 self.start()
         elif self._current is not None and now > self._deadline:
             self._requeue(f"has not finished window {self._current.index} in {self._allowed_seconds:.0f} s")
-            self._worker.kill()
+            self.worker.kill()
         self._dispatch(now)
         return reports
 
@@ -149,7 +140,7 @@ class Supervisor:
         if window is None or window.index != result.window_index:  # the window was requeued meanwhile
             return None
         self._current = None
-        self._worker.reset_backoff()
+        self.worker.reset_backoff()
         if result.report is None:
             self._miss(window, result.failure)
             return None
@@ -170,11 +161,11 @@ class Supervisor:
             self._waiting.appendleft(window)
 
     def _dispatch(self, now: float) -> None:
-        if self._current is not None or not self._waiting or not self._worker.alive:
+        if self._current is not None or not self._waiting or not self.worker.alive:
             return
         self.state, self._changes = self._next_state(), []
         self._current = self._waiting.popleft()
-        self._worker.offer((self.state, self._current))
+        self.worker.offer((self.state, self._current))
         self._deadline = now + self._allowed_seconds
 
     def _next_state(self) -> AdaptationState:
