@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.discovery.motor import Faults, J, live, windows
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.sequential_test import WindowDecision
+from otolith.discovery.decision import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 

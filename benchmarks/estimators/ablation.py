@@ -92,8 +92,8 @@ class _Pinned:
         self._objective, self._parameters = objective, parameters
         self.low, self.high = objective.low[objective.free :], objective.high[objective.free :]
 
-    def linearised(self, guess: Array) -> tuple[Array, Array]:
-        residuals, jacobian = self._objective.linearised(np.concatenate([self._parameters, guess]))
+    def linearise(self, guess: Array) -> tuple[Array, Array]:
+        residuals, jacobian = self._objective.linearise(np.concatenate([self._parameters, guess]))
         return residuals, jacobian[:, len(self._parameters) :]
 
 

@@ -9,7 +9,7 @@ from benchmarks.paper.scenarios import CHUNK, NOISE, Life, Number, Unknown, live
 from benchmarks.paper.study import LENGTH, PERIOD, SEED, Curves, Kind, Steps, Tell, curves, listened
 from otolith.acquisition.window import Array, Window
 from otolith.cli.common import examples_directory
-from otolith.discovery.sequential_test import WindowDecision
+from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import ComponentDocument, Report, ReportDocument
 from otolith_drivers.plant.faults import Step, Unbalance
 from otolith_drivers.plant.scenario import Scenario, load_scenario

@@ -155,11 +155,11 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
     plan, keeper = _keeper(file)
     state = _lived(plan, data)
     found = learned_noise(plan, data, windows)
-    if not state.catalogue:  # what the noise of the file may have hidden
+    if not state.adopted:  # what the noise of the file may have hidden
         state = _lived(replace(plan, problem=with_noise(plan.problem, found)), data)
     for line in lines_of(plan, found):
         click.echo(line)
-    if state.catalogue:
+    if state.adopted:
         click.echo(
             "# process noise was learned without the components below and contains them: keep what the file says"
         )
@@ -215,9 +215,8 @@ def _belongs() -> bool:
 
 
 def _parameters(state: "AdaptationState") -> Iterator[tuple[str, str]]:
-    from otolith.estimation.imm_filter import moment_match
 
-    known = moment_match(state.memory.belief, state.problem)
+    known = state.posterior.prior()
     for index, entry in enumerate(state.problem.free):
         if not entry.name.startswith("_"):
             sd = float(known.covariance[index, index]) ** 0.5

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from otolith.cli.live_table import STYLES, value_cells
-from otolith.discovery.sequential_test import WindowDecision
+from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import load_machine
 from otolith.runtime.replay import RealTimePacer, Replay, ReplayRecorder, open_recorded

@@ -92,7 +92,7 @@ class Likelihood:
         total, innovations, scales = 0.0, [], []
         for fit in fits:
             objective = self._objective(levels, fit.window, fit.centre)
-            residuals, jacobian = objective.linearised(fit.guess)
+            residuals, jacobian = objective.linearise(fit.guess)
             found = replace(fit.found, residuals=residuals, jacobian=jacobian, chi_square=float(residuals @ residuals))
             total += self._unlikelihood(objective, found)
             scaled = fit.found.jacobian * self.width

@@ -80,7 +80,7 @@ class Service:
             state, decisions = restore_components(state, store.components()), store.decisions()
         except OtolithError as error:  # an unreadable file must not keep the machine from being monitored
             log.warning("started without saved components: %s", error)
-        self._saved, self._saved_at = tuple(adopted.component.key for adopted in state.catalogue), 0.0
+        self._saved, self._saved_at = tuple(known.component.key for known in state.adopted), 0.0
         if self._saved:
             remedy = "'otolith components forget' removes those that no longer exist"
             log.info("started with saved components: %s; %s", ", ".join(self._saved), remedy)
@@ -208,7 +208,7 @@ class Service:
     def _save_components(self, now: float) -> None:
         """Request a save if components were added or removed, or the last save is ``SAVE_INTERVAL`` ago."""
         state = self._supervisor.state
-        keys = tuple(adopted.component.key for adopted in state.catalogue)
+        keys = tuple(known.component.key for known in state.adopted)
         if keys != self._saved or (keys and now - self._saved_at >= SAVE_INTERVAL):
             self._writer.save(component_records(state))
             self._saved, self._saved_at = keys, now

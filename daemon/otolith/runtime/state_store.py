@@ -85,7 +85,7 @@ class StateStore:
         component = record.adopted.component
         if component.family not in NAMES or component.amplitude == 0.0:
             return False
-        numbers = 1 + (component.model.inner is not None) + component.repeats
+        numbers = 1 + (component.model.inner is not None) + component.periodic
         return (
             component.site in {site.name for site in sites(self._twin)}
             and component.source in {source.name for source in sources(self._twin)}

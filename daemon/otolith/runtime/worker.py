@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.state import AdaptationState
+from otolith.adaptation.state import AdaptationState, with_problem
 from otolith.health.schema import Report
 from otolith.runtime.process import ChildProcess
 
@@ -72,7 +72,7 @@ def _warm_up(state: AdaptationState) -> None:
     values = np.random.default_rng(state.problem.seed).standard_normal((WARM_UP_RECORDS, len(signals)))
     window = Window.whole(0, 0.0, 0.01, signals, values)
     short = replace(state.problem, swarm=replace(state.problem.swarm, generations=2))
-    perform(replace(state, problem=short), window)
+    perform(with_problem(state, short), window)
 
 
 class Supervisor:
