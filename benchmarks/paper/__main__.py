@@ -12,7 +12,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from benchmarks.paper import process_pool as crew
+from benchmarks.paper import process_pool
 from benchmarks.paper.discovery import Discovery, Search
 from benchmarks.paper.output import document, pages
 from benchmarks.paper.scenarios import HIDING, NAMES, UNKNOWN_NAMES, UNKNOWNS, row_of
@@ -38,7 +38,7 @@ def compare(names: Sequence[str], folder: Path | None, *, noise: bool, quick: bo
     if folder is not None:
         writable(folder)  # before all the work
     with _bars() as hear:
-        found = crew.perform(jobs_of(names, noise=noise, quick=quick), hear)
+        found = process_pool.perform(jobs_of(names, noise=noise, quick=quick), hear)
     studies = [entry for entry in found if isinstance(entry, Study)]
     discoveries = [entry for entry in found if isinstance(entry, Discovery)]
     written: list[Path] = []
@@ -58,12 +58,12 @@ def compare(names: Sequence[str], folder: Path | None, *, noise: bool, quick: bo
     return 0 if met and all(entry.met for entry in discoveries) else 1
 
 
-def jobs_of(names: Sequence[str], *, noise: bool, quick: bool) -> list[crew.Work]:
+def jobs_of(names: Sequence[str], *, noise: bool, quick: bool) -> list[process_pool.Work]:
     """In the order of the rows, each once; a search for a noise once for each machine."""
     rows = [row_of(name) for name in NAMES if name in names or not names]
     seconds = {row.name: min(row.seconds, QUICK) if quick else row.seconds for row in rows}
     unknown = [row for row in UNKNOWNS if row.name in names or not names]
-    jobs: list[crew.Work] = [Job(row, Kind.IDEAL, seconds[row.name]) for row in rows]
+    jobs: list[process_pool.Work] = [Job(row, Kind.IDEAL, seconds[row.name]) for row in rows]
     for kind in (Kind.IDEAL, Kind.NOISY) if noise else (Kind.IDEAL,):
         jobs += [Search(row, kind, min(row.seconds, QUICK) if quick else row.seconds) for row in unknown]
     if noise:
@@ -74,14 +74,14 @@ def jobs_of(names: Sequence[str], *, noise: bool, quick: bool) -> list[crew.Work
 
 
 @contextmanager
-def _bars() -> Iterator[Callable[[crew.Progress], None]]:
+def _bars() -> Iterator[Callable[[process_pool.Progress], None]]:
     """A bar for each job that has begun, on standard error, if somebody sees it."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-        tasks: dict[crew.Work, TaskID] = {}
+        tasks: dict[process_pool.Work, TaskID] = {}
 
-        def hear(told: crew.Progress) -> None:
+        def hear(told: process_pool.Progress) -> None:
             if told.job not in tasks:
                 tasks[told.job] = bars.add_task("", total=told.job.steps)
             bars.update(tasks[told.job], completed=told.steps, description=told.doing)

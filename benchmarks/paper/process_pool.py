@@ -51,36 +51,36 @@ def perform(jobs: Sequence[Work], hear: Callable[[Progress], None]) -> list[Foun
     """
     waiting, found = list(jobs), dict[Work, Found]()
     cores = len(os.sched_getaffinity(0))
-    crew = [
+    pool = [
         ChildProcess(f"otolith-paper-{number}", f"{__name__}:main", 2) for number in range(min(cores, MOST, len(jobs)))
     ]
     busy: dict[ChildProcess, Work] = {}
     try:
         while len(found) < len(jobs):
-            for companion in crew:
-                if waiting and companion not in busy:
-                    busy[companion] = waiting.pop(0)
-                    _hand_over(companion, busy[companion])
-            wait([waitable for companion in busy for waitable in companion.waitables], PATIENCE)
-            for companion, job in list(busy.items()):
-                for said in companion.replies():
+            for child in pool:
+                if waiting and child not in busy:
+                    busy[child] = waiting.pop(0)
+                    _hand_over(child, busy[child])
+            wait([waitable for child in busy for waitable in child.waitables], PATIENCE)
+            for child, job in list(busy.items()):
+                for said in child.replies():
                     if isinstance(said, Progress):
                         hear(said)
                     elif isinstance(said, OtolithError):
                         raise said
                     else:
                         found[job] = said
-                        del busy[companion]
+                        del busy[child]
                         hear(Progress(job, job.steps, f"{job.row.name}: done"))
-                if companion in busy and not companion.alive:
+                if child in busy and not child.alive:
                     raise ServiceError(f"the process of {job.row.name} died: is there enough memory?")
     finally:
-        for companion in crew:
-            companion.kill()
+        for child in pool:
+            child.kill()
     return [found[job] for job in jobs]
 
 
-def _hand_over(companion: ChildProcess, job: Work) -> None:
-    if not companion.alive:
-        companion.start()
-    companion.offer(job)
+def _hand_over(child: ChildProcess, job: Work) -> None:
+    if not child.alive:
+        child.start()
+    child.offer(job)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.paper import __main__ as comparison
-from benchmarks.paper import process_pool as crew
+from benchmarks.paper import process_pool
 from benchmarks.paper import study as studies
 from benchmarks.paper.__main__ import paper
 from benchmarks.paper.discovery import Search
@@ -212,7 +212,7 @@ def test_the_command_says_the_same_as_any_other_run(monkeypatch: pytest.MonkeyPa
 def test_a_missed_target_is_an_exit_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     right = found(DRIFTING[0])
     missed = replace(right, job=replace(right.job, row=replace(right.job.row, target=1e-12)))
-    monkeypatch.setattr(crew, "perform", lambda _jobs, _hear: [missed])
+    monkeypatch.setattr(process_pool, "perform", lambda _jobs, _hear: [missed])
     result = run("--plots", str(tmp_path / "plots"))
     assert result.return_value == 1, result.output
     assert "not met" in result.stdout

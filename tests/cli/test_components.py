@@ -47,9 +47,9 @@ def test_components_of_other_signals_are_not_restored(data: Path) -> None:
     """Correcting a wrong unit must drop the components that it caused."""
     assert otolith("commission", MACHINE, data, "--windows", "8", answer="y\n").exit_code == 0
     machine = load_machine(MACHINE, with_driver=False)
-    names, folder = (machine.file.machine.site, machine.file.machine.name), store().known.parent
+    names, folder = (machine.file.machine.site, machine.file.machine.name), store().components_path.parent
     records = store().components()
-    StateStore(*names, machine.twin, folder, "before").keep(records)
+    StateStore(*names, machine.twin, folder, "before").save_components(records)
     assert StateStore(*names, machine.twin, folder, "before").components() == records
     assert StateStore(*names, machine.twin, folder, "after").components() == ()
 
@@ -126,19 +126,19 @@ def test_list_of_a_machine_without_components() -> None:
 
 def test_an_invalid_state_file_is_refused_by_name() -> None:
     files = store()
-    files.known.parent.mkdir(parents=True, exist_ok=True)
-    files.known.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
+    files.components_path.parent.mkdir(parents=True, exist_ok=True)
+    files.components_path.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
     with pytest.raises(ConfigurationError, match=r"components.0.adopted.*move it away"):
         files.components()
-    files.said.write_text("half a fi", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=files.said.name):
+    files.decisions_path.write_text("half a fi", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=files.decisions_path.name):
         files.decisions()
 
 
 @pytest.mark.parametrize(
     ("line", "word"),
     [
-        ('families = ["periodik"]', "'periodik' is none of them"),
+        ('families = ["periodik"]', "unknown name 'periodik'"),
         ('sites = ["shfat"]', "shaft"),
         ('inputs = ["angle(i)"]', "angle.omega."),
     ],

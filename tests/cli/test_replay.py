@@ -21,7 +21,7 @@ from otolith.adaptation.state import initial_state
 from otolith.cli.replay import replay
 from otolith.health.schema import ReportDocument
 from otolith.machine import load_machine
-from otolith.publishing.recorder import LEAST_FREE
+from otolith.publishing.recorder import MIN_FREE_BYTES
 from otolith.runtime.replay import Replay
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -80,7 +80,7 @@ def test_only_replay_needs_no_driver() -> None:
     file = MACHINE_FILES / "no-driver" / "machine.toml"
     with pytest.raises(ConfigurationError, match="loaded without its driver"):
         _ = load_machine(file, with_driver=False).driver
-    with pytest.raises(ConfigurationError, match="say where the signals come from"):
+    with pytest.raises(ConfigurationError, match=r"missing: write \[driver\]"):
         load_machine(file)
 
 
@@ -136,7 +136,7 @@ def test_the_summary_has_parameters_and_counts(tmp_path: Path, rows: Lines, caps
     assert "ohm" in text
     assert "4 windows: 4 good, 0 bad; the twin explains 4 of 4" in text
     assert "950 rows read, 0 reordered" in text
-    assert "the last 1.5 s make no window of 2 s" in text
+    assert "the last 1.5 s are too short for a window of 2 s" in text
 
 
 def test_a_recording_is_written(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
@@ -149,8 +149,8 @@ def test_a_recording_is_written(tmp_path: Path, rows: Lines, capsys: pytest.Capt
 def test_a_full_disk_ends_a_recording_with_an_error(
     tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("otolith.publishing.recorder.LEAST_FREE", LEAST_FREE << 40)
-    with pytest.raises(OtolithError, match="too little room"):
+    monkeypatch.setattr("otolith.publishing.recorder.MIN_FREE_BYTES", MIN_FREE_BYTES << 40)
+    with pytest.raises(OtolithError, match="MB are free on its disk"):
         replay(MACHINE, written(tmp_path, rows), tmp_path / "run.rrd", as_json=True, stopped=lambda: False)
 
 

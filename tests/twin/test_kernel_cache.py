@@ -88,7 +88,7 @@ def test_identity_depends_on_equations_only() -> None:
 
 
 def test_old_kernels_are_removed(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernel_cache, "MOST_KERNELS", 3)
+    monkeypatch.setattr(kernel_cache, "MAX_KERNELS", 3)
     for index in range(6):
         kernel_cache.load(f"number {index}", lambda: "")
         time.sleep(0.01)  # so that their times differ

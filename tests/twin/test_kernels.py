@@ -7,7 +7,7 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.machine import find_twin
-from otolith.machine import names as library
+from otolith.machine import library_twins as library
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import Excitation, NoiseModel, kernel_of
 from tests.twin.reference import Reference

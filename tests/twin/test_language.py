@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith.machine import LIBRARY, find_twin, load_twin
-from otolith.machine import names as library
+from otolith.machine import library_twins as library
 from otolith.twin.dimensions import describe, dimension_of, infer_dimension
 from otolith.twin.expressions import FUNCTIONS, ExpressionError, names_in, parse
 from otolith.twin.kernel import Excitation, kernel_of

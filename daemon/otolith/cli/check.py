@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 
-from otolith.machine import LoadedMachine, load_machine, recording_folder
+from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import prefix
 from otolith_drivers.base import Sample
 from otolith_drivers.user_dirs import complain_unless_writable
@@ -33,7 +33,7 @@ def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool)
     for line in describe(machine):
         echo(line)
     if machine.file.recording.enabled:
-        complain_unless_writable(recording_folder(machine))
+        complain_unless_writable(machine.recording_folder)
     if not with_device:
         return True
     counts, lines = _listen(machine)
@@ -66,7 +66,7 @@ def describe(machine: LoadedMachine) -> list[str]:
         lines += [f"process noise of {state.name}: {noise:g} {state.unit} per square root of a second"] if noise else []
     endpoints = ", ".join(file.zenoh.listen) or "no endpoint"
     lines.append(f"reports on {endpoints}, keys {prefix(file.machine.site, file.machine.name)}/...")
-    lines.append(f"recordings into {recording_folder(machine)}" if file.recording.enabled else "no recordings")
+    lines.append(f"recordings into {machine.recording_folder}" if file.recording.enabled else "no recordings")
     return lines
 
 

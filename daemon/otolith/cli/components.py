@@ -143,7 +143,7 @@ def _decide(file: Path, component: str, decision: str, add: "Callable[[OperatorD
     if component not in known:
         raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
     rest = replace(decisions, approved=decisions.approved - {component}, rejected=decisions.rejected - {component})
-    store.decide(add(rest))
+    store.save_decisions(add(rest))
     click.echo(f"{component} is {decision}")
 
 
@@ -212,9 +212,9 @@ def _review(machine: "LoadedMachine", store: "StateStore", state: "AdaptationSta
         click.echo(f"found {_key(record)}: {_equation(machine, record)}", err=True)
         (approved if approve_all or _is_healthy() else rejected).add(_key(record))
     decisions = store.decisions()
-    store.keep(tuple(record for record in records if _key(record) in approved))
+    store.save_components(tuple(record for record in records if _key(record) in approved))
     rejected = {*decisions.rejected, *rejected} - approved
-    store.decide(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))
+    store.save_decisions(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))
     if not records:
         click.echo("no component was found: the twin explains the machine up to the noise", err=True)
     posterior = state.posterior.prior()

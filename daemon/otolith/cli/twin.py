@@ -35,9 +35,9 @@ def list_(as_json: bool) -> None:
     Example:
       otolith twin list
     """
-    from otolith.machine import find_twin, names
+    from otolith.machine import find_twin, library_twins
 
-    twins = [find_twin(name) for name in names()]
+    twins = [find_twin(name) for name in library_twins()]
     if as_json:
         click.echo(json.dumps([{"name": twin.name, "title": twin.title} for twin in twins]))
         return

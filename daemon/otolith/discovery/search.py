@@ -125,7 +125,9 @@ def _threshold_gain(response: LinearResponse) -> float:
     problem, fresh = response.problem, initial_prior(response.problem)
     forms = allowed_forms(problem, response.x)
     alternatives = Alternatives.among(problem, forms)
-    guesses = [(form, form.bounds[0]) for form in forms if form.model.threshold_like and not alternatives.is_sensor(form)]
+    guesses = [
+        (form, form.bounds[0]) for form in forms if form.model.threshold_like and not alternatives.is_sensor(form)
+    ]
     screening = Screening.of(response, guesses, alternatives)
     readable = [guess for guess in map(screening.__getitem__, range(len(guesses))) if guess.is_readable]
     proposals = [

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.playback import Playback
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Window
@@ -41,7 +41,7 @@ def read(path: Path) -> tuple[list[Rows], str, list[str]]:
 
 
 def windows_of(chunks: list[Rows]) -> list[Window]:
-    playback = Playback(tuple(UNITS), RECORDS, PERIOD, Limits())
+    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
     return [window for rows in chunks for window in playback.windows(rows)] + list(playback.rest())
 
 
@@ -62,7 +62,7 @@ def test_can_log_samples_equal_live_samples(tmp_path: Path, frames: list[can.Mes
 def cut_live(frames: list[can.Message]) -> list[Window]:
     """The windows that the service would cut while the frames come."""
     rings = Rings(tuple(UNITS), 4 * RECORDS)
-    windower = Windower(tuple(UNITS), RECORDS, PERIOD, Limits())
+    windower = Windower(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
     samples, windows = live(frames), list[Window]()
     now, last = BEGUN, samples[-1].time
     while now < last + 0.5:
@@ -103,7 +103,7 @@ def test_can_log_locates_frames_out_of_order(tmp_path: Path, frames: list[can.Me
         lines[first + 2000 : first + 2000] = lines[first : first + 3]
         path.write_text("".join(lines[:first] + lines[first + 30 :]), encoding="utf-8")
         place = first + 1971
-    playback = Playback(tuple(UNITS), RECORDS, PERIOD, Limits())
+    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
     with opened(path) as log:
         for rows in log.chunks():
             list(playback.windows(rows))
