@@ -9,7 +9,7 @@ from pathlib import Path
 from otolith.machine import LoadedMachine, load_machine, recording_folder
 from otolith.publishing.zenoh_session import prefix
 from otolith_drivers.base import Sample
-from otolith_drivers.user_dirs import complain_unless_writable
+from otolith_drivers.user_dirs import check_writable
 
 LISTEN = 1.0  # s, or as long as so many samples take:
 ENOUGH = 60
@@ -30,7 +30,7 @@ def check_machine(path: Path, say: Callable[[str], None], *, with_device: bool) 
     for line in describe(plan):
         say(line)
     if plan.file.recording.enabled:
-        complain_unless_writable(recording_folder(plan))
+        check_writable(recording_folder(plan))
     if not with_device:
         return True
     counts, lines = _listen(plan)
