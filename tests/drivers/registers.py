@@ -3,7 +3,7 @@
 import struct
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus.options import Item, Options, Source, item_of
+from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.protocol import LETTERS, Order, TypeName
 
 KINDS: list[TypeName] = list(LETTERS)
@@ -20,6 +20,6 @@ def registers(number: float, kind: TypeName, order: Order) -> list[int]:
     return [high << 8 | low for high, low in words]
 
 
-def item(name: str = "s", **keys: object) -> Item:
-    source = Source.model_validate({"register": 0, "type": "float32", "unit": "V", **keys})
-    return item_of(Signal(name, "V", source), Options(host="localhost"))
+def item(name: str = "s", **keys: object) -> RegisterSignal:
+    source = ModbusSource.model_validate({"register": 0, "type": "float32", "unit": "V", **keys})
+    return register_signal(Signal(name, "V", source), ModbusOptions(host="localhost"))

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from otolith_drivers.modbus.probe import Block, Number, Words, numbers_of
+from otolith_drivers.modbus.probe import Block, Words
+from otolith_drivers.modbus.probe_numbers import Number, numbers_of
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, is_float, orders_of
 from otolith_drivers.number_inference import FRAMES, REGISTERS, Layout, LayoutVerdict, Part, parts
 from tests.drivers.registers import registers
@@ -67,12 +68,12 @@ def test_a_number_among_registers_that_stand_still(name: str, kind: TypeName, or
     numbers = [number for number in found_in(still(0x1234, 0), column, still(0, 7)) if number.part.layout]
     for number in numbers:
         layout = number.part.layout
-        if number.part.verdict is LayoutVerdict.TOLD:
+        if number.part.verdict is LayoutVerdict.CERTAIN:
             # The high half of an integer may stand still: then its low half is all that can be told of it.
             half = kind == "int32" and layout is not None and layout.kind in ("int16", "uint16")
             assert half or (number.address == 2 and same(layout, kind, order))
     if is_float(kind) and name not in ("set-point in halves", "one step in the last decimal"):
-        assert [number.part.verdict for number in numbers] == [LayoutVerdict.TOLD]
+        assert [number.part.verdict for number in numbers] == [LayoutVerdict.CERTAIN]
         assert numbers[0].part.latest == pytest.approx(SIGNALS[name][-1], rel=1e-6)
 
 
@@ -109,7 +110,7 @@ def test_nothing_is_claimed_of_what_stands_still(seed: int) -> None:
 def test_noise_of_all_bits_is_no_signal() -> None:
     random = np.random.default_rng(2)
     column = random.integers(0, 1 << 16, (READINGS, 3)).astype(np.uint16)
-    assert {number.part.verdict for number in found_in(column)} == {LayoutVerdict.WILD}
+    assert {number.part.verdict for number in found_in(column)} == {LayoutVerdict.ERRATIC}
 
 
 def frames(*columns: Floats | NDArray[np.int_], layout: str) -> NDArray[np.uint8]:
@@ -133,7 +134,7 @@ def test_fields_of_a_frame(mark: str, order: str) -> None:
         (0, f"int16 {order}"),
         (2, f"int16 {order}"),
     ]
-    assert (one.verdict, counter.start, counter.verdict) == (LayoutVerdict.TOLD, 6, LayoutVerdict.COUNTS)
+    assert (one.verdict, counter.start, counter.verdict) == (LayoutVerdict.CERTAIN, 6, LayoutVerdict.COUNTER)
 
 
 def test_fields_of_three_and_four_bytes() -> None:

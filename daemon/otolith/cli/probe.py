@@ -108,7 +108,7 @@ def modbus(
     from otolith.cli.probe_view import console, modbus_document, probe_device, scan_line, show_device, show_scan
     from otolith_drivers.config_files import validated
     from otolith_drivers.modbus.options import LineOptions
-    from otolith_drivers.modbus.probe import Place
+    from otolith_drivers.modbus.probe_numbers import Place
 
     if device is not None and device[0] != device[1] and not scan:
         raise click.BadParameter("a range of devices goes with --scan", param_hint="--device")

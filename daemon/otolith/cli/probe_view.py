@@ -29,31 +29,33 @@ from otolith_drivers.errors import DeviceError
 from otolith_drivers.modbus.client import FUNCTION_CODES
 from otolith_drivers.modbus.options import HIGHEST_ADDRESS
 from otolith_drivers.modbus.probe import (
-    COLUMNS,
-    WIDE_COLUMNS,
     Answer,
     Block,
-    Client,
-    Number,
-    Place,
+    ProbeClient,
     ProgressCallback,
-    Reading,
     Speed,
     Stopped,
     Survey,
     Words,
-    bytes_of,
-    modbus_driver_lines,
-    modbus_signal_lines,
-    numbers_of,
     opened,
     possible_rate,
-    readings_at,
     scan,
     spans,
     speeds,
     survey,
     watch,
+)
+from otolith_drivers.modbus.probe_numbers import (
+    COLUMNS,
+    WIDE_COLUMNS,
+    Number,
+    Place,
+    Reading,
+    bytes_of,
+    modbus_driver_lines,
+    modbus_signal_lines,
+    numbers_of,
+    readings_at,
 )
 from otolith_drivers.modbus.protocol import LETTERS, TypeName
 from otolith_drivers.number_inference import LayoutVerdict, number_text
@@ -137,7 +139,7 @@ def _cell(row: Row, name: str) -> Text:
 
 LONGEST_NUMBER = 4  # registers
 FEWEST_ZEROS = 3  # registers in a row that are one row of the table
-MARKS = {LayoutVerdict.TOLD: "*", LayoutVerdict.COUNTS: "*", LayoutVerdict.LIKELY: "?"}
+MARKS = {LayoutVerdict.CERTAIN: "*", LayoutVerdict.COUNTER: "*", LayoutVerdict.LIKELY: "?"}
 ALONE = "a register alone may be half of a longer number: ask for its neighbours as well"
 MODBUS_LEGEND = "* what it is, told by how it moves    ? likely, but it hardly moves    · a number that no machine has"
 
@@ -175,17 +177,17 @@ def probe_device(
         DeviceError: the line cannot be opened, or the device does not answer.
     """
     with opened(place.options, told) as line:
-        asker = Client(line, place.options, place.device, place.table)
+        client = ProbeClient(line, place.options, place.device, place.table)
         first, last = registers
         if first == last:
             last = min(first + LONGEST_NUMBER - 1, HIGHEST_ADDRESS)
-        found = survey(asker, first, last, stopped, told)
-        asker.round_trips.clear()  # the first ones take longer
+        found = survey(client, first, last, stopped, told)
+        client.round_trips.clear()  # the first ones take longer
         begun = time.monotonic()
-        readings = watch(asker, found.blocks, seconds, stopped, told)
+        readings = watch(client, found.blocks, seconds, stopped, told)
         elapsed = time.monotonic() - begun
         told("comparing")
-        return Probed(place, registers, found, readings, numbers_of(readings), speeds(asker, found.blocks), elapsed)
+        return Probed(place, registers, found, readings, numbers_of(readings), speeds(client, found.blocks), elapsed)
 
 
 def scan_line(
@@ -197,8 +199,8 @@ def scan_line(
         DeviceError: the line cannot be opened.
     """
     with opened(place.options, told) as line:
-        asker = Client(line, place.options, devices[0], place.table)
-        return scan(asker, range(devices[0], devices[1] + 1), register, stopped, told)
+        client = ProbeClient(line, place.options, devices[0], place.table)
+        return scan(client, range(devices[0], devices[1] + 1), register, stopped, told)
 
 
 def show_scan(place: Place, devices: tuple[int, int], answers: Sequence[Answer], console: Console) -> None:
@@ -326,7 +328,7 @@ def modbus_document(probed: Probed) -> dict[str, Any]:
         "first_address": place.first_address,
         "readable": [[place.shown(block.address), place.shown(block.end - 1)] for block in probed.survey.blocks],
         "refused": {str(place.shown(at)): reason for at, reason in probed.survey.refused.items()},
-        "most_registers": probed.survey.most,
+        "most_registers": probed.survey.max_registers,
         "speed": [
             {"registers": speed.registers, "median_s": speed.median, "slow_s": speed.slow} for speed in probed.speeds
         ],

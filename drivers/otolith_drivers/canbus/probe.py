@@ -276,7 +276,7 @@ def fields_of(heard: ObservedFrames) -> list[Field]:
     return [
         Field(heard, part, part.layout)
         for part in parts_of(heard)
-        if part.layout is not None and part.verdict in (LayoutVerdict.TOLD, LayoutVerdict.LIKELY)
+        if part.layout is not None and part.verdict in (LayoutVerdict.CERTAIN, LayoutVerdict.LIKELY)
     ]
 
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith_drivers.modbus.client import Line
+from otolith_drivers.modbus.client import ReadOnlyClient
 from otolith_drivers.modbus.driver import Options
-from otolith_drivers.modbus.protocol import Broken, Refused, Silent
+from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
 from tests.conftest import free_port
 from tests.drivers.modbus_readers import TWO, Listener, floats, poller, source, wait_for
 from tests.drivers.modbus_servers import Behaviour, odd_server
@@ -118,12 +118,12 @@ def test_whatever_bytes_come_are_the_right_registers_or_none(
         at, cut, put = damage
         return reply[:at] + put + reply[at + cut :]
 
-    line = Line(Options(host="127.0.0.1", port=port, timeout="0.03 s"))
+    line = ReadOnlyClient(Options(host="127.0.0.1", port=port, timeout="0.03 s"))
     line.connect()
     behaviour.spoil = spoil
     try:
         registers = line.read(1, "holding", 0, 4)
-    except (Silent, Refused, Broken):
+    except (NoReplyError, ExceptionReplyError, ConnectionLostError):
         return
     finally:
         line.close()

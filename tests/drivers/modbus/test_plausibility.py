@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from otolith_drivers.modbus.plausibility import MOST_IN_A_ROW, OrderWatch, StalenessMonitor, judge
+from otolith_drivers.modbus.plausibility import MAX_STALE_RUN, OrderMonitor, StalenessMonitor, judge_order
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, orders_of, registers_of
 from otolith_drivers.modbus.schedule import plan
 from tests.drivers.registers import KINDS, item, registers
@@ -33,9 +33,9 @@ def test_swapped_words_are_told_and_right_ones_are_not(name: str, kind: TypeName
     whole = 1.0 if kind.startswith("float") else 2e4 / np.abs(SIGNALS[name]).max()
     numbers = SIGNALS[name] * whole
     history = drawn(numbers.tolist(), kind, order)
-    assert judge(history, kind, order).plausible
+    assert judge_order(history, kind, order).plausible
     swapped: dict[Order, Order] = {"ABCD": "CDAB", "CDAB": "ABCD", "BADC": "DCBA", "DCBA": "BADC"}
-    judgement = judge(history, kind, swapped[order])
+    judgement = judge_order(history, kind, swapped[order])
     assert not judgement.plausible
     assert judgement.better is not None
 
@@ -68,14 +68,14 @@ def test_what_machines_do_is_not_taken_for_swapped_words(order: Order) -> None:
         (name, kind)
         for kind, signals in kinds
         for name, numbers in signals.items()
-        if not judge(drawn(numbers.tolist(), kind, order), kind, order).plausible
+        if not judge_order(drawn(numbers.tolist(), kind, order), kind, order).plausible
     ]
     assert not withheld
 
 
 def test_the_end_of_a_filter_is_as_good_as_zero_but_a_swap_on_the_way_is_told() -> None:
     watched = item(type="float32")
-    watch = OrderWatch([watched])
+    watch = OrderMonitor([watched])
 
     def read(numbers: Sequence[float], order: Order) -> frozenset[str]:
         for words in drawn(numbers, "float32", order):
@@ -93,16 +93,16 @@ def test_the_end_of_a_filter_is_as_good_as_zero_but_a_swap_on_the_way_is_told() 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_machine_at_rest_is_plausible(kind: TypeName) -> None:
-    assert all(judge([[0] * registers_of(kind)] * 20, kind, order).plausible for order in orders_of(kind))
+    assert all(judge_order([[0] * registers_of(kind)] * 20, kind, order).plausible for order in orders_of(kind))
 
 
 def test_an_old_image_among_new_ones_is_none() -> None:
-    freshness, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
+    monitor, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
     for index in range(500):
-        assert freshness.take(request, [100 * index, 0]) == (False, False)
-    assert freshness.take(request, [49900, 0]) == (True, False)  # the beat of two clocks
-    assert freshness.take(request, [49900, 0]) == (True, True)
-    assert freshness.take(request, [50000, 0]) == (False, False)
+        assert monitor.take(request, [100 * index, 0]) == (False, False)
+    assert monitor.take(request, [49900, 0]) == (True, False)  # the beat of two clocks
+    assert monitor.take(request, [49900, 0]) == (True, True)
+    assert monitor.take(request, [50000, 0]) == (False, False)
 
 
 STEPS = {
@@ -113,27 +113,27 @@ STEPS = {
 
 @pytest.mark.parametrize("name", STEPS)
 def test_coarse_registers_repeat_by_chance(name: str) -> None:
-    freshness, request = StalenessMonitor(), plan([item("a", type="uint16")], 0, 125)[0]
-    assert not any(freshness.take(request, [int(word)])[1] for word in STEPS[name])
+    monitor, request = StalenessMonitor(), plan([item("a", type="uint16")], 0, 125)[0]
+    assert not any(monitor.take(request, [int(word)])[1] for word in STEPS[name])
 
 
 def test_a_machine_that_stops_is_soon_believed() -> None:
-    freshness, request = StalenessMonitor(), plan([item("a", type="uint16")], 0, 125)[0]
+    monitor, request = StalenessMonitor(), plan([item("a", type="uint16")], 0, 125)[0]
     for word in RANDOM.permutation(1000):
-        freshness.take(request, [int(word)])
-    assert sum(freshness.take(request, [0])[1] for _ in range(1000)) <= MOST_IN_A_ROW
+        monitor.take(request, [int(word)])
+    assert sum(monitor.take(request, [0])[1] for _ in range(1000)) <= MAX_STALE_RUN
 
 
 def test_registers_that_often_say_the_same_are_believed_and_told() -> None:
     """A machine that stands still is no fault; nor is a coarse register."""
-    freshness, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
-    stale = [freshness.take(request, [index // 5, 0])[1] for index in range(1000)]
+    monitor, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
+    stale = [monitor.take(request, [index // 5, 0])[1] for index in range(1000)]
     assert not any(stale)
-    assert "80% of the readings" in freshness.warnings([request], 0.01)[0]
+    assert "80% of the readings" in monitor.warnings([request], 0.01)[0]
 
 
 def test_registers_that_never_say_the_same_are_not_complained_of() -> None:
-    freshness, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
+    monitor, request = StalenessMonitor(), plan([item("a")], 0, 125)[0]
     for index in range(300):
-        freshness.take(request, [index, 0])
-        assert not freshness.warnings([request], 0.01)
+        monitor.take(request, [index, 0])
+        assert not monitor.warnings([request], 0.01)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.modbus.client import Line
+from otolith_drivers.modbus.client import ReadOnlyClient
 from otolith_drivers.modbus.options import LineOptions
 from otolith_drivers.modbus.probe import (
     Block,
-    Client,
+    ProbeClient,
     Speed,
     open_line,
     possible_rate,
@@ -27,13 +27,13 @@ from tests.drivers.modbus_servers import Behaviour, odd_server
 
 
 @contextmanager
-def asking(behaviour: Behaviour, timeout: str = "0.1 s") -> Iterator[Client]:
+def asking(behaviour: Behaviour, timeout: str = "0.1 s") -> Iterator[ProbeClient]:
     port = free_port(socket.SOCK_STREAM)
     options = LineOptions.model_validate({"host": "127.0.0.1", "port": port, "timeout": timeout})
-    line = Line(options)
+    line = ReadOnlyClient(options)
     with odd_server(behaviour, port):
         open_line(line, options)
-        yield Client(line, options, 1, "holding")
+        yield ProbeClient(line, options, 1, "holding")
         line.close()
 
 
@@ -65,8 +65,8 @@ def having(registers: set[int]) -> Behaviour:
 )
 def test_what_is_refused_is_split_until_it_is_known_what_there_is(registers: set[int]) -> None:
     behaviour = having(registers)
-    with asking(behaviour) as asker:
-        found = survey(asker, 0, 63, never, quiet)
+    with asking(behaviour) as client:
+        found = survey(client, 0, 63, never, quiet)
     readable = {at for block in found.blocks for at in range(block.address, block.end)}
     assert readable == registers
     assert set(found.refused) == set(range(64)) - registers
@@ -76,8 +76,8 @@ def test_what_is_refused_is_split_until_it_is_known_what_there_is(registers: set
 
 
 def test_the_answer_is_said_in_words() -> None:
-    with asking(having({*range(20), *range(60, 64)})) as asker:
-        lines = survey(asker, 0, 63, never, quiet).describe(first_address=1)
+    with asking(having({*range(20), *range(60, 64)})) as client:
+        lines = survey(client, 0, 63, never, quiet).describe(first_address=1)
     assert lines == [
         "registers 1 to 20 and 61 to 64 can be read",
         "registers 21 to 60 refused: illegal data address",
@@ -85,52 +85,52 @@ def test_the_answer_is_said_in_words() -> None:
 
 
 def test_a_device_that_gives_only_some_at_once_is_found_out() -> None:
-    with asking(Behaviour({}, refuse=lambda _, __, count: 3 if count > 32 else None)) as asker:
-        found = survey(asker, 0, 99, never, quiet)
+    with asking(Behaviour({}, refuse=lambda _, __, count: 3 if count > 32 else None)) as client:
+        found = survey(client, 0, 99, never, quiet)
     assert {at for block in found.blocks for at in range(block.address, block.end)} == set(range(100))
-    assert 24 <= found.most <= 32
+    assert 24 <= found.max_registers <= 32
 
 
 def test_numbers_of_two_registers_that_cannot_be_read_by_halves_are_found() -> None:
     behaviour = Behaviour({}, refuse=lambda _, at, count: 2 if at % 2 or count % 2 or at + count > 30 else None)
-    with asking(behaviour) as asker:
-        found = survey(asker, 0, 63, never, quiet)
+    with asking(behaviour) as client:
+        found = survey(client, 0, 63, never, quiet)
     assert found.blocks == [Block(0, 30)]
 
 
 def test_a_busy_device_is_asked_again() -> None:
     answers = iter([6, 6, None, None, None])
-    with asking(Behaviour({0: 7}, refuse=lambda *_: next(answers))) as asker:
-        assert survey(asker, 0, 0, never, quiet).blocks == [Block(0, 1)]
+    with asking(Behaviour({0: 7}, refuse=lambda *_: next(answers))) as client:
+        assert survey(client, 0, 0, never, quiet).blocks == [Block(0, 1)]
 
 
 def test_a_device_that_keeps_silent_is_an_error_with_a_way_out() -> None:
-    with asking(Behaviour({}, silent=lambda _: True)) as asker, pytest.raises(DeviceError, match=r"no answer.*--scan"):
-        survey(asker, 0, 63, never, quiet)
+    with asking(Behaviour({}, silent=lambda _: True)) as client, pytest.raises(DeviceError, match=r"no answer.*--scan"):
+        survey(client, 0, 63, never, quiet)
 
 
 def test_a_gateway_without_that_device_is_an_error() -> None:
-    with asking(Behaviour({}, refuse=lambda *_: 11)) as asker, pytest.raises(DeviceError, match="gateway"):
-        survey(asker, 0, 63, never, quiet)
+    with asking(Behaviour({}, refuse=lambda *_: 11)) as client, pytest.raises(DeviceError, match="gateway"):
+        survey(client, 0, 63, never, quiet)
 
 
 def test_readings_are_many_and_timed() -> None:
-    with asking(Behaviour({3: 77})) as asker:
-        found = survey(asker, 0, 9, never, quiet)
-        asker.round_trips.clear()
-        readings = watch(asker, found.blocks, 0.3, never, quiet)
+    with asking(Behaviour({3: 77})) as client:
+        found = survey(client, 0, 9, never, quiet)
+        client.round_trips.clear()
+        readings = watch(client, found.blocks, 0.3, never, quiet)
         assert [block for block, _ in readings.items()] == [Block(0, 10)]
         words = readings[Block(0, 10)]
         assert words.shape[0] >= 5
         assert set(words[:, 3]) == {77}
-        (speed,) = speeds(asker, found.blocks)
+        (speed,) = speeds(client, found.blocks)
     assert 0.0 < speed.median <= speed.slow < 0.3
     assert "10 registers in one request" in speed.describe()
 
 
 def test_one_round_is_read_even_in_no_time() -> None:
-    with asking(Behaviour({})) as asker:
-        readings = watch(asker, [Block(0, 2)], 0.0, never, quiet)
+    with asking(Behaviour({})) as client:
+        readings = watch(client, [Block(0, 2)], 0.0, never, quiet)
     assert readings[Block(0, 2)].shape == (1, 2)
 
 
@@ -147,8 +147,8 @@ def test_a_scan_lists_those_that_answer_also_with_an_exception() -> None:
         silent=lambda device: device not in (3, 7, 9),
         refuse=lambda device, *_: {7: 2, 9: 11}.get(device),
     )
-    with asking(behaviour, "0.05 s") as asker:
-        found = scan(asker, range(1, 12), 0, never, quiet)
+    with asking(behaviour, "0.05 s") as client:
+        found = scan(client, range(1, 12), 0, never, quiet)
     assert [(answer.device, answer.reply) for answer in found] == [(3, ""), (7, "illegal data address")]
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus.options import Options, Source, item_of
+from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, register_signal
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, bits, reader, registers_of
 from tests.drivers.registers import KINDS, item, registers
 
@@ -51,5 +51,5 @@ def test_a_value_out_of_range_is_no_reading() -> None:
 
 
 def test_files_may_count_registers_from_one() -> None:
-    source = Source.model_validate({"register": 1, "type": "int16", "unit": "V"})
-    assert item_of(Signal("s", "V", source), Options(host="localhost", first_address=1)).address == 0
+    source = ModbusSource.model_validate({"register": 1, "type": "int16", "unit": "V"})
+    assert register_signal(Signal("s", "V", source), ModbusOptions(host="localhost", first_address=1)).address == 0
