@@ -34,7 +34,7 @@ def can_rig(machine: OwnMachine) -> Iterator[Rig]:
     )
     bus = open_bus(BusOptions(**options.model_dump(include=set(BusOptions.model_fields))))
 
-    def say() -> None:
+    def emit() -> None:
         bus.send(
             can.Message(
                 arbitration_id=385, data=bytes(2) + (2000).to_bytes(2, "little") + bytes(4), is_extended_id=False
@@ -42,7 +42,7 @@ def can_rig(machine: OwnMachine) -> Iterator[Rig]:
         )
         bus.send(can.Message(arbitration_id=641, data=(1000).to_bytes(2, "little") + bytes(6), is_extended_id=False))
 
-    yield Rig(can_receiver.build(options, SETUP), EXPECTED, say)
+    yield Rig(can_receiver.build(options, SETUP), EXPECTED, emit)
     bus.shutdown()
 
 
