@@ -97,16 +97,6 @@ def content(path: Path, limit: int, key: tuple[str, ...] = ()) -> bytes:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}", key) from error
 
 
-def load(path: Path, model: type[Model]) -> Model:
-    """Return the file as ``model``.
-
-    Raises:
-        ConfigurationError: the file is missing, unreadable, not TOML, or does not fit ``model``.
-    """
-    page = read(path)
-    return validate(parse(page), model, page)
-
-
 def read(path: Path) -> SourceFile:
     r"""Return the text of a file that the user named, with line ends ``\n``.
 
@@ -121,11 +111,7 @@ def read(path: Path) -> SourceFile:
 
 
 def parse(page: SourceFile) -> dict[str, Any]:
-    """Return the tables of a TOML file.
-
-    Raises:
-        ConfigurationError: the text is not TOML.
-    """
+    """Return the tables of a TOML file; raise ConfigurationError if it is none."""
     try:
         return tomllib.loads(page.text)
     except (ValueError, RecursionError) as error:
@@ -134,22 +120,14 @@ def parse(page: SourceFile) -> dict[str, Any]:
 
 
 def expect(page: SourceFile, data: dict[str, Any], key: str) -> None:
-    """Reject a file of another kind with one error, instead of one error for each of its keys.
-
-    Raises:
-        ConfigurationError: the file lacks ``key`` and has the key of another kind.
-    """
+    """Raise one ConfigurationError for a file of another kind, instead of one for each of its keys."""
     for other, (kind, command) in KINDS.items():
         if other != key and other in data and key not in data:
             raise ConfigurationError(f"{page.path}: this is {kind}, for '{command}'; {KINDS[key][0]} is needed here")
 
 
 def validate(data: Any, model: type[Model], page: SourceFile, under: Location = ()) -> Model:
-    """Return ``data``, which is at location ``under`` of the file, as ``model``.
-
-    Raises:
-        ConfigurationError: with one line for each fault.
-    """
+    """Return ``data``, at location ``under`` of the file, as ``model``; the ConfigurationError has a line per fault."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -158,11 +136,7 @@ def validate(data: Any, model: type[Model], page: SourceFile, under: Location = 
 
 
 def validated(data: Any, model: type[Model], under: tuple[str, ...]) -> Model:
-    """Return ``data``, which is at key ``under`` of a file that the caller does not know, as ``model``.
-
-    Raises:
-        ConfigurationError: with the first fault and its key.
-    """
+    """Return ``data`` as ``model`` for a caller that does not know the file; the ConfigurationError has the key."""
     try:
         return model.model_validate(data)
     except ValidationError as error:

@@ -124,11 +124,10 @@ class Layout:
 
     def is_likely_float(self, numbers: Floats) -> bool:
         """Whether these are floats of a usual magnitude."""
-        sizes = np.abs(numbers[numbers != 0.0])
-        if not self.is_float or not len(sizes) or not np.isfinite(sizes).all():
+        if not self.is_float or not np.isfinite(numbers).all():
             return False
         low, high = LIKELY_FLOATS
-        return bool(low <= float(np.median(sizes)) <= high)
+        return bool(low <= np.median(np.abs(numbers[numbers != 0.0])) <= high)
 
 
 def register_layouts(kind: TypeName) -> tuple[Layout, ...]:
@@ -212,12 +211,16 @@ class Part:
     @property
     def low(self) -> float:
         """The smallest finite reading; NaN if there is none."""
-        return float(np.fmin.reduce(np.where(np.isinf(self.numbers), np.nan, self.numbers)))
+        return float(np.fmin.reduce(self._finite))
 
     @property
     def high(self) -> float:
         """The largest finite reading; NaN if there is none."""
-        return float(np.fmax.reduce(np.where(np.isinf(self.numbers), np.nan, self.numbers)))
+        return float(np.fmax.reduce(self._finite))
+
+    @property
+    def _finite(self) -> Floats:
+        return np.where(np.isfinite(self.numbers), self.numbers, np.nan)
 
 
 def parts(data: Bytes, layouts: Sequence[Layout], step: int) -> list[Part]:
@@ -236,11 +239,8 @@ def parts(data: Bytes, layouts: Sequence[Layout], step: int) -> list[Part]:
 
     def rivals(part: Part) -> list[tuple[float, Part]]:
         near = [rival for at in range(part.start - MAX_WIDTH + 1, part.end) for rival in candidates.get(at, ())]
-        return [
-            (before[rival.start] + rival.bits + after[rival.end] - after[0], rival)
-            for rival in near
-            if rival.end > part.start and rival is not part
-        ]
+        overlapping = [rival for rival in near if rival.end > part.start and rival is not part]
+        return [(before[rival.start] + rival.bits + after[rival.end] - after[0], rival) for rival in overlapping]
 
     at, inferred = 0, []
     while at < length:

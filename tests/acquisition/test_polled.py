@@ -42,7 +42,7 @@ def read_window(sampling: Sampling) -> float:
     rings = Rings(("a", "b"), 4 * RECORDS)
     windower = Windower(("a", "b"), RECORDS, PERIOD, Limits(missing=1.0, gap=10.0, jitter=1.0), sampling)
     driver = build(Options(host="127.0.0.1", port=port), Setup(signals, Path(), PERIOD))
-    with odd_server(Behaviour(Moving(), spoil=slow), port):
+    with odd_server(Behaviour(Moving(), corrupt=slow), port):
         driver.open(rings.deliver)
         begun = time.monotonic()
         while not (windower.begin(rings, time.monotonic(), 0.0) and windower.due(rings, time.monotonic())):

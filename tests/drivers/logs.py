@@ -34,18 +34,18 @@ WRITERS: dict[str, Any] = {
 
 
 def frames_of(scenario: MotorScenario, ticks: int, begun: float = BEGUN) -> list[can.Message]:
-    """What the motor would have sent, each message with a delay of its own, with frames of others in between."""
+    """The frames that the motor would send, each message with its own delay, between frames of other nodes."""
     messages = load_dbc(EXAMPLES / "dc-motor.dbc").messages
     units = scenario.SIGNALS
-    found = []
+    frames = []
     for index, tick in enumerate(islice(simulate(scenario), ticks)):
         for place, message in enumerate(messages):
             time = begun + 0.01 * index + 0.0002 * (place + 1)
-            found.append(_frame(message, tick.measured, index, units, time))
-        found.append(
-            can.Message(arbitration_id=0x7FF, data=b"other", timestamp=found[-1].timestamp, is_extended_id=False)
+            frames.append(_frame(message, tick.measured, index, units, time))
+        frames.append(
+            can.Message(arbitration_id=0x7FF, data=b"other", timestamp=frames[-1].timestamp, is_extended_id=False)
         )
-    return found
+    return frames
 
 
 def _frame(message: Message, measured: Any, index: int, units: dict[str, str], time: float) -> can.Message:
@@ -67,13 +67,13 @@ def _frame(message: Message, measured: Any, index: int, units: dict[str, str], t
 
 
 def live(frames: list[can.Message]) -> list[Sample]:
-    """What the driver would have delivered of ``frames``."""
+    """The samples that the driver would deliver from ``frames``."""
     decoder = decoder_of(FRAMES, SETUP)
     return [sample for frame in frames for sample in decoder.decode(frame, frame.timestamp)]
 
 
 def written(folder: Path, frames: list[can.Message], suffix: str) -> Path:
-    """``frames`` in a file of the format that ``suffix`` names, packed if it ends so."""
+    """``frames`` in a file of the format that ``suffix`` names, compressed for ``.gz``."""
     plain = suffix.removesuffix(".gz")
     path = folder / f"bus{plain}"
     with WRITERS[plain](path) as writer:
@@ -93,8 +93,8 @@ def opened(path: Path) -> CanLog:
 
 def samples_of(stretches: list[Rows]) -> list[tuple[str, float]]:
     """Signal and value, in the order of the rows."""
-    found = []
+    samples = []
     for rows in stretches:
         for index in range(len(rows.times)):
-            found += [(name, float(c[index])) for name, c in rows.columns.items() if c[index] == c[index]]
-    return found
+            samples += [(name, float(c[index])) for name, c in rows.columns.items() if c[index] == c[index]]
+    return samples

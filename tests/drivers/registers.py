@@ -1,4 +1,4 @@
-"""Numbers as a device has them in its registers, and items that read them."""
+"""Numbers as a device has them in its registers, and signals that read them."""
 
 import struct
 
@@ -10,7 +10,7 @@ KINDS: list[TypeName] = list(LETTERS)
 
 
 def registers(number: float, kind: TypeName, order: Order) -> list[int]:
-    """The inverse of what is tested, written byte by byte."""
+    """The inverse of ``reader``, written byte by byte."""
     data = list(struct.pack(f">{LETTERS[kind]}", number if kind.startswith("float") else int(number)))
     words = [data[at : at + 2] for at in range(0, len(data), 2)]
     if order in ("BADC", "DCBA"):

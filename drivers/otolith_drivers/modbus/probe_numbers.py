@@ -24,7 +24,7 @@ from otolith_drivers.number_inference import (
 )
 
 # A device that has one byte order for some numbers seldom has another for others. Engineering choices, guarded by
-# tests/drivers/test_number_inference.py (numbers of all types side by side).
+# tests/drivers/test_number_inference.py (adjacent numbers of all types).
 OTHER_ORDER_BITS, OTHER_ORDER_BITS_PER_READING = 8.0, 1.5
 VOTES = {LayoutVerdict.CERTAIN: 3, LayoutVerdict.LIKELY: 1}  # of a number for the device's order
 
