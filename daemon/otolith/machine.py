@@ -206,7 +206,7 @@ def _twin(file: MachineFile, context: Context) -> Definition:
     if (file.twin.name is None) == (file.twin.file is None):
         context.fail(("twin",), 'write either name = "dc_motor" or the like, or file = "my-twin.toml"')
     if file.twin.file is not None:
-        return load_twin(context.page.path.parent / file.twin.file)
+        return load_twin(context.file.path.parent / file.twin.file)
     with context.at("twin", "name"):
         return find_twin(file.twin.name or "")
 

@@ -60,13 +60,13 @@ class SourceFile:
 class Context:
     """Adds file, line and key to errors of checks that run after the file has been validated."""
 
-    def __init__(self, page: SourceFile) -> None:
-        self.page = page
+    def __init__(self, file: SourceFile) -> None:
+        self.file = file
         self._location: tuple[int | str, ...] = ()
 
     def fail(self, location: tuple[int | str, ...], message: str) -> None:
         """Raise ``message`` as an error at ``location``."""
-        raise ConfigurationError(f"{self.page.place(location)}: {message}")
+        raise ConfigurationError(f"{self.file.place(location)}: {message}")
 
     def at(self, *location: int | str) -> "Context":
         """Return a context manager that places errors raised in it at ``location``."""
@@ -78,7 +78,7 @@ class Context:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if isinstance(error, ValueError | ConfigurationError):
-            raise ConfigurationError(f"{self.page.place(self._location)}: {error}") from error
+            raise ConfigurationError(f"{self.file.place(self._location)}: {error}") from error
 
 
 def content(path: Path, limit: int, key: tuple[str, ...] = ()) -> bytes:
@@ -110,28 +110,28 @@ def read(path: Path) -> SourceFile:
     return SourceFile(path, re.sub("\r\n?", "\n", text))
 
 
-def parse(page: SourceFile) -> dict[str, Any]:
+def parse(file: SourceFile) -> dict[str, Any]:
     """Return the tables of a TOML file; raise ConfigurationError if it is none."""
     try:
-        return tomllib.loads(page.text)
+        return tomllib.loads(file.text)
     except (ValueError, RecursionError) as error:
         hint = "; a key may occur only once in its table" if "overwrite" in str(error) else ""
-        raise ConfigurationError(f"{page.path}: not valid TOML: {error}{hint}") from error
+        raise ConfigurationError(f"{file.path}: not valid TOML: {error}{hint}") from error
 
 
-def expect(page: SourceFile, data: dict[str, Any], key: str) -> None:
+def expect(file: SourceFile, data: dict[str, Any], key: str) -> None:
     """Raise one ConfigurationError for a file of another kind, instead of one for each of its keys."""
     for other, (kind, command) in KINDS.items():
         if other != key and other in data and key not in data:
-            raise ConfigurationError(f"{page.path}: this is {kind}, for '{command}'; {KINDS[key][0]} is needed here")
+            raise ConfigurationError(f"{file.path}: this is {kind}, for '{command}'; {KINDS[key][0]} is needed here")
 
 
-def validate(data: Any, model: type[Model], page: SourceFile, under: Location = ()) -> Model:
+def validate(data: Any, model: type[Model], file: SourceFile, under: Location = ()) -> Model:
     """Return ``data``, at location ``under`` of the file, as ``model``; the ConfigurationError has a line per fault."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        lines = [f"{page.place([*under, *at])}: {message}" for at, message in _faults(error, data, model)]
+        lines = [f"{file.place([*under, *at])}: {message}" for at, message in _faults(error, data, model)]
         raise ConfigurationError("\n".join(dict.fromkeys(lines))) from error
 
 

@@ -25,8 +25,8 @@ class Outer(StrictModel):
 
 
 def load(path: Path) -> Outer:
-    page = read(path)
-    return validate(parse(page), Outer, page)
+    file = read(path)
+    return validate(parse(file), Outer, file)
 
 
 FAULTS = [
@@ -75,9 +75,9 @@ def test_missing_file_or_folder_is_refused(tmp_path: Path) -> None:
 
 @given(st.text(max_size=300))
 def test_any_text_is_parsed_or_refused(text: str) -> None:
-    page = SourceFile(Path("any.toml"), text)
+    file = SourceFile(Path("any.toml"), text)
     try:
-        validate(parse(page), Outer, page)
+        validate(parse(file), Outer, file)
     except ConfigurationError as error:
         assert str(error).startswith("any.toml")  # noqa: PT017 - either outcome is right, another error is not
 

@@ -124,7 +124,7 @@ class ReadOnlyClient:
 
     def _open_socket(self, host: str, port: int) -> socket.socket:
         """Connect like ``socket.create_connection``, but so that :meth:`abort` ends it."""
-        cause = OSError(0, "the name stands for no address")
+        cause = OSError(0, "the name has no address")
         for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
             connection = self._client.socket = socket.socket(family, kind, protocol)
             connection.settimeout(self._options.timeout)

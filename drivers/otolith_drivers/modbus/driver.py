@@ -212,5 +212,5 @@ class ModbusPoller:
     def _go_down(self, reason: str) -> None:
         self._client.close()
         if reason != self._reason:
-            log.warning("%s: %s; tried again until it answers", self._options.title(), reason)
+            log.warning("%s: %s; retried until it answers", self._options.title(), reason)
         self._up, self._reason = False, reason

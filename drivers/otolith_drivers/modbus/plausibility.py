@@ -202,12 +202,12 @@ class OrderMonitor:
         for name, verdict in list(self._verdicts.items()):
             if verdict.plausible:
                 continue
-            remedy = "no order of its bytes makes it plausible: is register or type wrong?"
+            remedy = "no order of its bytes makes it plausible: is the register or type wrong?"
             if verdict.better:
                 remedy = f'as {verdict.better} it would be plausible: set order = "{verdict.better}", '
-                remedy += "unless register is one off"
+                remedy += "unless the register is one off"
             where = self._signals[name].describe()
-            lines.append(f"{name} ({where}) is withheld: {verdict.reason}; {remedy}, or say trusted = true")
+            lines.append(f"{name} ({where}) is withheld: {verdict.reason}; {remedy}, or set trusted = true")
         return lines
 
 
@@ -252,8 +252,8 @@ class StalenessMonitor:
         """Return a line for each request whose registers repeat too often for a period of ``period`` s."""
         states = [(request, self._repeats.get(request, _Repeats())) for request in requests]
         return [
-            f"{request.describe()} say the same in {state.share:.0%} of the readings: the machine stands still, or "
-            f"they are renewed more slowly than every {period * 1e3:g} ms"
+            f"{request.describe()} repeat in {state.share:.0%} of the readings: the machine is at rest, or the device "
+            f"renews them more slowly than every {period * 1e3:g} ms"
             for request, state in states
             if state.readings >= SETTLING_READINGS and FREQUENT_REPEATS < state.share < 1.0 - SHARE_WEIGHT
         ]

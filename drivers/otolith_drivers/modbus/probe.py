@@ -164,7 +164,7 @@ def scan(
     for device in devices:
         if stopped():
             break
-        progress(f"asking device {device}; {len(answers)} answered so far")
+        progress(f"requesting from device {device}; {len(answers)} have answered")
         client.device = device
         with contextlib.suppress(NoReplyError):
             try:
@@ -224,7 +224,7 @@ def survey(client: ProbeClient, first: int, last: int, stopped: Stopped, progres
     waiting = [Block(at, min(CHUNK, last + 1 - at)) for at in range(first, last + 1, CHUNK)]
     while waiting and not stopped():
         block = waiting.pop(0)
-        progress(f"looking which registers there are: {block.address} to {block.end - 1}")
+        progress(f"reading registers {block.address} to {block.end - 1}")
         reason = _refusal(client, block)
         if reason is None:
             result.blocks.append(block)

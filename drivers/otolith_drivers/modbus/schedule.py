@@ -177,14 +177,14 @@ class RequestSet:
     def warnings(self, now: float) -> list[str]:
         """Return a line for each paused device and request."""
         lines = [
-            f"device {number} does not answer for {now - backoff.since:.0f} s: {backoff.fault}; tried again"
+            f"device {number} does not answer for {now - backoff.since:.0f} s: {backoff.fault}; retried"
             for number, backoff in list(self._by_device.items())
             if backoff.paused
         ]
         for request, backoff in list(self._by_request.items()):
             if backoff.paused:
                 names = ", ".join(signal.name for signal in request.signals)
-                lines.append(f"{names}: {request.describe()} refused: {backoff.fault}; tried again now and then")
+                lines.append(f"{names}: {request.describe()} refused: {backoff.fault}; retried after a pause")
         return lines
 
 

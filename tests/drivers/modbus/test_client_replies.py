@@ -66,7 +66,7 @@ def test_swapped_word_order_is_withheld_and_reported() -> None:
     behaviour.corrupt = moving
     sources = [source(register=0), source(register=2, order="CDAB")]
     with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
-        listener.wait(lambda link: any('set order = "ABCD", unless register' in line for line in link.warnings))
+        listener.wait(lambda link: any('set order = "ABCD", unless the register' in line for line in link.warnings))
         wait_for(lambda: len(listener.of("s0")) > 20)
         assert not listener.of("s1")
         assert listener.driver.counters().bad >= 20
