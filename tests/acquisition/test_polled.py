@@ -42,7 +42,7 @@ def read_window(sampling: Sampling) -> float:
     rings = Rings(("a", "b"), 4 * RECORDS)
     windower = Windower(("a", "b"), RECORDS, PERIOD, QualityLimits(missing=1.0, gap=10.0, jitter=1.0), sampling)
     driver = build(Options(host="127.0.0.1", port=port), Setup(signals, Path(), PERIOD))
-    with odd_server(Behaviour(SineRegisters(), spoil=slow), port):
+    with odd_server(Behaviour(SineRegisters(), corrupt=slow), port):
         driver.open(rings.deliver)
         deadline = time.monotonic() + 20.0
         while not (windower.begin(rings, time.monotonic(), 0.0) and windower.due(rings, time.monotonic())):

@@ -96,7 +96,7 @@ def test_plots_are_pictures_that_open(name: str, tmp_path: Path) -> None:
 
 def test_a_plot_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(ServiceError, match="cannot be made"):
+    with pytest.raises(ServiceError, match="cannot be created"):
         draw([found(DRIFTING[0])], [], tmp_path / "file" / "folder")
 
 

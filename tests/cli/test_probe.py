@@ -22,7 +22,8 @@ from otolith_drivers.base import Signal
 from otolith_drivers.canbus.driver import Options as CanOptions
 from otolith_drivers.canbus.driver import Source as CanSource
 from otolith_drivers.errors import ConfigurationError, DeviceError
-from otolith_drivers.modbus.options import Options, Source, item_of
+from otolith_drivers.modbus.driver import Options, Source
+from otolith_drivers.modbus.options import register_signal
 from otolith_drivers.modbus.protocol import Order, TypeName
 from tests.conftest import OwnMachine, free_port
 from tests.drivers.modbus_servers import Behaviour, Words, library_server, odd_server
@@ -79,7 +80,7 @@ def test_inferred_registers_become_lines_that_the_driver_reads(drive: int) -> No
     items = set()
     for line in lines_of(text, "NAME"):
         keys = tomllib.loads(line)["NAME"] | {"unit": "V"}
-        item = item_of(Signal("s", "V", Source.model_validate(keys)), options)
+        item = register_signal(Signal("s", "V", Source.model_validate(keys)), options)
         items.add((item.address, item.kind, item.order))
     assert items == {(address, kind, order) for address, kind, order, _ in MOVING}
     assert re.search(r"register = 0, .*# 2[34]\.\d+ now, between 23\.9\d* and 24\.0\d*", text)
@@ -98,7 +99,7 @@ def test_json_of_a_device(drive: int) -> None:
     document = json.loads(probe("modbus", f"127.0.0.1:{drive}", *arguments).stdout)
     assert document["readable"] == [[1, 13]]
     assert document["refused"] == {"14": "illegal data address"}
-    inferred = {number["register"]: number["type"] for number in document["numbers"] if number["verdict"] == "told"}
+    inferred = {number["register"]: number["type"] for number in document["numbers"] if number["verdict"] == "certain"}
     assert inferred[1] == "float32"
     assert document["registers"][2]["values"]["int16"] == pytest.approx(1500, abs=30)
     assert 0.0 < document["speed"][0]["median_s"] < 1.0

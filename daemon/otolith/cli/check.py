@@ -9,7 +9,7 @@ from pathlib import Path
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import prefix
 from otolith_drivers.base import Sample
-from otolith_drivers.user_dirs import complain_unless_writable
+from otolith_drivers.user_dirs import check_writable
 
 # Engineering choices, guarded by tests/cli/test_check.py.
 LISTEN = 1.0  # s; the shortest time to listen,
@@ -33,7 +33,7 @@ def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool)
     for line in describe(machine):
         echo(line)
     if machine.file.recording.enabled:
-        complain_unless_writable(machine.recording_folder)
+        check_writable(machine.recording_folder)
     if not with_device:
         return True
     counts, lines = _listen(machine)

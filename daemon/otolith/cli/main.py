@@ -224,11 +224,11 @@ def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | No
 
     from otolith_drivers.plant.realtime import TruthFile, open_node, write_summary
     from otolith_drivers.plant.scenario import load_scenario
-    from otolith_drivers.user_dirs import complain_unless_writable
+    from otolith_drivers.user_dirs import check_writable
 
     loaded = load_scenario(scenario)
     if summary is not None:
-        complain_unless_writable(summary.absolute().parent)
+        check_writable(summary.absolute().parent)
     stop = StopSignal()
     with ExitStack() as stack:
         truth_file = stack.enter_context(closing(TruthFile(truth))) if truth is not None else None

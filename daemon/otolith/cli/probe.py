@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from otolith.cli.probe_view import DeviceProbe
     from otolith_drivers.canbus.bus import BusOptions
     from otolith_drivers.canbus.probe import Picture
-    from otolith_drivers.modbus.probe import Answer, Place
+    from otolith_drivers.modbus.probe import Answer
+    from otolith_drivers.modbus.probe_numbers import Place
 
 NOTHING_THERE = 1  # exit code
 MAX_REGISTERS = 1000  # in one call
@@ -115,7 +116,7 @@ def modbus(
     from otolith.cli.probe_view import modbus_document, show_device, stdout_console
     from otolith_drivers.config_files import validated
     from otolith_drivers.modbus.options import LineOptions
-    from otolith_drivers.modbus.probe import Place
+    from otolith_drivers.modbus.probe_numbers import Place
 
     if device is not None and device[0] != device[1] and not scan:
         raise click.BadParameter("a range of devices needs --scan", param_hint="--device")
@@ -161,10 +162,10 @@ def _scan(place: "Place", devices: Span, address: int, stop: StopSignal) -> "lis
     Raises:
         DeviceError: the line cannot be opened.
     """
-    from otolith_drivers.modbus.probe import Client, opened, scan
+    from otolith_drivers.modbus.probe import ProbeClient, opened, scan
 
     with progress_line("opening") as show, opened(place.options, show) as line:
-        client = Client(line, place.options, devices[0], place.table)
+        client = ProbeClient(line, place.options, devices[0], place.table)
         return scan(client, range(devices[0], devices[1] + 1), address, stop.received, show)
 
 
@@ -192,10 +193,11 @@ def _read(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> 
     """
     from otolith.cli.probe_view import DeviceProbe
     from otolith_drivers.modbus.options import HIGHEST_ADDRESS
-    from otolith_drivers.modbus.probe import Client, numbers_of, opened, speeds, survey, watch
+    from otolith_drivers.modbus.probe import ProbeClient, opened, speeds, survey, watch
+    from otolith_drivers.modbus.probe_numbers import numbers_of
 
     with progress_line("opening") as show, opened(place.options, show) as line:
-        client = Client(line, place.options, place.device, place.table)
+        client = ProbeClient(line, place.options, place.device, place.table)
         first, last = addresses
         if first == last:
             last = min(first + MAX_NUMBER_REGISTERS - 1, HIGHEST_ADDRESS)

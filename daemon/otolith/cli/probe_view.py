@@ -16,6 +16,7 @@ from rich.text import Text
 from otolith_drivers.canbus import probe as canbus
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.modbus import probe as modbus
+from otolith_drivers.modbus import probe_numbers
 from otolith_drivers.modbus.client import FUNCTION_CODES
 from otolith_drivers.modbus.protocol import LETTERS, TypeName
 from otolith_drivers.number_inference import LayoutVerdict, number_text
@@ -27,7 +28,7 @@ TEXT_WIDTH = 24  # characters to which a text column may shrink
 MIN_ZERO_RUN = 3  # registers in a row that are always zero and share a row of the table
 MAX_NAMES = 12  # messages or arbitration IDs named in a line
 STYLES = {"*": "bold green", "?": "yellow", "!": "bold red", "·": "dim"}  # by the first character of a cell
-MARKS = {LayoutVerdict.TOLD: "*", LayoutVerdict.COUNTS: "*", LayoutVerdict.LIKELY: "?"}
+MARKS = {LayoutVerdict.CERTAIN: "*", LayoutVerdict.COUNTER: "*", LayoutVerdict.LIKELY: "?"}
 MODBUS_LEGEND = "* inferred from its changes    ? likely, but it hardly changes    · not a plausible number"
 SINGLE_LEGEND = "a single register may be half of a longer number: probe its neighbours as well"
 CAN_LEGEND = "[..] bytes that have changed    ± half of the width that holds 19 of 20 periods"
@@ -86,7 +87,7 @@ def _table(fixed: tuple[str, ...], names: Sequence[str], rows: Sequence[Row]) ->
 class DeviceProbe:
     """What was read from a Modbus device."""
 
-    place: modbus.Place
+    place: probe_numbers.Place
     registers: tuple[int, int]
     """Addresses (on the wire) of the first and the last register asked for."""
     survey: modbus.Survey
@@ -94,7 +95,7 @@ class DeviceProbe:
     speeds: list[modbus.Speed]
     seconds: float
     """Time spent reading."""
-    numbers: list[modbus.Number]
+    numbers: list[probe_numbers.Number]
 
     @property
     def single(self) -> bool:
@@ -102,7 +103,7 @@ class DeviceProbe:
         return self.registers[0] == self.registers[1]
 
     @property
-    def requested(self) -> list[modbus.Number]:
+    def requested(self) -> list[probe_numbers.Number]:
         """The numbers asked for; with a single register only the one that begins there."""
         return [number for number in self.numbers if not self.single or number.address == self.registers[0]]
 
@@ -122,7 +123,7 @@ def show_device(probe: DeviceProbe, console: Console, *, wide: bool) -> None:
     for line in _speed_lines(probe):
         console.print(line)
     console.print()
-    kinds = modbus.COLUMNS + modbus.WIDE_COLUMNS if wide else modbus.COLUMNS
+    kinds = probe_numbers.COLUMNS + probe_numbers.WIDE_COLUMNS if wide else probe_numbers.COLUMNS
     fixed, rows = ("register", "raw"), list(_register_rows(probe, kinds))
     if probe.single:
         fixed, rows = ("type", "order"), _type_rows(probe)
@@ -137,8 +138,8 @@ def show_device(probe: DeviceProbe, console: Console, *, wide: bool) -> None:
 
 def _modbus_lines(probe: DeviceProbe) -> list[str]:
     """The tables ``[driver]`` and ``[signals]``."""
-    driver = modbus.modbus_driver_lines(probe.place, probe.survey)
-    return [*driver, "", *modbus.modbus_signal_lines(probe.place, probe.requested)]
+    driver = probe_numbers.modbus_driver_lines(probe.place, probe.survey)
+    return [*driver, "", *probe_numbers.modbus_signal_lines(probe.place, probe.requested)]
 
 
 def _speed_lines(probe: DeviceProbe) -> list[str]:
@@ -166,7 +167,7 @@ def _register_rows(probe: DeviceProbe, kinds: Sequence[TypeName]) -> Iterator[Ro
                 at += zeros
                 continue
             row = {"register": label, "raw": f"{words[-1, at]:04X}"}
-            for reading in modbus.readings_at(modbus.bytes_of(words), at, kinds):
+            for reading in probe_numbers.readings_at(probe_numbers.bytes_of(words), at, kinds):
                 usable = not reading.fault and math.isfinite(reading.latest)
                 row[reading.layout.name] = number_text(reading.latest, reading.layout) if usable else "·"
             part = numbers[address].part if address in numbers else None
@@ -184,7 +185,7 @@ def _type_rows(probe: DeviceProbe) -> list[Row]:
         return []
     part = next((number.part for number in probe.requested), None)
     rows = []
-    for reading in modbus.readings_at(modbus.bytes_of(probe.readings[block]), 0, LETTERS):
+    for reading in probe_numbers.readings_at(probe_numbers.bytes_of(probe.readings[block]), 0, LETTERS):
         layout, step = reading.layout, reading.high - reading.low
         inferred = part is not None and part.layout is not None and part.layout.name == layout.name
         mark = MARKS.get(part.verdict, "") if part is not None and inferred else ""
@@ -209,7 +210,7 @@ def modbus_document(probe: DeviceProbe) -> dict[str, Any]:
         "first_address": place.first_address,
         "readable": [[place.shown(block.address), place.shown(block.end - 1)] for block in survey.blocks],
         "refused": {str(place.shown(address)): reason for address, reason in survey.refused.items()},
-        "most_registers": survey.most,
+        "most_registers": survey.max_registers,
         "speed": [
             {"registers": speed.registers, "median_s": speed.median, "slow_s": speed.slow} for speed in probe.speeds
         ],
@@ -220,7 +221,7 @@ def modbus_document(probe: DeviceProbe) -> dict[str, Any]:
                 "raw": f"{words[-1, at]:04X}",
                 "values": {
                     reading.layout.name: _finite(reading.latest)
-                    for reading in modbus.readings_at(modbus.bytes_of(words), at, LETTERS)
+                    for reading in probe_numbers.readings_at(probe_numbers.bytes_of(words), at, LETTERS)
                 },
             }
             for block, words in probe.readings.items()
@@ -231,7 +232,7 @@ def modbus_document(probe: DeviceProbe) -> dict[str, Any]:
     }
 
 
-def _number_document(place: modbus.Place, number: modbus.Number) -> dict[str, Any]:
+def _number_document(place: probe_numbers.Place, number: probe_numbers.Number) -> dict[str, Any]:
     layout, part = number.part.layout, number.part
     return {
         "register": place.shown(number.address),

@@ -253,7 +253,7 @@ def fields_of(observed: ObservedFrames) -> list[tuple[Part, Layout]]:
     return [
         (part, part.layout)
         for part in parts(data, FRAMES, 1)
-        if part.layout is not None and part.verdict in (LayoutVerdict.TOLD, LayoutVerdict.LIKELY)
+        if part.layout is not None and part.verdict in (LayoutVerdict.CERTAIN, LayoutVerdict.LIKELY)
     ]
 
 

@@ -43,7 +43,7 @@ def test_modbus_read_is_one_sample_of_the_scenario(drive: Callable[..., Drive], 
     assert code == 0
     assert done["functions"] == {"3": len(seen) // 2 + 2, "4": len(seen) // 2}
     assert done["answers"] == len(seen) + 2
-    assert f"{len(seen) + 2} answers to {len(seen) + 2} requests" in node.said
+    assert f"{len(seen) + 2} answers to {len(seen) + 2} requests" in node.stderr
     assert not node.line.is_symlink()
 
 
