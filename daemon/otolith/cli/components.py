@@ -149,14 +149,13 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
       otolith commission my-machine.toml monday.csv --yes
     """
     from otolith.cli.noise import learned_noise, lines_of
-    from otolith.commissioning.identification import with_noise
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
     plan, keeper = _keeper(file)
     state = _lived(plan, data)
     found = learned_noise(plan, data, windows)
     if not state.catalogue:  # what the noise of the file may have hidden
-        state = _lived(replace(plan, problem=with_noise(plan.problem, found)), data)
+        state = _lived(replace(plan, problem=found.applied(plan.problem)), data)
     for line in lines_of(plan, found):
         click.echo(line)
     if state.catalogue:

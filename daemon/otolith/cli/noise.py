@@ -61,8 +61,8 @@ def learned_noise(plan: "LoadedMachine", data: Path, windows: int) -> "Identifie
     from otolith.commissioning.identification import identify_noise
     from otolith_drivers.errors import ConfigurationError
 
-    with _progress() as told:
-        found = identify_noise(plan.problem, _windows(plan, data, windows), told=told.update)
+    with _progress() as status:
+        found = identify_noise(plan.problem, _windows(plan, data, windows), progress=status.update)
     if plan.problem.open_loop:
         click.echo(f"{plan.path}: as long as open_loop is true, process noise will not be used", err=True)
     if not found.windows:
