@@ -5,4 +5,4 @@ import sys
 from benchmarks.estimators.__main__ import main
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:] or ["--windows", "40", "--dear", "3"]))
+    sys.exit(main(sys.argv[1:] or ["--windows", "40", "--slow", "3"]))
