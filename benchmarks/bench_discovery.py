@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.discovery.motor import Faults, J, live, windows
+from benchmarks.discovery.motor import Faults, J, simulate_motor, windows
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.discovery.sequential_test import WindowDecision
@@ -29,7 +29,7 @@ def main() -> int:
             return 5.0 * J * float(np.sin(10.0 * t))
 
         state, plain = begun, replace(begun, problem=replace(problem, discover=False))
-        for window in windows(live("steps", 30.0, Faults(torque=torque, since=20.0), seed)):
+        for window in windows(simulate_motor("steps", 30.0, Faults(torque=torque, since=20.0), seed)):
             start = time.perf_counter()
             state, report = adapt(state, window)
             seconds = time.perf_counter() - start
