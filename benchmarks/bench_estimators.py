@@ -1,4 +1,4 @@
-"""The comparison with other estimators on a modest budget; ``python -m benchmarks.estimators`` has the full one."""
+"""The comparison with other estimators with a small budget; ``python -m benchmarks.estimators`` has the full one."""
 
 import sys
 
