@@ -1,4 +1,4 @@
-"""Jobs, several at a time, each in a process that ends with this one: simulating and estimating take a whole core."""
+"""Run several jobs at a time, each in a child process."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -11,76 +11,76 @@ from benchmarks.paper.study import Job, Limit, Study, study
 from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import OtolithError, ServiceError
 
-MOST = 4  # processes: there are no more jobs that take long
-TOLD_EVERY = 20  # steps
-PATIENCE = 1.0  # s between two looks whether a process has died
+MAX_PROCESSES = 4  # processes: more would wait for the longest jobs only
+PROGRESS_EVERY = 20  # steps between two messages of a child
+POLL_SECONDS = 1.0  # s between two checks whether a child has died
 
-# What is done, and what comes of it.
-Work = Job | Search
-Found = Study | Limit | Discovery
+AnyJob = Job | Search
+Result = Study | Limit | Discovery
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a job has come."""
+    """How many of its steps a job has done."""
 
-    job: Work
+    job: AnyJob
     steps: int
-    doing: str
+    activity: str
 
 
 def main(connection: Any) -> None:
-    """Do jobs until None comes."""
+    """Entry point of the child: run jobs until None arrives."""
     while (job := connection.recv()) is not None:
 
-        def tell(steps: int, doing: str, job: Work = job) -> None:
-            if steps % TOLD_EVERY == 1:
-                connection.send(Progress(job, steps, doing))
+        def on_progress(steps: int, activity: str, job: AnyJob = job) -> None:
+            if steps % PROGRESS_EVERY == 1:
+                connection.send(Progress(job, steps, activity))
 
         try:
-            connection.send(discover(job, tell) if isinstance(job, Search) else study(job, tell))
+            connection.send(discover(job, on_progress) if isinstance(job, Search) else study(job, on_progress))
         except OtolithError as error:
             connection.send(error)
 
 
-def perform(jobs: Sequence[Work], hear: Callable[[Progress], None]) -> list[Found]:
-    """What the jobs find, in their order; ``hear`` is told of progress.
+def run_jobs(jobs: Sequence[AnyJob], on_progress: Callable[[Progress], None]) -> list[Result]:
+    """The results of the jobs, in their order; ``on_progress`` is called from time to time.
 
     Raises:
-        OtolithError: an example file that cannot be used, or a process that died.
+        OtolithError: an example file cannot be used, or a child died.
     """
-    waiting, found = list(jobs), dict[Work, Found]()
+    waiting, results = list(jobs), dict[AnyJob, Result]()
     cores = len(os.sched_getaffinity(0))
-    pool = [
-        ChildProcess(f"otolith-paper-{number}", f"{__name__}:main", 2) for number in range(min(cores, MOST, len(jobs)))
+    children = [
+        ChildProcess(f"otolith-paper-{number}", f"{__name__}:main", 2)
+        for number in range(min(cores, MAX_PROCESSES, len(jobs)))
     ]
-    busy: dict[ChildProcess, Work] = {}
+    busy: dict[ChildProcess, AnyJob] = {}
     try:
-        while len(found) < len(jobs):
-            for child in pool:
+        while len(results) < len(jobs):
+            for child in children:
                 if waiting and child not in busy:
                     busy[child] = waiting.pop(0)
-                    _hand_over(child, busy[child])
-            wait([waitable for child in busy for waitable in child.waitables], PATIENCE)
+                    _start(child, busy[child])
+            wait([waitable for child in busy for waitable in child.waitables], POLL_SECONDS)
             for child, job in list(busy.items()):
-                for said in child.replies():
-                    if isinstance(said, Progress):
-                        hear(said)
-                    elif isinstance(said, OtolithError):
-                        raise said
+                for message in child.replies():
+                    if isinstance(message, Progress):
+                        on_progress(message)
+                    elif isinstance(message, OtolithError):
+                        raise message
                     else:
-                        found[job] = said
+                        results[job] = message
                         del busy[child]
-                        hear(Progress(job, job.steps, f"{job.row.name}: done"))
+                        on_progress(Progress(job, job.steps, f"{job.row.name}: done"))
                 if child in busy and not child.alive:
                     raise ServiceError(f"the process of {job.row.name} died: is there enough memory?")
     finally:
-        for child in pool:
+        for child in children:
             child.kill()
-    return [found[job] for job in jobs]
+    return [results[job] for job in jobs]
 
 
-def _hand_over(child: ChildProcess, job: Work) -> None:
+def _start(child: ChildProcess, job: AnyJob) -> None:
     if not child.alive:
         child.start()
     child.offer(job)

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-from benchmarks.discovery.motor import SIGNALS, Faults, live
+from benchmarks.discovery.motor import SIGNALS, Faults
 from click.testing import CliRunner, Result
 
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state, restore_components
@@ -30,7 +30,7 @@ def torque(t: float, angle: float, *_: float) -> float:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A motor that has always been a little out of balance."""
-    samples = live("sweep", 24.0, Faults(torque=torque), seed=5)
+    samples = simulate_motor("sweep", 24.0, Faults(torque=torque), seed=5)
     path = tmp_path_factory.mktemp("data") / "healthy.csv"
     table = np.column_stack([0.01 * np.arange(len(samples)), samples])
     np.savetxt(path, table, delimiter=",", header="t," + ",".join(SIGNALS), comments="", fmt="%.9g")

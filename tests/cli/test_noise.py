@@ -1,4 +1,4 @@
-"""``otolith noise``: its lines are valid in a machine file, its levels are right, unusable data are refused."""
+"""``otolith noise``: lines for the machine file, JSON, and refusals."""
 
 import json
 import tomllib
@@ -25,7 +25,7 @@ def noise(*arguments: str | Path) -> Result:
     return CliRunner().invoke(cli, ["noise", *map(str, arguments)], catch_exceptions=False, standalone_mode=False)
 
 
-def test_lines_are_valid_in_a_machine_file_and_right(tmp_path: Path, data: Path) -> None:
+def test_printed_lines_are_valid_in_a_machine_file(tmp_path: Path, data: Path) -> None:
     result = noise(MACHINE, data)
     text = MACHINE.read_text(encoding="utf-8")
     machine = tmp_path / "machine.toml"
@@ -35,7 +35,7 @@ def test_lines_are_valid_in_a_machine_file_and_right(tmp_path: Path, data: Path)
     assert problem.input_noise == pytest.approx((0.0, 0.0002))
     assert problem.process_noise == pytest.approx((0.0, 0.0), abs=0.05)
     assert set(tomllib.loads(result.stdout)) == {"noise", "process_noise"}
-    assert "# identified from 5 windows of 2 s" in result.stdout
+    assert "# learned from 5 windows of 2 s" in result.stdout
     assert "chi-square between windows" in result.stdout
     assert "T_load" in result.stdout
 
@@ -50,7 +50,7 @@ def test_json_has_units_and_uncertainties(data: Path) -> None:
     assert document["consistency"]["degrees"] > 0
 
 
-def test_data_without_a_usable_window_is_refused_with_the_reason(tmp_path: Path, scenario: MotorScenario) -> None:
+def test_data_without_a_usable_window_is_refused(tmp_path: Path, scenario: MotorScenario) -> None:
     rows = recorded(scenario)
     short = written(tmp_path, rows[:100])
     with pytest.raises(ConfigurationError, match="no window of 2 s can be used: the data is too short"):

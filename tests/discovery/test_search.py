@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.discovery.motor import Faults, J, live, windows
+from benchmarks.discovery.motor import Faults, J, simulate_motor, windows
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
@@ -37,7 +37,7 @@ def problem(*names: str) -> Problem:
 
 
 def lived(kind: str, seconds: float, faults: Faults, seed: int = 3) -> list[Window]:
-    return windows(live(kind, seconds, faults, seed))
+    return windows(simulate_motor(kind, seconds, faults, seed))
 
 
 def run(state: AdaptationState, record: list[Window]) -> tuple[AdaptationState, list[ReportDocument]]:

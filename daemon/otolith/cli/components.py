@@ -174,14 +174,13 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
       otolith commission my-machine.toml monday.csv --yes
     """
     from otolith.cli.noise import identified_noise, noise_lines
-    from otolith.commissioning.identification import with_noise
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
     machine, store = _store(file)
     state = _replayed(machine, data)
     identified = identified_noise(machine, data, windows)
     if not state.adopted:  # the file's noise levels may have hidden a component, so search again with these
-        state = _replayed(replace(machine, problem=with_noise(machine.problem, identified)), data)
+        state = _replayed(replace(machine, problem=identified.applied(machine.problem)), data)
     click.echo("\n".join(noise_lines(machine, identified)))
     if state.adopted:
         click.echo("# this process noise contains the components below: keep that of the file if you approve them")

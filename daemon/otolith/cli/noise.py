@@ -55,7 +55,7 @@ def identified_noise(machine: "LoadedMachine", data: Path, count: int) -> "Ident
     from otolith_drivers.errors import ConfigurationError
 
     with progress_line("reading") as show:
-        identified = identify_noise(machine.problem, _good_windows(machine, data, count), told=show)
+        identified = identify_noise(machine.problem, _good_windows(machine, data, count), progress=show)
     if machine.problem.open_loop:
         click.echo(f"{machine.path}: open_loop is true, so the process noise will not be used", err=True)
     if not identified.windows:

@@ -216,18 +216,18 @@ class LinearResponse:
         counts = np.array([len(form.model.phases) for form, _ in guesses], dtype=np.int64)
         first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
         pairs = np.column_stack([first, first + counts - 1])
-        return self._score(self._responses(basis_functions(iter(guesses))), pairs)
+        return self.score_responses(self.responses(basis_functions(iter(guesses))), pairs)
 
     def score_parameters(self, names: list[str]) -> Array:
         """Return by how much χ² falls (parameters,) if each parameter moves alone."""
         one = np.arange(len(names))
-        return self._score(self._parameter_responses(names), np.column_stack([one, one])).gain
+        return self.score_responses(self._parameter_responses(names), np.column_stack([one, one])).gain
 
     def is_parameter(self, curves: BasisFunctions, amplitudes: Array) -> Mask:
         """Return which curves (curves,) of these ``amplitudes`` a parameter within its bounds would produce as well."""
         parameters_of_twin = base_model(self.problem).parameters
         names = [parameter.name for parameter in parameters_of_twin]
-        parameters, responses = self._parameter_responses(names), self._responses(curves)
+        parameters, responses = self._parameter_responses(names), self.responses(curves)
         size, response_size = np.linalg.norm(parameters, axis=0), np.linalg.norm(responses, axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             cosine = np.abs(parameters.T @ responses) / np.outer(size, response_size)
@@ -241,7 +241,7 @@ class LinearResponse:
         within = (low <= now + step) & (now + step <= high)
         return np.asarray(((cosine > SAME_DIRECTION) & (difference < MAX_DIFFERENCE) & within).any(axis=0))
 
-    def _responses(self, curves: BasisFunctions) -> Array:
+    def responses(self, curves: BasisFunctions) -> Array:
         """Return the responses (residuals, curves) of the whitened innovations."""
         values = self._kernel.curves(curves.families, self.x, curves.sources, curves.inner, curves.phases)
         model, present = self.objective.innovation_model, self.objective.present
@@ -256,7 +256,7 @@ class LinearResponse:
         columns = np.where(objective.present[..., None], slopes[:, :, [order.index(name) for name in names]], 0.0)
         return np.asarray(np.matmul(objective.whitening, columns).reshape(-1, len(names)))
 
-    def _score(self, responses: Array, pairs: Array) -> ScoreStatistics:
+    def score_responses(self, responses: Array, pairs: Array) -> ScoreStatistics:
         """Return the statistics of ``responses`` (residuals, curves).
 
         ``pairs`` (guesses, 2) holds the two curves of each guess, or its one curve twice. The amplitudes solve the
