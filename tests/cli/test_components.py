@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-from benchmarks.discovery.motor import SIGNALS, Faults
+from benchmarks.discovery.motor import SIGNALS, Faults, simulate_motor
 from click.testing import CliRunner, Result
 
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state, restore_components
