@@ -14,6 +14,7 @@ from otolith_drivers.base import Sampling, Setup, Signal
 from otolith_drivers.modbus.driver import Options, Source, build
 from tests.conftest import free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
+from tests.waiting import PATIENCE
 
 PERIOD, RECORDS = 0.02, 100
 FREQUENCY = 2.0 * math.pi  # rad/s
@@ -46,7 +47,7 @@ def read_window(sampling: Sampling) -> float:
         driver.open(rings.deliver)
         begun = time.monotonic()
         while not (windower.begin(rings, time.monotonic(), 0.0) and windower.due(rings, time.monotonic())):
-            assert time.monotonic() < begun + 20.0
+            assert time.monotonic() < begun + PATIENCE
             time.sleep(0.01)
         window = windower.cut(rings, 0.0)
         driver.close()

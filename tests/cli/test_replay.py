@@ -43,6 +43,7 @@ from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import frames_of, live
 from tests.drivers.logs import written as written_log
 from tests.machine.test_machine_file import GOLDEN as MACHINE_FILES
+from tests.waiting import PATIENCE
 
 CASES = sorted(path.parent for path in GOLDEN.glob("*/data.*"))
 
@@ -227,7 +228,7 @@ def test_in_real_time_a_window_comes_when_it_would_have_ended(
         printed.append(capsys.readouterr().out)
     assert printed[0] == printed[1]
     assert len(printed[0].splitlines()) == 4
-    assert 2.0 <= time.monotonic() - begun < 20.0  # the silence in the middle is passed over
+    assert 2.0 <= time.monotonic() - begun < PATIENCE  # the silence in the middle is passed over
 
 
 def test_the_columns_of_a_replayed_machine_are_found_where_it_says(

@@ -14,6 +14,7 @@ from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
 from otolith_drivers.canbus.signals import Source
 from tests.conftest import EXAMPLES, OwnMachine
+from tests.waiting import PATIENCE
 
 DRIVERS = Path(can_receiver.__file__).parents[1]
 WRITES = {
@@ -46,7 +47,7 @@ def test_a_tap_on_the_bus_hears_nobody_but_the_machine(source: Source, own_machi
             frame = can.Message(arbitration_id=identifier, data=bytes(length), is_extended_id=False)
             machine.send(frame)
             sent += 1
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + PATIENCE
     while (not got or len(heard) < sent) and time.monotonic() < deadline:
         time.sleep(0.01)
     driver.close()
@@ -70,13 +71,13 @@ def test_an_adapter_that_can_is_told_to_listen_only(own_machine: OwnMachine) -> 
     opened = threading.Thread(target=driver.open, args=(lambda _: None,))
     opened.start()
     os.set_blocking(adapter, False)
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline and b"L\r" not in written:
         try:
             written += os.read(adapter, 100)
         except BlockingIOError:
             time.sleep(0.01)
-    opened.join(timeout=10.0)
+    opened.join(timeout=PATIENCE)
     os.write(adapter, b"t18180000000000000000\r")
     driver.close()
     os.close(adapter)

@@ -16,13 +16,14 @@ from otolith_drivers.conformance import Rig
 from otolith_drivers.errors import DeviceError
 from tests.conftest import OwnMachine
 from tests.drivers.rigs import SETUP, can_rig
+from tests.waiting import PATIENCE
 
 
 def collect(rig: Rig, enough: int) -> list[Sample]:
     """Open the driver and let its source speak until there are enough samples."""
     got: list[Sample] = []
     rig.driver.open(got.extend)
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + PATIENCE
     while len(got) < enough and time.monotonic() < deadline:
         rig.say()
         time.sleep(0.01)
@@ -79,7 +80,7 @@ def test_a_frame_that_cannot_be_unpacked_does_not_cost_the_bus(own_machine: OwnM
             sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
             for _ in range(5):
                 sender.sendto(b"\xc1 no frame", (own_machine.group, own_machine.port))
-        deadline = time.monotonic() + 5.0
+        deadline = time.monotonic() + PATIENCE
         while rig.driver.counters().bad < 5 and time.monotonic() < deadline:
             time.sleep(0.01)
         assert rig.driver.counters().bad == 5
@@ -101,7 +102,7 @@ def test_a_bus_that_breaks_is_opened_again(own_machine: OwnMachine, monkeypatch:
             return original(self, timeout)
 
         monkeypatch.setattr(can.BusABC, "recv", recv)
-        deadline = time.monotonic() + 5.0
+        deadline = time.monotonic() + PATIENCE
         while rig.driver.counters().reconnects == 0 and time.monotonic() < deadline:
             time.sleep(0.01)
         received = rig.driver.counters().received

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,17 +13,11 @@ from otolith.discovery.adopted import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import find_twin
 from otolith.runtime.state_store import StateStore, WriterThread
+from tests.waiting import PATIENCE, wait_for, within
 
 DRY = Component("shaft", "Coulomb", "omega", -0.004)
 KEPT = (ComponentRecord(AdoptedComponent(DRY, 5.0), (-0.004,), (1e-5,)),)
-AT_ONCE = 0.1  # s: far less than a disk that does not answer
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+AT_ONCE = within(0.1)  # s: far less than a disk that does not answer
 
 
 def is_being_read(pipe: Path, held: list[int]) -> bool:
@@ -49,7 +43,7 @@ def house(keeper: StateStore) -> Iterator[WriterThread]:
 def test_the_latest_is_on_disk_when_it_stops(keeper: StateStore, house: WriterThread) -> None:
     for amplitude in (-0.001, -0.002, -0.003, -0.004):
         house.keep((ComponentRecord(AdoptedComponent(DRY, 5.0), (amplitude,), (1e-5,)),))
-    house.stop(5.0)
+    house.stop(PATIENCE)
     assert keeper.components() == KEPT
 
 
@@ -74,10 +68,11 @@ def test_what_was_known_at_the_start_is_not_heard_again(keeper: StateStore) -> N
     house.start()
     house.keep(KEPT)
     wait_for(keeper.known.exists)
-    house.stop(5.0)
+    house.stop(PATIENCE)
     assert house.new_decisions() is None
 
 
+@pytest.mark.timed
 def test_nobody_waits_for_a_disk_that_does_not_answer(keeper: StateStore, house: WriterThread) -> None:
     """A pipe into which nobody writes, where the specialist's file is expected: who reads it is held up."""
     keeper.said.parent.mkdir(parents=True)
@@ -104,6 +99,6 @@ def test_what_the_disk_does_not_take_is_tried_again(
     house.keep(KEPT)
     wait_for(lambda: "components are not kept" in caplog.text)
     folder.unlink()
-    house.stop(5.0)
+    house.stop(PATIENCE)
     assert keeper.components() == KEPT
     assert caplog.text.count("components are not kept") == 1

@@ -15,6 +15,7 @@ from otolith.runtime import worker as supervisor
 from otolith.runtime.worker import Supervisor
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.estimation.test_window_fit import Cut, state_for
+from tests.waiting import PATIENCE
 
 
 @pytest.fixture
@@ -22,7 +23,9 @@ def batch(scenario: MotorScenario, windows: Cut) -> list[Window]:
     return [window for window, _ in windows(scenario, 5)]
 
 
-def poll_until(watched: Supervisor, done: Callable[[list[Report]], bool], seconds: float = 40.0) -> list[Report]:
+def poll_until(
+    watched: Supervisor, done: Callable[[list[Report]], bool], seconds: float = 3 * PATIENCE
+) -> list[Report]:
     reports: list[Report] = []
     deadline = time.monotonic() + seconds
     while not done(reports) and time.monotonic() < deadline:

@@ -15,6 +15,7 @@ import pytest
 from otolith.health.schema import ReportDocument
 from otolith.publishing.zenoh_session import Listener
 from tests.conftest import OwnMachine
+from tests.waiting import PATIENCE
 
 OTOLITH = [sys.executable, "-m", "otolith"]
 
@@ -37,7 +38,9 @@ class Running:
         with (self.folder / f"{name}.log").open("wb") as log:
             return subprocess.Popen([*OTOLITH, *arguments], stdout=log, stderr=subprocess.STDOUT)
 
-    def wait_for(self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 60.0) -> list[ReportDocument]:
+    def wait_for(
+        self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 2 * PATIENCE
+    ) -> list[ReportDocument]:
         """The reports, once there are enough of them; fails with the daemon's log after ``seconds``."""
         deadline = time.monotonic() + seconds
         while not enough(self.reports):
@@ -60,7 +63,7 @@ class Running:
         """The daemon's exit code and the seconds it took to end."""
         begun = time.monotonic()
         self.daemon.send_signal(number)
-        return self.daemon.wait(timeout=10), time.monotonic() - begun
+        return self.daemon.wait(timeout=PATIENCE), time.monotonic() - begun
 
     def close(self) -> None:
         """End whatever still runs."""
@@ -68,7 +71,7 @@ class Running:
         for process in (self.daemon, self.plant):
             if process is not None and process.poll() is None:
                 process.terminate()
-                process.wait(timeout=10)
+                process.wait(timeout=PATIENCE)
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The service towards systemd, its recorder and its disk."""
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -22,6 +23,7 @@ from otolith.runtime.state_store import StateStore
 from otolith.runtime.worker import COMPILING
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
+from tests.waiting import PATIENCE, within
 
 # Seen only while the shaft all but stands, so that nothing makes it fade.
 DRY = Component("shaft", "Stribeck", "omega", -0.004, inner=0.01, low=0.005, high=0.02)
@@ -45,19 +47,21 @@ def test_it_tells_systemd_when_it_is_ready_and_of_every_progress(own_machine: Ow
     )
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
-        manager.settimeout(30.0)
+        manager.settimeout(PATIENCE)
         environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "4000000"}
         command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
         daemon = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
         said: list[str] = []
-        while sum("WATCHDOG=1" in text for text in said) < 4 or not any("window 1 good" in text for text in said):
+        while sum("WATCHDOG=1" in text for text in said) < 4 or not any(
+            re.search(r"window \d+ good", text) for text in said
+        ):
             said.append(manager.recv(4096).decode())
         daemon.send_signal(signal.SIGTERM)
-        assert daemon.wait(timeout=10) == 0
+        assert daemon.wait(timeout=PATIENCE) == 0
         while not any("STOPPING=1" in text for text in said):
             said.append(manager.recv(4096).decode())
     plant.terminate()
-    plant.wait(timeout=10)
+    plant.wait(timeout=PATIENCE)
     assert said[0].startswith("READY=1\nSTATUS=listening: CAN bus udp_multicast")
     assert f"MAINPID={daemon.pid}" in said[0]
 
@@ -102,8 +106,9 @@ def test_a_stopped_worker_starves_the_watchdog(
         watched._notifier.close()
 
 
+@pytest.mark.timed
 def test_windows_without_a_recorder_are_counted(running: Running) -> None:
-    running.wait_for(lambda reports: len(reports) >= 2)
+    before = running.wait_for(lambda reports: len(reports) >= 2)[-1].counters
     os.kill(running.child("recorder").pid, signal.SIGKILL)
     shutil.rmtree(running.folder / "state", ignore_errors=True)
     (running.folder / "state").write_text("no folder any more", encoding="utf-8")
@@ -111,13 +116,15 @@ def test_windows_without_a_recorder_are_counted(running: Running) -> None:
         lambda found: bool(found and found[-1].counters and found[-1].counters.recordings_dropped >= 2)
     )
     last = reports[-1].counters
+    assert before is not None
     assert last is not None
-    assert (last.windows_missed, last.lost) == (0, 0)
+    assert (last.windows_missed, last.lost) == (before.windows_missed, 0)
     code, seconds = running.stop()
     assert code == 0
-    assert seconds < 3.0
+    assert seconds < within(3.0)
 
 
+@pytest.mark.timed
 def test_components_are_kept_and_the_specialist_is_heard_while_it_runs(
     running_with_component: tuple[Running, StateStore],
 ) -> None:
@@ -129,7 +136,7 @@ def test_components_are_kept_and_the_specialist_is_heard_while_it_runs(
     keeper.decide(OperatorDecisions(approved=frozenset({DRY.key})))
     running.wait_for(lambda reports: reports[-1].components[0].approval is Approval.APPROVED)
     code, seconds = running.stop()
-    assert (code, seconds < 3.0) == (0, True)
+    assert (code, seconds < within(3.0)) == (0, True)
     assert [entry.adopted.component.key for entry in keeper.components()] == [DRY.key]  # known better now
 
 
@@ -160,5 +167,5 @@ def test_nohup_is_respected(own_machine: OwnMachine) -> None:
     time.sleep(0.5)  # long enough for it to have ended
     assert daemon.poll() is None
     daemon.terminate()
-    assert daemon.wait(timeout=5) == 0
+    assert daemon.wait(timeout=PATIENCE) == 0
     daemon.stderr.close()

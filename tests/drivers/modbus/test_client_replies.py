@@ -13,13 +13,14 @@ from otolith_drivers.modbus.client import Line
 from otolith_drivers.modbus.driver import Options
 from otolith_drivers.modbus.protocol import Broken, Refused, Silent
 from tests.conftest import free_port
-from tests.drivers.modbus_readers import TWO, Listener, floats, poller, source, wait_for
+from tests.drivers.modbus_readers import TIMEOUT, TWO, Listener, floats, poller, source
 from tests.drivers.modbus_servers import Behaviour, odd_server
+from tests.waiting import wait_for
 
 
 def late(reply: bytes) -> bytes:
     """Of another value, and later than the driver waits: it is not to be taken for the answer to the next question."""
-    time.sleep(0.15)
+    time.sleep(1.5 * TIMEOUT)
     return reply[:-4] + struct.pack(">f", 99.0)
 
 
@@ -50,7 +51,7 @@ def test_a_spoiled_reply_is_no_reading(spoil: Callable[[bytes], bytes]) -> None:
         wait_for(lambda: listener.driver.counters().lost > lost + 2)
         behaviour.spoil = lambda reply: reply
         count = len(listener.samples)
-        wait_for(lambda: len(listener.samples) > count, 15.0)
+        wait_for(lambda: len(listener.samples) > count)
     assert {sample.value for sample in listener.samples} == {24.0, 1.5}
 
 

@@ -15,7 +15,7 @@ from pymodbus.framer.rtu import FramerRTU
 
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.modbus.driver import ModbusPoller, Options, Source, build
-from tests.drivers.modbus_readers import wait_for
+from tests.waiting import wait_for, within
 
 REGISTERS = {"a": 1000, "b": 2000}
 TIMEOUT = 0.2  # s
@@ -86,7 +86,7 @@ def test_a_late_reply_is_not_taken_for_the_next_one_of_the_same_size(device: Dev
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
-        wait_for(lambda: device.questions > 100, 30.0)
+        wait_for(lambda: device.questions > 100)
     finally:
         driver.close()
     assert driver.counters().lost > 0
@@ -100,7 +100,7 @@ def test_what_an_adapter_hears_of_itself_is_no_answer(device: Device) -> None:
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
-        wait_for(lambda: device.questions > 100, 30.0)
+        wait_for(lambda: device.questions > 100)
     finally:
         driver.close()
     assert len(samples) > 50
@@ -116,7 +116,7 @@ def test_a_silent_line_is_opened_again_and_heard_again(device: Device) -> None:
         device.delay = lambda question: None
         wait_for(lambda: not driver.link().up)
         device.delay = lambda question: 0.0
-        wait_for(lambda: driver.link().up, 20.0)
+        wait_for(lambda: driver.link().up)
     finally:
         driver.close()
     assert driver.counters().reconnects == 1
@@ -131,11 +131,12 @@ def test_a_clock_that_is_set_back_does_not_hold_up_the_line(device: Device, monk
         asked = device.questions
         wait_for(lambda: device.questions > asked)
         monkeypatch.setattr(time, "time", lambda: wall() - 3600.0)
-        wait_for(lambda: not driver.link().up, 20.0)
+        wait_for(lambda: not driver.link().up)
     finally:
         driver.close()
 
 
+@pytest.mark.timed
 def test_a_slow_device_does_not_delay_the_end(device: Device) -> None:
     device.delay = lambda question: None
     driver = poller(device, 10.0)
@@ -143,7 +144,7 @@ def test_a_slow_device_does_not_delay_the_end(device: Device) -> None:
     wait_for(lambda: device.questions > 0)
     begun = time.monotonic()
     driver.close()
-    assert time.monotonic() - begun < 1.0
+    assert time.monotonic() - begun < within(1.0)
     assert not [thread for thread in threading.enumerate() if thread.name == "modbus-poll"]
 
 
