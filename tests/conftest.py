@@ -29,6 +29,7 @@ SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurre
 
 # Whole files that take longest, so that workers start with them; a mix of files that compute and files that wait.
 SLOWEST = (
+    "adaptation/test_measured_axis.py",
     "system/test_faults.py",
     "benchmarks/test_paper.py",
     "system/test_main_job.py",
@@ -39,8 +40,8 @@ SLOWEST = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Show what runs, if several processes share the tests."""
-    if config.pluginmanager.hasplugin("dsession"):
+    """Show what runs, if several processes share the tests; this is the process that gives them out."""
+    if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
         config.pluginmanager.register(Progress(config))
 
 

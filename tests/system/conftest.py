@@ -15,7 +15,7 @@ import pytest
 from otolith.health.schema import ReportDocument
 from otolith.publishing.zenoh_session import Listener
 from tests.conftest import OwnMachine
-from tests.waiting import PATIENCE
+from tests.waiting import PATIENCE, wait_for
 
 OTOLITH = [sys.executable, "-m", "otolith"]
 
@@ -27,9 +27,11 @@ class Running:
         self.machine, self.folder = machine, folder
         self.recording, self.truth, self.log = folder / "run.rrd", folder / "truth.csv", folder / "daemon.log"
         self.summary = folder / "summary.json"
+        self.daemon = self._start("daemon", "run", str(machine.machine), "--recording", str(self.recording))
+        # The clock of the plant starts when the daemon listens, however long a busy computer takes until then.
+        wait_for(lambda: "reports on" in self.log.read_text() or self.daemon.poll() is not None)
         plays = [*machine.plays, "--truth", str(self.truth), "--summary", str(self.summary)]
         self.plant = self._start("plant", "plant", *plays) if machine.plays else None
-        self.daemon = self._start("daemon", "run", str(machine.machine), "--recording", str(self.recording))
         self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._listener = Listener([machine.endpoint], "otolith/**/report", self._heard.put)
         self.reports: list[ReportDocument] = []

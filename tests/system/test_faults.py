@@ -51,8 +51,8 @@ FAULTS = [
     Injected("word_order", 66.0, 68.0, 'order = "CDAB"', MODBUS),
     Injected("frozen", 76.0, 79.0, 'signal = "RotorSpeed"'),
 ]
-TWO = [Injected("gone", 20.0, 23.0), Injected("garbage", 32.0, 34.0, "share = 0.5")]
-SCENARIOS = {"two": (TWO, 44.0), "all": (FAULTS, 92.0)}
+TWO = [Injected("gone", 24.0, 27.0), Injected("garbage", 36.0, 38.0, "share = 0.5")]
+SCENARIOS = {"two": (TWO, 48.0), "all": (FAULTS, 92.0)}
 """Faults, and the time (s of the plant) at which the run ends. Daemons start more slowly on a busy computer."""
 
 

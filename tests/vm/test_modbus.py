@@ -1,4 +1,4 @@
-"""Our Modbus driver against a server of another house: libmodbus in C, over TCP and over a serial line.
+"""Our Modbus driver against a server made with libmodbus, in C, over TCP and over a serial line.
 
 Runs on the host; the server's own record says which function codes were sent.
 """
