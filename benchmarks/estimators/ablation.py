@@ -60,16 +60,16 @@ def attempts(problem: Problem, window: Window, start: Array) -> tuple[Attempt, .
     objective = Objective(problem, window, start)
     made = time.perf_counter() - begin
 
-    def polished(values: Array) -> Attempt:
+    def refined(values: Array) -> Attempt:
         begin = time.perf_counter()
         values = gauss_newton(objective, objective.guess(values)).guess[: objective.free]
         return Attempt(values, time.perf_counter() - begin + made)
 
-    alone = polished(start)
+    alone = refined(start)
     begin = time.perf_counter()
     values = particle_swarm(objective, problem.swarm, start, problem.seed + window.index).places[0]
     swarm = Attempt(values, time.perf_counter() - begin + made)
-    after = polished(values)
+    after = refined(values)
     begin = time.perf_counter()
     whole = np.array([parameter.value for parameter in estimate(problem, window, start).parameters])
     both = Attempt(whole, time.perf_counter() - begin)
