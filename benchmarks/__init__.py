@@ -1,1 +1,1 @@
-"""Timings, as ratios within one run."""
+"""Benchmarks: timings as ratios within one run, accuracy, and comparisons."""

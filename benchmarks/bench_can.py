@@ -1,7 +1,7 @@
-"""A busy CAN bus: what a frame costs from the socket into the rings, beside a bare python-can loop on the same frames.
+"""Cost of a CAN frame from the socket into the rings, compared with a bare python-can loop on the same frames.
 
-Another process sends 8000 frames a second of ten messages, each with one signal that is wanted and a counter, on the
-virtual bus of this computer. ``python -m benchmarks.bench_can 10`` takes 10 s for each loop instead of 60.
+Another process sends 8000 frames per second of ten messages, each with one used signal and a counter, on the virtual
+bus of this computer. ``python -m benchmarks.bench_can 10`` takes 10 s for each loop instead of 60.
 """
 
 import subprocess
@@ -17,13 +17,13 @@ import can
 from otolith.acquisition.ring import Rings
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.canbus.bus import BusOptions, enlarge_buffer, open_bus
-from otolith_drivers.canbus.driver import Options, build
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.driver import CanOptions, build
+from otolith_drivers.canbus.signals import CanSource
 
 RATE, MESSAGES, FIRST_ID = 8000.0, 10, 0x180  # frames/s
 SETTLE = 0.5  # s after the last frame
-GROUP, PORT = "239.74.163.88", 43188
-BUS = BusOptions(interface="udp_multicast", channel=GROUP, port=PORT)
+MULTICAST_GROUP, PORT = "239.74.163.88", 43188
+BUS = BusOptions(interface="udp_multicast", channel=MULTICAST_GROUP, port=PORT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,19 +56,19 @@ def database() -> str:
 
 
 def send(seconds: float) -> int:
-    """The other process: says how many frames it has sent."""
+    """The other process: prints the number of frames sent."""
     frames = [
         can.Message(arbitration_id=FIRST_ID + index, data=bytes(8), is_extended_id=False) for index in range(MESSAGES)
     ]
     sent, total = 0, int(RATE * seconds)
     with open_bus(BUS) as bus:
-        begun = time.monotonic()
+        start = time.monotonic()
         while sent < total:
-            due = min(total, int((time.monotonic() - begun) * RATE) + 1)
+            due = min(total, int((time.monotonic() - start) * RATE) + 1)
             while sent < due:
                 frame = frames[sent % MESSAGES]
-                turn = sent // MESSAGES
-                frame.data[0], frame.data[7] = turn % 200, turn % 256
+                cycle = sent // MESSAGES
+                frame.data[0], frame.data[7] = cycle % 200, cycle % 256
                 bus.send(frame)
                 sent += 1
             time.sleep(1.0 / RATE)
@@ -78,60 +78,60 @@ def send(seconds: float) -> int:
 
 def sender(seconds: float) -> int:
     command = [sys.executable, "-m", "benchmarks.bench_can", "send", str(seconds)]
-    return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)  # noqa: S603 - our own
+    return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)  # noqa: S603 - a module of this project
 
 
-def bare(seconds: float) -> Result:
+def receive_bare(seconds: float) -> Result:
     received, cpu = 0, 0.0
     stop = threading.Event()
 
     def loop() -> None:
         nonlocal received, cpu
-        begun = time.thread_time()
+        start = time.thread_time()
         while not stop.is_set():
             received += bus.recv(0.2) is not None
-        cpu = time.thread_time() - begun
+        cpu = time.thread_time() - start
 
     with open_bus(BUS) as bus:
         enlarge_buffer(bus)
         thread = threading.Thread(target=loop)
         thread.start()
-        begun = time.monotonic()
+        start = time.monotonic()
         sent = sender(seconds)
         time.sleep(SETTLE)
-        elapsed = time.monotonic() - begun
+        elapsed = time.monotonic() - start
         stop.set()
         thread.join()
     return Result(sent, received, elapsed, cpu)
 
 
-def ours(seconds: float) -> Result:
+def receive_with_driver(seconds: float) -> Result:
     names = [f"omega_{index}" for index in range(MESSAGES)]
     rings = Rings(names, int(4 * RATE / MESSAGES))
     with TemporaryDirectory() as folder:
         (Path(folder) / "bench.dbc").write_text(database(), encoding="utf-8")
-        signals = tuple(Signal(name, "rad/s", Source(signal=f"Speed{index}")) for index, name in enumerate(names))
-        options = Options(dbc=Path("bench.dbc"), **BUS.model_dump(exclude_unset=True))
+        signals = tuple(Signal(name, "rad/s", CanSource(signal=f"Speed{index}")) for index, name in enumerate(names))
+        options = CanOptions(dbc=Path("bench.dbc"), **BUS.model_dump(exclude_unset=True))
         driver = build(options, Setup(signals, Path(folder), MESSAGES / RATE))
     driver.open(rings.deliver)
     thread = next(thread for thread in threading.enumerate() if thread.name == "can-receive")
     clock = time.pthread_getcpuclockid(thread.ident or 0)
-    before, begun = time.clock_gettime(clock), time.monotonic()
+    before, start = time.clock_gettime(clock), time.monotonic()
     sent = sender(seconds)
     time.sleep(SETTLE)
-    cpu, elapsed = time.clock_gettime(clock) - before, time.monotonic() - begun
+    cpu, elapsed = time.clock_gettime(clock) - before, time.monotonic() - start
     counters, link = driver.counters(), driver.link()
     driver.close()
     for line in link.warnings:
-        print(f"  complaint: {line}")
-    print(f"  counted: {counters}")
+        print(f"  warning: {line}")
+    print(f"  counters: {counters}")
     return Result(sent, rings.counters().received, elapsed, cpu)
 
 
 def main(seconds: float) -> int:
-    plain = bare(seconds)
+    plain = receive_bare(seconds)
     print(plain.line("python-can, bus.recv alone"))
-    whole = ours(seconds)
+    whole = receive_with_driver(seconds)
     print(whole.line("Otolith, into the rings"))
     print(f"ratio {whole.cpu / whole.received * plain.received / plain.cpu:.2f}")
     return 0

@@ -1,8 +1,8 @@
-"""The comparison with other estimators on a modest budget; ``python -m benchmarks.estimators`` has the full one."""
+"""The comparison with other estimators with a small budget; ``python -m benchmarks.estimators`` has the full one."""
 
 import sys
 
 from benchmarks.estimators.__main__ import main
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:] or ["--windows", "40", "--dear", "3"]))
+    sys.exit(main(sys.argv[1:] or ["--windows", "40", "--slow", "3"]))

@@ -1,6 +1,6 @@
-"""Generated kernels against what else there is, in one run: 200 records of the DC motor, then with sensitivities.
+"""Generated kernels compared with alternatives: 200 records of the DC motor, then with sensitivities.
 
-By hand: numba as an engineer who knows it would write it. CasADi: its Runge-Kutta through MX/SX and ``mapaccum``.
+By hand: a hand-written Numba kernel. CasADi: its Runge-Kutta through MX/SX and ``mapaccum``.
 NumPy: vectorised over states only, as a first version would be. Ratios are medians of interleaved runs.
 """
 
@@ -18,32 +18,32 @@ from otolith.twin.kernel import Excitation, kernel_of
 
 RECORDS, PERIOD, SUBSTEPS = 200, 0.01, handwritten.SUBSTEPS
 TWIN = find_twin("dc_motor")
-PARAMETERS = np.array([entry.nominal for entry in TWIN.parameters])
+PARAMETERS = np.array([parameter.nominal for parameter in TWIN.parameters])
 INITIAL = np.array([0.3, 4.0])
 TIMES = np.arange(RECORDS) * PERIOD
 INPUTS = np.column_stack([np.where(TIMES < 0.7, 12.0, 5.0), 0.05 + 0.02 * np.sin(9.0 * TIMES)])
 
 
-def interleaved(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Median seconds of each, taken in turn so that all see the same machine."""
-    times: dict[str, list[float]] = {name: [] for name in works}
-    for work in works.values():
-        work()
+def interleaved(functions: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Median seconds of each; the functions take turns, so that load on the computer affects all alike."""
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    for function in functions.values():
+        function()
     for _ in range(rounds):
-        for name, work in works.items():
-            begun = time.perf_counter()
-            work()
-            times[name].append(time.perf_counter() - begun)
-    return {name: float(np.median(found)) for name, found in times.items()}
+        for name, function in functions.items():
+            start = time.perf_counter()
+            function()
+            times[name].append(time.perf_counter() - start)
+    return {name: float(np.median(seconds)) for name, seconds in times.items()}
 
 
 def in_numpy(parameters: Array = PARAMETERS, initial: Array = INITIAL) -> Array:
     R_a, L_a, J, K_e, K_t, D = parameters
     A = np.array([[-R_a / L_a, -K_e / L_a], [K_t / J, -D / J]])
     B = np.array([[1.0 / L_a, 0.0], [0.0, -1.0 / J]])
-    found, x, h = np.empty((RECORDS, 2)), initial.copy(), PERIOD / SUBSTEPS
+    outputs, x, h = np.empty((RECORDS, 2)), initial.copy(), PERIOD / SUBSTEPS
     for record in range(RECORDS):
-        found[record] = x
+        outputs[record] = x
         u = INPUTS[record].copy()
         slope = np.array([0.0, (INPUTS[min(record + 1, RECORDS - 1), 1] - u[1]) / SUBSTEPS])
         for _ in range(SUBSTEPS):
@@ -53,7 +53,7 @@ def in_numpy(parameters: Array = PARAMETERS, initial: Array = INITIAL) -> Array:
             k4 = A @ (x + h * k3) + B @ (u + slope)
             x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             u = u + slope
-    return found
+    return outputs
 
 
 def in_casadi() -> tuple[casadi.Function, casadi.Function]:
@@ -84,7 +84,7 @@ def main() -> int:
     kernel, drive = kernel_of(TWIN), Excitation(INPUTS, PERIOD, SUBSTEPS)
     run, both = in_casadi()
     one, start = PARAMETERS[None], INITIAL[None]
-    assert np.allclose(kernel.simulate(one, start, drive)[0], in_numpy(), atol=1e-10)  # noqa: S101 - same problem
+    assert np.allclose(kernel.simulate(one, start, drive)[0], in_numpy(), atol=1e-10)  # noqa: S101 - all solve the same problem
     assert np.allclose(run(INITIAL, PARAMETERS).full().T, in_numpy()[1:], atol=1e-10)  # noqa: S101
     plain = interleaved(
         {
@@ -102,10 +102,13 @@ def main() -> int:
         },
         300,
     ) | interleaved({"NumPy": lambda: [in_numpy(PARAMETERS * (1 + 1e-6 * np.eye(6)[k])) for k in range(6)]}, 10)
-    for title, found in (("one trajectory", plain), ("with five sensitivities (the generated one has eight)", slopes)):
+    for title, timings in (
+        ("one trajectory", plain),
+        ("with five sensitivities (the generated one has eight)", slopes),
+    ):
         print(title)
-        for name, seconds in found.items():
-            print(f"  {name:10} {seconds * 1e6:9.1f} us   {seconds / found['by hand']:8.2f} x by hand")
+        for name, seconds in timings.items():
+            print(f"  {name:10} {seconds * 1e6:9.1f} us   {seconds / timings['by hand']:8.2f} x by hand")
     return 0
 
 

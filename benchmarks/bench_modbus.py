@@ -1,7 +1,7 @@
-"""Polling a Modbus TCP drive: 20 registers at 200 Hz, the driver beside a bare loop over the same library.
+"""Polling a Modbus TCP drive: 20 registers at 200 Hz, the driver compared with a bare loop over the same library.
 
-The drive is pymodbus's server in a process of its own. Jitter is how far a reading is from the grid of absolute moments
-that fits best. ``python -m benchmarks.bench_modbus SECONDS`` (20 each without it).
+The drive is pymodbus's server in its own process. Jitter is the distance of a reading from the best-fitting grid of
+absolute times. ``python -m benchmarks.bench_modbus SECONDS`` (20 each without it).
 """
 
 import asyncio
@@ -24,43 +24,43 @@ from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.modbus.driver import Options, Source, build
 
 PERIOD = 0.005
-NUMBERS = 10  # of two registers
+VALUES = 10  # of two registers each
 TARGET = 2e-3  # s, of the 99th percentile
 
 
-def drive(port: int, up: Event) -> None:
-    """The server's process."""
-    values = [float(index) + 0.1 for index in range(NUMBERS)]
+def run_server(port: int, ready: Event) -> None:
+    """Entry point of the server's process."""
+    values = [float(index) + 0.1 for index in range(VALUES)]
     device = SimDevice(id=1, simdata=[SimData(0, values=values, datatype=DataType.FLOAT32)])
 
     async def serve() -> None:
         server = ModbusTcpServer(device, address=("127.0.0.1", port))
         await server.serve_forever(background=True)
-        up.set()
+        ready.set()
         await server.serving
 
     asyncio.run(serve())
 
 
-def bare(port: int, seconds: float) -> list[float]:
-    """Moments of reading by the library alone."""
+def poll_bare(port: int, seconds: float) -> list[float]:
+    """Times of the readings by the library alone."""
     client = ModbusTcpClient("127.0.0.1", port=port, timeout=0.5, retries=0)
-    client.connect()  # type: ignore[no-untyped-call]  # of a library that is typed but for this
-    begun, moments = time.monotonic(), list[float]()
+    client.connect()  # type: ignore[no-untyped-call]  # the only untyped methods of the library
+    start, moments = time.monotonic(), list[float]()
     for index in range(round(seconds / PERIOD)):
-        left = begun + index * PERIOD - time.monotonic()
+        left = start + index * PERIOD - time.monotonic()
         if left > 0.0:
             time.sleep(left)
-        asked = time.monotonic()
-        if not client.read_holding_registers(0, count=2 * NUMBERS, device_id=1).isError():
-            moments.append(0.5 * (asked + time.monotonic()))
+        sent = time.monotonic()
+        if not client.read_holding_registers(0, count=2 * VALUES, device_id=1).isError():
+            moments.append(0.5 * (sent + time.monotonic()))
     client.close()  # type: ignore[no-untyped-call]  # as above
     return moments
 
 
-def ours(port: int, seconds: float) -> tuple[list[float], str]:
-    """The same by the driver, into the rings; and what it says of itself."""
-    sources = [{"register": 2 * index, "type": "float32", "unit": "V"} for index in range(NUMBERS)]
+def poll_with_driver(port: int, seconds: float) -> tuple[list[float], str]:
+    """Times of the readings by the driver into the rings, and its plan and counters."""
+    sources = [{"register": 2 * index, "type": "float32", "unit": "V"} for index in range(VALUES)]
     signals = tuple(Signal(f"s{at}", "V", Source.model_validate(source)) for at, source in enumerate(sources))
     rings = Rings([signal.name for signal in signals], 4096)
     moments: list[float] = []
@@ -78,11 +78,11 @@ def ours(port: int, seconds: float) -> tuple[list[float], str]:
 
 
 def jitter(moments: list[float]) -> NDArray[np.float64]:
-    """Seconds from the grid, of each reading."""
+    """Distance of each reading from the grid, in seconds."""
     times = np.array(moments) - moments[0]
-    off = times - np.rint(times / PERIOD) * PERIOD
-    found: NDArray[np.float64] = np.abs(off - np.median(off))
-    return found
+    offset = times - np.rint(times / PERIOD) * PERIOD
+    deviation: NDArray[np.float64] = np.abs(offset - np.median(offset))
+    return deviation
 
 
 def row(name: str, moments: list[float], seconds: float, cpu: float) -> float:
@@ -100,20 +100,20 @@ def main() -> int:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
     context = get_context("spawn")
-    up = context.Event()
-    process = context.Process(target=drive, args=(port, up), daemon=True)
+    ready = context.Event()
+    process = context.Process(target=run_server, args=(port, ready), daemon=True)
     process.start()
-    if not up.wait(30.0):
+    if not ready.wait(30.0):
         raise RuntimeError("the server did not start")
-    print(f"Modbus TCP, {2 * NUMBERS} registers at {1 / PERIOD:.0f} Hz for {seconds:.0f} s, server in another process")
-    begun = time.process_time()
-    alone = row("bare pymodbus loop", bare(port, seconds), seconds, time.process_time() - begun)
-    begun = time.process_time()
-    moments, said = ours(port, seconds)
-    driven = row("driver into the rings", moments, seconds, time.process_time() - begun)
-    print(f"  {said}")
-    print(f"  99th percentile {driven / alone:.2f} times that of the bare loop; target {TARGET * 1e3:.0f} ms: "
-          f"{'reached' if driven <= TARGET else 'MISSED'}")  # fmt: skip
+    print(f"Modbus TCP, {2 * VALUES} registers at {1 / PERIOD:.0f} Hz for {seconds:.0f} s, server in another process")
+    start = time.process_time()
+    bare_late = row("bare pymodbus loop", poll_bare(port, seconds), seconds, time.process_time() - start)
+    start = time.process_time()
+    moments, summary = poll_with_driver(port, seconds)
+    driver_late = row("driver into the rings", moments, seconds, time.process_time() - start)
+    print(f"  {summary}")
+    print(f"  99th percentile {driver_late / bare_late:.2f} times that of the bare loop; target {TARGET * 1e3:.0f} ms: "
+          f"{'reached' if driver_late <= TARGET else 'MISSED'}")  # fmt: skip
     process.terminate()
     return 0
 

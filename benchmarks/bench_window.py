@@ -1,4 +1,4 @@
-"""What one window costs, cold and warm, and where: as times of this run and as ratios that hold elsewhere."""
+"""Time of one window, cold and warm, and of its parts: in seconds here, and as ratios that hold elsewhere."""
 
 import sys
 import time
@@ -11,43 +11,47 @@ import numpy as np
 from benchmarks.motor import CONFIG, windows
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
+from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import particle_swarm
+from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
-from otolith.estimation.window_fit import estimate
+from otolith.estimation.window_fit import Search, estimate
 from otolith.machine import load_machine
 from otolith_drivers.plant.scenario import load_scenario
 
 
-def median_seconds(work: Callable[[], object], runs: int) -> float:
-    work()
+def median_seconds(function: Callable[[], object], runs: int) -> float:
+    function()
     times = []
     for _ in range(runs):
-        begun = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - begun)
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
     return float(np.median(times))
 
 
-def of(problem: Problem, names: tuple[str, ...]) -> Problem:
-    """``problem`` with these parameters free."""
+def with_free(problem: Problem, names: tuple[str, ...]) -> Problem:
+    """``problem`` with these parameters free, all others known."""
     twin = problem.twin
-    known = tuple((entry.name, entry.nominal) for entry in twin.parameters if entry.name not in names)
-    return replace(problem, known=known, free=tuple(entry for entry in twin.parameters if entry.name in names))
+    known = tuple((parameter.name, parameter.nominal) for parameter in twin.parameters if parameter.name not in names)
+    return replace(
+        problem, known=known, free=tuple(parameter for parameter in twin.parameters if parameter.name in names)
+    )
 
 
 def main() -> int:
     problem = load_machine(CONFIG / "dc-motor.toml").problem
     record = list(windows(load_scenario(CONFIG / "scenarios" / "demo.toml"), 12))
     for names in (("R_a",), ("R_a", "D"), ("R_a", "D", "J")):
-        free = of(problem, names)
-        start = np.array([entry.nominal for entry in free.free])
-        cold = median_seconds(partial(estimate, free, record[-1], start), 5)
-        warm = median_seconds(partial(estimate, free, record[-1], start, warm=True), 50)
+        free = with_free(problem, names)
+        start = np.array([parameter.nominal for parameter in free.free])
+        prior = initial_prior(free)
+        cold = median_seconds(partial(estimate, free, record[-1], prior, start, Search.ALWAYS), 5)
+        warm = median_seconds(partial(estimate, free, record[-1], prior, start, Search.IF_UNEXPLAINED), 50)
         objective = Objective(free, record[-1], start)
         guess = objective.guess(start)
-        kernel = median_seconds(partial(objective.linearised, guess), 200)
-        generations = particle_swarm(objective, free.swarm, start, seed=1).generations
+        kernel = median_seconds(partial(objective.linearise, guess), 200)
+        generations = search_parameters(objective, free.swarm, start, seed=1).generations
         print(f"200 records, unknown: {', '.join(names)}, and the initial state")
         print(f"  warm {warm * 1e3:8.2f} ms   one linearisation is {kernel / warm:.1%} of it")
         print(f"  cold {cold * 1e3:8.2f} ms   {cold / warm:.0f} x warm, {generations} generations of the swarm")
@@ -55,7 +59,7 @@ def main() -> int:
     for window in record:
         state, _ = adapt(state, window)
     whole = median_seconds(lambda: adapt(state, record[-1]), 50)
-    print(f"the whole heart, warm: {whole * 1e3:.2f} ms a window")
+    print(f"the whole core, warm: {whole * 1e3:.2f} ms a window")
     return 0
 
 

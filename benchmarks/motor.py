@@ -1,4 +1,4 @@
-"""Windows of the simulated motor, as the daemon would cut them, without any clock."""
+"""Windows of the simulated motor, as the daemon cuts them, without a clock."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -15,8 +15,8 @@ RECORDS = 200
 
 
 def windows(scenario: Scenario, count: int) -> Iterator[Window]:
-    ticks = simulate(scenario)
+    samples = simulate(scenario)
     for index in range(count):
-        part = list(islice(ticks, RECORDS))
-        values = np.array([[tick.measured[name] for name in SIGNALS.values()] for tick in part])
-        yield Window.whole(index, part[0].time, scenario.sample_period, tuple(SIGNALS), values)
+        chunk = list(islice(samples, RECORDS))
+        values = np.array([[sample.measured[name] for name in SIGNALS.values()] for sample in chunk])
+        yield Window.whole(index, chunk[0].time, scenario.sample_period, tuple(SIGNALS), values)

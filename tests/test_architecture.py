@@ -18,7 +18,7 @@ BREACHES = {
     "adaptation opens a file": ("daemon/otolith/estimation/particle_swarm.py", "import pathlib"),
     "health publishes": ("daemon/otolith/health/status.py", "import zenoh"),
     "the twin knows the estimation": ("daemon/otolith/twin/definition.py", "import otolith.estimation.problem"),
-    "acquisition knows the outlets": ("daemon/otolith/acquisition/ring.py", "import otolith.publishing.recorder"),
+    "acquisition imports publishing": ("daemon/otolith/acquisition/ring.py", "import otolith.publishing.recorder"),
 }
 
 

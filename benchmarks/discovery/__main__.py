@@ -11,12 +11,12 @@ from multiprocessing import get_context
 import click
 from rich.console import Console, RenderableType
 
-from benchmarks.discovery import report, rivals
-from benchmarks.discovery.judge import judged
-from benchmarks.discovery.rivals import ask, cells
+from benchmarks.discovery import comparison, report
+from benchmarks.discovery.comparison import cells, run_cell
+from benchmarks.discovery.judge import run_case
 
 PROCESSES = 2
-ROOM = 250  # columns where nobody watches: a file has room
+FILE_WIDTH = 250  # columns, if the output is no terminal
 
 
 @click.group(help=__doc__)
@@ -31,30 +31,30 @@ def main() -> None:
 @click.option("--verbose", is_flag=True, help="A line for every case.")
 @click.option("--json", "as_json", is_flag=True)
 def cases_command(count: int, seed: int, processes: int, *, verbose: bool, as_json: bool) -> None:
-    """How often the search finds what is there; exit code 1 where a target is missed."""
+    """How often the search identifies the true component; exit code 1 if a target is missed."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        rows = list(pool.map(partial(judged, seed=seed), range(count), chunksize=4))
+        rows = list(pool.map(partial(run_case, seed=seed), range(count), chunksize=4))
     if as_json:
         click.echo(json.dumps(report.document(rows, seed), indent=2))
     else:
         _show(report.pages(rows, verbose=verbose))
-    sys.exit(0 if all(entry.met for entry in report.shares(rows)) else 1)
+    sys.exit(0 if all(share.met for share in report.shares(rows)) else 1)
 
 
-@main.command("rivals")
+@main.command("compare")
 @click.option("--repeats", default=3, show_default=True, help="Windows of each case and noise.")
 @click.option("--seed", default=1, show_default=True)
 @click.option("--processes", default=PROCESSES, show_default=True, type=click.IntRange(1, PROCESSES))
 @click.option("--json", "as_json", is_flag=True)
-def rivals_command(repeats: int, seed: int, processes: int, *, as_json: bool) -> None:
-    """What the search and PySINDy find in twelve typical cases under noise."""
+def compare_command(repeats: int, seed: int, processes: int, *, as_json: bool) -> None:
+    """The search and PySINDy in twelve typical cases with noise."""
     with_sindy = importlib.util.find_spec("pysindy") is not None
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        rows = list(pool.map(partial(ask, with_sindy=with_sindy), cells(repeats, seed)))
+        rows = list(pool.map(partial(run_cell, with_sindy=with_sindy), cells(repeats, seed)))
     if as_json:
-        click.echo(json.dumps(rivals.document(rows), indent=2))
+        click.echo(json.dumps(comparison.document(rows), indent=2))
         return
-    _show(rivals.pages(rows))
+    _show(comparison.pages(rows))
     if not with_sindy:
         click.echo("not compared: PySINDy, as it is not installed")
 
@@ -62,7 +62,7 @@ def rivals_command(repeats: int, seed: int, processes: int, *, as_json: bool) ->
 def _show(pages: Iterable[RenderableType]) -> None:
     console = Console()
     if not console.is_terminal:
-        console = Console(width=ROOM)
+        console = Console(width=FILE_WIDTH)
     for page in pages:
         console.print(page)
 

@@ -1,9 +1,10 @@
-"""Random components for the motor, as large as can just be seen and up to thirty times larger.
+"""Random components for the motor, 3 to 30 times as large as the detection limit.
 
 The detection limit is the amplitude whose gain in -2 log evidence, expected from the linear picture of a healthy
 window of the same operation, equals what the search asks for: amplitude² * information = numbers * log(values) +
-2 log(3 rivals) + CLEARLY. The information is what is left of the unit response beside parameters, trends and initial
-state, with all that is known of them; rivals are the structures of the machine (not of its sensors) in that window.
+2 log(3 alternatives) + DECISIVE. The information is the part of the unit response that parameters, trends and initial
+state do not explain, given the prior; alternatives are the candidates of the machine in that window,
+not those of its sensors.
 """
 
 import math
@@ -11,31 +12,38 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.discovery.motor import Faults, live, windows
-from benchmarks.discovery.setting import looked, prior, problem
+from benchmarks.discovery.motor import Faults, simulate_motor, windows
+from benchmarks.discovery.setting import prior, problem, screen
 from benchmarks.discovery.truth import SHAFT, Truth, is_a_parameter
 from otolith.acquisition.window import Array, Window
-from otolith.discovery.candidates import CLEARLY
+from otolith.discovery.candidates import DECISIVE
 from otolith.discovery.linear_response import BasisFunctions, CandidateForm, LinearResponse, candidate_library
 from otolith.discovery.search import ScreeningResult
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.augmented import base_model
 from otolith.twin.augmentation import sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, Kind, code_of
+from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
 
 SECONDS = 2.0
-LEAST, MOST = 3.0, 30.0  # of the detection limit
+MIN_RATIO, MAX_RATIO = 3.0, 30.0  # of the detection limit
 KINDS = ("steps", "constant", "sweep", "reversing")
-SUITS = {"logarithmic": ("steps", "sweep"), "Coulomb": ("reversing",), "Stribeck": ("steps", "sweep", "reversing")}
-INSIDE = 1.3  # how far an inner number stays away from the ends of what a window can show
-NEARLY_LINEAR = (0.75, 1.3)  # exponents in which a power is hardly told from a parameter, so they are not drawn
-LARGEST = {True: 0.1, False: 10.0}  # N·m on the shaft, V in the winding: more than that is no fault but another motor
+OPERATIONS_OF_FAMILY = {
+    "logarithmic": ("steps", "sweep"),
+    "Coulomb": ("reversing",),
+    "Stribeck": ("steps", "sweep", "reversing"),
+}
+INNER_MARGIN = 1.3  # factor between an inner number and the ends of its observable range
+NEARLY_LINEAR = (0.75, 1.3)  # exponents whose power is hardly distinguishable from a parameter: not drawn
+MAX_EFFECT = {
+    True: 0.1,
+    False: 10.0,
+}  # N·m on the shaft (True), V in the winding (False): a larger effect is no fault but another motor
 ATTEMPTS = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """A component and the window it is to be found in."""
+    """A component and a window with it."""
 
     number: int
     kind: str
@@ -46,65 +54,65 @@ class Case:
     prior: Prior
     window: Window
     false_gain: float
-    """Of a glance at the healthy window of the same operation."""
+    """Gain of the screening test in the healthy window of the same operation."""
 
 
 def draw(number: int, seed: int) -> Case:
-    """The case of that number; the families take turns.
+    """The case of that number, of one family after another.
 
     Raises:
-        RuntimeError: nothing of the family could be seen in any operation.
+        RuntimeError: no component of the family is detectable in any operation.
     """
     random = np.random.default_rng([seed, number])
     model = COMPONENT_FAMILIES[number % len(COMPONENT_FAMILIES)]
     for _ in range(ATTEMPTS):
-        found = _attempt(number, model, random)
-        if found is not None:
-            return found
+        case = _draw_once(number, model, random)
+        if case is not None:
+            return case
     raise RuntimeError(f"no case of family {model.name!r} in {ATTEMPTS} attempts")
 
 
-def _attempt(number: int, model: ComponentFamily, random: np.random.Generator) -> Case | None:
-    kind, operation = str(random.choice(SUITS.get(model.name, KINDS))), int(random.integers(2**31))
+def _draw_once(number: int, model: ComponentFamily, random: np.random.Generator) -> Case | None:
+    kind, operation = str(random.choice(OPERATIONS_OF_FAMILY.get(model.name, KINDS))), int(random.integers(2**31))
     known = prior(random)
     healthy = recorded(kind, Faults(), operation)
-    seen = looked(problem(), healthy, known)
-    chosen = _chosen(model, kind, seen.landscape, random)
+    screening = screen(problem(), healthy, known)
+    chosen = _chosen(model, kind, screening.response, random)
     if chosen is None:
         return None
-    times = float(np.exp(random.uniform(np.log(LEAST), np.log(MOST))))
-    truth = _truth(chosen, times, seen.landscape, random)
+    times = float(np.exp(random.uniform(np.log(MIN_RATIO), np.log(MAX_RATIO))))
+    truth = _truth(chosen, times, screening.response, random)
     if truth is None:
         return None
     try:
         window = recorded(kind, truth.faults(), operation)
-    except OverflowError:  # the motor ran away
+    except OverflowError:  # the motor is unstable
         return None
-    if not _is_there(truth, chosen, window, known):
+    if not _is_distinguishable(truth, chosen, window, known):
         return None
-    return Case(number, kind, times, truth, known, window, seen.gain)
+    return Case(number, kind, times, truth, known, window, screening.gain)
 
 
 def recorded(kind: str, faults: Faults, operation: int) -> Window:
     """One window; ``operation`` seeds set-points and noise."""
-    return windows(live(kind, SECONDS, faults, operation))[0]
+    return windows(simulate_motor(kind, SECONDS, faults, operation))[0]
 
 
 def _chosen(
     model: ComponentFamily, kind: str, landscape: LinearResponse, random: np.random.Generator
 ) -> CandidateForm | None:
-    """A structure of the family that this operation shows and that is no parameter; sites are as likely."""
+    """A candidate of the family that this operation excites and that is no parameter; all sites are equally likely."""
     twin = base_model(problem())
-    found: dict[int, list[CandidateForm]] = {}
-    for entry in candidate_library(twin, landscape.x):
-        source = sources(twin)[entry.source]
-        still = kind == "constant" and source.kind is Kind.SIGNAL  # only its noise moves
-        own = entry.model is model and entry.site < len(twin.sites)
-        if own and not still and not is_a_parameter(sites(twin)[entry.site].name, model.name, source.name):
-            found.setdefault(entry.site, []).append(entry)
-    if not found:
+    candidates: dict[int, list[CandidateForm]] = {}
+    for candidate in candidate_library(twin, landscape.x):
+        source = sources(twin)[candidate.source]
+        is_constant = kind == "constant" and source.kind is SourceKind.SIGNAL  # only its noise changes
+        own = candidate.model is model and candidate.site < len(twin.sites)
+        if own and not is_constant and not is_a_parameter(sites(twin)[candidate.site].name, model.name, source.name):
+            candidates.setdefault(candidate.site, []).append(candidate)
+    if not candidates:
         return None
-    of_site = found[int(random.choice(sorted(found)))]
+    of_site = candidates[int(random.choice(sorted(candidates)))]
     return of_site[int(random.integers(len(of_site)))]
 
 
@@ -113,16 +121,16 @@ def _inner(structure: CandidateForm, random: np.random.Generator) -> float:
         return 0.0
     low, high = structure.bounds
     while True:
-        inside = min(INSIDE, (high / low) ** 0.25)
-        found = float(np.exp(random.uniform(np.log(low * inside), np.log(high / inside))))
-        if structure.model.name != "power" or not NEARLY_LINEAR[0] < found < NEARLY_LINEAR[1]:
-            return found
+        inside = min(INNER_MARGIN, (high / low) ** 0.25)
+        value = float(np.exp(random.uniform(np.log(low * inside), np.log(high / inside))))
+        if structure.model.name != "power" or not NEARLY_LINEAR[0] < value < NEARLY_LINEAR[1]:
+            return value
 
 
 def _truth(
     structure: CandidateForm, times: float, landscape: LinearResponse, random: np.random.Generator
 ) -> Truth | None:
-    """With an amplitude of so many ``times`` the detection limit, or nothing where that would be another motor."""
+    """A component with ``times`` the amplitude of the detection limit, or None if its effect would be too large."""
     twin, model = base_model(problem()), structure.model
     two = len(model.phases) > 1
     inner, phase = _inner(structure, random), float(random.uniform(-np.pi, np.pi)) if two else 0.0
@@ -134,46 +142,46 @@ def _truth(
         largest = max(abs(truth.amplitude * truth.shape(float(x))) for x in landscape.x[structure.source])
     except OverflowError:
         return None
-    if model.name == "Stribeck":  # what it is at rest, or else a window far from rest shows the tail of a mountain
+    if model.name == "Stribeck":  # its effect at rest; a window far from rest shows only the tail
         largest = abs(truth.amplitude)
-    return truth if largest <= LARGEST[truth.site == SHAFT] else None
+    return truth if largest <= MAX_EFFECT[truth.site == SHAFT] else None
 
 
 def detection_limit(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:
-    """Amplitude in the unit of the site; infinite for what parameters do as well."""
+    """Amplitude in the unit of the site; infinite if parameters explain the component."""
     numbers = len(structure.model.phases) + (structure.model.inner is not None)
     own = len(base_model(problem()).sites)
-    rivals = sum(1 for entry in candidate_library(base_model(problem()), landscape.x) if entry.site < own)
-    asked = numbers * math.log(landscape.objective.count) + 2.0 * math.log(3.0 * rivals) + CLEARLY
-    return math.sqrt(asked / max(_information(structure, inner, phase, landscape), 1e-300))
+    alternatives = sum(1 for candidate in candidate_library(base_model(problem()), landscape.x) if candidate.site < own)
+    required = numbers * math.log(landscape.objective.count) + 2.0 * math.log(3.0 * alternatives) + DECISIVE
+    return math.sqrt(required / max(_information(structure, inner, phase, landscape), 1e-300))
 
 
 def _information(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:
-    """Of the amplitude: what a fit gains by the square of what it finds, whatever the noise happens to be."""
+    """Information about the amplitude: gain of the fit per squared amplitude, independent of the noise."""
     curve = BasisFunctions(
-        np.array([code_of(structure.model.name)]),
+        np.array([family_code(structure.model.name)]),
         np.array([structure.source]),
         np.array([structure.site]),
         np.array([inner]),
         np.array([phase]),
     )
-    gains = landscape.gains(landscape.responses(curve), np.zeros((1, 2), dtype=np.int64))
+    gains = landscape.score_responses(landscape.responses(curve), np.zeros((1, 2), dtype=np.int64))
     amplitude: float = gains.amplitudes[0, 0]
     return float(gains.gain[0] / amplitude**2) if amplitude else 0.0
 
 
-def _is_there(truth: Truth, structure: CandidateForm, window: Window, known: Prior) -> bool:
-    """Whether the window lets this structure be told, and its inner number lies within what it can show."""
+def _is_distinguishable(truth: Truth, structure: CandidateForm, window: Window, known: Prior) -> bool:
+    """Whether the candidate is in the library for this window, and its inner number within the bounds."""
     values: Array = window.values
     if not np.isfinite(values).all() or float(np.abs(values).max()) > 100.0:
         return False
-    x = _seen(window, known).landscape.x
-    for entry in candidate_library(base_model(problem()), x):
-        if (entry.site, entry.model, entry.source) == (structure.site, structure.model, structure.source):
-            low, high = entry.bounds
+    x = screen(problem(), window, known).response.x
+    for candidate in candidate_library(base_model(problem()), x):
+        if (candidate.site, candidate.model, candidate.source) == (structure.site, structure.model, structure.source):
+            low, high = candidate.bounds
             return structure.model.inner is None or low <= truth.inner <= high
     return False
 
 
-def _seen(window: Window, known: Prior) -> ScreeningResult:
-    return looked(problem(), window, known)
+def _screened(window: Window, known: Prior) -> ScreeningResult:
+    return screen(problem(), window, known)

@@ -1,4 +1,4 @@
-"""One case searched and judged."""
+"""Search of one case, compared with the truth."""
 
 import math
 from dataclasses import dataclass
@@ -6,19 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.discovery.draw import Case, draw
-from benchmarks.discovery.setting import Ranked, problem, ranked
+from benchmarks.discovery.setting import RankedHypotheses, problem, search_and_rank
 from benchmarks.discovery.truth import same
-from otolith.discovery.candidates import CLEARLY
+from otolith.discovery.candidates import DECISIVE
 from otolith.discovery.hypotheses import FaultType, FittedHypothesis
 from otolith.estimation.augmented import indices
 
-APART = 2.0 * math.log(150.0)  # in -2 log evidence: what decides between two explanations
-INTERVAL = 1.96  # standard deviations on either side of which 95 % lie
+DECISIVE = 2.0 * math.log(150.0)  # in -2 log evidence: decides between two hypotheses
+QUANTILE_95 = 1.96  # standard deviations on either side of which 95 % lie
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """One line of the details."""
+class CaseResult:
+    """Result of one case."""
 
     number: int
     kind: str
@@ -30,73 +30,78 @@ class Judged:
     amplitude: float
     inner: float
     best: str
-    """Key of the best explanation, or its reason where it is no component."""
+    """Key of the best hypothesis, or its fault type if it is no component."""
     best_family: str
     first: bool
-    """The truth, or what is the same in this motor, is best."""
+    """The truth, or an equivalent of it, is best."""
     decided: bool
-    """No other than the truth's equals comes within a factor of 150 of the best."""
+    """Only equivalents of the truth are within a factor of 150 of the best."""
     named: bool
     """The truth is within a factor of 150 of the best."""
     behind: float
-    """How far in -2 log evidence the truth is behind the best; infinite where it was not tried."""
+    """Distance of the truth from the best in -2 log evidence; infinite if it was not tried."""
     tried: bool
-    """The truth itself was polished."""
+    """The true hypothesis was fitted."""
     noticed: bool
-    """By the glance."""
+    """By the screening test."""
     detected: bool
     """A component or a sensor is clearly better than nothing and than other parameters."""
-    found_amplitude: float
-    """By the explanation that is the truth; not a number where it was not tried."""
+    estimated_amplitude: float
+    """By the true hypothesis; not a number if it was not tried."""
     sd: float
     chi_square: float
     """Of the truth, per value."""
     ranking: tuple[tuple[str, float], ...]
-    """The first few explanations, and how far each is behind."""
+    """The first hypotheses, and the distance of each from the best."""
     false_gain: float
 
     @property
-    def off(self) -> float:
-        """How many standard deviations the amplitude is off."""
-        return (self.found_amplitude - self.amplitude) / self.sd if self.tried else math.nan
+    def normalised_error(self) -> float:
+        """Error of the amplitude in its standard deviations."""
+        return (self.estimated_amplitude - self.amplitude) / self.sd if self.tried else math.nan
 
     @property
     def covered(self) -> bool:
         """Whether the 95 % interval has the true amplitude."""
-        return abs(self.off) <= INTERVAL
+        return abs(self.normalised_error) <= QUANTILE_95
 
 
-def judged(number: int, seed: int) -> Judged:
+def run_case(number: int, seed: int) -> CaseResult:
     """The case of that number."""
     case = draw(number, seed)
-    return verdict(case, ranked(problem(), case.window, case.prior))
+    return judge(case, search_and_rank(problem(), case.window, case.prior))
 
 
-def verdict(case: Case, found: Ranked) -> Judged:
-    """What came out of a search.
+def judge(case: Case, ranked: RankedHypotheses) -> CaseResult:
+    """Compare a search with the truth.
 
-    Explanations that are the same function as the truth count as one with it: the best of them is the truth, and two
-    of them do not have to be told apart to be decided.
+    Hypotheses that are equivalent to the truth count as the truth, and need not be decided between.
     """
-    alike, least = same(case.truth), found.deviances[0]
-    best, own = found.explanations[0], None
-    for entry in found.explanations:
-        own = entry if entry.name == case.truth.key else own
-    right = [value for entry, value in zip(found.explanations, found.deviances, strict=True) if entry.name in alike]
-    first = best.name in alike
+    equivalent, least = same(case.truth), ranked.deviances[0]
+    best, true_hypothesis = ranked.hypotheses[0], None
+    for hypothesis in ranked.hypotheses:
+        true_hypothesis = hypothesis if hypothesis.name == case.truth.key else true_hypothesis
+    right = [
+        value
+        for hypothesis, value in zip(ranked.hypotheses, ranked.deviances, strict=True)
+        if hypothesis.name in equivalent
+    ]
+    first = best.name in equivalent
     others = [
         value - least
-        for place, (entry, value) in enumerate(zip(found.explanations, found.deviances, strict=True))
-        if place and not (first and entry.name in alike)
+        for index, (hypothesis, value) in enumerate(zip(ranked.hypotheses, ranked.deviances, strict=True))
+        if index and not (first and hypothesis.name in equivalent)
     ]
     simpler = [
         value - least
-        for entry, value in zip(found.explanations, found.deviances, strict=True)
-        if entry.reason in {FaultType.NOTHING, FaultType.PARAMETER}
+        for hypothesis, value in zip(ranked.hypotheses, ranked.deviances, strict=True)
+        if hypothesis.type in {FaultType.NOTHING, FaultType.PARAMETER}
     ]
     behind = min(right, default=math.inf) - least
-    amplitude, sd, left = (math.nan, math.nan, math.nan) if own is None else _measured(own, found.count)
-    return Judged(
+    amplitude, sd, chi_square = (
+        (math.nan, math.nan, math.nan) if true_hypothesis is None else _amplitude(true_hypothesis, ranked.count)
+    )
+    return CaseResult(
         number=case.number,
         kind=case.kind,
         truth=case.truth.key,
@@ -107,41 +112,42 @@ def verdict(case: Case, found: Ranked) -> Judged:
         best=label(best),
         best_family=_family(best, case),
         first=first,
-        decided=min(others, default=math.inf) > APART,
-        named=behind <= APART,
+        decided=min(others, default=math.inf) > DECISIVE,
+        named=behind <= DECISIVE,
         behind=behind,
-        tried=own is not None,
-        noticed=found.glance.gain > 0.0,
-        detected=min(simpler) > CLEARLY,
-        found_amplitude=amplitude,
+        tried=true_hypothesis is not None,
+        noticed=ranked.screening.gain > 0.0,
+        detected=min(simpler) > DECISIVE,
+        estimated_amplitude=amplitude,
         sd=sd,
-        chi_square=left,
+        chi_square=chi_square,
         ranking=tuple(
-            (label(entry), value - least) for entry, value in zip(found.explanations, found.deviances, strict=True)
+            (label(hypothesis), value - least)
+            for hypothesis, value in zip(ranked.hypotheses, ranked.deviances, strict=True)
         )[:6],
         false_gain=case.false_gain,
     )
 
 
-def label(entry: FittedHypothesis) -> str:
-    """Of any explanation."""
-    return entry.reason.value if entry.reason in {FaultType.NOTHING, FaultType.PARAMETER} else entry.name
+def label(hypothesis: FittedHypothesis) -> str:
+    """Name of a hypothesis."""
+    return hypothesis.type.value if hypothesis.type in {FaultType.NOTHING, FaultType.PARAMETER} else hypothesis.name
 
 
 def _family(best: FittedHypothesis, case: Case) -> str:
-    """For the table: of an equal of the truth it is the truth's."""
+    """Family for the table; an equivalent of the truth has the family of the truth."""
     if best.name in same(case.truth):
         return case.truth.family
-    if best.reason is FaultType.COMPONENT:
+    if best.type is FaultType.COMPONENT:
         return "two or more" if len(best.problem.components) > 1 else best.problem.components[0].family
-    return "sensor" if best.reason is FaultType.SENSOR else best.reason.name.lower()
+    return "sensor" if best.type is FaultType.SENSOR else best.type.name.lower()
 
 
-def _measured(entry: FittedHypothesis, count: float) -> tuple[float, float, float]:
+def _amplitude(hypothesis: FittedHypothesis, count: float) -> tuple[float, float, float]:
     """Amplitude, its standard deviation with trends and initial state unknown, and χ² per value."""
-    place = indices(entry.problem, 0)[0]
-    normal = entry.fit.jacobian.T @ entry.fit.jacobian
+    index = indices(hypothesis.problem, 0)[0]
+    normal = hypothesis.fit.result.jacobian.T @ hypothesis.fit.result.jacobian
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-13, hermitian=True)
-    sd = math.sqrt(max(float(inverse[place, place]), 0.0)) / float(size[place])
-    return float(entry.fit.guess[place]), max(sd, 1e-300), entry.chi_square / count
+    sd = math.sqrt(max(float(inverse[index, index]), 0.0)) / float(size[index])
+    return float(hypothesis.fit.result.guess[index]), max(sd, 1e-300), hypothesis.chi_square / count

@@ -1,7 +1,7 @@
-"""A DC motor with a component that its twin lacks, integrated by other equations and another integrator.
+"""A DC motor with a component that its twin lacks.
 
-Nothing of the twin is used here, else the search would be tested against itself. The voltage is held from record to
-record; the load torque is a function of the speed and moves along.
+Equations and integrator are independent of the twin, so that the search is not tested against itself. The voltage is
+held from record to record; the load torque follows the speed.
 """
 
 from collections.abc import Callable
@@ -17,29 +17,29 @@ STEPS = 10  # of the integrator, per record
 SIGNALS = ("V_a", "T_load", "i", "omega")
 NOISE = {"T_load": 0.0002, "i": 0.005, "omega": 0.02}
 
-# What enters, of time (s), angle (rad), voltage (V), load torque (N·m), current (A) and speed (rad/s).
+# A torque or voltage by time (s), angle (rad), voltage (V), load torque (N·m), current (A) and speed (rad/s).
 Term = Callable[[float, float, float, float, float, float], float]
 
 
 def nothing(*_: float) -> float:
-    """Of a healthy motor."""
+    """The term of a healthy motor."""
     return 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What the twin does not know."""
+    """Differences from the twin."""
 
     torque: Term = nothing
     """N·m on the shaft, added."""
     voltage: Term = nothing
     """V in the winding, added."""
     current_gain: float = 1.0
-    """Of its sensor."""
+    """Of the current sensor."""
     resistance: float = R_A
     """Ohm."""
     since: float = 0.0
-    """s: from when on torque and voltage are there."""
+    """Onset of torque and voltage, s."""
 
 
 def speeds(kind: str, seconds: float, random: np.random.Generator) -> Callable[[float], float]:
@@ -54,30 +54,30 @@ def speeds(kind: str, seconds: float, random: np.random.Generator) -> Callable[[
     return lambda t: float(levels[int(t / 0.7)])
 
 
-def live(kind: str, seconds: float, faults: Faults, seed: int, *, noisy: bool = True) -> Array:
-    """(records, signals) as its sensors tell."""
+def simulate_motor(kind: str, seconds: float, faults: Faults, seed: int, *, noisy: bool = True) -> Array:
+    """(records, signals) as measured."""
     random = np.random.default_rng(seed)
-    wanted = speeds(kind, seconds, random)
+    set_point = speeds(kind, seconds, random)
     records = round(seconds / PERIOD)
-    told = np.empty((records, 4))
+    measured = np.empty((records, 4))
     state, integral = [0.0, 0.0, 0.0], 0.0
-    start = -2.0  # so that the loop has settled
+    start = -2.0  # s: the control loop settles before the first record
     for record in range(round(start / PERIOD), records):
         moment = record * PERIOD
-        error = wanted(max(moment, 0.0)) - state[1]
+        error = set_point(max(moment, 0.0)) - state[1]
         integral += error * PERIOD
-        voltage = 0.3 * error + 0.6 * integral + 0.08 * wanted(max(moment, 0.0))
+        voltage = 0.3 * error + 0.6 * integral + 0.08 * set_point(max(moment, 0.0))
         if record >= 0:
-            told[record] = voltage, LOAD * state[1], state[0] * faults.current_gain, state[1]
+            measured[record] = voltage, LOAD * state[1], state[0] * faults.current_gain, state[1]
         state = _advance(state, moment, PERIOD, voltage, faults)
     if noisy:
         for column, name in enumerate(SIGNALS):
-            told[:, column] += NOISE.get(name, 0.0) * random.standard_normal(records)
-    return told
+            measured[:, column] += NOISE.get(name, 0.0) * random.standard_normal(records)
+    return measured
 
 
 def _advance(state: list[float], moment: float, period: float, voltage: float, faults: Faults) -> list[float]:
-    """The classical Runge-Kutta method in steps that a step of dry friction does not disturb much."""
+    """The classical Runge-Kutta method, with steps small enough for dry friction."""
     step = period / STEPS
 
     def rates(t: float, i: float, w: float, angle: float) -> tuple[float, float, float]:
@@ -97,9 +97,11 @@ def _advance(state: list[float], moment: float, period: float, voltage: float, f
     return state
 
 
-def windows(told: Array, records: int = 200) -> list[Window]:
-    """As the daemon would cut them."""
+def windows(measured: Array, records: int = 200) -> list[Window]:
+    """Consecutive windows, as the daemon cuts them."""
     return [
-        Window.whole(index, index * records * PERIOD, PERIOD, SIGNALS, told[index * records : (index + 1) * records])
-        for index in range(len(told) // records)
+        Window.whole(
+            index, index * records * PERIOD, PERIOD, SIGNALS, measured[index * records : (index + 1) * records]
+        )
+        for index in range(len(measured) // records)
     ]

@@ -1,4 +1,4 @@
-"""What many cases come to."""
+"""Shares and tables of many cases."""
 
 import math
 from collections import Counter
@@ -9,38 +9,38 @@ from typing import Any
 from rich.console import RenderableType
 from rich.table import Table
 
-from benchmarks.discovery.judge import Judged
-from otolith.twin.component_families import NAMES
+from benchmarks.discovery.judge import CaseResult
+from otolith.twin.component_families import FAMILY_NAMES
 
 FIRST_AT_LEAST, NAMED_AT_LEAST, COVERED = 0.90, 0.98, (0.93, 0.97)
-OTHERS = ("two or more", "sensor", "parameter", "nothing")  # that a family may be taken for
+OTHERS = ("two or more", "sensor", "parameter", "nothing")  # results that are no single component
 SHORT = {"negative exponential": "neg. exp.", "exponential": "exp.", "logarithmic": "log."}
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """So many of so many."""
+    """A share of the cases, and its target."""
 
     name: str
     hits: int
     of: int
     low: float = 0.0
-    """What is asked for at least."""
+    """Target, with ``high``."""
     high: float = 1.0
 
     @property
     def value(self) -> float:
-        """From 0 to 1; not a number of none."""
+        """From 0 to 1; not a number without cases."""
         return self.hits / self.of if self.of else math.nan
 
     @property
     def met(self) -> bool:
-        """Whether the target is."""
+        """Whether the target is met."""
         return not self.of or self.low <= self.value <= self.high
 
 
-def shares(rows: Sequence[Judged]) -> list[Share]:
-    """All shares; those without a target have one that is always met."""
+def shares(rows: Sequence[CaseResult]) -> list[Share]:
+    """All shares; one without a target is always met."""
     decided = [row for row in rows if row.decided]
     tried = [row for row in rows if row.tried]
     return [
@@ -49,15 +49,15 @@ def shares(rows: Sequence[Judged]) -> list[Share]:
         Share("amplitude within its 95 % interval", sum(row.covered for row in tried), len(tried), *COVERED),
         Share("first among all", sum(row.first for row in rows), len(rows)),
         Share("decided", len(decided), len(rows)),
-        Share("truth itself polished", len(tried), len(rows)),
+        Share("true hypothesis fitted", len(tried), len(rows)),
         Share("detected by the search", sum(row.detected for row in rows), len(rows)),
-        Share("noticed by the glance", sum(row.noticed for row in rows), len(rows)),
-        Share("healthy windows noticed by the glance", sum(row.false_gain > 0.0 for row in rows), len(rows)),
+        Share("noticed by screening", sum(row.noticed for row in rows), len(rows)),
+        Share("healthy windows noticed by screening", sum(row.false_gain > 0.0 for row in rows), len(rows)),
     ]
 
 
-def pages(rows: Sequence[Judged], *, verbose: bool) -> Iterator[RenderableType]:
-    """What a person reads."""
+def pages(rows: Sequence[CaseResult], *, verbose: bool) -> Iterator[RenderableType]:
+    """All tables."""
     if verbose:
         yield _lines(rows)
     yield _confusion(rows)
@@ -65,32 +65,32 @@ def pages(rows: Sequence[Judged], *, verbose: bool) -> Iterator[RenderableType]:
     yield _shares(rows)
 
 
-def document(rows: Sequence[Judged], seed: int) -> dict[str, Any]:
+def document(rows: Sequence[CaseResult], seed: int) -> dict[str, Any]:
     """For ``--json``."""
     return {
         "seed": seed,
-        "shares": [asdict(entry) | {"value": entry.value, "met": entry.met} for entry in shares(rows)],
-        "cases": [asdict(row) | {"off": row.off, "covered": row.covered} for row in rows],
+        "shares": [asdict(share) | {"value": share.value, "met": share.met} for share in shares(rows)],
+        "cases": [asdict(row) | {"normalised_error": row.normalised_error, "covered": row.covered} for row in rows],
     }
 
 
-def _confusion(rows: Sequence[Judged]) -> Table:
-    table = Table(title="true family down, family of the best explanation across", title_justify="left")
+def _confusion(rows: Sequence[CaseResult]) -> Table:
+    table = Table(title="true family down, family of the best hypothesis across", title_justify="left")
     table.add_column("")
-    for name in (*NAMES, *OTHERS):
+    for name in (*FAMILY_NAMES, *OTHERS):
         table.add_column(SHORT.get(name, name), justify="right")
     counts = Counter((row.family, row.best_family) for row in rows)
-    for family in NAMES:
-        cells = [counts[family, name] for name in (*NAMES, *OTHERS)]
+    for family in FAMILY_NAMES:
+        cells = [counts[family, name] for name in (*FAMILY_NAMES, *OTHERS)]
         table.add_row(family, *(str(cell) if cell else "·" for cell in cells))
     return table
 
 
-def _by_family(rows: Sequence[Judged]) -> Table:
+def _by_family(rows: Sequence[CaseResult]) -> Table:
     table = Table(title="by true family", title_justify="left")
-    for name in ("", "cases", "decided", "first of decided", "named", "polished", "covered", "detected", "noticed"):
+    for name in ("", "cases", "decided", "first of decided", "named", "fitted", "covered", "detected", "noticed"):
         table.add_column(name, justify="right" if name else "left")
-    for family in NAMES:
+    for family in FAMILY_NAMES:
         own = [row for row in rows if row.family == family]
         decided, tried = [row for row in own if row.decided], [row for row in own if row.tried]
         table.add_row(
@@ -107,20 +107,32 @@ def _by_family(rows: Sequence[Judged]) -> Table:
     return table
 
 
-def _shares(rows: Sequence[Judged]) -> Table:
+def _shares(rows: Sequence[CaseResult]) -> Table:
     table = Table(title="shares", title_justify="left")
-    for name in ("", "share", "of", "asked", ""):
+    for name in ("", "share", "of", "target, %", ""):
         table.add_column(name, justify="right" if name else "left")
-    for entry in shares(rows):
-        asked = "" if (entry.low, entry.high) == (0.0, 1.0) else f"{100 * entry.low:.0f} to {100 * entry.high:.0f} %"
-        met = ("met" if entry.met else "[red]missed") if asked else ""
-        table.add_row(entry.name, _percent(entry.hits, entry.of), str(entry.of), asked, met)
+    for share in shares(rows):
+        target = "" if (share.low, share.high) == (0.0, 1.0) else f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
+        met = ("met" if share.met else "[red]missed") if target else ""
+        table.add_row(share.name, _percent(share.hits, share.of), str(share.of), target, met)
     return table
 
 
-def _lines(rows: Sequence[Judged]) -> Table:
-    table = Table(title="cases: how far explanations are behind the best, in -2 log evidence", title_justify="left")
-    for name in ("", "operation", "truth", "× limit", "amplitude", "inner", "found", "off/sd", "behind", "", "ranking"):
+def _lines(rows: Sequence[CaseResult]) -> Table:
+    table = Table(title="cases: distance of hypotheses from the best, in -2 log evidence", title_justify="left")
+    for name in (
+        "",
+        "operation",
+        "truth",
+        "× limit",
+        "amplitude",
+        "inner",
+        "estimate",
+        "error/sd",
+        "behind",
+        "",
+        "ranking",
+    ):
         table.add_column(name)
     for row in rows:
         marks = ("first" if row.first else "", "decided" if row.decided else "", "" if row.named else "[red]not named")
@@ -131,8 +143,8 @@ def _lines(rows: Sequence[Judged]) -> Table:
             f"{row.times:.1f}",
             f"{row.amplitude:.4g}",
             f"{row.inner:.4g}",
-            f"{row.found_amplitude:.4g}",
-            f"{row.off:.1f}",
+            f"{row.estimated_amplitude:.4g}",
+            f"{row.normalised_error:.1f}",
             f"{row.behind:.1f}",
             " ".join(filter(None, marks)),
             ", ".join(f"{name} {behind:.0f}" for name, behind in row.ranking),

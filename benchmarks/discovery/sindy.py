@@ -1,4 +1,4 @@
-"""PySINDy on a typical case, with all that could help it.
+"""PySINDy on a typical case, with every advantage.
 
 (A. A. Kaptanoglu et al., PySINDy: a comprehensive package, JOSS 7, 2022; U. Fasel et al., Ensemble-SINDy, 2022.)
 
@@ -6,7 +6,7 @@ In its favour: the known part of the motor's equations, with its true parameters
 that only the component is left to find, and both are smoothed alike; the library has sines of the right frequency, the
 right rate of the exponential and the sign of the speed beside all polynomials of degree 2; columns are of unit size,
 and derivatives in shares of what drives them; and its smoothing, ridge and threshold are those that do best over the
-whole table, which nobody knows beforehand.
+whole table, which is unknown beforehand.
 """
 
 import importlib
@@ -22,7 +22,7 @@ from benchmarks.discovery.typical import PERIOD, Answer, Recorded, Typical, erro
 from otolith.acquisition.window import Array
 
 THRESHOLDS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.2)  # of a coefficient, in shares of what drives the motor
-RIDGES = (0.05, 5.0)  # its own, and one that holds columns that are nearly the same
+RIDGES = (0.05, 5.0)  # its default, and one for nearly collinear columns
 SMOOTHED = (7, 21)  # records
 DRIVE = np.array([0.05, 5.0])  # N·m, V: about what the current's torque and the voltage are
 FREQUENCIES = (5.0, 10.0, 20.0, 40.0)  # rad/s
@@ -32,22 +32,22 @@ STLSQ, ENSEMBLE = "STLSQ", "ensemble"
 MODELS = 10
 
 
-def answers(case: Typical, seen: Recorded, seed: int) -> dict[str, Answer]:
-    """One for each variant and setting; its name has no space, and what is after a space is the setting."""
-    sindy = importlib.import_module("pysindy")  # it has no types, and not everybody has it
-    found = {}
+def answers(case: Typical, record: Recorded, seed: int) -> dict[str, Answer]:
+    """One answer per variant and setting; the name is the variant, a space, the setting."""
+    sindy = importlib.import_module("pysindy")  # optional, and without types
+    answers = {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of thresholds that leave nothing
+        warnings.simplefilter("ignore")  # about thresholds that remove all terms
         for smoothed in SMOOTHED:
-            smooth, targets = left_over(sindy, seen.told, smoothed)
+            smooth, targets = unexplained_derivatives(sindy, record.measured, smoothed)
             names, columns = library(sindy, smooth)
-            inside = slice(smoothed // 2, -(smoothed // 2))  # a filter is worst at the ends
-            theta, wanted = columns / _size(columns), targets / DRIVE
+            inside = slice(smoothed // 2, -(smoothed // 2))  # the filter is inaccurate at the ends
+            theta, target = columns / _size(columns), targets / DRIVE
             for name, optimizer in _optimizers(sindy):
                 np.random.seed(seed)  # noqa: NPY002 - the ensemble draws from the global generator
-                terms = np.asarray(optimizer.fit(theta[inside], wanted[inside]).coef_) * DRIVE[:, None]
-                found[f"{name}/{smoothed}"] = _answer(case, seen, names, theta, terms)
-    return found
+                terms = np.asarray(optimizer.fit(theta[inside], target[inside]).coef_) * DRIVE[:, None]
+                answers[f"{name}/{smoothed}"] = _answer(case, record, names, theta, terms)
+    return answers
 
 
 def _optimizers(sindy: Any) -> Iterator[tuple[str, Any]]:
@@ -63,16 +63,16 @@ def _size(columns: Array) -> Array:
     return np.asarray(np.maximum(np.sqrt((columns**2).mean(axis=0)), 1e-12))
 
 
-def left_over(sindy: Any, told: Array, smoothed: int) -> tuple[Array, Array]:
-    """(records, signals) -> smoothed signals, and (records, 2) torque and voltage that known equations leave.
+def unexplained_derivatives(sindy: Any, measured: Array, smoothed: int) -> tuple[Array, Array]:
+    """(records, signals) -> smoothed signals, and (records, 2) torque and voltage beyond the known equations.
 
-    The voltage jumps at a record and holds to the next: a centred difference sees the mean of two, so this is what is
-    smoothed with the other signals.
+    The voltage jumps at a record and holds to the next: a centred difference sees the mean of two, so the mean
+    is smoothed with the other signals.
     """
-    signals = told.copy()
-    signals[1:, 0] = (told[1:, 0] + told[:-1, 0]) / 2.0
+    signals = measured.copy()
+    signals[1:, 0] = (measured[1:, 0] + measured[:-1, 0]) / 2.0
     difference = sindy.SmoothedFiniteDifference(smoother_kws={"window_length": smoothed, "polyorder": 3})
-    slopes = np.asarray(difference._differentiate(signals, PERIOD * np.arange(len(told), dtype=np.float64)))
+    slopes = np.asarray(difference._differentiate(signals, PERIOD * np.arange(len(measured), dtype=np.float64)))
     smooth = np.asarray(difference.smoothed_x_)
     held, load, i, omega = smooth.T
     torque = J * slopes[:, SIGNALS.index("omega")] - (K_T * i - load - D * omega)
@@ -97,8 +97,8 @@ def library(sindy: Any, smooth: Array) -> tuple[list[str], Array]:
     return names + list(more), np.column_stack([*columns, *more.values()])
 
 
-def wanted_terms(truth: Truth) -> frozenset[str]:
-    """The columns that are the truth, or what is the same in this motor."""
+def true_terms(truth: Truth) -> frozenset[str]:
+    """The columns of the truth and of its equivalents in this motor."""
     inner, source = f"{truth.inner:g}", truth.source
     match truth.family:
         case "constant":
@@ -114,17 +114,17 @@ def wanted_terms(truth: Truth) -> frozenset[str]:
     return frozenset({source})
 
 
-def _answer(case: Typical, seen: Recorded, names: list[str], theta: Array, terms: Array) -> Answer:
+def _answer(case: Typical, record: Recorded, names: list[str], theta: Array, terms: Array) -> Answer:
     """``theta`` (records, columns) of unit size, ``terms`` (2, columns): torque, then voltage."""
     there = terms != 0.0
     if case.truth is None:
         return Answer(not there.any(), np.nan, int(there.sum()))
-    equation, wanted = 0 if case.truth.site == SHAFT else 1, wanted_terms(case.truth)
-    right = np.array([name in wanted for name in names])
+    equation, terms_true = 0 if case.truth.site == SHAFT else 1, true_terms(case.truth)
+    right = np.array([name in terms_true for name in names])
     own = terms[equation]
     spurious = int(there.sum() - there[equation, right].sum())
     largest = int(np.abs(own).argmax())
     if not own.any() or not right[largest]:
         return Answer(False, np.nan, spurious)
     effect = theta[:, right] @ own[right]
-    return Answer(True, error_of(effect, seen.effect(case.truth)), spurious)
+    return Answer(True, error_of(effect, record.effect(case.truth)), spurious)

@@ -1,4 +1,4 @@
-"""What a component is in truth: written down once more, so that a mistake in the twin's formulas would show."""
+"""True components: the formulas are repeated here, so that an error in those of the twin shows."""
 
 import math
 from collections.abc import Callable
@@ -53,42 +53,42 @@ class Truth:
         return SHAPES[self.family](x, self.inner, self.phase)
 
     def faults(self) -> Faults:
-        """For the simulator, once: what it enters remembers at which angle it began."""
+        """For one simulation: the term keeps the angle of its first record."""
         term = self._term()
         return Faults(torque=term) if self.site == SHAFT else Faults(voltage=term)
 
     def _term(self) -> Term:
         place = SOURCES.index(self.source) if self.source else 0
-        begun: list[float] = []  # the angle at the first record, from which the twin counts
+        first_angle: list[float] = []  # at the first record, where the twin's angle is zero
 
         def term(*x: float) -> float:
-            if not begun:
-                begun.append(x[1])
-            return self.amplitude * self.shape(x[place] - begun[0] if place == 1 else x[place])
+            if not first_angle:
+                first_angle.append(x[1])
+            return self.amplitude * self.shape(x[place] - first_angle[0] if place == 1 else x[place])
 
         return term
 
 
 def same(truth: Truth) -> frozenset[str]:
-    """The keys of all that is the same function in this motor, the truth itself among them.
+    """The keys of all components that are equivalent to the truth in this motor, and its own.
 
     The load torque is 0.006 N·m·s/rad times the speed, so what depends on one depends on the other, but for a
     logarithm, whose constant tells them apart. A sensor of an input that has an offset or is off in its gain does to
     the twin what a constant or a gain of this input at its site does.
     """
-    found = {truth.key}
+    keys = {truth.key}
     other = {"T_load": "omega", "omega": "T_load"}.get(truth.source)
     if other is not None and truth.family != "logarithmic":
-        found.add(f"{truth.site}/{truth.family}/{other}")
+        keys.add(f"{truth.site}/{truth.family}/{other}")
     signal = "T_load" if truth.site == SHAFT else "V_a"
     if truth.family == "constant":
-        found.add(f"sensor of {signal}/constant")
+        keys.add(f"sensor of {signal}/constant")
     if truth.family == "linear" and (truth.site, truth.source) == (WINDING, "V_a"):
-        found.add("sensor of V_a/linear/V_a")
-    return frozenset(found)
+        keys.add("sensor of V_a/linear/V_a")
+    return frozenset(keys)
 
 
 def is_a_parameter(site: str, family: str, source: str) -> bool:
-    """Whether it is what a free parameter does: D by the speed or the load torque, R_a by the current."""
+    """Whether it is equivalent to a free parameter: D by the speed or the load torque, R_a by the current."""
     moved = {(SHAFT, "omega"), (SHAFT, "T_load"), (WINDING, "i")}
     return family == "linear" and (site, source) in moved

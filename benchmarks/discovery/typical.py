@@ -1,15 +1,15 @@
-"""Twelve typical components, and what sensors of a given noise tell of them."""
+"""Twelve typical components, and their records with a given sensor noise."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.discovery.motor import SIGNALS, Faults, live
+from benchmarks.discovery.motor import SIGNALS, Faults, simulate_motor
 from benchmarks.discovery.truth import SHAFT, SOURCES, WINDING, Truth
 from otolith.acquisition.window import Array
 
 SECONDS, PERIOD = 2.0, 0.01
-FLOOR = 1e-3  # of a signal's standard deviation: what is believed of a sensor that has no noise at all
+FLOOR = 1e-3  # of a signal's standard deviation: assumed noise of an ideal sensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +43,12 @@ TYPICAL = (
 class Recorded:
     """One window of a typical case."""
 
-    told: Array
-    """(records, signals) as sensors tell."""
+    measured: Array
+    """(records, signals)."""
     noise: Array
     """(signals,) standard deviations."""
     x: Array
-    """(records, sources) in truth, in the order of :data:`SOURCES`."""
+    """(records, sources) true values, in the order of :data:`SOURCES`."""
 
     def effect(self, truth: Truth) -> Array:
         """(records,) of a component, in the unit of its site."""
@@ -59,11 +59,11 @@ class Recorded:
 def record(case: Typical, share: float, seed: int) -> Recorded:
     """With noise of that ``share`` of each signal's standard deviation, the inputs' among them."""
     faults = Faults() if case.truth is None else case.truth.faults()
-    clean = live(case.kind, SECONDS, faults, seed, noisy=False)
+    clean = simulate_motor(case.kind, SECONDS, faults, seed, noisy=False)
     random = np.random.default_rng([seed, 1])
     size = clean.std(axis=0)
-    told = clean + share * size * random.standard_normal(clean.shape)
-    return Recorded(told, max(share, FLOOR) * size, inputs_of(clean))
+    measured = clean + share * size * random.standard_normal(clean.shape)
+    return Recorded(measured, max(share, FLOOR) * size, inputs_of(clean))
 
 
 def inputs_of(signals: Array) -> Array:
@@ -76,16 +76,16 @@ def inputs_of(signals: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What somebody found in one window."""
+    """The result of one method in one window."""
 
     right: bool
-    """Site, family and input, or an equal of them; of a healthy motor that there is nothing."""
+    """Site, family and input are true or equivalent; for a healthy motor, nothing is identified."""
     error: float
-    """Of its effect on the machine, in shares of the true one; not a number where it is not right."""
+    """Relative error of its effect on the machine; not a number if it is not right."""
     spurious: int
-    """Terms that are not there."""
+    """Number of terms that do not exist."""
 
 
-def error_of(found: Array, true: Array) -> float:
-    """Of an effect (records,): how far its size along the true one is off."""
-    return abs(float(found @ true) / float(true @ true) - 1.0)
+def error_of(estimated: Array, true: Array) -> float:
+    """Relative error of an effect (records,), projected onto the true one."""
+    return abs(float(estimated @ true) / float(true @ true) - 1.0)

@@ -1,6 +1,6 @@
-"""``python -m benchmarks.estimators.ablation``: how often the swarm, the polish and both find the global optimum.
+"""``python -m benchmarks.estimators.ablation``: how often swarm, Gauss-Newton and both reach the global optimum.
 
-Cold, from random points within bounds much wider than the library's. What was found counts by the χ² of its
+Cold, from random points within bounds much wider than the library's. A result is judged by the χ² of its
 parameters with the initial state refitted, the same for all, against the best that is known of the window.
 """
 
@@ -14,61 +14,71 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.estimators.cases import WIDER, Case, cases, start, windows
+from benchmarks.estimators.cases import BOUNDS_FACTOR, Case, cases, start, windows
 from otolith.acquisition.window import Array, Window
+from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.gauss_newton import gauss_newton
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import particle_swarm
+from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
-from otolith.estimation.window_fit import estimate
+from otolith.estimation.window_fit import Search, estimate
 
-WINDOWS = 10  # machines that the starts are dealt to
-NEAR, NEAR_SHARE = 3.0, 0.01  # of the best χ²: what may be missing to it
+WINDOWS = 10  # machines, over which the starts are distributed
+CHI_SQUARE_TOLERANCE, RELATIVE_TOLERANCE = (
+    3.0,
+    0.01,
+)  # above the best χ², absolute and relative: counts as the global optimum
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One twin. Shares of the starts, and seconds, by way of searching."""
+    """Result of one twin: shares of the starts, and seconds, by method."""
 
     twin: str
     unknown: tuple[str, ...]
     starts: int
-    found: dict[str, float]
+    global_optimum: dict[str, float]
     seconds: dict[str, float]
     """Median."""
     seconds_worst: dict[str, float]
 
 
-WAYS = ("swarm", "polish", "swarm, polish", "both")  # the last as a cold window is estimated, with a vague prior
+# The last is the way a cold window is estimated, with the initial prior.
+METHODS_COMPARED = ("swarm", "Gauss-Newton", "both, no prior", "both")
 
 
 class Attempt(NamedTuple):
-    """What one way of searching came to."""
+    """Result of one method."""
 
     values: Array
     """(free,)."""
     seconds: float
 
 
-def attempts(problem: Problem, window: Window, begin: Array) -> tuple[Attempt, ...]:
-    """All ways from one start, in the order of :data:`WAYS`."""
-    begun = time.perf_counter()
-    objective = Objective(problem, window, begin)
-    made = time.perf_counter() - begun
+def attempts(problem: Problem, window: Window, start: Array) -> tuple[Attempt, ...]:
+    """All methods from one start, in the order of :data:`WAYS`."""
+    begin = time.perf_counter()
+    objective = Objective(problem, window, start)
+    made = time.perf_counter() - begin
 
-    def polished(values: Array) -> Attempt:
-        begun = time.perf_counter()
-        found = gauss_newton(objective, objective.guess(values)).guess[: objective.free]
-        return Attempt(found, time.perf_counter() - begun + made)
+    def refined(values: Array) -> Attempt:
+        begin = time.perf_counter()
+        values = gauss_newton(objective, objective.guess(values)).guess[: objective.free]
+        return Attempt(values, time.perf_counter() - begin + made)
 
-    alone = polished(begin)
-    begun = time.perf_counter()
-    found = particle_swarm(objective, problem.swarm, begin, problem.seed + window.index).places[0]
-    swarm = Attempt(found, time.perf_counter() - begun + made)
-    after = polished(found)
-    begun = time.perf_counter()
-    whole = np.array([entry.value for entry in estimate(problem, window, begin).parameters])
-    both = Attempt(whole, time.perf_counter() - begun)
+    alone = refined(start)
+    begin = time.perf_counter()
+    values = search_parameters(objective, problem.swarm, start, problem.seed + window.index).positions[0, 0]
+    swarm = Attempt(values, time.perf_counter() - begin + made)
+    after = refined(values)
+    begin = time.perf_counter()
+    whole = np.array(
+        [
+            parameter.value
+            for parameter in estimate(problem, window, initial_prior(problem), start, Search.ALWAYS).parameters
+        ]
+    )
+    both = Attempt(whole, time.perf_counter() - begin)
     return swarm, alone, Attempt(after.values, after.seconds + swarm.seconds - made), both
 
 
@@ -92,65 +102,69 @@ class _Pinned:
         self._objective, self._parameters = objective, parameters
         self.low, self.high = objective.low[objective.free :], objective.high[objective.free :]
 
-    def linearised(self, guess: Array) -> tuple[Array, Array]:
-        residuals, jacobian = self._objective.linearised(np.concatenate([self._parameters, guess]))
+    def linearise(self, guess: Array) -> tuple[Array, Array]:
+        residuals, jacobian = self._objective.linearise(np.concatenate([self._parameters, guess]))
         return residuals, jacobian[:, len(self._parameters) :]
 
 
 def ablate(case: Case, starts: int, seed: int) -> Row:
-    """All ways from the same starts."""
+    """All methods from the same starts."""
     random = np.random.default_rng(seed)
     dealt = windows(case, min(WINDOWS, starts), seed)
     judges = [Judge(case.problem, window, truth) for truth, window in dealt]
-    costs = {way: np.empty(starts) for way in WAYS}
-    times = {way: np.empty(starts) for way in WAYS}
+    costs = {method: np.empty(starts) for method in METHODS_COMPARED}
+    times = {method: np.empty(starts) for method in METHODS_COMPARED}
     for index in range(starts):
         begin, (_, window) = start(case.problem, random), dealt[index % len(dealt)]
-        for way, attempt in zip(WAYS, attempts(case.problem, window, begin), strict=True):
-            times[way][index] = attempt.seconds
-            costs[way][index] = judges[index % len(dealt)].chi_square(attempt.values)
+        for method, attempt in zip(METHODS_COMPARED, attempts(case.problem, window, begin), strict=True):
+            times[method][index] = attempt.seconds
+            costs[method][index] = judges[index % len(dealt)].chi_square(attempt.values)
         if (index + 1) % max(1, starts // 10) == 0:
             print(f"{case.name}: {index + 1} of {starts} starts", file=sys.stderr)
     everything = np.stack(list(costs.values()))
     which = np.arange(starts) % len(dealt)
     best = np.array([min(judge.best, everything[:, which == k].min()) for k, judge in enumerate(judges)])[which]
-    near = best + np.maximum(NEAR, NEAR_SHARE * best)
+    near = best + np.maximum(CHI_SQUARE_TOLERANCE, RELATIVE_TOLERANCE * best)
     return Row(
         twin=case.name,
-        unknown=tuple(entry.name for entry in case.problem.free),
+        unknown=tuple(parameter.name for parameter in case.problem.free),
         starts=starts,
-        found={way: float((cost <= near).mean()) for way, cost in costs.items()},
-        seconds={way: float(np.median(taken)) for way, taken in times.items()},
-        seconds_worst={way: float(taken.max()) for way, taken in times.items()},
+        global_optimum={method: float((cost <= near).mean()) for method, cost in costs.items()},
+        seconds={method: float(np.median(taken)) for method, taken in times.items()},
+        seconds_worst={method: float(taken.max()) for method, taken in times.items()},
     )
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
     """The table."""
-    head = "".join(f"{way:>15}" for way in WAYS)
-    found = [f"{'found the global optimum':24}{head}  unknown"]
+    head = "".join(f"{method:>15}" for method in METHODS_COMPARED)
+    table = [f"{'reached global optimum':24}{head}  unknown"]
     for row in rows:
-        shares = "".join(f"{100.0 * row.found[way]:>14.1f}%" for way in WAYS)
-        found.append(f"{row.twin:12}{row.starts:>5} starts{shares}  {', '.join(row.unknown)}")
-    found.append(f"{'seconds: median (worst)':24}{head}")
+        shares = "".join(f"{100.0 * row.global_optimum[method]:>14.1f}%" for method in METHODS_COMPARED)
+        table.append(f"{row.twin:12}{row.starts:>5} starts{shares}  {', '.join(row.unknown)}")
+    table.append(f"{'seconds: median (worst)':24}{head}")
     for row in rows:
-        taken = "".join(f"{f'{row.seconds[way]:.3f} ({row.seconds_worst[way]:.2f})':>15}" for way in WAYS)
-        found.append(f"{row.twin:24}{taken}")
-    return found
+        taken = "".join(
+            f"{f'{row.seconds[method]:.3f} ({row.seconds_worst[method]:.2f})':>15}" for method in METHODS_COMPARED
+        )
+        table.append(f"{row.twin:24}{taken}")
+    return table
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.estimators.ablation", description=__doc__)
-    known = {case.name: case for case in cases(WIDER)}
+    known = {case.name: case for case in cases(BOUNDS_FACTOR)}
     parser.add_argument("--starts", type=int, default=1000, help="per twin (%(default)s)")
-    parser.add_argument("--twin", choices=known, action="append", help="only this one; may be said again")
-    parser.add_argument("--wider", type=float, default=WIDER, help="how much than the library's bounds (%(default)g)")
+    parser.add_argument("--twin", choices=known, action="append", help="only this one; may be repeated")
+    parser.add_argument(
+        "--factor", type=float, default=BOUNDS_FACTOR, help="width of the bounds in those of the library (%(default)g)"
+    )
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--json", action="store_true")
-    asked = parser.parse_args(arguments)
-    known = {case.name: case for case in cases(asked.wider)}
-    rows = [ablate(known[name], asked.starts, asked.seed) for name in asked.twin or known]
-    print(json.dumps([asdict(row) for row in rows], indent=2) if asked.json else "\n".join(lines(rows)))
+    options = parser.parse_args(arguments)
+    known = {case.name: case for case in cases(options.factor)}
+    rows = [ablate(known[name], options.starts, options.seed) for name in options.twin or known]
+    print(json.dumps([asdict(row) for row in rows], indent=2) if options.json else "\n".join(lines(rows)))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What a rival is and what it is asked."""
+"""The interface of the methods that are compared."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,48 +8,48 @@ from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Problem
 
 
-class Said(NamedTuple):
-    """What an estimator says of the unknown parameters after a window."""
+class Estimate(NamedTuple):
+    """Estimates of the unknown parameters after a window."""
 
     values: Array
-    """(free,); not a number where it says nothing."""
+    """(free,); not a number without an estimate."""
     sd: Array | None = None
-    """(free,) standard deviations, from those who give an interval."""
+    """(free,) standard deviations; None if the method gives no interval."""
 
 
 class Estimator(Protocol):
-    """One machine's estimator."""
+    """The estimator of one machine."""
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
-        """One for each row of the table; this call is what is timed."""
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
+        """One estimate for each row of the table; only this call is timed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Rival:
-    """A way to estimate."""
+class Method:
+    """A method of estimation."""
 
     rows: tuple[str, ...]
     """Its names in the table, one for each kind of result."""
-    begin: Callable[[Problem], Estimator]
-    """A fresh estimator, for a machine nothing is known of. Not timed."""
-    remembers: bool = False
-    """It learns from window to window, so it sees every one."""
-    dear: bool = False
-    """It takes seconds a window, so it sees few."""
+    create: Callable[[Problem], Estimator]
+    """A new estimator without any previous window. Not timed."""
+    stateful: bool = False
+    """It carries a state from window to window, so it gets all of them."""
+    slow: bool = False
+    """It takes seconds per window, so it gets few of them."""
     scale: float = 1.0
-    """What its time is multiplied by, if its budget was cut."""
+    """Factor on its time, if its budget was cut."""
     note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """How much is run."""
+    """Size of the comparison."""
 
     windows: int = 200
-    """That are scored."""
-    dear: int = 20
-    """Of these, for rivals that take seconds each."""
+    """Scored windows."""
+    slow: int = 20
+    """Of these, for slow methods."""
     generations: int = 1000
-    """Of the paper's swarm."""
+    """Generations of the paper's swarm."""
     drift: float = 0.0
-    """Of each parameter, in shares of it an hour."""
+    """Of each parameter, relative, per hour."""

@@ -1,4 +1,4 @@
-"""What the ablation searches in: a twin, its unknowns within wide bounds, and windows of many truths."""
+"""Cases of the ablation: a twin, its unknowns within wide bounds, and windows with random true values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.estimators.data import APART
+from benchmarks.estimators.data import TRUTH_RANGE
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin, load_twin
@@ -14,9 +14,9 @@ from otolith.twin.definition import Definition, Input, Parameter, Role
 from otolith.twin.kernel import Excitation, kernel_of
 
 RECORDS = 200
-HELD = 20  # records that a level of an input lasts
-WIDER = 10.0
-EXACT = 1e-3  # of the noise: the error that the data's own integration may have
+LEVEL_RECORDS = 20  # records that a level of an input lasts
+BOUNDS_FACTOR = 10.0
+EXACT = 1e-3  # of the noise: integration error of the data
 HERE = Path(__file__).parent / "twins"
 
 
@@ -30,8 +30,8 @@ class Case:
     excite: Callable[[np.random.Generator, Definition, Array], Array]
 
 
-def cases(wider: float) -> tuple[Case, ...]:
-    """Four machines of the library, then two whose cost has many valleys, their bounds ``wider`` times as wide."""
+def cases(factor: float) -> tuple[Case, ...]:
+    """Four machines of the library and two with many local minima, their bounds ``factor`` times as wide."""
     made = (
         _case(find_twin("dc_motor"), 0.01, unknown=("R_a", "J", "D")),
         _case(find_twin("two_mass"), 0.002),
@@ -40,46 +40,46 @@ def cases(wider: float) -> tuple[Case, ...]:
         _case(load_twin(HERE / "resonator.toml"), 0.005, _sweep),
         _case(load_twin(HERE / "eccentric.toml"), 0.005),
     )
-    return tuple(_widened(case, wider) for case in made)
+    return tuple(_widened(case, factor) for case in made)
 
 
 def windows(case: Case, count: int, seed: int) -> list[tuple[Array, Window]]:
-    """Truth (free,) and a window cut from the middle of its motion, of ``count`` machines."""
+    """True values (free,) and a window from the middle of the motion, of ``count`` machines."""
     random = np.random.default_rng(seed)
     return [_window(case, random, index) for index in range(count)]
 
 
 def start(problem: Problem, random: np.random.Generator) -> Array:
-    """Anywhere within the bounds: of what is positive the order of magnitude is drawn, of the rest the value."""
+    """A random point within the bounds, log-uniform if the lower one is positive, uniform otherwise."""
     low, high = problem.bounds
     share = random.random(len(low))
     orders = np.log(np.maximum(low, 1e-300)), np.log(np.maximum(high, 1e-300))
     return np.where(low > 0.0, np.exp(orders[0] + share * (orders[1] - orders[0])), low + share * (high - low))
 
 
-def wide(entry: Parameter, wider: float) -> Parameter:
-    """So many times wider on either side; a phase repeats, so it stays."""
-    if entry.unit == "rad":
-        return entry
-    low = entry.low / wider if entry.low > 0.0 else entry.low * wider
-    return replace(entry, low=low, high=entry.high * wider)
+def widened(parameter: Parameter, factor: float) -> Parameter:
+    """Bounds that are ``factor`` times wider on either side; those of a phase stay."""
+    if parameter.unit == "rad":
+        return parameter
+    low = parameter.low / factor if parameter.low > 0.0 else parameter.low * factor
+    return replace(parameter, low=low, high=parameter.high * factor)
 
 
-def _widened(case: Case, wider: float) -> Case:
-    free = tuple(wide(entry, wider) for entry in case.problem.free)
+def _widened(case: Case, factor: float) -> Case:
+    free = tuple(widened(parameter, factor) for parameter in case.problem.free)
     return replace(case, problem=replace(case.problem, free=free))
 
 
 def _levels(random: np.random.Generator, twin: Definition, times: Array) -> Array:
-    """Random levels, held or run through, over each input's range."""
+    """Random levels over each input's range, held or interpolated."""
 
-    def column(entry: Input) -> Array:
-        levels = random.uniform(entry.low, entry.high, len(times) // HELD + 2)
-        if entry.hold == "zoh":
-            return np.repeat(levels, HELD)[: len(times)]
-        return np.interp(np.arange(len(times)), HELD * np.arange(len(levels)), levels)
+    def column(signal: Input) -> Array:
+        levels = random.uniform(signal.low, signal.high, len(times) // LEVEL_RECORDS + 2)
+        if signal.hold == "zoh":
+            return np.repeat(levels, LEVEL_RECORDS)[: len(times)]
+        return np.interp(np.arange(len(times)), LEVEL_RECORDS * np.arange(len(levels)), levels)
 
-    return np.column_stack([column(entry) for entry in twin.inputs])
+    return np.column_stack([column(signal) for signal in twin.inputs])
 
 
 def _sweep(_: np.random.Generator, twin: Definition, times: Array) -> Array:
@@ -96,23 +96,25 @@ def _case(
     excite: Callable[[np.random.Generator, Definition, Array], Array] = _levels,
     unknown: tuple[str, ...] = (),
 ) -> Case:
-    unknown = unknown or tuple(entry.name for entry in twin.parameters if entry.role is Role.ESTIMATED)
-    free = tuple(entry for entry in twin.parameters if entry.name in unknown)
-    known = tuple((entry.name, entry.nominal) for entry in twin.parameters if entry.name not in unknown)
-    return Case(twin.name, Problem(twin, known, free, tuple(o.noise for o in twin.outputs)), period, excite)
+    unknown = unknown or tuple(parameter.name for parameter in twin.parameters if parameter.role is Role.ESTIMATED)
+    free = tuple(parameter for parameter in twin.parameters if parameter.name in unknown)
+    known = tuple((parameter.name, parameter.nominal) for parameter in twin.parameters if parameter.name not in unknown)
+    return Case(twin.name, Problem(twin, known, free, tuple(output.noise for output in twin.outputs)), period, excite)
 
 
 def _window(case: Case, random: np.random.Generator, index: int) -> tuple[Array, Window]:
     problem, twin = case.problem, case.problem.twin
-    off = np.where(problem.nominal == 0.0, 1.0, problem.nominal)  # of what is nominally nothing: about its unit
-    truth = np.where(problem.nominal == 0.0, random.normal(size=len(off)), random.uniform(*APART, len(off)) * off)
-    values = dict(problem.known) | dict(zip((entry.name for entry in problem.free), truth, strict=True))
-    parameters = np.array([values[entry.name] for entry in twin.parameters])
-    initial = np.array([entry.initial for entry in twin.states])
+    scale = np.where(problem.nominal == 0.0, 1.0, problem.nominal)  # a nominal value of zero: one unit
+    truth = np.where(
+        problem.nominal == 0.0, random.normal(size=len(scale)), random.uniform(*TRUTH_RANGE, len(scale)) * scale
+    )
+    values = dict(problem.known) | dict(zip((parameter.name for parameter in problem.free), truth, strict=True))
+    parameters = np.array([values[parameter.name] for parameter in twin.parameters])
+    initial = np.array([state.initial for state in twin.states])
     times: Array = np.multiply(case.period, np.arange(2 * RECORDS), dtype=np.float64)
     inputs = case.excite(random, twin, times)
     drive, noise, kernel = Excitation(inputs, case.period), np.array(problem.noise), kernel_of(twin)
     drive = replace(drive, substeps=kernel.substeps(parameters, initial, drive, EXACT * noise))
     outputs = kernel.simulate(parameters[None], initial[None], drive)[0]
-    found = np.column_stack([inputs, outputs + random.normal(size=outputs.shape) * noise])[RECORDS:]
-    return truth, Window.whole(index, 0.0, case.period, twin.signals, found)
+    signals = np.column_stack([inputs, outputs + random.normal(size=outputs.shape) * noise])[RECORDS:]
+    return truth, Window.whole(index, 0.0, case.period, twin.signals, signals)

@@ -4,17 +4,17 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from benchmarks import handwritten
-from benchmarks.estimators.base import Budget, Rival, Said
+from benchmarks.estimators.base import Budget, Estimate, Method
 from benchmarks.estimators.data import NOISE, full, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Problem
 
-REACH = 5.0  # standard deviations around the first record in which the initial state is sought
+INITIAL_STATE_REACH = 5.0  # standard deviations around the first record within which the initial state is estimated
 
 
-def rivals(_: Budget) -> tuple[Rival, ...]:
-    """SciPy's defaults: 15 members per unknown, up to 1000 generations, polished by L-BFGS-B."""
-    return (Rival(("differential_evolution",), Evolution),)
+def methods(_: Budget) -> tuple[Method, ...]:
+    """SciPy's defaults: 15 members per unknown, up to 1000 generations, refined by L-BFGS-B."""
+    return (Method(("differential_evolution",), Evolution),)
 
 
 class Evolution:
@@ -24,16 +24,16 @@ class Evolution:
         self._low, self._high = problem.bounds
         handwritten.simulate(full(problem.nominal[None]), np.zeros((1, 2)), np.zeros((2, 2)), 0.01)  # compiles
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         inputs, measured = inputs_of(window), outputs_of(window)
 
         def cost(guesses: Array) -> Array:
             members = np.atleast_2d(guesses.T)
-            found = handwritten.simulate(full(members[:, :-2]), members[:, -2:], inputs, window.sample_period)
-            return np.asarray((((found - measured) / NOISE) ** 2).sum(axis=(1, 2)))
+            result = handwritten.simulate(full(members[:, :-2]), members[:, -2:], inputs, window.sample_period)
+            return np.asarray((((result - measured) / NOISE) ** 2).sum(axis=(1, 2)))
 
-        low = np.concatenate([self._low, measured[0] - REACH * NOISE])
-        high = np.concatenate([self._high, measured[0] + REACH * NOISE])
+        low = np.concatenate([self._low, measured[0] - INITIAL_STATE_REACH * NOISE])
+        high = np.concatenate([self._high, measured[0] + INITIAL_STATE_REACH * NOISE])
         bounds = list(zip(low, high, strict=True))
-        found = differential_evolution(cost, bounds, vectorized=True, updating="deferred", rng=window.index)
-        return (Said(np.asarray(found.x[:-2])),)
+        result = differential_evolution(cost, bounds, vectorized=True, updating="deferred", rng=window.index)
+        return (Estimate(np.asarray(result.x[:-2])),)

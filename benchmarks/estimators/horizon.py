@@ -1,8 +1,8 @@
 """Moving-horizon estimation by CasADi and IPOPT: multiple shooting over a window, Runge-Kutta between the records.
 
-It begins at the last window's parameters and has their covariance as its arrival cost (C. V. Rao, J. B. Rawlings,
-D. Q. Mayne, 2003); the initial state is free. How much the parameters wander between windows is tuned as the filter's:
-CALM for parameters that stay as they are, AWAKE for a drift of up to 20 % an hour.
+It starts at the last window's parameters, with their covariance as its arrival cost (C. V. Rao, J. B. Rawlings, D. Q.
+Mayne, 2003); the initial state is free. The random walk of the parameters between windows is tuned like the filter's:
+CONSTANT for constant parameters, DRIFTING for a drift of up to 20 % per hour.
 """
 
 from functools import partial
@@ -11,48 +11,52 @@ from typing import Any
 import casadi
 import numpy as np
 
-from benchmarks.estimators.base import Budget, Rival, Said
+from benchmarks.estimators.base import Budget, Estimate, Method
 from benchmarks.estimators.data import KNOWN, NOISE, PERIOD, RECORDS, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Problem
 
-CALM, AWAKE = 1e-5, 3e-4  # of each parameter per window, in shares of its nominal value
-SPREAD = 0.5  # in the same, at the beginning
-QUIET: dict[str, Any] = {"expand": True, "print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8}}
+CONSTANT, DRIFTING = 1e-5, 3e-4  # of each parameter per window, in shares of its nominal value
+INITIAL_SPREAD = 0.5  # in the same, at the beginning
+IPOPT_OPTIONS: dict[str, Any] = {
+    "expand": True,
+    "print_time": False,
+    "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8},
+}
 
 
-def rivals(_: Budget) -> tuple[Rival, ...]:
+def methods(_: Budget) -> tuple[Method, ...]:
     """Both tunings."""
     return (
-        Rival(("MHE (CasADi, IPOPT), calm",), partial(Horizon, CALM), remembers=True),
-        Rival(("MHE (CasADi, IPOPT), awake",), partial(Horizon, AWAKE), remembers=True),
+        Method(("MHE (CasADi, IPOPT), constant",), partial(Horizon, CONSTANT), stateful=True),
+        Method(("MHE (CasADi, IPOPT), drifting",), partial(Horizon, DRIFTING), stateful=True),
     )
 
 
 class Horizon:
-    """The nonlinear programme, built once a machine; unknowns are the three parameters in shares, then every state."""
+    """The nonlinear programme, built once per machine; unknowns are the three relative parameters, then all states."""
 
-    def __init__(self, wander: float, problem: Problem) -> None:
-        self._wander, self._nominal = wander, problem.nominal
+    def __init__(self, walk: float, problem: Problem) -> None:
+        self._walk, self._nominal = walk, problem.nominal
         low, high = problem.bounds
         free = np.full(2 * RECORDS, np.inf)
         self._low, self._high = (
             np.concatenate([low / problem.nominal, -free]),
             np.concatenate([high / problem.nominal, free]),
         )
-        self._mean, self._covariance = np.ones(3), SPREAD**2 * np.eye(3)
+        self._mean, self._covariance = np.ones(3), INITIAL_SPREAD**2 * np.eye(3)
         self._solver, self._slopes = _programme(problem.nominal)
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         inputs, measured = inputs_of(window), outputs_of(window)
         weight: Array = np.asarray(np.linalg.inv(self._covariance), dtype=np.float64)
         given = np.concatenate([inputs.ravel(), measured.ravel(), self._mean, weight.ravel()])
-        begin = np.concatenate([self._mean, measured.ravel()])
-        found = self._solver(x0=begin, p=given, lbx=self._low, ubx=self._high, lbg=0.0, ubg=0.0)["x"].full().ravel()
-        shares, initial = found[:3], found[3:5]
+        start = np.concatenate([self._mean, measured.ravel()])
+        solution = self._solver(x0=start, p=given, lbx=self._low, ubx=self._high, lbg=0.0, ubg=0.0)["x"].full().ravel()
+        shares, initial = solution[:3], solution[3:5]
         covariance = self._posterior(shares, initial, inputs, weight)
-        self._mean, self._covariance = shares, covariance + self._wander**2 * np.eye(3)
-        return (Said(shares * self._nominal, np.sqrt(np.diag(covariance)) * self._nominal),)
+        self._mean, self._covariance = shares, covariance + self._walk**2 * np.eye(3)
+        return (Estimate(shares * self._nominal, np.sqrt(np.diag(covariance)) * self._nominal),)
 
     def _posterior(self, shares: Array, initial: Array, inputs: Array, weight: Array) -> Array:
         """From the Gauss-Newton Hessian of window and arrival cost, the initial state eliminated by inverting it."""
@@ -78,7 +82,7 @@ def _programme(nominal: Array) -> tuple[casadi.Function, casadi.Function]:
         "f": 0.5 * casadi.sumsqr(error) + 0.5 * casadi.mtimes([off.T, weight, off]),
         "g": casadi.vec(after - X[:, 1:]),
     }
-    solver = casadi.nlpsol("mhe", "ipopt", programme, QUIET)
+    solver = casadi.nlpsol("mhe", "ipopt", programme, IPOPT_OPTIONS)
     z = casadi.MX.sym("z", 5)
     run = step.mapaccum(RECORDS - 1)(z[3:], casadi.repmat(z[:3], 1, RECORDS - 1), U[:, :-1], U[1, 1:])
     whole = casadi.horzcat(z[3:], run) / casadi.repmat(casadi.DM(NOISE), 1, RECORDS)

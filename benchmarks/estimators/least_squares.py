@@ -1,7 +1,7 @@
-"""scipy.optimize.least_squares over parameters and initial state, begun where the last window ended.
+"""scipy.optimize.least_squares over parameters and initial state, started from the result of the last window.
 
-Three simulations behind it: ``solve_ivp`` as in every tutorial, ``lsim`` by somebody who saw that the motor is linear,
-and a hand-written Numba kernel, a whole finite-difference Jacobian per call, by somebody who had a week.
+With three simulations: ``solve_ivp``, the usual choice; ``lsim``, as the motor is linear; and a hand-written Numba
+kernel that computes a whole finite-difference Jacobian per call.
 """
 
 from collections.abc import Callable
@@ -13,22 +13,22 @@ from scipy.optimize import least_squares
 from scipy.signal import StateSpace, lsim
 
 from benchmarks import handwritten
-from benchmarks.estimators.base import Budget, Rival, Said
+from benchmarks.estimators.base import Budget, Estimate, Method
 from benchmarks.estimators.data import KNOWN, NOISE, full, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Problem
 
 Simulation = Callable[[Array, Array, Array, float], Array]
 """Parameters (free,), initial state (states,), inputs (records, inputs), sample period -> (records, outputs)."""
-NUDGE = 1e-6  # relative: of the finite differences
+DIFFERENCE_STEP = 1e-6  # relative: of the finite differences
 
 
-def rivals(_: Budget) -> tuple[Rival, ...]:
+def methods(_: Budget) -> tuple[Method, ...]:
     """All three."""
     return (
-        Rival(("least_squares, solve_ivp",), partial(Fitted, by_solve_ivp), dear=True),
-        Rival(("least_squares, lsim",), partial(Fitted, by_lsim)),
-        Rival(("least_squares, own Numba kernel",), Expert),
+        Method(("least_squares, solve_ivp",), partial(Fitted, by_solve_ivp), slow=True),
+        Method(("least_squares, lsim",), partial(Fitted, by_lsim)),
+        Method(("least_squares, own Numba kernel",), Expert),
     )
 
 
@@ -37,30 +37,32 @@ class Fitted:
 
     def __init__(self, simulation: Simulation, problem: Problem) -> None:
         self._simulation = simulation
-        self._begin, (self._low, self._high) = problem.nominal, problem.bounds
+        self._start, (self._low, self._high) = problem.nominal, problem.bounds
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         inputs, measured = inputs_of(window), outputs_of(window)
 
         def residuals(guess: Array) -> Array:
-            found = self._simulation(guess[:-2], guess[-2:], inputs, window.sample_period)
-            return np.asarray(((found - measured) / NOISE).ravel())
+            result = self._simulation(guess[:-2], guess[-2:], inputs, window.sample_period)
+            return np.asarray(((result - measured) / NOISE).ravel())
 
         return (self._solve(residuals, "2-point", measured[0]),)
 
-    def _solve(self, residuals: Callable[[Array], Array], jac: str | Callable[[Array], Array], first: Array) -> Said:
+    def _solve(
+        self, residuals: Callable[[Array], Array], jac: str | Callable[[Array], Array], first: Array
+    ) -> Estimate:
         free = np.full(2, np.inf)
-        found = least_squares(
+        result = least_squares(
             residuals,
-            np.concatenate([self._begin, first]),
+            np.concatenate([self._start, first]),
             jac=jac,
             bounds=(np.concatenate([self._low, -free]), np.concatenate([self._high, free])),
             x_scale="jac",
             method="trf",
         )
-        self._begin = found.x[:-2]
-        covariance = np.linalg.inv(found.jac.T @ found.jac)
-        return Said(found.x[:-2], np.sqrt(np.diag(covariance))[:-2])
+        self._start = result.x[:-2]
+        covariance = np.linalg.inv(result.jac.T @ result.jac)
+        return Estimate(result.x[:-2], np.sqrt(np.diag(covariance))[:-2])
 
 
 class Expert(Fitted):
@@ -70,17 +72,17 @@ class Expert(Fitted):
         super().__init__(by_solve_ivp, problem)
         handwritten.simulate(full(problem.nominal[None]), np.zeros((1, 2)), np.zeros((2, 2)), 0.01)  # compiles
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         inputs, measured = inputs_of(window), outputs_of(window)
 
         def simulate(guesses: Array) -> Array:
-            found = handwritten.simulate(full(guesses[:, :-2]), guesses[:, -2:], inputs, window.sample_period)
-            return np.asarray(((found - measured) / NOISE).reshape(len(guesses), -1))
+            outputs = handwritten.simulate(full(guesses[:, :-2]), guesses[:, -2:], inputs, window.sample_period)
+            return np.asarray(((outputs - measured) / NOISE).reshape(len(guesses), -1))
 
         def jacobian(guess: Array) -> Array:
-            nudges = NUDGE * np.maximum(np.abs(guess), 1e-6)
-            found = simulate(np.vstack([guess, guess + np.diag(nudges)]))
-            return np.asarray(((found[1:] - found[0]) / nudges[:, None]).T)
+            steps = DIFFERENCE_STEP * np.maximum(np.abs(guess), 1e-6)
+            outputs = simulate(np.vstack([guess, guess + np.diag(steps)]))
+            return np.asarray(((outputs[1:] - outputs[0]) / steps[:, None]).T)
 
         return (self._solve(lambda guess: simulate(guess[None])[0], jacobian, measured[0]),)
 
@@ -93,7 +95,7 @@ def matrices(parameters: Array) -> tuple[Array, Array]:
 
 
 def by_solve_ivp(parameters: Array, initial: Array, inputs: Array, period: float) -> Array:
-    """Runge-Kutta 4(5) with no step beyond a record, so that none of the voltage's steps is missed."""
+    """Runge-Kutta 4(5) with no step beyond a record, so that no step of the voltage is missed."""
     R_a, D, J = parameters.tolist()
     L_a, K_e, K_t = KNOWN["L_a"], KNOWN["K_e"], KNOWN["K_t"]
     times = period * np.arange(len(inputs))
@@ -105,12 +107,12 @@ def by_solve_ivp(parameters: Array, initial: Array, inputs: Array, period: float
         T_load = float(np.interp(t, times, load))
         return [(V_a - R_a * i - K_e * omega) / L_a, (K_t * i - T_load - D * omega) / J]
 
-    found = solve_ivp(rates, (0.0, times[-1]), initial, t_eval=times, max_step=period, rtol=1e-6, atol=1e-8)
-    return np.asarray(found.y.T)
+    solution = solve_ivp(rates, (0.0, times[-1]), initial, t_eval=times, max_step=period, rtol=1e-6, atol=1e-8)
+    return np.asarray(solution.y.T)
 
 
 def by_lsim(parameters: Array, initial: Array, inputs: Array, period: float) -> Array:
-    """The held voltage and the running load one by one, as lsim knows one hold for all inputs; then the sum."""
+    """The sum of the responses to the held voltage and to the interpolated load: lsim has one hold for all inputs."""
     A, B = matrices(parameters)
     times = period * np.arange(len(inputs))
     held = lsim(StateSpace(A, B[:, :1], np.eye(2), np.zeros((2, 1))), inputs[:, 0], times, X0=initial, interp=False)

@@ -1,4 +1,4 @@
-"""Everybody on the same windows in turn, and what comes of it."""
+"""Runs all methods on the same windows in turn, and summarises errors, intervals and times."""
 
 import sys
 import time
@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.estimators.base import Budget, Estimator, Rival, Said
-from benchmarks.estimators.data import FREE, RUN_IN, Machine, machines, problem
+from benchmarks.estimators.base import Budget, Estimate, Estimator, Method
+from benchmarks.estimators.data import FREE, RUN_IN_WINDOWS, Machine, machines, problem
 from otolith.acquisition.window import Array, Mask
 from otolith.estimation.information import QUANTILE
 
@@ -19,7 +19,7 @@ class Row:
 
     name: str
     windows: int
-    """Scored, of those it said something of."""
+    """Scored windows with an estimate."""
     error: dict[str, float]
     """Median."""
     error_p99: dict[str, float]
@@ -32,30 +32,30 @@ class Row:
 
     @property
     def size(self) -> float:
-        """Of its error: the geometric mean of the parameters' medians; not a number without any."""
+        """Geometric mean of the parameters' median errors; not a number without any."""
         return float(np.exp(np.mean(np.log(list(self.error.values()))))) if self.error else float("nan")
 
 
 @dataclass
 class _Tally:
-    rival: Rival
+    method: Method
     errors: list[Array] = field(default_factory=list)
     inside: list[Mask] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
-    def add(self, said: Said, truth: Array, seconds: float) -> None:
-        self.seconds.append(seconds * self.rival.scale)
-        if np.isfinite(said.values).all():
-            self.errors.append(100.0 * np.abs(said.values / truth - 1.0))
-            if said.sd is not None:
-                self.inside.append(np.abs(said.values - truth) <= QUANTILE * said.sd)
+    def add(self, estimate: Estimate, truth: Array, seconds: float) -> None:
+        self.seconds.append(seconds * self.method.scale)
+        if np.isfinite(estimate.values).all():
+            self.errors.append(100.0 * np.abs(estimate.values / truth - 1.0))
+            if estimate.sd is not None:
+                self.inside.append(np.abs(estimate.values - truth) <= QUANTILE * estimate.sd)
 
     def row(self, name: str) -> Row:
         def of(rows: Sequence[Array | Mask], quantile: float | None = None) -> dict[str, float]:
             if not rows:
                 return {}
-            found = np.mean(rows, axis=0) if quantile is None else np.quantile(rows, quantile, axis=0)
-            return dict(zip(FREE, map(float, found), strict=True))
+            summary = np.mean(rows, axis=0) if quantile is None else np.quantile(rows, quantile, axis=0)
+            return dict(zip(FREE, map(float, summary), strict=True))
 
         return Row(
             name=name,
@@ -65,31 +65,31 @@ class _Tally:
             covered=of(self.inside),
             seconds=float(np.median(self.seconds)),
             seconds_p99=float(np.quantile(self.seconds, 0.99)),
-            note=self.rival.note,
+            note=self.method.note,
         )
 
 
-def compare(rivals: Sequence[Rival], budget: Budget, seed: int) -> list[Row]:
-    """A row for each kind of result, in the order of the rivals."""
-    tallies = [{name: _Tally(rival) for name in rival.rows} for rival in rivals]
-    share = max(1.0, budget.windows / budget.dear)
-    dear = {round(share * index) for index in range(min(budget.dear, budget.windows))}
+def compare(methods: Sequence[Method], budget: Budget, seed: int) -> list[Row]:
+    """A row for each kind of result, in the order of the methods."""
+    tallies = [{name: _Tally(method) for name in method.rows} for method in methods]
+    share = max(1.0, budget.windows / budget.slow)
+    slow = {round(share * index) for index in range(min(budget.slow, budget.windows))}
     scored = 0
     for machine in machines(budget.windows, budget.drift, seed):
-        present = [rival.begin(problem()) for rival in rivals]
+        present = [method.create(problem()) for method in methods]
         for index in range(len(machine.windows)):
-            counts = index >= RUN_IN
-            for rival, estimator, tally in zip(rivals, present, tallies, strict=True):
-                if not rival.dear or (counts and scored in dear):
-                    _ask(estimator, machine, index, tally if counts else {})
+            counts = index >= RUN_IN_WINDOWS
+            for method, estimator, tally in zip(methods, present, tallies, strict=True):
+                if not method.slow or (counts and scored in slow):
+                    _time_fit(estimator, machine, index, tally if counts else {})
             scored += counts
         print(f"{scored} of {budget.windows} windows", file=sys.stderr)
     return [tally.row(name) for rows in tallies for name, tally in rows.items()]
 
 
-def _ask(estimator: Estimator, machine: Machine, index: int, tallies: dict[str, _Tally]) -> None:
+def _time_fit(estimator: Estimator, machine: Machine, index: int, tallies: dict[str, _Tally]) -> None:
     begun = time.perf_counter()
-    found = estimator.fit(machine.windows[index])
+    estimates = estimator.fit(machine.windows[index])
     seconds = time.perf_counter() - begun
-    for tally, said in zip(tallies.values(), found, strict=False):  # none where the window is not scored
-        tally.add(said, machine.truths[index], seconds)
+    for tally, estimate in zip(tallies.values(), estimates, strict=False):  # none where the window is not scored
+        tally.add(estimate, machine.truths[index], seconds)

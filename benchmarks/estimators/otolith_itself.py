@@ -1,8 +1,8 @@
-"""Otolith: the whole heart, warm over consecutive windows and cold on each."""
+"""Otolith: the whole core, warm over consecutive windows, and cold on each window."""
 
 import numpy as np
 
-from benchmarks.estimators.base import Budget, Rival, Said
+from benchmarks.estimators.base import Budget, Estimate, Method
 from benchmarks.estimators.data import FREE
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
@@ -13,33 +13,34 @@ from otolith.health.schema import ParameterDocument
 PUBLISHED, ALONE, COLD = "Otolith warm, published", "Otolith warm, window alone", "Otolith cold"
 
 
-def rivals(_: Budget) -> tuple[Rival, ...]:
-    """Both."""
-    return (Rival((PUBLISHED, ALONE), Warm, remembers=True), Rival((COLD,), Cold))
+def methods(_: Budget) -> tuple[Method, ...]:
+    """Warm and cold."""
+    return (Method((PUBLISHED, ALONE), Warm, stateful=True), Method((COLD,), Cold))
 
 
 class Warm:
-    """State carried from window to window: what is published, and what the window alone says."""
+    """State carried from window to window: published values, and those of the window alone."""
 
     def __init__(self, problem: Problem) -> None:
         self._state = _fresh(problem)
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         self._state, report = adapt(self._state, window)
-        found = [report.document.parameters[name] for name in FREE]
-        published = Said(
-            np.array([_number(entry.value) for entry in found]), np.array([_number(entry.sd) for entry in found])
+        parameters = [report.document.parameters[name] for name in FREE]
+        published = Estimate(
+            np.array([_number(parameter.value) for parameter in parameters]),
+            np.array([_number(parameter.sd) for parameter in parameters]),
         )
-        return published, _alone(found)
+        return published, _alone(parameters)
 
 
 class Cold:
-    """Each window as if it were a machine's first."""
+    """Each window as the first of its machine."""
 
     def __init__(self, problem: Problem) -> None:
         self._state = _fresh(problem)
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         _, report = adapt(self._state, window)
         return (_alone([report.document.parameters[name] for name in FREE]),)
 
@@ -48,8 +49,11 @@ def _fresh(problem: Problem) -> AdaptationState:
     return initial_state("motor", "bench", problem)
 
 
-def _alone(found: list[ParameterDocument]) -> Said:
-    return Said(np.array([_number(entry.raw) for entry in found]), np.array([_number(entry.raw_sd) for entry in found]))
+def _alone(parameters: list[ParameterDocument]) -> Estimate:
+    return Estimate(
+        np.array([_number(parameter.raw) for parameter in parameters]),
+        np.array([_number(parameter.raw_sd) for parameter in parameters]),
+    )
 
 
 def _number(value: float | None) -> float:

@@ -1,4 +1,4 @@
-"""The paper's method to the letter: pymoo's swarm of Table 2 on an explicit Euler simulation at 0.1 ms.
+"""The paper's method as published: pymoo's swarm of Table 2 on an explicit Euler simulation at 0.1 ms.
 
 A particle is the parameters, its initial state the first noisy record, its cost the root of the mean square error over
 both outputs in their own units (section 3.2).
@@ -14,26 +14,32 @@ from pymoo.core.problem import ElementwiseProblem
 from pymoo.core.problem import Problem as PymooProblem
 from pymoo.optimize import minimize
 
-from benchmarks.estimators.base import Budget, Rival, Said
+from benchmarks.estimators.base import Budget, Estimate, Method
 from benchmarks.estimators.data import KNOWN, TWIN, full, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Problem
 from otolith.twin.kernel import Excitation, kernel_of
 
 STEP = 1e-4  # s
-FEW = 2  # generations of the pure Python run: each costs the same
+PYTHON_GENERATIONS = 2  # generations in pure Python; each takes the same time
 ADAPTIVE, FIXED, PYTHON = "paper, adaptive inertia", "paper, inertia fixed", "paper, pure Python"
 
 
-def rivals(budget: Budget) -> tuple[Rival, ...]:
-    """Compiled in both readings of Table 2, and in plain Python, whose result would be the same."""
+def methods(budget: Budget) -> tuple[Method, ...]:
+    """Compiled in both readings of Table 2, and in pure Python for its time only."""
     done = budget.generations
     cut = 1000.0 / done
     note = f"time scaled from {done} of 1000 generations" if done < 1000 else ""
     return (
-        Rival((ADAPTIVE,), partial(Compiled, generations=done, adaptive=True), dear=True, scale=cut, note=note),
-        Rival((FIXED,), partial(Compiled, generations=done, adaptive=False), dear=True, scale=cut, note=note),
-        Rival((PYTHON,), Plain, dear=True, scale=1000.0 / FEW, note=f"time scaled from {FEW} of 1000 generations"),
+        Method((ADAPTIVE,), partial(Compiled, generations=done, adaptive=True), slow=True, scale=cut, note=note),
+        Method((FIXED,), partial(Compiled, generations=done, adaptive=False), slow=True, scale=cut, note=note),
+        Method(
+            (PYTHON,),
+            Plain,
+            slow=True,
+            scale=1000.0 / PYTHON_GENERATIONS,
+            note=f"time scaled from {PYTHON_GENERATIONS} of 1000 generations",
+        ),
     )
 
 
@@ -46,43 +52,43 @@ class Compiled:
         still = Excitation(np.zeros((2, 2)), STEP)
         self._kernel.euler(full(problem.nominal[None]), np.zeros((1, 2)), still, STEP)  # compiles: not timed
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         measured = outputs_of(window)
         excitation = Excitation(inputs_of(window), window.sample_period)
 
         def cost(particles: Array) -> Array:
             initial = np.repeat(measured[:1], len(particles), axis=0)
             with np.errstate(over="ignore", invalid="ignore"):
-                found = self._kernel.euler(full(particles), initial, excitation, STEP)
-                error = np.sqrt(np.mean((found - measured) ** 2, axis=(1, 2)))
+                outputs = self._kernel.euler(full(particles), initial, excitation, STEP)
+                error = np.sqrt(np.mean((outputs - measured) ** 2, axis=(1, 2)))
             return np.where(np.isfinite(error), error, 1e30)
 
         swarm = _swarm(adaptive=self._adaptive)
         best = minimize(_Whole(cost, self._bounds), swarm, ("n_gen", self._generations), seed=window.index)
-        return (Said(np.asarray(best.X)),)
+        return (Estimate(np.asarray(best.X)),)
 
 
 class Plain:
-    """The same in loops over numbers; only its time is of interest."""
+    """The same in loops over Python numbers, for its time only."""
 
     def __init__(self, problem: Problem) -> None:
         self._bounds = problem.bounds
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         measured = outputs_of(window).tolist()
         inputs = inputs_of(window).tolist()
 
         def cost(particle: Array) -> float:
             return euler_rmse(tuple(particle.tolist()), inputs, measured, window.sample_period)
 
-        minimize(_Single(cost, self._bounds), _swarm(adaptive=True), ("n_gen", FEW), seed=window.index)
-        return (Said(np.full(3, np.nan)),)
+        minimize(_Single(cost, self._bounds), _swarm(adaptive=True), ("n_gen", PYTHON_GENERATIONS), seed=window.index)
+        return (Estimate(np.full(3, np.nan)),)
 
 
 def euler_rmse(
     particle: tuple[float, float, float], inputs: list[list[float]], measured: list[list[float]], period: float
 ) -> float:
-    """Eq. 11 and 12, record by record; the load runs straight from one record to the next."""
+    """Eq. 11 and 12, record by record; the load is interpolated linearly between records."""
     R_a, D, J = particle
     L_a, K_e, K_t = KNOWN["L_a"], KNOWN["K_e"], KNOWN["K_t"]
     substeps = round(period / STEP)

@@ -1,9 +1,9 @@
 """An augmented-state unscented Kalman filter by filterpy: current, speed, and the logarithms of the three unknowns.
 
-Tuned as its users would, on motors of another seed than those compared: Merwe's points with alpha 0.1, beta 2 and kappa
-3 - n; hardly any noise in the states, since the equations hold; the logarithms begin at the nominal values with SPREAD.
-How much they wander is the user's guess, so there are two: CALM is best for parameters that stay as they are, AWAKE has
-honest intervals up to a drift of 20 % an hour.
+Tuned on motors of another seed than those compared: Merwe's points with alpha 0.1, beta 2 and kappa 3 - n; hardly any
+noise in the states, since the equations are exact; the logarithms start at the nominal values, with INITIAL_SPREAD.
+Their random walk is the user's choice, so there are two: CONSTANT is best for constant parameters, DRIFTING has correct
+intervals up to a drift of 20 % per hour.
 """
 
 from functools import partial
@@ -11,50 +11,50 @@ from functools import partial
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from benchmarks.estimators.base import Budget, Rival, Said
+from benchmarks.estimators.base import Budget, Estimate, Method
 from benchmarks.estimators.data import KNOWN, NOISE, PERIOD, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Problem
 
-CALM, AWAKE = 1e-6, 3e-5  # of the logarithms, standard deviation per record
-STRAY = 1e-6  # A and rad/s per record
-SPREAD = 0.3  # of the logarithms at the beginning
+CONSTANT, DRIFTING = 1e-6, 3e-5  # of the logarithms, standard deviation per record
+STATE_NOISE = 1e-6  # A and rad/s per record
+INITIAL_SPREAD = 0.3  # of the logarithms at the beginning
 
 
-def rivals(_: Budget) -> tuple[Rival, ...]:
-    """Both tunings: a filter remembers, so there is no cold one."""
+def methods(_: Budget) -> tuple[Method, ...]:
+    """Both tunings; there is no cold one, as a filter carries its state."""
     return (
-        Rival(("UKF (filterpy), calm",), partial(Unscented, CALM), remembers=True),
-        Rival(("UKF (filterpy), awake",), partial(Unscented, AWAKE), remembers=True),
+        Method(("UKF (filterpy), constant",), partial(Unscented, CONSTANT), stateful=True),
+        Method(("UKF (filterpy), drifting",), partial(Unscented, DRIFTING), stateful=True),
     )
 
 
 class Unscented:
-    """One filter for the life of the machine."""
+    """One filter for all windows of the machine."""
 
-    def __init__(self, wander: float, problem: Problem) -> None:
+    def __init__(self, walk: float, problem: Problem) -> None:
         points = MerweScaledSigmaPoints(5, alpha=0.1, beta=2.0, kappa=-2.0)
         self._filter = UnscentedKalmanFilter(5, 2, PERIOD, lambda x: x[:2], _advance, points)
         self._filter.x = np.concatenate([np.zeros(2), np.log(problem.nominal)])
-        self._filter.P = np.diag([*NOISE**2, *[SPREAD**2] * 3])
-        self._filter.Q = np.diag([STRAY**2] * 2 + [wander**2] * 3)
+        self._filter.P = np.diag([*NOISE**2, *[INITIAL_SPREAD**2] * 3])
+        self._filter.Q = np.diag([STATE_NOISE**2] * 2 + [walk**2] * 3)
         self._filter.R = np.diag(NOISE**2)
         self._before: Array | None = None
 
-    def fit(self, window: Window) -> tuple[Said, ...]:
+    def fit(self, window: Window) -> tuple[Estimate, ...]:
         for u, y in zip(inputs_of(window), outputs_of(window), strict=True):
-            if self._before is None:  # the first record of all is the state, as uncertain as its sensors
+            if self._before is None:  # the very first record is the initial state, with the uncertainty of its sensors
                 self._filter.x[:2] = y
             else:
                 self._filter.predict(u=self._before.tolist(), load=float(u[1]))
                 self._filter.update(y)
             self._before = u
         values = np.exp(self._filter.x[2:])
-        return (Said(values, values * np.sqrt(np.diag(self._filter.P)[2:])),)
+        return (Estimate(values, values * np.sqrt(np.diag(self._filter.P)[2:])),)
 
 
 def _advance(x: Array, dt: float, u: list[float], load: float) -> Array:
-    """One record by the classical Runge-Kutta method; the voltage is held, the load runs to ``load``."""
+    """One record by the classical Runge-Kutta method; the voltage is held, the load is interpolated to ``load``."""
     L_a, K_e, K_t = KNOWN["L_a"], KNOWN["K_e"], KNOWN["K_t"]
     R_a, D, J = np.exp(x[2:]).tolist()
     i, w = float(x[0]), float(x[1])

@@ -1,1 +1,1 @@
-"""The paper's scenarios through the very heart of the daemon, and what is found beside what the paper found."""
+"""The paper's scenarios through the daemon's core, compared with the truth and with the paper (``make paper``)."""

@@ -12,81 +12,81 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from benchmarks.paper import process_pool as crew
+from benchmarks.paper import process_pool
 from benchmarks.paper.discovery import Discovery, Search
 from benchmarks.paper.output import document, pages
-from benchmarks.paper.scenarios import HIDING, NAMES, UNKNOWN_NAMES, UNKNOWNS, row_of
+from benchmarks.paper.scenarios import LIMITING_SIGNAL, NAMES, UNKNOWN_NAMES, UNKNOWNS, row_of
 from benchmarks.paper.study import Job, Kind, Study, verdict
 from otolith_drivers.user_dirs import state_directory, writable
 
-QUICK = 300.0  # s
-WIDTH = 120  # columns of tables that go into a file
+QUICK = 300.0  # s of each scenario with --quick
+WIDTH = 120  # columns, if the output is no terminal
 
 
 def new_folder() -> Path:
-    """For the plots of this run."""
+    """Folder for the plots of this run."""
     stamp = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
     return state_directory() / "paper" / f"{stamp}-{os.getpid()}"
 
 
 def compare(names: Sequence[str], folder: Path | None, *, noise: bool, quick: bool, as_json: bool) -> int:
-    """Study the scenarios ``names``, or all, and draw into ``folder``; 0 if every target is met, 1 if not.
+    """Exit code: 0 if every target of the scenarios ``names``, or of all, is met, 1 if not; plots go into ``folder``.
 
     Raises:
-        OtolithError: a file or folder that cannot be used.
+        OtolithError: a file or folder cannot be used.
     """
     if folder is not None:
-        writable(folder)  # before all the work
-    with _bars() as hear:
-        found = crew.perform(jobs_of(names, noise=noise, quick=quick), hear)
-    studies = [entry for entry in found if isinstance(entry, Study)]
-    discoveries = [entry for entry in found if isinstance(entry, Discovery)]
+        writable(folder)  # fail before the long computation
+    with _bars() as on_progress:
+        results = process_pool.run_jobs(jobs_of(names, noise=noise, quick=quick), on_progress)
+    studies = [result for result in results if isinstance(result, Study)]
+    discoveries = [result for result in results if isinstance(result, Discovery)]
     written: list[Path] = []
     if folder is not None:
-        from benchmarks.paper.plots import draw  # noqa: PLC0415 - slow to load, and nobody else needs it
+        from benchmarks.paper.plots import draw  # noqa: PLC0415 - slow to load, and only needed for plots
 
         written = draw(studies, discoveries, folder)
     if as_json:
-        click.echo(document(found, written))
+        click.echo(document(results, written))
     else:
         console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
-        for page in pages(found):
+        for page in pages(results):
             console.print(page)
         if written:
             console.print(f"{len(written)} plots are in {folder}", soft_wrap=True)
-    met = all(verdict(entry.job.row, entry.score) for entry in studies if entry.job.kind is Kind.IDEAL)
-    return 0 if met and all(entry.met for entry in discoveries) else 1
+    met = all(verdict(study.job.row, study.score) for study in studies if study.job.kind is Kind.IDEAL)
+    return 0 if met and all(discovery.met for discovery in discoveries) else 1
 
 
-def jobs_of(names: Sequence[str], *, noise: bool, quick: bool) -> list[crew.Work]:
-    """In the order of the rows, each once; a search for a noise once for each machine."""
+def jobs_of(names: Sequence[str], *, noise: bool, quick: bool) -> list[process_pool.AnyJob]:
+    """The jobs in the order of the rows, each once; one search for the limiting noise per machine."""
     rows = [row_of(name) for name in NAMES if name in names or not names]
     seconds = {row.name: min(row.seconds, QUICK) if quick else row.seconds for row in rows}
     unknown = [row for row in UNKNOWNS if row.name in names or not names]
-    jobs: list[crew.Work] = [Job(row, Kind.IDEAL, seconds[row.name]) for row in rows]
+    jobs: list[process_pool.AnyJob] = [Job(row, Kind.IDEAL, seconds[row.name]) for row in rows]
     for kind in (Kind.IDEAL, Kind.NOISY) if noise else (Kind.IDEAL,):
         jobs += [Search(row, kind, min(row.seconds, QUICK) if quick else row.seconds) for row in unknown]
     if noise:
         jobs += [Job(row, Kind.NOISY, seconds[row.name]) for row in rows]
-        first = {row.machine: row for row in reversed(rows) if row.machine in HIDING}
+        first = {row.machine: row for row in reversed(rows) if row.machine in LIMITING_SIGNAL}
         jobs += [Job(row, Kind.LIMIT, seconds[row.name]) for row in first.values()]
     return jobs
 
 
 @contextmanager
-def _bars() -> Iterator[Callable[[crew.Progress], None]]:
-    """A bar for each job that has begun, on standard error, if somebody sees it."""
+def _bars() -> Iterator[Callable[[process_pool.Progress], None]]:
+    """A progress bar for each job that has begun, on standard error if that is a terminal."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-        tasks: dict[crew.Work, TaskID] = {}
+        tasks: dict[process_pool.AnyJob, TaskID] = {}
 
-        def hear(told: crew.Progress) -> None:
-            if told.job not in tasks:
-                tasks[told.job] = bars.add_task("", total=told.job.steps)
-            bars.update(tasks[told.job], completed=told.steps, description=told.doing)
+        def on_progress(progress: process_pool.Progress) -> None:
+            if progress.job not in tasks:
+                tasks[progress.job] = bars.add_task("", total=progress.job.steps)
+            bars.update(tasks[progress.job], completed=progress.steps, description=progress.activity)
 
-        yield hear
+        yield on_progress
 
 
 @click.command()
@@ -97,7 +97,9 @@ def _bars() -> Iterator[Callable[[crew.Progress], None]]:
     help="Only this one; may be given more than once.",
 )
 @click.option("--quick", is_flag=True, help="Only the first 300 s of each.")
-@click.option("--noise", is_flag=True, help="Again with noisy sensors; and how much noise hides the lift's damping.")
+@click.option(
+    "--noise", is_flag=True, help="Also with noisy sensors, and the noise at which the lift's damping is lost."
+)
 @click.option(
     "--plots",
     type=click.Path(path_type=Path, file_okay=False),
@@ -109,7 +111,7 @@ def _bars() -> Iterator[Callable[[crew.Progress], None]]:
 def paper(
     scenario: tuple[str, ...], quick: bool, noise: bool, plots: Path | None, no_plots: bool, as_json: bool
 ) -> int:
-    """Run the paper's scenarios through the daemon's estimation; compare what is found with the truth and the paper.
+    """Run the paper's scenarios through the daemon's core; compare the estimates with the truth and with the paper.
 
     Each machine is simulated; drifting parameters are estimated in windows of 0.1, 1, 2, 4 and 10 s, unknown components
     discovered in windows of 2 s. That takes minutes.
@@ -123,7 +125,7 @@ def paper(
     """
     if plots is not None and no_plots:
         raise click.UsageError("--plots and --no-plots exclude each other")
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # so that bars and processes are put away
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # so that bars and child processes are cleaned up
     folder = None if no_plots else plots or new_folder()
     return compare(scenario, folder, noise=noise, quick=quick, as_json=as_json)
 

@@ -1,4 +1,4 @@
-"""A picture for each figure of the paper, and one for the study of windows."""
+"""Plots: one for each figure of the paper, and the errors by window length."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,28 +16,28 @@ from otolith_drivers.errors import ServiceError
 from otolith_drivers.user_dirs import writable
 
 DOTS_PER_INCH = 150
-LEAD = 5  # windows that are shown before a component begins
-SMALLEST = 1e-8  # share: what a logarithmic axis shows of an error of nothing
+LEAD = 5  # windows shown before the onset of a component
+SMALLEST = 1e-8  # share: the least error that a logarithmic axis shows
 ESTIMATED, ACTUAL, PAPER, TARGET = "tab:blue", "black", "tab:red", "tab:green"
 
 
 Picture = tuple[str, str, Figure]
-"""Kind, the paper's number if it has one, and the figure."""
+"""Kind, the number of the paper's figure or an empty text, and the plot."""
 
 
 def draw(studies: Sequence[Study], discoveries: Sequence[Discovery], folder: Path) -> list[Path]:
-    """Write the pictures into ``folder``, and say what they are called.
+    """Write the plots into ``folder``; returns their paths.
 
     Raises:
-        ServiceError: they cannot be written.
+        ServiceError: a plot cannot be written.
     """
     writable(folder)
     written = []
     figures: list[tuple[Study | Discovery, Picture]] = [(made, one) for made in studies for one in _figures(made)]
     figures += [(made, one) for made in discoveries for one in _of_discovery(made)]
-    for entry, (kind, number, figure) in figures:
-        noisy = "noisy-" if entry.job.kind is Kind.NOISY else ""
-        path = folder / f"{noisy}{entry.job.row.name}-{kind}{f'-fig-{number}' if number else ''}.png"
+    for result, (kind, number, figure) in figures:
+        noisy = "noisy-" if result.job.kind is Kind.NOISY else ""
+        path = folder / f"{noisy}{result.job.row.name}-{kind}{f'-fig-{number}' if number else ''}.png"
         try:
             figure.savefig(path, dpi=DOTS_PER_INCH)
         except OSError as error:
@@ -46,37 +46,37 @@ def draw(studies: Sequence[Study], discoveries: Sequence[Discovery], folder: Pat
     return written
 
 
-def _figures(entry: Study) -> list[Picture]:
-    value, error, outputs = entry.job.row.figures
+def _figures(study: Study) -> list[Picture]:
+    value, error, outputs = study.job.row.figures
     return [
-        ("value", value, _figure(entry, value, _draw_value)),
-        ("error", error, _figure(entry, error, _draw_error)),
-        ("outputs", outputs, _outputs(entry.curves, _title(entry, outputs))),
-        ("windows", "", _figure(entry, "", _draw_windows)),
+        ("value", value, _figure(study, value, _draw_value)),
+        ("error", error, _figure(study, error, _draw_error)),
+        ("outputs", outputs, _plot_outputs(study.curves, _title(study, outputs))),
+        ("windows", "", _figure(study, "", _draw_windows)),
     ]
 
 
-def _figure(entry: Study, number: str, draw_into: Callable[[Study, Axes], None]) -> Figure:
+def _figure(study: Study, number: str, draw_into: Callable[[Study, Axes], None]) -> Figure:
     figure = Figure(figsize=(9.0, 4.5), layout="constrained")
     axes = figure.subplots()
-    draw_into(entry, axes)
-    axes.set_title(_title(entry, number))
+    draw_into(study, axes)
+    axes.set_title(_title(study, number))
     axes.grid(visible=True, alpha=0.3)
     figure.legend(loc="outside lower center", ncols=5)
     return figure
 
 
-def _of_discovery(entry: Discovery) -> list[Picture]:
+def _of_discovery(discovery: Discovery) -> list[Picture]:
     """The outputs before and after the discovery, and the component's numbers over time."""
-    before, after = entry.job.row.figures
-    curves, end = entry.curves, entry.curves.times[-1]
-    adopted = end if entry.adopted is None else entry.adopted - LENGTH
-    lead = max(entry.begun - LEAD * LENGTH, 0.0)
-    found = [("before", before, _outputs(_between(curves, lead, adopted), _title(entry, before)))]
-    if entry.adopted is not None:
-        found.append(("after", after, _outputs(_between(curves, adopted, end), _title(entry, after))))
-        found.append(("numbers", "", _numbers(entry)))
-    return found
+    before, after = discovery.job.row.figures
+    curves, end = discovery.curves, discovery.curves.times[-1]
+    adopted = end if discovery.adopted is None else discovery.adopted - LENGTH
+    lead = max(discovery.begun - LEAD * LENGTH, 0.0)
+    pictures = [("before", before, _plot_outputs(_between(curves, lead, adopted), _title(discovery, before)))]
+    if discovery.adopted is not None:
+        pictures.append(("after", after, _plot_outputs(_between(curves, adopted, end), _title(discovery, after))))
+        pictures.append(("numbers", "", _numbers(discovery)))
+    return pictures
 
 
 def _between(curves: Curves, first: float, last: float) -> Curves:
@@ -86,11 +86,11 @@ def _between(curves: Curves, first: float, last: float) -> Curves:
     )
 
 
-def _numbers(entry: Discovery) -> Figure:
-    figure = Figure(figsize=(9.0, 2.5 * len(entry.courses)), layout="constrained")
-    grid = figure.subplots(len(entry.courses), 1, squeeze=False, sharex=True)
-    ends = LENGTH * np.arange(1, len(entry.courses[0].value) + 1)
-    for axes, course in zip(grid[:, 0], entry.courses, strict=True):
+def _numbers(discovery: Discovery) -> Figure:
+    figure = Figure(figsize=(9.0, 2.5 * len(discovery.courses)), layout="constrained")
+    grid = figure.subplots(len(discovery.courses), 1, squeeze=False, sharex=True)
+    ends = LENGTH * np.arange(1, len(discovery.courses[0].value) + 1)
+    for axes, course in zip(grid[:, 0], discovery.courses, strict=True):
         known = np.isfinite(course.value)
         columns = (course.low, course.high, course.value, course.truth)
         low, high, value, truth = (column[known] - course.truth[known] for column in columns)
@@ -101,28 +101,28 @@ def _numbers(entry: Discovery) -> Figure:
         axes.grid(visible=True, alpha=0.3)
         axes.legend(loc="upper right")
     grid[-1, 0].set_xlabel("time, s")
-    figure.suptitle(_title(entry, ""))
+    figure.suptitle(_title(discovery, ""))
     return figure
 
 
-def _title(entry: Study | Discovery, number: str) -> str:
+def _title(result: Study | Discovery, number: str) -> str:
     compare = f" (figure{'s' if '-' in number else ''} {number} of the paper)" if number else ""
-    return f"{entry.job.row.title}, {entry.job.kind}{compare}"
+    return f"{result.job.row.title}, {result.job.kind}{compare}"
 
 
-def _draw_value(entry: Study, axes: Axes) -> None:
-    found, name = entry.track, entry.job.row.parameter
-    axes.fill_between(found.ends, found.low, found.high, color=ESTIMATED, alpha=0.25, label="95 % interval")
-    axes.plot(found.ends, found.value, color=ESTIMATED, label=f"{name} estimated")
-    axes.plot(found.ends, found.truth, color=ACTUAL, linestyle="--", linewidth=1.0, label=f"{name} actual")
+def _draw_value(study: Study, axes: Axes) -> None:
+    track, name = study.track, study.job.row.parameter
+    axes.fill_between(track.ends, track.low, track.high, color=ESTIMATED, alpha=0.25, label="95 % interval")
+    axes.plot(track.ends, track.value, color=ESTIMATED, label=f"{name} estimated")
+    axes.plot(track.ends, track.truth, color=ACTUAL, linestyle="--", linewidth=1.0, label=f"{name} actual")
     axes.set_xlabel("time, s")
-    axes.set_ylabel(f"{name}, {entry.unit}")
+    axes.set_ylabel(f"{name}, {study.unit}")
 
 
-def _draw_error(entry: Study, axes: Axes) -> None:
-    found, row = entry.track, entry.job.row
-    axes.plot(found.ends, _per_cent(found.raw, found.truth), color="tab:gray", linewidth=0.8, label="window alone")
-    axes.plot(found.ends, _per_cent(found.value, found.truth), color=ESTIMATED, label="published")
+def _draw_error(study: Study, axes: Axes) -> None:
+    track, row = study.track, study.job.row
+    axes.plot(track.ends, _per_cent(track.raw, track.truth), color="tab:gray", linewidth=0.8, label="window alone")
+    axes.plot(track.ends, _per_cent(track.value, track.truth), color=ESTIMATED, label="published")
     for share, colour, meaning in (
         (row.paper, PAPER, "paper: below, but for peaks"),
         (row.target, TARGET, "target for 99 %"),
@@ -139,10 +139,10 @@ def _per_cent(values: Array, truth: Array) -> Array:
     return np.asarray(100.0 * np.maximum(errors(values, truth), SMALLEST))
 
 
-def _draw_windows(entry: Study, axes: Axes) -> None:
-    lengths = [found.length for found in entry.scores]
+def _draw_windows(study: Study, axes: Axes) -> None:
+    lengths = [score.length for score in study.scores]
     for name, colour in (("raw", "tab:gray"), ("published", ESTIMATED)):
-        spreads = [getattr(found, name) for found in entry.scores]
+        spreads = [getattr(score, name) for score in study.scores]
         for share, line, meaning in (("median", "--", "median"), ("p99", "-", "99 % below")):
             values = [getattr(spread, share) for spread in spreads]
             known = [np.nan if value is None else 100.0 * max(value, SMALLEST) for value in values]
@@ -153,11 +153,11 @@ def _draw_windows(entry: Study, axes: Axes) -> None:
     axes.set_xticks(lengths, [f"{length:g}" for length in lengths])
     axes.minorticks_off()
     axes.set_xlabel("length of the window, s")
-    axes.set_ylabel(f"relative error of {entry.job.row.parameter}, %")
+    axes.set_ylabel(f"relative error of {study.job.row.parameter}, %")
 
 
-def _outputs(curves: Curves, title: str) -> Figure:
-    """Each output measured and predicted, and beside it what is left between them."""
+def _plot_outputs(curves: Curves, title: str) -> Figure:
+    """Each output measured and predicted, and the residual beside it."""
     figure = Figure(figsize=(12.0, 3.0 * len(curves.outputs)), layout="constrained")
     grid = figure.subplots(len(curves.outputs), 2, squeeze=False, sharex=True)
     for index, (name, unit) in enumerate(zip(curves.outputs, curves.units, strict=True)):

@@ -1,4 +1,4 @@
-"""Jobs, several at a time, each in a process that ends with this one: simulating and estimating take a whole core."""
+"""Run several jobs at a time, each in a child process."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -11,76 +11,76 @@ from benchmarks.paper.study import Job, Limit, Study, study
 from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import OtolithError, ServiceError
 
-MOST = 4  # processes: there are no more jobs that take long
-TOLD_EVERY = 20  # steps
-PATIENCE = 1.0  # s between two looks whether a process has died
+MAX_PROCESSES = 4  # processes: more would wait for the longest jobs only
+PROGRESS_EVERY = 20  # steps between two messages of a child
+POLL_SECONDS = 1.0  # s between two checks whether a child has died
 
-# What is done, and what comes of it.
-Work = Job | Search
-Found = Study | Limit | Discovery
+AnyJob = Job | Search
+Result = Study | Limit | Discovery
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a job has come."""
+    """How many of its steps a job has done."""
 
-    job: Work
+    job: AnyJob
     steps: int
-    doing: str
+    activity: str
 
 
 def main(connection: Any) -> None:
-    """Do jobs until None comes."""
+    """Entry point of the child: run jobs until None arrives."""
     while (job := connection.recv()) is not None:
 
-        def tell(steps: int, doing: str, job: Work = job) -> None:
-            if steps % TOLD_EVERY == 1:
-                connection.send(Progress(job, steps, doing))
+        def on_progress(steps: int, activity: str, job: AnyJob = job) -> None:
+            if steps % PROGRESS_EVERY == 1:
+                connection.send(Progress(job, steps, activity))
 
         try:
-            connection.send(discover(job, tell) if isinstance(job, Search) else study(job, tell))
+            connection.send(discover(job, on_progress) if isinstance(job, Search) else study(job, on_progress))
         except OtolithError as error:
             connection.send(error)
 
 
-def perform(jobs: Sequence[Work], hear: Callable[[Progress], None]) -> list[Found]:
-    """What the jobs find, in their order; ``hear`` is told of progress.
+def run_jobs(jobs: Sequence[AnyJob], on_progress: Callable[[Progress], None]) -> list[Result]:
+    """The results of the jobs, in their order; ``on_progress`` is called from time to time.
 
     Raises:
-        OtolithError: an example file that cannot be used, or a process that died.
+        OtolithError: an example file cannot be used, or a child died.
     """
-    waiting, found = list(jobs), dict[Work, Found]()
+    waiting, results = list(jobs), dict[AnyJob, Result]()
     cores = len(os.sched_getaffinity(0))
-    crew = [
-        ChildProcess(f"otolith-paper-{number}", f"{__name__}:main", 2) for number in range(min(cores, MOST, len(jobs)))
+    children = [
+        ChildProcess(f"otolith-paper-{number}", f"{__name__}:main", 2)
+        for number in range(min(cores, MAX_PROCESSES, len(jobs)))
     ]
-    busy: dict[ChildProcess, Work] = {}
+    busy: dict[ChildProcess, AnyJob] = {}
     try:
-        while len(found) < len(jobs):
-            for companion in crew:
-                if waiting and companion not in busy:
-                    busy[companion] = waiting.pop(0)
-                    _hand_over(companion, busy[companion])
-            wait([waitable for companion in busy for waitable in companion.waitables], PATIENCE)
-            for companion, job in list(busy.items()):
-                for said in companion.replies():
-                    if isinstance(said, Progress):
-                        hear(said)
-                    elif isinstance(said, OtolithError):
-                        raise said
+        while len(results) < len(jobs):
+            for child in children:
+                if waiting and child not in busy:
+                    busy[child] = waiting.pop(0)
+                    _start(child, busy[child])
+            wait([waitable for child in busy for waitable in child.waitables], POLL_SECONDS)
+            for child, job in list(busy.items()):
+                for message in child.replies():
+                    if isinstance(message, Progress):
+                        on_progress(message)
+                    elif isinstance(message, OtolithError):
+                        raise message
                     else:
-                        found[job] = said
-                        del busy[companion]
-                        hear(Progress(job, job.steps, f"{job.row.name}: done"))
-                if companion in busy and not companion.alive:
+                        results[job] = message
+                        del busy[child]
+                        on_progress(Progress(job, job.steps, f"{job.row.name}: done"))
+                if child in busy and not child.alive:
                     raise ServiceError(f"the process of {job.row.name} died: is there enough memory?")
     finally:
-        for companion in crew:
-            companion.kill()
-    return [found[job] for job in jobs]
+        for child in children:
+            child.kill()
+    return [results[job] for job in jobs]
 
 
-def _hand_over(companion: ChildProcess, job: Work) -> None:
-    if not companion.alive:
-        companion.start()
-    companion.offer(job)
+def _start(child: ChildProcess, job: AnyJob) -> None:
+    if not child.alive:
+        child.start()
+    child.offer(job)

@@ -1,9 +1,4 @@
-"""The paper's scenarios, one row each, and the sensors that the noise study gives their machines.
-
-The paper's scenarios in which something appears that the twin does not know, one row each.
-
-A scenario lived through once: what the sensors said and what was true, to be cut into windows of any length.
-"""
+"""The paper's scenarios, one row each, their sensors, and their simulation into windows of any length."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,12 +15,14 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from otolith_drivers.units import factor
 
-PEAK = 5.0  # times what 99 % of the errors must stay below: what the largest may reach
+PEAK = 5.0  # largest error allowed, in multiples of the target for 99 % of the errors
+NOISE = 0.005  # standard deviation of a sensor, as a share of that of its signal
+CHUNK = 200  # simulated records between two calls of ``on_chunk``
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A scenario in which one parameter drifts and is sought."""
+    """A scenario in which one parameter drifts and is estimated."""
 
     name: str
     """Of the scenario file."""
@@ -33,17 +30,17 @@ class Row:
     machine: str
     """The machine file, for its twin, its known parameters and its noise."""
     parameter: str
-    """The one that is sought; all others are known."""
+    """The estimated one; all others are known."""
     seconds: float
     paper: float
-    """What the paper's relative error stays below, but for peaks."""
+    """Bound of the paper's relative error, without its peaks."""
     target: float
-    """What 99 % of our relative errors shall stay below."""
+    """Bound of 99 % of our relative errors."""
     figures: tuple[str, str, str]
-    """The paper's numbers for the value over time, its error, and the outputs; empty for a figure it does not have."""
+    """The paper's figures of the value over time, its error, and the outputs; empty if it has none."""
 
 
-# The text of section 5.3.1 sees a change of the damping that its formula is a hundred times too small for: hence two.
+# Section 5.3.1 reports a change of the damping a hundred times larger than its formula gives: hence two rows.
 ROWS = (
     Row(
         name="armature-resistance",
@@ -96,7 +93,7 @@ def row_of(name: str) -> Row:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A noisy sensor behind a converter of 12 bit."""
+    """A noisy sensor with a 12-bit converter."""
 
     signal: str
     """Of the twin."""
@@ -109,17 +106,17 @@ class Sensor:
     high: float
 
     @property
-    def quantum(self) -> float:
+    def adc_step(self) -> float:
         """The converter's step."""
         return (self.high - self.low) / 2**12
 
     @property
     def deviation(self) -> float:
         """Standard deviation of noise and rounding together."""
-        return math.hypot(self.noise, self.quantum / math.sqrt(12.0))
+        return math.hypot(self.noise, self.adc_step / math.sqrt(12.0))
 
 
-# By machine file. What the drive commands, voltage and valve, it knows without a sensor.
+# By machine file. Commands of the drive, voltage and valve, need no sensor.
 SENSORS = {
     "dc-motor": (
         Sensor("i", "current", "A", 0.005, -10.0, 10.0),
@@ -131,29 +128,26 @@ SENSORS = {
         Sensor("p", "pressure", "Pa", 0.2, 0.0, 60e3),
     ),
 }
-# By machine file: the signal whose noise can hide the parameter; damping is 7 Pa of the lift's pressure of 50 kPa.
-HIDING = {"hydraulic-actuator": "p"}
-
-
-NOISE = 0.005  # standard deviation of a sensor, as a share of that of its signal
+# By machine file: the signal whose noise limits the parameter; damping is 7 Pa of the lift's pressure of 50 kPa.
+LIMITING_SIGNAL = {"hydraulic-actuator": "p"}
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number of a component that is to be found."""
+    """A number of a component that is to be discovered."""
 
     name: str
     """In the report."""
     target: float | None = None
-    """What its relative error shall stay below from the discovery on, with ideal sensors; None for no target."""
+    """Bound of its relative error from the discovery on, with ideal sensors; None for no target."""
     noisy: float | None = None
     """The same with noisy sensors."""
     paper: float | None = None
     """The paper's relative error."""
     over: str = ""
-    """The parameter by which the paper divides it, if it does."""
+    """The parameter by which the paper divides it, if any."""
     unit: str = ""
-    """The paper's, if it divides."""
+    """The paper's unit, if it divides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,19 +160,19 @@ class Unknown:
     machine: str
     """The machine file, for its twin, its known parameters and its noise."""
     parameter: str
-    """The one that is estimated all the while; all others are known."""
+    """The estimated one; all others are known."""
     seconds: float
     component: str
-    """The key that it has to be found as."""
+    """Its expected key."""
     numbers: tuple[Number, ...]
     output: str
-    """The one whose prediction the paper looks at."""
+    """The output whose prediction the paper shows."""
     within: float
-    """What its largest error shall stay below from the discovery on, in its unit, with ideal sensors."""
+    """Bound of its largest error from the discovery on, in its unit, with ideal sensors."""
     paper: tuple[float, float] | None
-    """The paper's largest errors before and after the discovery; None for what it does not say."""
+    """The paper's largest errors before and after the discovery; None if not reported."""
     figures: tuple[str, str]
-    """The paper's numbers for the outputs before and after."""
+    """The paper's figures of the outputs before and after."""
     sensors: tuple[Sensor, ...] = ()
     """Noisy ones; none for noise in proportion to the signals (:data:`NOISE`)."""
 
@@ -220,16 +214,13 @@ UNKNOWNS = (
 UNKNOWN_NAMES = tuple(row.name for row in UNKNOWNS)
 
 
-def unknown_of(name: str) -> Unknown:
+def unknown_row_of(name: str) -> Unknown:
     """The row of that name."""
     return next(row for row in UNKNOWNS if row.name == name)
 
 
-CHUNK = 200  # records between two calls that tell of progress
-
-
-class Lived(Protocol):
-    """A row of any kind."""
+class AnyRow(Protocol):
+    """What both kinds of rows have."""
 
     @property
     def name(self) -> str:
@@ -241,12 +232,12 @@ class Lived(Protocol):
 
     @property
     def parameter(self) -> str:
-        """The one that is estimated."""
+        """The estimated one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Life:
-    """A simulated machine's signals, and its parameter as it really was."""
+class SimulatedRecord:
+    """Signals of a simulated machine, and the true values of its parameter."""
 
     signals: tuple[str, ...]
     """Of the twin."""
@@ -258,14 +249,14 @@ class Life:
     """(records + 1,) at each record, and at the end of the last."""
 
     def windows(self, records: int) -> Iterator[Window]:
-        """As the daemon would cut them; what is left over at the end makes none."""
+        """Consecutive windows of so many records, as the daemon cuts them; an incomplete last one is dropped."""
         for index in range(len(self.values) // records):
             first = index * records
             values = self.values[first : first + records]
             yield Window.whole(index, first * self.period, self.period, self.signals, values)
 
-    def with_noise(self, deviations: Mapping[str, float], seed: int) -> "Life":
-        """As other sensors would have seen the same life: for signals that no controller acts upon."""
+    def with_noise(self, deviations: Mapping[str, float], seed: int) -> "SimulatedRecord":
+        """The same record with other sensors, for signals that no controller uses."""
         random = np.random.default_rng(seed)
         values = self.values.copy()
         for name, deviation in deviations.items():
@@ -273,34 +264,36 @@ class Life:
         return replace(self, values=values)
 
 
-def plan_of(row: Lived) -> LoadedMachine:
-    """What the row's machine file means.
+def machine_of(row: AnyRow) -> LoadedMachine:
+    """The row's machine, loaded.
 
     Raises:
-        OtolithError: it cannot be used.
+        OtolithError: its file cannot be used.
     """
     return load_machine(examples_directory() / f"{row.machine}.toml", with_driver=False)
 
 
-def problem_of(row: Lived, plan: LoadedMachine, deviations: Mapping[str, float]) -> Problem:
-    """The plan's, with the row's parameter sought and all others known, told ``deviations`` of the sensors.
+def problem_of(row: AnyRow, machine: LoadedMachine, deviations: Mapping[str, float]) -> Problem:
+    """The machine's problem with only the row's parameter free, and ``deviations`` as noise of the sensors.
 
-    An input that is measured by an ideal sensor is exact; outputs are weighed as the machine file says.
+    An input without a deviation is exact; an output without one has the noise of the machine file.
     """
-    problem, twin = plan.problem, plan.twin
-    nominal = dict(problem.known) | {entry.name: entry.nominal for entry in problem.free}
-    sought = next((entry for entry in problem.free if entry.name == row.parameter), twin.parameter(row.parameter))
+    problem, twin = machine.problem, machine.twin
+    nominal = dict(problem.known) | {parameter.name: parameter.nominal for parameter in problem.free}
+    estimated = next((free for free in problem.free if free.name == row.parameter), twin.parameter(row.parameter))
     return replace(
         problem,
         known=tuple((name, value) for name, value in nominal.items() if name != row.parameter),
-        free=(replace(sought, nominal=nominal[row.parameter]),),
-        noise=tuple(deviations.get(entry.name, own) for entry, own in zip(twin.outputs, problem.noise, strict=True)),
-        input_noise=tuple(deviations.get(entry.name, 0.0) for entry in twin.inputs),
+        free=(replace(estimated, nominal=nominal[row.parameter]),),
+        noise=tuple(deviations.get(signal.name, own) for signal, own in zip(twin.outputs, problem.noise, strict=True)),
+        input_noise=tuple(deviations.get(signal.name, 0.0) for signal in twin.inputs),
     )
 
 
-def live(row: Lived, plan: LoadedMachine, seconds: float, sensors: Sequence[Sensor], lived: Callable[[], None]) -> Life:
-    """Simulate the row's scenario, with ideal sensors if none are given; ``lived`` is called after every 200 records.
+def simulate_row(
+    row: AnyRow, machine: LoadedMachine, seconds: float, sensors: Sequence[Sensor], on_chunk: Callable[[], None]
+) -> SimulatedRecord:
+    """The row's scenario, simulated with ``sensors`` or ideal ones; ``on_chunk`` is called every ``CHUNK`` records.
 
     Raises:
         OtolithError: the scenario file cannot be used.
@@ -308,20 +301,20 @@ def live(row: Lived, plan: LoadedMachine, seconds: float, sensors: Sequence[Sens
     scenario = load_scenario(examples_directory() / "scenarios" / f"{row.name}.toml")
     noise = {sensor.plant: sensor.noise for sensor in sensors}
     scenario = scenario.model_copy(update={"noise": scenario.noise.model_copy(update=noise)})
-    sources = [str(plan.file.signals[name]["signal"]) for name in plan.twin.signals]
+    sources = [str(machine.file.signals[name]["signal"]) for name in machine.twin.signals]
     records = round(seconds / scenario.sample_period)
     values, truth = np.empty((records + 1, len(sources))), np.empty(records + 1)
     for index, tick in enumerate(islice(simulate(scenario), records + 1)):
         values[index] = [tick.measured[source] for source in sources]
         truth[index] = tick.truth[row.parameter]
         if index % CHUNK == CHUNK - 1:
-            lived()
+            on_chunk()
     units = scenario.SIGNALS
-    for column, (name, source) in enumerate(zip(plan.twin.signals, sources, strict=True)):
-        scale, offset = factor(units[source], plan.twin.unit_of(name))
+    for column, (name, source) in enumerate(zip(machine.twin.signals, sources, strict=True)):
+        scale, offset = factor(units[source], machine.twin.unit_of(name))
         values[:, column] = scale * values[:, column] + offset
     for sensor in sensors:
-        column = plan.twin.signals.index(sensor.signal)
-        clipped = np.clip(values[:, column], sensor.low, sensor.high - sensor.quantum)
-        values[:, column] = sensor.low + np.rint((clipped - sensor.low) / sensor.quantum) * sensor.quantum
-    return Life(plan.twin.signals, scenario.sample_period, values[:records], truth)
+        column = machine.twin.signals.index(sensor.signal)
+        clipped = np.clip(values[:, column], sensor.low, sensor.high - sensor.adc_step)
+        values[:, column] = sensor.low + np.rint((clipped - sensor.low) / sensor.adc_step) * sensor.adc_step
+    return SimulatedRecord(machine.twin.signals, scenario.sample_period, values[:records], truth)

@@ -1,10 +1,6 @@
-"""What is done with one scenario: the comparison with the paper, the study of windows, and the studies of noise.
+"""Studies of one scenario: errors of the published values by window length, and the noise that hides a parameter.
 
-Pure of processes: a job goes in, progress is told, and what was found comes out; the same job finds the same.
-
-One life through the heart, window by window, as the daemon would have it: what was published, and what was true.
-
-How far what was published lies from what was true, in numbers.
+Without processes and files: the same job gives the same result.
 """
 
 from collections import Counter
@@ -15,7 +11,18 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.paper.scenarios import CHUNK, HIDING, PEAK, SENSORS, Life, Row, Sensor, live, plan_of, problem_of
+from benchmarks.paper.scenarios import (
+    CHUNK,
+    LIMITING_SIGNAL,
+    PEAK,
+    SENSORS,
+    Row,
+    Sensor,
+    SimulatedRecord,
+    machine_of,
+    problem_of,
+    simulate_row,
+)
 from otolith.acquisition.window import Array, Mask
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
@@ -23,12 +30,12 @@ from otolith.estimation.information import Identifiability
 from otolith.estimation.problem import Problem
 from otolith.health.schema import Report, Status
 
-EXCITED = 10.0  # standard deviations of a sensor: how far an output must move for a window to be excited
+EXCITED = 10.0  # standard deviations of a sensor: an output that moves farther excites the window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Of every window what was said of the parameter; not a number where nothing was. Arrays are (windows,)."""
+    """The parameter in every window; arrays are (windows,), not a number without an estimate."""
 
     length: float
     """Of a window, s."""
@@ -37,11 +44,11 @@ class Track:
     truth: Array
     """At the end of each window."""
     value: Array
-    """Published: from this window and those before it."""
+    """Published value: from this window and those before it."""
     low: Array
     high: Array
     raw: Array
-    """What the window alone says."""
+    """Estimate of the window alone."""
     excited: Mask
     """Whether an output moved."""
     determined: Mask
@@ -50,7 +57,7 @@ class Track:
 
     @property
     def begun(self) -> int:
-        """The first excited window: from there on everything counts."""
+        """The first excited window, from which on errors count."""
         return int(np.argmax(self.excited)) if self.excited.any() else len(self.excited)
 
     @property
@@ -69,39 +76,41 @@ class Curves:
     """s."""
     measured: Array
     predicted: Array
-    """Not a number where nothing was predicted."""
+    """Not a number without a prediction."""
 
 
-def listened(problem: Problem, life: Life, records: int, heard: Callable[[], None]) -> list[Report]:
-    """What the heart says of ``life`` in windows of so many records; ``heard`` is called after each."""
+def reports_of(problem: Problem, record: SimulatedRecord, records: int, on_window: Callable[[], None]) -> list[Report]:
+    """Reports of the core for windows of so many records; ``on_window`` is called after each."""
     state = initial_state("paper", "paper", problem)
     reports = []
-    for window in life.windows(records):
+    for window in record.windows(records):
         state, report = adapt(state, window)
         reports.append(report)
-        heard()
+        on_window()
     return reports
 
 
-def track(problem: Problem, life: Life, length: float, heard: Callable[[], None]) -> tuple[Track, Curves]:
-    """Let the heart hear ``life`` in windows of ``length`` s; ``heard`` is called after each."""
-    name, records = problem.free[0].name, round(length / life.period)
-    reports = listened(problem, life, records, heard)
-    said = [(report, report.document.parameters[name]) for report in reports]
-    ends = np.arange(1, len(said) + 1) * records
-    found = Track(
+def track(
+    problem: Problem, record: SimulatedRecord, length: float, on_window: Callable[[], None]
+) -> tuple[Track, Curves]:
+    """Track and curves in windows of ``length`` s; ``on_window`` is called after each."""
+    name, records = problem.free[0].name, round(length / record.period)
+    reports = reports_of(problem, record, records, on_window)
+    estimates = [(report, report.document.parameters[name]) for report in reports]
+    ends = np.arange(1, len(estimates) + 1) * records
+    result = Track(
         length=length,
-        ends=np.asarray(ends * life.period, dtype=np.float64),
-        truth=life.truth[ends],
-        value=_column([entry.value for _, entry in said]),
-        low=_column([entry.low for _, entry in said]),
-        high=_column([entry.high for _, entry in said]),
-        raw=_column([entry.raw for _, entry in said]),
+        ends=np.asarray(ends * record.period, dtype=np.float64),
+        truth=record.truth[ends],
+        value=_column([estimate.value for _, estimate in estimates]),
+        low=_column([estimate.low for _, estimate in estimates]),
+        high=_column([estimate.high for _, estimate in estimates]),
+        raw=_column([estimate.raw for _, estimate in estimates]),
         excited=np.array([_is_excited(report, problem) for report in reports], dtype=np.bool_),
-        determined=np.array([entry.identifiability is Identifiability.DETERMINED for _, entry in said]),
-        statuses=tuple(entry.status for _, entry in said),
+        determined=np.array([estimate.identifiability is Identifiability.DETERMINED for _, estimate in estimates]),
+        statuses=tuple(estimate.status for _, estimate in estimates),
     )
-    return found, curves(problem, life, reports)
+    return result, curves(problem, record, reports)
 
 
 def _column(values: list[float | None]) -> Array:
@@ -113,16 +122,16 @@ def _is_excited(report: Report, problem: Problem) -> bool:
     return bool((moved > EXCITED * np.array(problem.noise)).any())
 
 
-def curves(problem: Problem, life: Life, reports: list[Report]) -> Curves:
+def curves(problem: Problem, record: SimulatedRecord, reports: list[Report]) -> Curves:
     """The outputs of all windows."""
     outputs = problem.twin.outputs
     traces = [report.traces for report in reports]
     measured = np.concatenate([trace.measured for trace in traces])
     nothing = np.full_like(traces[0].measured, np.nan)
     return Curves(
-        outputs=tuple(entry.name for entry in outputs),
-        units=tuple(entry.unit for entry in outputs),
-        times=np.asarray(life.period * np.arange(len(measured)), dtype=np.float64),
+        outputs=tuple(output.name for output in outputs),
+        units=tuple(output.unit for output in outputs),
+        times=np.asarray(record.period * np.arange(len(measured)), dtype=np.float64),
         measured=measured,
         predicted=np.concatenate([nothing if trace.predicted is None else trace.predicted for trace in traces]),
     )
@@ -130,7 +139,7 @@ def curves(problem: Problem, life: Life, reports: list[Report]) -> Curves:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Of relative errors, over every window from the first excited one on; None where no window said anything."""
+    """Relative errors of all windows from the first excited one on; None without any estimate."""
 
     median: float | None
     p99: float | None
@@ -139,13 +148,13 @@ class Spread:
     """Windows without a value."""
 
     def meets(self, target: float) -> bool:
-        """Whether the 99th percentile is within it, and the largest error within five times as much."""
+        """Whether the 99th percentile is within the target, and the largest error within ``PEAK`` times it."""
         return self.p99 is not None and self.maximum is not None and self.p99 <= target >= self.maximum / PEAK
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What a track comes to."""
+    """Summary of a track."""
 
     length: float
     """Of a window, s."""
@@ -156,7 +165,7 @@ class Score:
     """The first window that estimated the parameter."""
     published: Spread
     raw: Spread
-    """Of each window alone, as the paper reports it."""
+    """Errors of each window alone, as the paper reports it."""
     worst: int | None
     """The window with the largest published error."""
     coverage: float | None
@@ -169,81 +178,79 @@ class Score:
     """Of the predicted outputs, from the first excited window on, each in its unit."""
 
 
-def score(found: Track, curves: Curves) -> Score:
-    """Judge a track and the curves that belong to it."""
-    begun = found.begun
-    value, truth = found.value[begun:], found.truth[begun:]
-    off, said = errors(value, truth), np.isfinite(value)
-    inside = (found.low[begun:] <= truth) & (truth <= found.high[begun:])
-    statuses = Counter(found.statuses[begun:])
+def score(track: Track, curves: Curves) -> Score:
+    """Summary of a track and its curves."""
+    begun = track.begun
+    value, truth = track.value[begun:], track.truth[begun:]
+    off, present = errors(value, truth), np.isfinite(value)
+    inside = (track.low[begun:] <= truth) & (truth <= track.high[begun:])
+    statuses = Counter(track.statuses[begun:])
     return Score(
-        length=found.length,
-        windows=len(found.value),
+        length=track.length,
+        windows=len(track.value),
         begun=begun,
-        first=found.first,
+        first=track.first,
         published=_spread(off),
-        raw=_spread(errors(found.raw[begun:], truth)),
-        worst=begun + int(np.nanargmax(off)) if said.any() else None,
-        coverage=float(inside[said].mean()) if said.any() else None,
+        raw=_spread(errors(track.raw[begun:], truth)),
+        worst=begun + int(np.nanargmax(off)) if present.any() else None,
+        coverage=float(inside[present].mean()) if present.any() else None,
         statuses={status.value: statuses[status] for status in Status},
-        alone=int(found.determined[begun:].sum()),
-        rmse=_rmse(curves, len(curves.times) // max(len(found.value), 1) * begun),
+        alone=int(track.determined[begun:].sum()),
+        rmse=_rmse(curves, len(curves.times) // max(len(track.value), 1) * begun),
     )
 
 
 def errors(values: Array, truth: Array) -> Array:
-    """Relative; not a number where there is no value."""
+    """Relative errors; not a number without a value."""
     return np.asarray(np.abs(values / truth - 1.0))
 
 
-def verdict(row: Row, found: Score) -> bool:
+def verdict(row: Row, score: Score) -> bool:
     """Whether the row's targets are met."""
-    return found.published.meets(row.target)
+    return score.published.meets(row.target)
 
 
 def _spread(off: Array) -> Spread:
-    said = off[np.isfinite(off)]
-    if not said.size:
+    present = off[np.isfinite(off)]
+    if not present.size:
         return Spread(None, None, None, len(off))
-    middle, p99 = np.percentile(said, (50.0, 99.0)).tolist()
-    return Spread(middle, p99, float(said.max()), len(off) - len(said))
+    middle, p99 = np.percentile(present, (50.0, 99.0)).tolist()
+    return Spread(middle, p99, float(present.max()), len(off) - len(present))
 
 
 def _rmse(curves: Curves, first: int) -> dict[str, float]:
     off = (curves.predicted - curves.measured)[first:]
-    found = {}
+    rmse = {}
     for index, name in enumerate(curves.outputs):
-        said = off[np.isfinite(off[:, index]), index]
-        if said.size:
-            found[name] = float(np.sqrt(np.mean(said**2)))
-    return found
+        errors = off[np.isfinite(off[:, index]), index]
+        if errors.size:
+            rmse[name] = float(np.sqrt(np.mean(errors**2)))
+    return rmse
 
 
 LENGTH = 2.0  # s: the paper's window
 LENGTHS = (0.1, 1.0, LENGTH, 4.0, 10.0)  # s: those of section 5.2.1
 PERIOD = 0.01  # s: of the paper's records
-QUIETEST = (
-    0.1  # of a sensor's noise: where the search for the level that hides a parameter begins; it ends at its range
-)
-HALVINGS = 9  # of that search
-BLUNT = 100.0
+MIN_NOISE_RATIO = 0.1  # of a sensor's noise: where the search for the limiting noise begins; it ends at the range
+BISECTIONS = 9  # of that search
+OTHERS_NOISE_FACTOR = 100.0  # on the noise of the other sensors, so that they hardly contribute
 SEED = 1
 
-Tell = Callable[[int, str], None]
-"""How many steps have been done, of :attr:`Job.steps`, and what is being done now."""
+OnProgress = Callable[[int, str], None]
+"""Called with the steps done, of :attr:`Job.steps`, and the present activity."""
 
 
 class Kind(StrEnum):
-    """What is done."""
+    """Kind of study."""
 
     IDEAL = "ideal sensors"
     NOISY = "noisy sensors"
-    LIMIT = "search for the noise that hides"
+    LIMIT = "search for the limiting noise"
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One scenario to be studied for its first ``seconds``."""
+    """Study of the first ``seconds`` of a scenario."""
 
     row: Row
     kind: Kind
@@ -251,22 +258,22 @@ class Job:
 
     @property
     def steps(self) -> int:
-        """How much work it is, in windows of the paper: simulating one takes about as long as estimating from one."""
+        """Amount of work in windows of the paper; simulating one takes about as long as estimating from it."""
         per = self.seconds / (CHUNK * PERIOD)
         if self.kind is Kind.LIMIT:
-            return int(per * (1 + 3 * HALVINGS))
+            return int(per * (1 + 3 * BISECTIONS))
         return int(per) + sum(int(self.seconds / length) for length in LENGTHS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Study:
-    """A scenario in windows of several lengths."""
+    """Result of a scenario in windows of several lengths."""
 
     job: Job
     unit: str
     """Of the parameter."""
     track: Track
-    """In windows of the paper's length, as the curves."""
+    """In windows of the paper's length, like the curves."""
     curves: Curves
     scores: tuple[Score, ...]
     """By length."""
@@ -274,12 +281,12 @@ class Study:
     @property
     def score(self) -> Score:
         """In windows of the paper's length."""
-        return next(entry for entry in self.scores if entry.length == LENGTH)
+        return next(score for score in self.scores if score.length == LENGTH)
 
 
 @dataclass(frozen=True, slots=True)
-class Edge:
-    """Between which noise levels something is lost; None for one beyond what was searched."""
+class NoiseBracket:
+    """Noise levels that enclose the limit; None for one outside the search."""
 
     kept: float | None
     lost: float | None
@@ -287,86 +294,88 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """At which noise of a sensor a parameter is lost, while the other sensors have theirs."""
+    """Noise of a sensor at which a parameter is lost, while the other sensors keep theirs."""
 
     job: Job
     sensor: Sensor
-    alone: Edge
-    """To every window alone."""
-    together: Edge
-    """To all of them together."""
-    unaided: Edge
-    """The same with the other sensors ``BLUNT`` times as noisy, so that they tell hardly anything."""
+    alone: NoiseBracket
+    """No window alone determines it."""
+    together: NoiseBracket
+    """All windows together do not determine it."""
+    unaided: NoiseBracket
+    """The same with the other sensors ``OTHERS_NOISE_FACTOR`` times as noisy."""
 
 
-def study(job: Job, tell: Tell) -> Study | Limit:
-    """Do a job.
+def study(job: Job, on_progress: OnProgress) -> Study | Limit:
+    """Run a job.
 
     Raises:
-        OtolithError: an example file that cannot be used.
+        OtolithError: an example file cannot be used.
     """
-    steps = Steps(tell, f"{job.row.name}, {job.kind}")
+    steps = StepCounter(on_progress, f"{job.row.name}, {job.kind}")
     return _limit(job, steps) if job.kind is Kind.LIMIT else _study(job, steps)
 
 
-class Steps:
-    """Counts them."""
+class StepCounter:
+    """Counts the steps of a job and reports them."""
 
-    def __init__(self, tell: Tell, what: str) -> None:
-        self._tell, self._what = tell, what
-        self._done, self._doing = 0, ""
+    def __init__(self, on_progress: OnProgress, job: str) -> None:
+        self._tell, self._job = on_progress, job
+        self._done, self._activity = 0, ""
 
-    def now(self, doing: str) -> None:
-        """From here on ``doing`` is done."""
-        self._doing = doing
+    def now(self, activity: str) -> None:
+        """Set the present activity."""
+        self._activity = activity
 
     def __call__(self) -> None:
-        """One more is done."""
+        """Count one step."""
         self._done += 1
-        self._tell(self._done, f"{self._what}: {self._doing}")
+        self._tell(self._done, f"{self._job}: {self._activity}")
 
 
-def _study(job: Job, steps: Steps) -> Study:
-    row, plan = job.row, plan_of(job.row)
+def _study(job: Job, steps: StepCounter) -> Study:
+    row, machine = job.row, machine_of(job.row)
     sensors = SENSORS[row.machine] if job.kind is Kind.NOISY else ()
     steps.now("simulating")
-    life = live(row, plan, job.seconds, sensors, steps)
-    problem = problem_of(row, plan, {sensor.signal: sensor.deviation for sensor in sensors})
-    found: dict[float, tuple[Track, Curves]] = {}
+    record = simulate_row(row, machine, job.seconds, sensors, steps)
+    problem = problem_of(row, machine, {sensor.signal: sensor.deviation for sensor in sensors})
+    results: dict[float, tuple[Track, Curves]] = {}
     for length in LENGTHS:
         steps.now(f"windows of {length:g} s")
-        found[length] = track(problem, life, length, steps)
-    scores = tuple(score(*found[length]) for length in LENGTHS)
-    return Study(job, problem.free[0].unit, *found[LENGTH], scores)
+        results[length] = track(problem, record, length, steps)
+    scores = tuple(score(*results[length]) for length in LENGTHS)
+    return Study(job, problem.free[0].unit, *results[LENGTH], scores)
 
 
-def _limit(job: Job, steps: Steps) -> Limit:
-    row, plan = job.row, plan_of(job.row)
-    sensor = next(entry for entry in SENSORS[row.machine] if entry.signal == HIDING[row.machine])
+def _limit(job: Job, steps: StepCounter) -> Limit:
+    row, machine = job.row, machine_of(job.row)
+    sensor = next(candidate for candidate in SENSORS[row.machine] if candidate.signal == LIMITING_SIGNAL[row.machine])
     steps.now("simulating")
-    life = live(row, plan, job.seconds, (), steps)
-    own = {entry.signal: entry.noise for entry in SENSORS[row.machine]}
+    record = simulate_row(row, machine, job.seconds, (), steps)
+    own = {candidate.signal: candidate.noise for candidate in SENSORS[row.machine]}
 
     @cache
-    def heard(level: float, others: float = 1.0) -> Track:
+    def at_noise(level: float, others: float = 1.0) -> Track:
         steps.now(f"{level:.3g} {sensor.unit}")
         deviations = {name: others * noise for name, noise in own.items()} | {sensor.signal: level}
-        problem = replace(problem_of(row, plan, deviations), discover=False)  # the plant's own ripple is none of this
-        return track(problem, life.with_noise(deviations, SEED), LENGTH, steps)[0]
+        problem = replace(
+            problem_of(row, machine, deviations), discover=False
+        )  # the plant's own ripple would be discovered
+        return track(problem, record.with_noise(deviations, SEED), LENGTH, steps)[0]
 
-    alone = _edge(sensor, lambda level: not heard(level).determined.any())
-    together = _edge(sensor, lambda level: bool(np.isnan(heard(level).value).all()))
-    unaided = _edge(sensor, lambda level: bool(np.isnan(heard(level, BLUNT).value).all()))
+    alone = _bracket(sensor, lambda level: not at_noise(level).determined.any())
+    together = _bracket(sensor, lambda level: bool(np.isnan(at_noise(level).value).all()))
+    unaided = _bracket(sensor, lambda level: bool(np.isnan(at_noise(level, OTHERS_NOISE_FACTOR).value).all()))
     return Limit(job, sensor, alone, together, unaided)
 
 
-def _edge(sensor: Sensor, lost: Callable[[float], bool]) -> Edge:
-    kept, gone = QUIETEST * sensor.noise, sensor.high - sensor.low
+def _bracket(sensor: Sensor, lost: Callable[[float], bool]) -> NoiseBracket:
+    kept, missing = MIN_NOISE_RATIO * sensor.noise, sensor.high - sensor.low
     if lost(kept):
-        return Edge(None, kept)
-    if not lost(gone):
-        return Edge(gone, None)
-    for _ in range(HALVINGS):
-        middle = (kept * gone) ** 0.5
-        kept, gone = (kept, middle) if lost(middle) else (middle, gone)
-    return Edge(kept, gone)
+        return NoiseBracket(None, kept)
+    if not lost(missing):
+        return NoiseBracket(missing, None)
+    for _ in range(BISECTIONS):
+        middle = (kept * missing) ** 0.5
+        kept, missing = (kept, middle) if lost(middle) else (middle, missing)
+    return NoiseBracket(kept, missing)

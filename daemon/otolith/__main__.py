@@ -1,26 +1,24 @@
-"""Where execution starts: ``otolith`` and ``python -m otolith``."""
+"""Entry point of ``otolith`` and ``python -m otolith``."""
 
-# Before anything else, by the C module, which needs no import of its own: Ctrl-C in start-up has nothing to clean
-# up, so it ends the process at once, without a traceback. Commands take the signal over.
-import _signal  # type: ignore[import-not-found]  # no stub: signal is the public face of it
+# First of all, and by the C module, which imports nothing itself: during start-up Ctrl-C ends the process at once,
+# without a traceback. The commands install their own handlers later.
+import _signal  # type: ignore[import-not-found]  # no stub: signal is its public interface
 
 _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
 import os  # noqa: E402
 import sys  # noqa: E402
 
-# Matrices here are small: threads of the linear algebra would only get into each other's way. Before NumPy is loaded.
+# The matrices are small, so threads of the linear algebra cost more than they save. Set before NumPy is loaded.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-INTERRUPTED = 130  # as a shell reports a command that Ctrl-C ended
-
 
 def main() -> None:
-    """Run the command line; errors become one line each and an exit code, never a traceback."""
+    """Run the command line and exit. An error is printed as one line per fault, never as a traceback."""
     import click  # noqa: PLC0415 - after the lines above
 
-    from otolith.cli.common import NobodyReads  # noqa: PLC0415
+    from otolith.cli.common import INTERRUPTED  # noqa: PLC0415
     from otolith.cli.main import cli  # noqa: PLC0415
     from otolith_drivers.errors import OtolithError  # noqa: PLC0415
 
@@ -35,10 +33,7 @@ def main() -> None:
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = INTERRUPTED
-    except NobodyReads:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 0
-    except OSError as error:  # a disk that is full, a file that went away: nothing that a traceback would explain
+    except OSError as error:  # such as a full disk or a file that was removed: a traceback would explain nothing
         click.echo(f"Error: {error}", err=True)
         code = 2
     sys.exit(code or 0)

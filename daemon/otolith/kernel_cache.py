@@ -1,8 +1,8 @@
-"""Compiled kernels on disk: the one place below the heart that touches files.
+"""Compiled kernels on disk: the only place below the adaptation core that touches files.
 
-What it returns depends on its arguments alone. The folder is private to its user, because what is loaded from it runs;
-two processes that want the same kernel at once compile it once; what other versions made is not used and, in the end,
-removed.
+The result of :func:`load` depends on its arguments alone. The folder must be private to the user, because the modules
+in it are executed. Two processes that need the same kernel at once compile it once. Kernels of other versions of
+Otolith or of its libraries are not used, and removed when the cache is full.
 """
 
 import fcntl
@@ -22,19 +22,19 @@ from types import ModuleType
 from otolith_drivers.errors import ServiceError
 from otolith_drivers.user_dirs import cache_directory
 
-MOST_KERNELS = 64  # folders; the oldest beyond are removed
+MAX_KERNELS = 64  # folders in the cache, at most 3 MB each; the least recently used beyond are removed
 GENERATOR = sorted((Path(__file__).parent / "twin").glob("*.py"))
 LIBRARIES = ("numba", "llvmlite", "numpy", "sympy")
 
 
 def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
-    """The module of ``make_source()``, which is only called for an ``identity`` that the cache does not have.
+    """Return the module with the source ``make_source()``, which is called only if ``identity`` is not in the cache.
 
     Raises:
-        ServiceError: the cache folder belongs to somebody else or can be written by others.
+        ServiceError: the cache folder belongs to another user or can be written by others.
     """
     versions = " ".join(f"{name} {version(name)}" for name in LIBRARIES)
-    text = f"{identity}\n{versions}\npython {sys.version}\n{_generator()}"
+    text = f"{identity}\n{versions}\npython {sys.version}\n{_generator_hash()}"
     key = hashlib.sha256(text.encode()).hexdigest()[:24]
     name = f"otolith_kernel_{key}"
     if name in sys.modules:
@@ -52,21 +52,21 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
 
 
 @cache
-def _generator() -> str:
-    """What tells one version of the generator from another: its own text, so that nobody has to remember a number."""
+def _generator_hash() -> str:
+    """Return a hash of the code that generates kernels, so that no version number has to be maintained."""
     return hashlib.sha256(b"".join(path.read_bytes() for path in GENERATOR)).hexdigest()
 
 
 @contextmanager
 def compiling(module: ModuleType) -> Iterator[None]:
-    """Held around the first call of a kernel: another process waits and then finds the result in the cache."""
+    """Hold the lock of a kernel during its first call: other processes wait, then load the compiled code."""
     file = Path(module.__file__ or "")
     with _locked(file.parent.parent / f"{file.parent.name}.lock"):
         yield
 
 
 def discard(module: ModuleType) -> None:
-    """Remove what is compiled of a module: a file that a power cut left half would fail for ever."""
+    """Remove the compiled code of a module: code that a power cut truncated would fail at every start."""
     shutil.rmtree(Path(module.__file__ or "").parent / "__pycache__", ignore_errors=True)
 
 
@@ -78,7 +78,7 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def _write(file: Path, text: str) -> None:
-    """All or nothing: a process that dies here leaves no half of a module."""
+    """Write all or nothing: a process that dies here leaves no truncated module."""
     handle, temporary = tempfile.mkstemp(dir=file.parent, suffix=".new")
     with os.fdopen(handle, "w", encoding="utf-8") as stream:
         stream.write(text)
@@ -97,7 +97,7 @@ def _import(name: str, file: Path) -> ModuleType:
 
 def _remove_old(store: Path, keep: Path) -> None:
     folders = sorted((path for path in store.iterdir() if path.is_dir()), key=lambda path: path.stat().st_mtime)
-    for folder in folders[:-MOST_KERNELS]:
+    for folder in folders[:-MAX_KERNELS]:
         if folder != keep:
             shutil.rmtree(folder, ignore_errors=True)
             (store / f"{folder.name}.lock").unlink(missing_ok=True)

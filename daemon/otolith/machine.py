@@ -1,27 +1,21 @@
-"""What a machine file means: its twin, its estimation problem, its driver. Faults are told with file, line and key.
+"""A machine file, loaded and checked: its twin, its estimation problem and its driver.
 
-The driver that a machine file names: which it is, and what the file says to it.
-
-What a machine file rules out of the search for components.
-
-Where twins come from: the library that travels with Otolith, and a specialist's own files.
-
-Where recordings go.
+Errors name file, line and key.
 """
 
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
-from otolith.machine_file import DiscoveryTable, MachineFile, ParameterTable, WindowTable, Written
+from otolith.machine_file import DiscoveryTable, MachineFile, ParameterTable, RawQuantity, WindowTable
 from otolith.twin.augmentation import sources
-from otolith.twin.component_families import NAMES
+from otolith.twin.component_families import FAMILY_NAMES
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import read_twin
 from otolith_drivers.base import Driver, DriverType, Setup, Signal
@@ -31,292 +25,294 @@ from otolith_drivers.registry import find
 from otolith_drivers.units import Quantity
 from otolith_drivers.user_dirs import state_directory
 
-
-@dataclass(frozen=True, slots=True)
-class NamedDriver:
-    """The driver of a machine file, and what the file says to it."""
-
-    name: str
-    module: DriverType
-    options: Any
-    setup: Setup
-    page: SourceFile
-
-    @contextlib.contextmanager
-    def faults_placed(self) -> Iterator[None]:
-        """What a driver finds wrong is told with file and line."""
-        try:
-            yield
-        except ConfigurationError as error:
-            if error.key:
-                Context(self.page).fail(error.key, str(error))
-            raise
-
-
-def named_driver(file: MachineFile, twin: Definition, page: SourceFile) -> NamedDriver:
-    """What ``[driver]`` and ``[signals]`` say.
-
-    Raises:
-        ConfigurationError: they are missing, or say something that cannot be meant.
-    """
-    context = Context(page)
-    if not file.driver:
-        way_out = "[driver] with type = \"can\" and the like, and [signals]; only 'otolith replay' does without"
-        context.fail(("driver",), f"missing: say where the signals come from by {way_out}")
-    wanted = list(twin.signals)
-    for name in file.signals:
-        if name not in wanted:
-            context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, wanted)}")
-    for name in wanted:
-        if name not in file.signals:
-            context.fail(("signals",), f"{name} ({twin.unit_of(name)}) is missing: the twin needs {', '.join(wanted)}")
-    with context.at("driver", "type"):
-        kind = file.driver.get("type")
-        if not isinstance(kind, str):
-            raise ValueError('missing: write type = "can" or another driver')  # noqa: TRY004 - a user's slip, not a bug
-        module = find(kind)
-    rest = {key: value for key, value in file.driver.items() if key != "type"}
-    options = validate(rest, module.Options, page, under=("driver",))
-    sources = {name: validate(file.signals[name], module.Source, page, under=("signals", name)) for name in wanted}
-    signals = tuple(Signal(name, twin.unit_of(name), source) for name, source in sources.items())
-    setup = Setup(signals, page.path.parent, file.window.sample_period)
-    return NamedDriver(kind, module, options, setup, page)
-
-
-def excluded(table: DiscoveryTable, twin: Definition, fail: Callable[[str, str], None]) -> frozenset[str]:
-    """Keys of components that are not to be looked for; ``fail`` is told the key of the table and what is wrong."""
-    places = [entry.name for entry in twin.sites]
-    inputs = [entry.name for entry in sources(twin) if entry.name]
-    asked = (("families", table.families, NAMES), ("sites", table.sites, places), ("inputs", table.inputs, inputs))
-    for key, names, known in asked:
-        for name in names or ():
-            if name not in known:
-                fail(key, f"{name!r} is none of them: {nearest(name, list(known))}")
-    return frozenset(
-        key_of(site, family, source.name)
-        for site in places
-        for family in NAMES
-        for source in sources(twin)
-        if (table.families is not None and family not in table.families)
-        or (table.sites is not None and site not in table.sites)
-        or (table.inputs is not None and bool(source.name) and source.name not in table.inputs)
-    )
-
-
 LIBRARY = Path(__file__).parent / "twin" / "library"
+FINGERPRINT_KEYS = ("dbc", "eds", "order", "first_address", "device")  # driver options that signal values depend on
 
-
-def names() -> list[str]:
-    """The twins of the library."""
-    return sorted(path.stem for path in LIBRARY.glob("*.toml"))
-
-
-def find_twin(name: str) -> Definition:
-    """The twin called ``name`` in the library.
-
-    Raises:
-        ConfigurationError: there is none of that name.
-    """
-    if name not in names():
-        raise ConfigurationError(f"unknown twin {name!r}: {nearest(name, names())}")
-    return load_twin(LIBRARY / f"{name}.toml")
-
-
-def load_twin(path: Path) -> Definition:
-    """The twin in a file.
-
-    Raises:
-        ConfigurationError: unreadable or wrong, one line per fault.
-    """
-    return read_twin(read(path))
-
-
-VALUED = ("dbc", "eds", "order", "first_address", "device")  # keys of a driver, that values of signals depend on
-SMALLEST_NOISE = 1e-12  # of an output: without any, no residual could be weighed
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+MIN_OUTPUT_NOISE = 1e-12  # in the unit of the output: the residual is divided by the noise
+MIN_WINDOW_RECORDS, MAX_WINDOW_RECORDS = 10, 1_000_000
+MAX_GRID_ERROR = 1e-6  # share of a window's length by which it may differ from a multiple of the sample period
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedMachine:
-    """A machine file understood: everything the service needs to begin."""
+    """A checked machine file: everything the service needs to start."""
 
     path: Path
     file: MachineFile
     twin: Definition
     problem: Problem
-    records: int
-    limits: Limits
-    source: Driver | None
-    """None where the file was loaded without its driver."""
+    built_driver: Driver | None
+    """None if the file was loaded without its driver."""
 
     @property
     def driver(self) -> Driver:
-        """Where the signals come from.
+        """The driver, built and not yet opened.
 
         Raises:
-            ConfigurationError: the file was loaded without it.
+            ConfigurationError: the file was loaded without its driver.
         """
-        if self.source is None:
+        if self.built_driver is None:
             raise ConfigurationError(f"{self.path}: loaded without its driver")
-        return self.source
+        return self.built_driver
+
+    @property
+    def title(self) -> str:
+        """Name and site of the machine, for people."""
+        return f"{self.file.machine.name} at {self.file.machine.site}"
+
+    @property
+    def records(self) -> int:
+        """Records of the first window."""
+        return self.problem.window.records
+
+    @property
+    def limits(self) -> QualityLimits:
+        """Bounds that a good window keeps."""
+        window = self.file.window
+        return QualityLimits(window.missing_limit, window.gap_limit, window.jitter_limit)
 
     @property
     def signal_fingerprint(self) -> str:
-        """A fingerprint of what the values of signals depend on; empty where the file does not say where they are."""
-        file = self.file
-        if not file.signals:
+        """Hash of everything in the file that signal values depend on; empty if the file has no signals."""
+        if not self.file.signals:
             return ""
-        said = {key: file.driver.get(key) for key in VALUED}
-        return hashlib.sha256(json.dumps([file.signals, said], sort_keys=True, default=str).encode()).hexdigest()[:16]
+        options = {key: self.file.driver.get(key) for key in FINGERPRINT_KEYS}
+        text = json.dumps([self.file.signals, options], sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
-    def recording_folder(self) -> Path | None:
-        """Where the file says that recordings go."""
+    def recording_folder(self) -> Path:
+        """Absolute folder for recordings: that of the file, else one in the state directory."""
         folder = self.file.recording.folder
-        return None if folder is None else self.path.parent / folder
+        return (state_directory() / "recordings" if folder is None else self.path.parent / folder).absolute()
 
 
 def load_machine(path: Path, *, with_driver: bool = True) -> LoadedMachine:
-    """The machine file at ``path``, its twin, its estimation problem and its driver (not yet opened).
+    """Load the machine file at ``path`` with its twin, its estimation problem and its driver, which is not opened.
 
-    Without ``with_driver`` nobody looks at ``[driver]`` and ``[signals]``, and they may be absent.
+    Without ``with_driver``, ``[driver]`` and ``[signals]`` are not checked and may be absent.
 
     Raises:
-        ConfigurationError: anything in it that cannot be meant, one line per fault.
+        ConfigurationError: something in the file is wrong; one line per fault.
     """
-    page = read(path)
-    data = parse(page)
-    expect(page, data, "machine")
-    file = validate(data, MachineFile, page)
-    context = Context(page)
-    twin = _twin(file, context)
+    source = read(path)
+    data = parse(source)
+    expect(source, data, "machine")
+    file = validate(data, MachineFile, source)
+    context = Context(source)
+    twin = _twin(file, path, context)
     problem = _problem(file, twin, context)
-    table = file.window
-    return LoadedMachine(
-        path=path,
-        file=file,
-        twin=twin,
-        problem=problem,
-        records=problem.window.records,
-        limits=Limits(table.missing_limit, table.gap_limit, table.jitter_limit),
-        source=_driver(file, twin, page) if with_driver else None,
-    )
+    driver = None
+    if with_driver:
+        config = driver_config(file, twin, source)
+        with config.located_errors():
+            driver = config.module.build(config.options, config.setup)
+    return LoadedMachine(path, file, twin, problem, driver)
 
 
-def _twin(file: MachineFile, context: Context) -> Definition:
+def library_twins() -> list[str]:
+    """Return the names of the twins in the library."""
+    return sorted(path.stem for path in LIBRARY.glob("*.toml"))
+
+
+def find_twin(name: str) -> Definition:
+    """Return the twin ``name`` of the library.
+
+    Raises:
+        ConfigurationError: the library has no such twin.
+    """
+    if name not in library_twins():
+        raise ConfigurationError(f"unknown twin {name!r}: {nearest(name, library_twins())}")
+    return load_twin(LIBRARY / f"{name}.toml")
+
+
+def load_twin(path: Path) -> Definition:
+    """Return the twin in a file.
+
+    Raises:
+        ConfigurationError: the file is unreadable or wrong; one line per fault.
+    """
+    return read_twin(read(path))
+
+
+def _twin(file: MachineFile, path: Path, context: Context) -> Definition:
     if (file.twin.name is None) == (file.twin.file is None):
-        context.fail(("twin",), 'write either name = "dc_motor" or the like, or file = "my-twin.toml"')
+        context.fail(("twin",), 'write either name = "dc_motor", a twin of the library, or file = "my-twin.toml"')
     if file.twin.file is not None:
-        return load_twin(context.page.path.parent / file.twin.file)
+        return load_twin(path.parent / file.twin.file)
     with context.at("twin", "name"):
         return find_twin(file.twin.name or "")
 
 
+@dataclass(frozen=True, slots=True)
+class DriverConfig:
+    """The driver that a machine file names, with its validated options."""
+
+    module: DriverType
+    options: Any
+    """Instance of the module's ``Options``."""
+    setup: Setup
+    source: SourceFile
+
+    @contextlib.contextmanager
+    def located_errors(self) -> Iterator[None]:
+        """Add file and line to the errors of a driver, which knows only the key."""
+        try:
+            yield
+        except ConfigurationError as error:
+            if error.key:
+                Context(self.source).fail(error.key, str(error))
+            raise
+
+
+def driver_config(file: MachineFile, twin: Definition, source: SourceFile) -> DriverConfig:
+    """Return what ``[driver]`` and ``[signals]`` configure.
+
+    Raises:
+        ConfigurationError: a table is missing, or has an unknown or invalid key, or does not fit the twin.
+    """
+    context = Context(source)
+    if not file.driver:
+        remedy = "write [driver] with type = \"can\" or another driver, and [signals]; only 'otolith replay' needs none"
+        context.fail(("driver",), f"missing: {remedy}")
+    needed = list(twin.signals)
+    for name in file.signals:
+        if name not in needed:
+            context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, needed)}")
+    for name in needed:
+        if name not in file.signals:
+            context.fail(("signals",), f"{name} ({twin.unit_of(name)}) is missing: the twin needs {', '.join(needed)}")
+    with context.at("driver", "type"):
+        kind = file.driver.get("type")
+        if not isinstance(kind, str):
+            raise ValueError('missing: write type = "can" or another driver')  # noqa: TRY004 - a fault of the file
+        module = find(kind)
+    written = {key: value for key, value in file.driver.items() if key != "type"}
+    options = validate(written, module.Options, source, under=("driver",))
+    signals = tuple(
+        Signal(name, twin.unit_of(name), validate(file.signals[name], module.Source, source, under=("signals", name)))
+        for name in needed
+    )
+    return DriverConfig(module, options, Setup(signals, source.path.parent, file.window.sample_period), source)
+
+
 def _problem(file: MachineFile, twin: Definition, context: Context) -> Problem:
-    known_names = [entry.name for entry in twin.parameters]
-    for name in file.parameters:
-        if name not in known_names:
-            context.fail(
-                ("parameters", name), f"twin {twin.name!r} has no such parameter: {nearest(name, known_names)}"
-            )
-    known: list[tuple[str, float]] = []
-    free: list[Parameter] = []
-    for entry in twin.parameters:
-        table = file.parameters.get(entry.name, ParameterTable())
-        estimated = table.value is None and entry.role is Role.ESTIMATED if table.estimate is None else table.estimate
-        parameter = _parameter(entry, table, context, estimated=estimated)
-        if estimated:
-            free.append(parameter)
-        else:
-            known.append((entry.name, parameter.nominal))
-    if not free:
-        context.fail(("parameters",), "nothing is to be estimated: write R_a = { estimate = true } or the like")
-    sensors = _sensor_noise(file, twin, context)
-    estimation = file.estimation
+    known, free = _parameters(file, twin, context)
+    inputs = {signal.name: (signal.unit, 0.0) for signal in twin.inputs}
+    outputs = {signal.name: (signal.unit, signal.noise) for signal in twin.outputs}
+    noise = _noise("noise", file.noise, inputs | outputs, context)
+    states = {state.name: (f"({state.unit})/s^0.5", 0.0) for state in twin.states}
     return Problem(
         twin=twin,
-        known=tuple(known),
-        free=tuple(free),
-        noise=sensors[0],
-        input_noise=sensors[1],
-        process_noise=_process_noise(file, twin, context),
-        open_loop=estimation.open_loop,
-        determined_within=estimation.determined_within,
-        excluded=excluded(file.discovery, twin, lambda key, fault: context.fail(("discovery", key), fault)),
+        known=known,
+        free=free,
+        noise=tuple(noise[name] for name in outputs),
+        input_noise=tuple(noise[name] for name in inputs),
+        process_noise=tuple(_noise("process_noise", file.process_noise, states, context).values()),
+        open_loop=file.estimation.open_loop,
+        determined_within=file.estimation.determined_within,
+        excluded=_excluded(file.discovery, twin, context),
         discover=file.discovery.enabled,
         window=_window(file.window, context),
-        swarm=SwarmOptions(
-            file.swarm.size, file.swarm.generations, file.swarm.inertia, file.swarm.cognitive, file.swarm.social
-        ),
+        swarm=SwarmOptions(**file.swarm.model_dump(exclude={"seed"})),
         seed=file.swarm.seed,
     )
 
 
-def _window(table: WindowTable, context: Context) -> WindowOptions:
-    found = {}
-    for key, length in (("length", table.length), ("shortest", table.shortest), ("longest", table.longest)):
-        whole = table.length if length is None else length
-        records = round(whole / table.sample_period)
-        if abs(records * table.sample_period - whole) > 1e-6 * whole or not 10 <= records <= 1_000_000:
-            context.fail(("window", key), f"{whole:g} s must be 10 to 1000000 times {table.sample_period:g} s")
-        found[key] = records
-    if not found["shortest"] <= found["length"] <= found["longest"]:
-        context.fail(("window", "length"), f"{table.length:g} s must lie between shortest and longest")
-    return WindowOptions(found["length"], found["shortest"], found["longest"])
+def _parameters(
+    file: MachineFile, twin: Definition, context: Context
+) -> tuple[tuple[tuple[str, float], ...], tuple[Parameter, ...]]:
+    """Return the known parameters with their values, and the free ones with nominal values and bounds."""
+    names = [parameter.name for parameter in twin.parameters]
+    for name in file.parameters:
+        if name not in names:
+            context.fail(("parameters", name), f"twin {twin.name!r} has no such parameter: {nearest(name, names)}")
+    known: list[tuple[str, float]] = []
+    free: list[Parameter] = []
+    for parameter in twin.parameters:
+        table = file.parameters.get(parameter.name, ParameterTable())
+        by_default = table.value is None and parameter.role is Role.ESTIMATED
+        estimated = by_default if table.estimate is None else table.estimate
+        adapted = _parameter(parameter, table, context, estimated=estimated)
+        if estimated:
+            free.append(adapted)
+        else:
+            known.append((parameter.name, adapted.nominal))
+    if not free:
+        context.fail(
+            ("parameters",), f"no parameter is estimated: write for example {names[0]} = {{ estimate = true }}"
+        )
+    return tuple(known), tuple(free)
 
 
-def _parameter(entry: Parameter, table: ParameterTable, context: Context, *, estimated: bool) -> Parameter:
-    given: dict[str, float] = {"value": entry.nominal, "low": entry.low, "high": entry.high}
+def _parameter(parameter: Parameter, table: ParameterTable, context: Context, *, estimated: bool) -> Parameter:
+    """Return the parameter of the twin with value and bounds of the file."""
+    where, unit = ("parameters", parameter.name), parameter.unit
+    numbers: dict[str, float] = {"value": parameter.nominal, "low": parameter.low, "high": parameter.high}
     for key, written in (("low", table.low), ("high", table.high), ("value", table.value)):
         if written is not None:
-            with context.at("parameters", entry.name, key):
-                given[key] = Quantity(entry.unit)(written)
-    where = ("parameters", entry.name)
-    if not estimated and given["value"] <= 0.0 < entry.low:
-        context.fail(where, f"{given['value']:g} {entry.unit}: {entry.meaning} must be above zero")
-    if given["low"] >= given["high"]:
-        context.fail(where, f"low {given['low']:g} {entry.unit} is not under high {given['high']:g} {entry.unit}")
-    if estimated and not given["low"] <= given["value"] <= given["high"]:
-        bounds = f"between {given['low']:g} and {given['high']:g} {entry.unit}"
-        context.fail(
-            where, f"{given['value']:g} {entry.unit} is out of bounds: it must lie {bounds}, or move the bounds"
-        )
-    return replace(entry, nominal=given["value"], low=given["low"], high=given["high"])
+            with context.at(*where, key):
+                numbers[key] = Quantity(unit)(written)
+    value, low, high = numbers["value"], numbers["low"], numbers["high"]
+    if not estimated and value <= 0.0 < parameter.low:
+        context.fail(where, f"{value:g} {unit}: {parameter.meaning} must be above zero")
+    if low >= high:
+        context.fail(where, f"low {low:g} {unit} must be below high {high:g} {unit}")
+    if estimated and not low <= value <= high:
+        remedy = f"write a value between {low:g} and {high:g} {unit}, or change low and high"
+        context.fail(where, f"{value:g} {unit} is out of bounds: {remedy}")
+    return replace(parameter, nominal=value, low=low, high=high)
 
 
-def _levels(
-    table: str, written: Mapping[str, Written], entries: Mapping[str, tuple[str, float]], context: Context
+def _noise(
+    table: str, written: Mapping[str, RawQuantity], defaults: Mapping[str, tuple[str, float]], context: Context
 ) -> dict[str, float]:
-    """Noise levels: ``entries`` has the unit of each name that may be given, and its level if it is not."""
+    """Return the noise level of each name in ``defaults``, which has unit and default level of every allowed name."""
     for name in written:
-        if name not in entries:
-            context.fail((table, name), f"the twin has no such signal or state: {nearest(name, list(entries))}")
-    found = {}
-    for name, (unit, level) in entries.items():
+        if name not in defaults:
+            context.fail((table, name), f"the twin has no such signal or state: {nearest(name, list(defaults))}")
+    levels = {}
+    for name, (unit, default) in defaults.items():
         with context.at(table, name):
-            low = 0.0 if level == 0.0 else SMALLEST_NOISE
-            found[name] = Quantity(unit, low=low, difference=True)(written[name]) if name in written else level
-    return found
+            low = 0.0 if default == 0.0 else MIN_OUTPUT_NOISE
+            levels[name] = Quantity(unit, low=low, difference=True)(written[name]) if name in written else default
+    return levels
 
 
-def _sensor_noise(file: MachineFile, twin: Definition, context: Context) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Of the outputs, and of the inputs."""
-    signals = {entry.name: (entry.unit, 0.0) for entry in twin.inputs}
-    signals |= {entry.name: (entry.unit, entry.noise) for entry in twin.outputs}
-    found = _levels("noise", file.noise, signals, context)
-    return tuple(found[entry.name] for entry in twin.outputs), tuple(found[entry.name] for entry in twin.inputs)
+def _window(table: WindowTable, context: Context) -> WindowOptions:
+    records = {}
+    for key, length in (("length", table.length), ("shortest", table.shortest), ("longest", table.longest)):
+        seconds = table.length if length is None else length
+        count = records[key] = round(seconds / table.sample_period)
+        on_grid = abs(count * table.sample_period - seconds) <= MAX_GRID_ERROR * seconds
+        if not on_grid or not MIN_WINDOW_RECORDS <= count <= MAX_WINDOW_RECORDS:
+            bounds = f"{MIN_WINDOW_RECORDS} to {MAX_WINDOW_RECORDS} times it"
+            multiple = f"a multiple of the sample period {table.sample_period:g} s, {bounds}"
+            context.fail(("window", key), f"{seconds:g} s must be {multiple}")
+    if not records["shortest"] <= records["length"] <= records["longest"]:
+        context.fail(("window", "length"), f"{table.length:g} s must lie between window.shortest and window.longest")
+    return WindowOptions(records["length"], records["shortest"], records["longest"])
 
 
-def _process_noise(file: MachineFile, twin: Definition, context: Context) -> tuple[float, ...]:
-    states = {entry.name: (f"({entry.unit})/s^0.5", 0.0) for entry in twin.states}
-    return tuple(_levels("process_noise", file.process_noise, states, context).values())
+def _excluded(table: DiscoveryTable, twin: Definition, context: Context) -> frozenset[str]:
+    """Return the keys of the components that discovery must not search for."""
 
+    def allowed(key: str, names: tuple[str, ...] | None, known: Collection[str]) -> Collection[str]:
+        for name in names or ():
+            if name not in known:
+                context.fail(("discovery", key), f"unknown name {name!r}: {nearest(name, list(known))}")
+        return known if names is None else names
 
-def _driver(file: MachineFile, twin: Definition, page: SourceFile) -> Driver:
-    named = named_driver(file, twin, page)
-    with named.faults_placed():
-        return named.module.build(named.options, named.setup)
-
-
-def recording_folder(plan: LoadedMachine) -> Path:
-    """Where the machine file says, else in the state directory."""
-    return (plan.recording_folder or state_directory() / "recordings").absolute()
+    sites = [site.name for site in twin.sites]
+    inputs = [source.name for source in sources(twin)]
+    families = allowed("families", table.families, FAMILY_NAMES)
+    allowed_sites = allowed("sites", table.sites, sites)
+    allowed_inputs = allowed("inputs", table.inputs, [name for name in inputs if name])
+    return frozenset(
+        key_of(site, family, name)
+        for site in sites
+        for family in FAMILY_NAMES
+        for name in inputs
+        if family not in families or site not in allowed_sites or (name and name not in allowed_inputs)
+    )

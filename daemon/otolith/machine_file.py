@@ -1,4 +1,7 @@
-"""The machine file: typed, bounded, closed, every value with its unit."""
+"""Schema of the machine file: typed, bounded, closed, every value with its unit.
+
+``docs/reference/machine-file.md`` explains every key; paths are relative to the machine file.
+"""
 
 import re
 from pathlib import Path
@@ -12,66 +15,66 @@ from otolith_drivers.units import Quantity
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
 
 
-def _name(written: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}", written):
+def _name(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}", text):
         raise ValueError(
-            f"{written!r} is no name: letters, digits, '-' and '_', at most 64, as it becomes part of keys"
+            f"{text!r} is not a valid name: use 1 to 64 letters, digits, '-' and '_', and begin with a letter or digit"
         )
-    return written
+    return text
 
 
-def _endpoint(written: str) -> str:
-    if not re.fullmatch(rf"({'|'.join(PROTOCOLS)})/\S+", written):
-        raise ValueError(f'{written!r} is no endpoint: write it like "tcp/127.0.0.1:7447" ({", ".join(PROTOCOLS)})')
-    if not written.startswith("unixsock-stream/") and not re.search(r":\d{1,5}$", written):
-        raise ValueError(f'{written!r} lacks its port: write it like "tcp/127.0.0.1:7447"')
-    return written
+def _endpoint(text: str) -> str:
+    if not re.fullmatch(rf"({'|'.join(PROTOCOLS)})/\S+", text):
+        raise ValueError(f'{text!r} is not an endpoint: write it like "tcp/127.0.0.1:7447" ({", ".join(PROTOCOLS)})')
+    if not text.startswith("unixsock-stream/") and not re.search(r":\d{1,5}$", text):
+        raise ValueError(f'{text!r} has no port: write it like "tcp/127.0.0.1:7447"')
+    return text
 
 
-def _value_alone(written: object) -> object:
-    """``"6.5 ohm"`` is short for ``{ value = "6.5 ohm" }``."""
+def _expand_value(written: object) -> object:
+    """Expand ``"6.5 ohm"``, the short form of ``{ value = "6.5 ohm" }``."""
     return written if isinstance(written, dict) else {"value": written}
 
 
 Name = Annotated[str, AfterValidator(_name)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
-Written = str | float | None
-"""A quantity that is understood once its unit is known; a number without a unit is refused then."""
+RawQuantity = str | float | None
+"""A quantity as written in the file. It is converted once the twin tells its unit; a number without unit is refused."""
+WindowLength = Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))]
 
 
 class MachineTable(StrictModel):
-    """Who the machine is; both names become part of the Zenoh keys and of file names."""
+    """Identity of the machine; both names become part of Zenoh keys and file names."""
 
     name: Name
     site: Name = "site"
 
 
 class TwinTable(StrictModel):
-    """Which twin: one of the library by its name, or a file of one's own."""
+    """The twin: either the name of one in the library, or a file."""
 
     name: str | None = None
     file: Path | None = None
-    """Relative to the machine file."""
 
 
 class ParameterTable(StrictModel):
-    """A parameter that is not simply known."""
+    """What the file says of one parameter; the twin gives the rest."""
 
-    value: Written = None
-    """Known, or for an estimated one where the search starts; without it the twin's nominal value."""
+    value: RawQuantity = None
+    """Value of a known parameter, or start of the search for an estimated one."""
     estimate: bool | None = None
-    """Without it: a parameter with a value is known, and one without is what the twin says of its role."""
-    low: Written = None
-    high: Written = None
+    """Without it, a parameter with a value is known, and one without has the role that the twin gives it."""
+    low: RawQuantity = None
+    high: RawQuantity = None
 
 
 class WindowTable(StrictModel):
-    """How samples become windows, and what a window may lack and still be estimated from."""
+    """Length and grid of windows, and the quality that estimation needs."""
 
-    length: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] = 2.0
-    shortest: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] | None = None
-    longest: Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))] | None = None
-    """With either of these the length follows what drift and noise ask for, from ``length`` on."""
+    length: WindowLength = 2.0
+    shortest: WindowLength | None = None
+    longest: WindowLength | None = None
+    """With ``shortest`` or ``longest`` the length adapts to drift and noise, starting at ``length``."""
     sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-4, 10.0))] = 0.01
     missing_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.01
     gap_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 60.0))] = 0.05
@@ -79,26 +82,25 @@ class WindowTable(StrictModel):
 
 
 class EstimationTable(StrictModel):
-    """What is asked of estimates."""
+    """Options of the estimator."""
 
     open_loop: bool = False
-    """The paper's cost: nothing corrects the twin within a window; noise other than the sensors' is left out."""
+    """Use the paper's cost: no innovation correction within a window, and sensor noise only."""
     determined_within: Annotated[float, BeforeValidator(Quantity("1", 1e-6, 1.0))] = 0.1
-    """A parameter counts as determined when the half of its 95 % interval is at most this share of its value."""
+    """A parameter is determined when half its 95 % interval is at most this share of its nominal value."""
 
 
 class DiscoveryTable(StrictModel):
-    """What is looked for when the twin does not explain the machine; everything unless restricted."""
+    """Which components discovery searches for; None stands for all."""
 
     enabled: bool = True
     families: tuple[str, ...] | None = None
     sites: tuple[str, ...] | None = None
     inputs: tuple[str, ...] | None = None
-    """``t``, ``angle(omega)``, or names of signals and states."""
 
 
 class SwarmTable(StrictModel):
-    """The particle swarm; the default values are Table 2 of the paper."""
+    """The particle swarm; the defaults are Table 2 of the paper."""
 
     size: Annotated[int, Field(ge=3, le=1000)] = 15
     generations: Annotated[int, Field(ge=1, le=100_000)] = 1000
@@ -109,7 +111,7 @@ class SwarmTable(StrictModel):
 
 
 class ZenohTable(StrictModel):
-    """Where reports go; loopback only unless told otherwise."""
+    """Endpoints of the Zenoh session; by default it listens on the loopback interface only."""
 
     listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
     connect: tuple[Endpoint, ...] = ()
@@ -120,7 +122,6 @@ class RecordingTable(StrictModel):
 
     enabled: bool = True
     folder: Path | None = None
-    """Relative to the machine file; without it the state directory of the daemon."""
 
 
 class MachineFile(StrictModel):
@@ -128,16 +129,17 @@ class MachineFile(StrictModel):
 
     machine: MachineTable
     driver: Annotated[dict[str, Any], Field(default_factory=dict)]
-    """With ``signals`` what the daemon needs; a replay does without."""
+    """``type`` and the options of that driver; a replay does not need it."""
     signals: Annotated[dict[str, dict[str, Any]], Field(default_factory=dict)]
+    """Where the driver finds each input and output of the twin; a replay does not need it."""
     twin: TwinTable
     parameters: Annotated[
-        dict[str, Annotated[ParameterTable, BeforeValidator(_value_alone)]], Field(default_factory=dict)
+        dict[str, Annotated[ParameterTable, BeforeValidator(_expand_value)]], Field(default_factory=dict)
     ]
-    noise: Annotated[dict[str, Written], Field(default_factory=dict)]
-    """Of sensors: standard deviation of outputs and of measured inputs."""
-    process_noise: Annotated[dict[str, Written], Field(default_factory=dict)]
-    """Of the machine itself: how far a state strays, in its unit per square root of a second."""
+    noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]
+    """Standard deviation of the sensors of outputs and measured inputs."""
+    process_noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]
+    """Process noise of states, each in the state's unit per square root of a second."""
     window: WindowTable = WindowTable()
     estimation: EstimationTable = EstimationTable()
     discovery: DiscoveryTable = DiscoveryTable()

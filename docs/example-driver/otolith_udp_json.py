@@ -17,32 +17,36 @@ from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.units import factor
 
-LONGEST = 1500  # bytes of a datagram
-WAKE = 0.2  # s; how late a stop can be noticed
-SILENCE = 2.0  # s, after which the device is taken to be gone
+MAX_DATAGRAM = 1500  # bytes
+STOP_DELAY = 0.2  # s that a stop may go unnoticed
+SILENCE_TIMEOUT = 2.0  # s without a datagram, after which the device counts as disconnected
 
 
 class Options(StrictModel):
-    """The keys of ``[driver]`` beside ``type``."""
+    """The keys of ``[driver]`` except ``type``."""
 
     port: Annotated[int, Field(ge=1024, le=65535)]
 
 
 class Source(StrictModel):
-    """The keys of each of ``[signals]``."""
+    """The keys of each signal in ``[signals]``."""
 
     key: str
-    """In the JSON object."""
+    """Key in the JSON object."""
     unit: str
 
 
 def build(options: Options, setup: Setup) -> "UdpJson":
-    """What the registry calls: a driver ready to be opened."""
+    """Return a driver that is not open yet.
+
+    Raises:
+        ConfigurationError: a unit has the wrong dimension.
+    """
     conversions = {}
     for signal in setup.signals:
         try:
             conversions[signal.name] = (signal.source.key, *factor(signal.source.unit, signal.unit))
-        except ValueError as error:  # told with file, line and key by the daemon
+        except ValueError as error:  # the daemon adds file and line
             raise ConfigurationError(str(error), ("signals", signal.name)) from error
     return UdpJson(options.port, conversions)
 
@@ -53,7 +57,7 @@ class UdpJson:
     sampling = Sampling.CYCLIC
 
     def __init__(self, port: int, conversions: dict[str, tuple[str, float, float]]) -> None:
-        """``conversions``: of each signal its key, and scale and offset to the unit that is wanted."""
+        """``conversions`` has, by signal, the JSON key, and scale and offset to the unit of the twin."""
         self._port = port
         self._conversions = conversions
         self._received = self._bad = 0
@@ -62,36 +66,37 @@ class UdpJson:
         self._thread: threading.Thread | None = None
 
     def open(self, deliver: Deliver) -> None:
-        """Start to listen."""
+        """Bind the port and start the thread."""
         listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             listener.bind(("127.0.0.1", self._port))
         except OSError as error:
             listener.close()
             raise DeviceError(f"UDP port {self._port}: {error.strerror}; set another driver.port") from error
-        listener.settimeout(WAKE)
+        listener.settimeout(STOP_DELAY)
         self._thread = threading.Thread(target=self._listen, args=(listener, deliver), name="udp-json", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop."""
+        """Stop the thread."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(timeout=1.0)
 
     def counters(self) -> Counters:
-        """So far."""
+        """Return the counts so far."""
         return Counters(received=self._received, bad=self._bad)
 
     def link(self) -> Link:
-        """A socket is always open; what counts is whether somebody speaks."""
+        """Return whether datagrams arrive: a UDP socket itself is always up."""
         silent = time.monotonic() - self._latest
         if math.isinf(silent):
-            return Link(up=False, reason="nothing has come yet")
-        return Link(up=silent < SILENCE, reason="" if silent < SILENCE else f"silent for {silent:.0f} s")
+            return Link(up=False, reason="no datagram has arrived yet")
+        up = silent < SILENCE_TIMEOUT
+        return Link(up=up, reason="" if up else f"silent for {silent:.0f} s")
 
     def describe(self) -> list[str]:
-        """For ``otolith check``."""
+        """Return a line per fact, for ``otolith check``."""
         return [f"JSON over UDP, port {self._port}"] + [
             f"{name} from {key}" for name, (key, _, _) in self._conversions.items()
         ]
@@ -100,19 +105,19 @@ class UdpJson:
         with listener:
             while not self._stop.is_set():
                 try:
-                    datagram = listener.recv(LONGEST)
+                    datagram = listener.recv(MAX_DATAGRAM)
                 except TimeoutError:
                     continue
                 self._take(datagram, time.monotonic(), deliver)
 
     def _take(self, datagram: bytes, moment: float, deliver: Deliver) -> None:
         try:
-            found = json.loads(datagram)
+            reading = json.loads(datagram)
             samples = [
-                Sample(name, moment, scale * float(found[key]) + offset)
+                Sample(name, moment, scale * float(reading[key]) + offset)
                 for name, (key, scale, offset) in self._conversions.items()
             ]
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # whatever comes, the thread goes on
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # no datagram may end the thread
             self._bad += 1
             return
         self._latest = moment

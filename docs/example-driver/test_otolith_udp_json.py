@@ -1,4 +1,4 @@
-"""The example driver keeps the contract of all drivers; run it with pytest in this folder."""
+"""The example driver keeps the contract of all drivers. Run with pytest in this folder."""
 
 import json
 import socket
@@ -19,7 +19,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def built(port: int) -> otolith_udp_json.UdpJson:
+def build_driver(port: int) -> otolith_udp_json.UdpJson:
     signals = (
         Signal("omega", "rad/s", otolith_udp_json.Source(key="speed", unit="rpm")),
         Signal("i", "A", otolith_udp_json.Source(key="current", unit="mA")),
@@ -27,18 +27,18 @@ def built(port: int) -> otolith_udp_json.UdpJson:
     return otolith_udp_json.build(otolith_udp_json.Options(port=port), Setup(signals, Path(), 0.01))
 
 
-@pytest.mark.parametrize("promise", CONTRACT, ids=lambda promise: promise.__name__)
-def test_the_driver_keeps_the_contract(promise: Callable[[Rig], None]) -> None:
+@pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
+def test_the_driver_keeps_the_contract(check: Callable[[Rig], None]) -> None:
     port = free_port()
-    driver = built(port)
+    driver = build_driver(port)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         reading = json.dumps({"speed": 60.0, "current": 500.0}).encode()
         expected = {"omega": 2 * 3.141592653589793, "i": 0.5}
-        promise(Rig(driver, expected, lambda: device.sendto(reading, ("127.0.0.1", port))))
+        check(Rig(driver, expected, lambda: device.sendto(reading, ("127.0.0.1", port))))
         driver.close()
 
 
-HOSTILE = (
+BAD_DATAGRAMS = (
     b"",
     b"\xff\xfe",
     b"[]",
@@ -49,18 +49,18 @@ HOSTILE = (
 )
 
 
-def test_nothing_that_comes_over_the_wire_ends_the_thread() -> None:
+def test_no_datagram_ends_the_thread() -> None:
     port = free_port()
-    driver = built(port)
+    driver = build_driver(port)
     driver.open(lambda samples: None)
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
-            for datagram in (*HOSTILE, b'{"speed": 60, "current": 500}'):
+            for datagram in (*BAD_DATAGRAMS, b'{"speed": 60, "current": 500}'):
                 device.sendto(datagram, ("127.0.0.1", port))
         deadline = time.monotonic() + 30.0
         while driver.counters().received < 2 and time.monotonic() < deadline:
             time.sleep(0.01)
         counters = driver.counters()
-        assert (counters.received, counters.bad) == (2, len(HOSTILE))
+        assert (counters.received, counters.bad) == (2, len(BAD_DATAGRAMS))
     finally:
         driver.close()

@@ -1,4 +1,4 @@
-"""Where the samples of a machine come from: read-only drivers, and the simulated plant.
+"""Read-only drivers that turn what a machine sends into samples, and the simulated plant.
 
 This package never imports ``otolith``; the daemon imports it.
 """

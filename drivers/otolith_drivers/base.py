@@ -1,7 +1,7 @@
-"""What every driver is: something that stamps samples at their source and hands them on, and can do nothing else.
+"""The driver interface: a driver reads samples from a machine, stamps them at their source and delivers them.
 
-A driver is read-only by construction: this protocol has no way to write to a machine. It owns its threads and its
-reconnect loop, counts what it receives and what it loses, and never lets an exception out of its threads.
+A driver is read-only by construction: the protocol has no method that writes to a machine. A driver owns its threads
+and its reconnect loop, counts the samples that it receives and loses, and lets no exception leave its threads.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,28 +18,28 @@ class Sample(NamedTuple):
 
     signal: str
     time: float
-    """Seconds on this computer's monotonic clock at which the reading was true or, failing that, arrived."""
+    """Seconds on this computer's monotonic clock at which the value was true or, if that is unknown, arrived."""
     value: float
-    """In the unit of the signal; not a number where the source said that it has no reading."""
+    """In the unit of the signal; NaN if the source reports that it has no reading."""
 
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """What the daemon wants to read: its own name and unit, and where the driver finds it."""
+    """A signal that the daemon wants: its name and unit in the twin, and where the driver reads it."""
 
     name: str
     unit: str
     source: Any
-    """Where the signal is: an instance of the driver's ``Source``."""
+    """Address of the signal: an instance of the driver's ``Source``."""
 
 
 class Sampling(StrEnum):
-    """What the times of a driver's samples mean, and so how they come onto the grid of a window."""
+    """Meaning of the times of a driver's samples, which decides how samples are aligned to the grid of a window."""
 
     CYCLIC = "cyclic"
-    """The source samples on a grid of its own; a time is that of arrival, which may be late but never early."""
+    """The source samples on its own grid; a time is an arrival time, which may be late but never early."""
     POLLED = "polled"
-    """A time is that at which the value was true: signals are brought to the grid by interpolation."""
+    """A time is the moment at which the value was true; samples are interpolated to the grid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,41 +48,41 @@ class Setup:
 
     signals: tuple[Signal, ...]
     folder: Path
-    """What files named in options are relative to."""
+    """Files named in options are relative to this folder."""
     sample_period: float
-    """s; how often the daemon wants each signal."""
+    """Period of the window's grid in s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """What a driver has seen since it was opened."""
+    """Counts since the driver was opened."""
 
     received: int = 0
     """Samples delivered."""
     bad: int = 0
-    """Frames, replies, rows or single values that came and could not be used: not decodable, out of range, repeated."""
+    """Frames, replies, rows or values that arrived but are unusable: not decodable, out of range, repeated."""
     lost: int = 0
-    """Samples known to be sent or asked for that never came."""
+    """Samples known to be sent or requested that never arrived."""
     reconnects: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """The state of the connection to the machine."""
+    """State of the connection to the machine."""
 
     up: bool
     reason: str = ""
-    """Why it is down, in words."""
+    """Why the connection is down; empty if it is up."""
     warnings: tuple[str, ...] = ()
-    """What is wrong now although it is up, a line each: a silent frame, a dead device, registers that are refused."""
+    """Present faults of a connection that is up, one line each: a silent frame, a dead device, refused registers."""
     plan: str = ""
-    """What is asked of the machine and what is achieved; empty where the machine sets the pace."""
+    """Requested and achieved polling; empty if the machine sends by its own clock."""
     period: float | None = None
-    """s from sample to sample as achieved; None where the machine sets the pace, or while it is not known."""
+    """Achieved sample period in s; None if the machine sends by its own clock, or if it is not known yet."""
 
 
 Deliver = Callable[[Sequence[Sample]], None]
-"""Takes the samples of one frame, reply or row; called from the driver's thread, never blocks for long."""
+"""Takes the samples of one frame, reply or row. Called from the driver's thread, never with an empty list."""
 
 
 class Driver(Protocol):
@@ -90,39 +90,39 @@ class Driver(Protocol):
 
     @property
     def sampling(self) -> Sampling:
-        """What the times of its samples mean."""
+        """Meaning of the sample times."""
 
     def open(self, deliver: Deliver) -> None:
-        """Start to deliver; a device that is not there yet is waited for in a thread, as one that went away is.
+        """Start to deliver samples. The driver's thread waits for an absent device and reconnects to a lost one.
 
         Raises:
-            DeviceError: this computer lacks what it takes: the interface, the permission, the file.
+            DeviceError: the computer lacks a requirement: the interface, the permission or the file.
         """
 
     def close(self) -> None:
-        """Stop within a second; may be called twice."""
+        """Stop within one second; may be called twice."""
 
     def counters(self) -> Counters:
-        """What has been seen so far; from any thread."""
+        """Return the counts so far; callable from any thread."""
 
     def link(self) -> Link:
-        """Whether the connection stands, and what is wrong with it; from any thread."""
+        """Return the state of the connection; callable from any thread."""
 
     def describe(self) -> list[str]:
-        """What will be read from where, a line per fact, for ``otolith check``."""
+        """Return what the driver will read and from where, one line per fact, for ``otolith check``."""
 
 
 class DriverType(Protocol):
     """What a row of the registry points to: a module with these three names."""
 
     Options: type[StrictModel]
-    """The keys of ``[driver]`` beside ``type``."""
+    """The keys of ``[driver]`` except ``type``."""
     Source: type[StrictModel]
-    """The keys of each of ``[signals]``: where to find the signal."""
+    """The keys of each signal in ``[signals]``."""
 
     def build(self, options: Any, setup: Setup) -> Driver:
-        """A driver ready to be opened; ``options`` is an instance of ``Options``.
+        """Return a driver that is not open yet; ``options`` is an instance of ``Options``.
 
         Raises:
-            ConfigurationError: a signal cannot be found where its source says.
+            ConfigurationError: a signal does not exist at its source.
         """

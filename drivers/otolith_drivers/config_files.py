@@ -1,13 +1,10 @@
-"""TOML files as typed, bounded, closed models: one line per fault, with file, line, key, value and the way out.
-
-Files that the user named: read whole, and never more than a file of their kind may have.
-"""
+"""TOML files as typed, bounded, closed models: each fault is one line with file, line, key, value and remedy."""
 
 import re
 import tomllib
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,12 +13,79 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from otolith_drivers.errors import ConfigurationError, nearest
 
+FILE_SIZE_LIMIT = 1 << 20  # bytes of a TOML file: engineering choice, 100 times the largest machine file
+
+Location = Sequence[int | str]
+"""Keys and list indices that lead to a value."""
+Model = TypeVar("Model", bound=BaseModel)
+
+SECTION = re.compile(r"\s*(\[\[?)\s*([^\]]+?)\s*\]\]?\s*(?:#.*)?$")
+ASSIGNMENT = re.compile(r"\s*([\w\-.\"' ()]+?)\s*=")
+KEY_PART = re.compile(r"\"[^\"]*\"|'[^']*'|[^.]+")
+TOML_TYPES = {
+    "tuple_type": "a list, in [ ]",
+    "list_type": "a list, in [ ]",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "string_type": "a text, in quotes",
+}
+"""How TOML writes what pydantic's error type asks for."""
+KINDS = {
+    "plant": ("a scenario of the simulated plant", "otolith plant"),
+    "machine": ("a machine file", "otolith run"),
+    "equations": ("a twin", "otolith twin check"),
+}
+"""By the key that only this kind of file has: its name, and the command that reads it."""
+
+
+class StrictModel(BaseModel):
+    """A table of a file: unknown keys are errors, values are finite and immutable."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True, slots=True)
+class SourceFile:
+    """A file and its text, to locate faults in it."""
+
+    path: Path
+    text: str = ""
+
+    def place(self, location: Location) -> str:
+        """Return ``file:line: key.of.the.value``, without the line if it is unknown."""
+        line = line_of(self.text, location)
+        return f"{self.path}:{line}: {dotted(location)}" if line else f"{self.path}: {dotted(location)}"
+
+
+class Context:
+    """Adds file, line and key to errors of checks that run after the file has been validated."""
+
+    def __init__(self, file: SourceFile) -> None:
+        self.file = file
+        self._location: tuple[int | str, ...] = ()
+
+    def fail(self, location: tuple[int | str, ...], message: str) -> None:
+        """Raise ``message`` as an error at ``location``."""
+        raise ConfigurationError(f"{self.file.place(location)}: {message}")
+
+    def at(self, *location: int | str) -> "Context":
+        """Return a context manager that places errors raised in it at ``location``."""
+        self._location = location
+        return self
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, ValueError | ConfigurationError):
+            raise ConfigurationError(f"{self.file.place(self._location)}: {error}") from error
+
 
 def content(path: Path, limit: int, key: tuple[str, ...] = ()) -> bytes:
-    """The bytes of ``path``, ``limit`` of them at most; ``key`` is where in the machine file it is named.
+    """Return the bytes of ``path``; ``key`` is the key of the machine file that names it.
 
     Raises:
-        ConfigurationError: no such file, no file at all, a larger one, or one that may not be read.
+        ConfigurationError: the file is missing, unreadable, not a regular file, or larger than ``limit`` bytes.
     """
     try:
         if path.exists() and not path.is_file():
@@ -33,69 +97,11 @@ def content(path: Path, limit: int, key: tuple[str, ...] = ()) -> bytes:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}", key) from error
 
 
-FILE_SIZE_LIMIT = 1 << 20  # bytes; a machine file has a few thousand
-Location = Sequence[int | str]
-Model = TypeVar("Model", bound=BaseModel)
-
-
-class StrictModel(BaseModel):
-    """A table of a file: unknown keys are errors, values are finite and do not change."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-@dataclass(frozen=True, slots=True)
-class SourceFile:
-    """A file and its text, so that a fault can say where it stands."""
-
-    path: Path
-    text: str = ""
-
-    def place(self, location: Location) -> str:
-        """``file:line: key.of.the.value``, the line left out where it cannot be told."""
-        line = line_of(self.text, location)
-        return f"{self.path}:{line}: {dotted(location)}" if line else f"{self.path}: {dotted(location)}"
-
-
-class Context:
-    """Says where in the file a fault is, when it is found after the file's own types were right."""
-
-    def __init__(self, page: SourceFile) -> None:
-        self.page = page
-        self._location: tuple[int | str, ...] = ()
-
-    def fail(self, location: tuple[int | str, ...], message: str) -> None:
-        """Raise ``message``, placed at ``location``."""
-        raise ConfigurationError(f"{self.page.place(location)}: {message}")
-
-    def at(self, *location: int | str) -> "Context":
-        """A context in which whatever is found wrong is placed at ``location``."""
-        self._location = location
-        return self
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if isinstance(error, ValueError | ConfigurationError):
-            raise ConfigurationError(f"{self.page.place(self._location)}: {error}") from error
-
-
-def load(path: Path, model: type[Model]) -> Model:
-    """The file as ``model``.
-
-    Raises:
-        ConfigurationError: missing or unreadable file, not TOML, or not what ``model`` asks for.
-    """
-    page = read(path)
-    return validate(parse(page), model, page)
-
-
 def read(path: Path) -> SourceFile:
-    """The text of a file that the user named, its line ends those of this system.
+    r"""Return the text of a file that the user named, with line ends ``\n``.
 
     Raises:
-        ConfigurationError: missing, unreadable, too large, or not UTF-8.
+        ConfigurationError: the file is missing, unreadable, too large, or not UTF-8.
     """
     try:
         text = content(path, FILE_SIZE_LIMIT).decode("utf-8")
@@ -104,113 +110,95 @@ def read(path: Path) -> SourceFile:
     return SourceFile(path, re.sub("\r\n?", "\n", text))
 
 
-def parse(page: SourceFile) -> dict[str, Any]:
-    """The TOML of ``page``."""
+def parse(file: SourceFile) -> dict[str, Any]:
+    """Return the tables of a TOML file; raise ConfigurationError if it is none."""
     try:
-        return tomllib.loads(page.text)
+        return tomllib.loads(file.text)
     except (ValueError, RecursionError) as error:
-        hint = "; a key may stand only once in its table" if "overwrite" in str(error) else ""
-        raise ConfigurationError(f"{page.path}: not valid TOML: {error}{hint}") from error
+        hint = "; a key may occur only once in its table" if "overwrite" in str(error) else ""
+        raise ConfigurationError(f"{file.path}: not valid TOML: {error}{hint}") from error
 
 
-SHAPES = {
-    "tuple_type": "a list, in [ ]",
-    "list_type": "a list, in [ ]",
-    "dict_type": "a table",
-    "model_type": "a table",
-    "string_type": "a text, in quotes",
-}
-KINDS = {
-    "plant": ("a scenario of the simulated plant", "otolith plant"),
-    "machine": ("a machine file", "otolith run"),
-    "equations": ("a twin", "otolith twin check"),
-}
-"""The key that only one kind of file has, what the file is, and what it is for."""
-
-
-def expect(page: SourceFile, data: dict[str, Any], key: str) -> None:
-    """Refuse a file of another kind, once and by its name, instead of every key in it."""
-    for other, (what, command) in KINDS.items():
+def expect(file: SourceFile, data: dict[str, Any], key: str) -> None:
+    """Raise one ConfigurationError for a file of another kind, instead of one for each of its keys."""
+    for other, (kind, command) in KINDS.items():
         if other != key and other in data and key not in data:
-            raise ConfigurationError(f"{page.path}: this is {what}, for '{command}'; {KINDS[key][0]} is needed here")
+            raise ConfigurationError(f"{file.path}: this is {kind}, for '{command}'; {KINDS[key][0]} is needed here")
 
 
-def validate(data: Any, model: type[Model], page: SourceFile, under: Location = ()) -> Model:
-    """``data`` as ``model``; ``under`` is where in the file it stands."""
+def validate(data: Any, model: type[Model], file: SourceFile, under: Location = ()) -> Model:
+    """Return ``data``, at location ``under`` of the file, as ``model``; the ConfigurationError has a line per fault."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        faults = [(_written(data, fault["loc"]), fault) for fault in error.errors()]
-        # A table that fails because of what is in it adds nothing to the fault inside.
-        deepest = [(at, fault) for at, fault in faults if not any(_inside(other, at) for other, _ in faults)]
-        lines = [f"{page.place([*under, *at])}: {_sentence(dict(fault), at, model)}" for at, fault in deepest]
+        lines = [f"{file.place([*under, *at])}: {message}" for at, message in _faults(error, data, model)]
         raise ConfigurationError("\n".join(dict.fromkeys(lines))) from error
 
 
 def validated(data: Any, model: type[Model], under: tuple[str, ...]) -> Model:
-    """``data`` as ``model``, for who does not know the file in which it stands at ``under``.
-
-    Raises:
-        ConfigurationError: with the first fault and the key of it.
-    """
+    """Return ``data`` as ``model`` for a caller that does not know the file; the ConfigurationError has the key."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        fault = error.errors()[0]
-        at = _written(data, fault["loc"])
-        raise ConfigurationError(_sentence(dict(fault), at, model), (*under, *map(str, at))) from error
+        at, message = next(_faults(error, data, model))
+        raise ConfigurationError(message, (*under, *map(str, at))) from error
 
 
 def dotted(location: Location) -> str:
-    """``("setpoints", 2, "speed")`` as ``setpoints[2].speed``."""
+    """Return ``("setpoints", 2, "speed")`` as ``setpoints[2].speed``."""
     return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".") or "the file"
 
 
 def line_of(text: str, location: Location) -> int | None:
-    """The line (from 1) where the value at ``location`` is written, as far as it can be told without a full parser."""
+    """Return the line (from 1) that writes the value at ``location``, or its nearest table; None if there is neither.
+
+    The standard library's parser reports no positions, so lines are matched one by one. Values that span several
+    lines are not followed.
+    """
     header: list[int | str] = []
-    counts: dict[tuple[str, ...], int] = {}
-    best: int | None = None
-    depth = 0
+    tables_seen: dict[tuple[str, ...], int] = {}
+    best, depth = None, 0
     for number, line in enumerate(text.splitlines(), start=1):
-        if section := re.match(r"\s*(\[\[?)\s*([^\]]+?)\s*\]\]?\s*(?:#.*)?$", line):
+        if section := SECTION.match(line):
             keys = tuple(part.strip().strip("\"'") for part in section[2].split("."))
             header = list(keys)
             if section[1] == "[[":
-                counts[keys] = counts.get(keys, -1) + 1
-                header.append(counts[keys])
-        elif entry := re.match(r"\s*([\w\-.\"' ()]+?)\s*=", line):
-            keys = tuple(part.strip().strip("\"'") for part in re.findall(r"\"[^\"]*\"|'[^']*'|[^.]+", entry[1]))
-            here = [*header, *keys]
-            if len(here) > depth and list(location[: len(here)]) == here:
-                best, depth = number, len(here)
-            continue
+                tables_seen[keys] = tables_seen.get(keys, -1) + 1
+                header.append(tables_seen[keys])
+            path = header
+        elif assignment := ASSIGNMENT.match(line):
+            path = [*header, *(part.strip().strip("\"'") for part in KEY_PART.findall(assignment[1]))]
         else:
             continue
-        if header and len(header) > depth and list(location[: len(header)]) == header:
-            best, depth = number, len(header)
+        if len(path) > depth and list(location[: len(path)]) == path:
+            best, depth = number, len(path)
     return best
 
 
+def _faults(error: ValidationError, data: Any, model: type[BaseModel]) -> Iterator[tuple[tuple[int | str, ...], str]]:
+    """Yield location and message of each fault."""
+    faults = [(_written(data, fault["loc"]), fault) for fault in error.errors()]
+    for at, fault in faults:
+        # A table that fails because of its content adds nothing to the fault of the content.
+        if not any(len(other) > len(at) and other[: len(at)] == at for other, _ in faults):
+            yield at, _message(dict(fault), at, model)
+
+
 def _written(data: Any, location: Location) -> tuple[int | str, ...]:
-    """``location`` without the keys that pydantic adds for the members of a union: they stand in no file."""
-    kept: list[int | str] = []
+    """Return ``location`` without the keys that pydantic adds for the members of a union."""
+    written: list[int | str] = []
     for position, key in enumerate(location):
         inside = data[key] if isinstance(key, int) and isinstance(data, list | tuple) and key < len(data) else None
         if isinstance(data, dict):
             if key not in data and position < len(location) - 1:
                 continue
             inside = data.get(key)
-        kept.append(key)
+        written.append(key)
         data = inside
-    return tuple(kept)
+    return tuple(written)
 
 
-def _inside(inner: tuple[int | str, ...], outer: tuple[int | str, ...]) -> bool:
-    return len(inner) > len(outer) and inner[: len(outer)] == outer
-
-
-def _sentence(fault: dict[str, Any], location: Location, model: type[BaseModel]) -> str:
+def _message(fault: dict[str, Any], location: Location, model: type[BaseModel]) -> str:
     if fault["type"] == "extra_forbidden":
         known = _keys_at(model, fault["loc"][:-1])
         return f"unknown key {location[-1]!r}: {nearest(str(location[-1]), known)}"
@@ -218,14 +206,14 @@ def _sentence(fault: dict[str, Any], location: Location, model: type[BaseModel])
         return "missing: this key must be set"
     if fault["type"] == "value_error":
         return str(fault["ctx"]["error"])
-    if fault["type"] in SHAPES:
-        return f"{fault['input']!r}: must be {SHAPES[fault['type']]}"
+    if fault["type"] in TOML_TYPES:
+        return f"{fault['input']!r}: must be {TOML_TYPES[fault['type']]}"
     message = re.sub(r"^Input", "the value", fault["msg"])
     return f"{fault['input']!r}: {message}"
 
 
 def _keys_at(model: Any, location: Location) -> list[str]:
-    """The keys that the table at ``location`` of ``model`` knows."""
+    """Return the keys that the table at ``location`` of ``model`` may have."""
     origin, arguments = typing.get_origin(model), typing.get_args(model)
     if origin is typing.Annotated:
         return _keys_at(arguments[0], location)
@@ -239,5 +227,5 @@ def _keys_at(model: Any, location: Location) -> list[str]:
         return sorted(fields)
     if location[0] in fields:
         return _keys_at(fields[str(location[0])].annotation, location[1:])
-    # The tag of a union's member stands in the location, not in the file.
+    # pydantic's location contains the tag of a union's member, which the file does not.
     return _keys_at(model, location[1:]) if fields else []

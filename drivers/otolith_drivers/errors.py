@@ -1,17 +1,17 @@
-"""The errors a user can meet, drawn as a tree.
+"""The errors that a user can meet.
 
     OtolithError
-     ├── ConfigurationError   a file says something that cannot be meant: unknown key, wrong unit, missing signal
-     ├── DeviceError          a device, bus or interface is not there or refuses: vcan0 missing, no permission
+     ├── ConfigurationError   a file is wrong: unknown key, wrong unit, missing signal
+     ├── DeviceError          a device, bus or interface is missing or refuses: no vcan0, no permission
      └── ServiceError         the computer refuses: port in use, folder not writable (raised by the daemon)
 
-Each message names the file or device, the key or signal, the value, the bound or cause, and the way out. Raised where
-the fault is seen, spoken once at the edge: ``otolith.__main__`` turns them into one line and an exit code.
+Each message names the file or device, the key or signal, the value, the bound or cause, and the remedy. An error is
+raised where the fault is detected; only ``otolith.__main__`` prints it, as one line, and turns it into an exit code.
 """
 
 
 class OtolithError(Exception):
-    """Anything Otolith says no to; the text is meant for the user as it stands."""
+    """Base of all errors whose text is written for the user."""
 
     exit_code = 2
 
@@ -19,11 +19,11 @@ class OtolithError(Exception):
 class ConfigurationError(OtolithError):
     """A machine file, scenario, DBC or option is wrong.
 
-    Example scenarios: unknown key, value without a unit, parameter outside its bounds, DBC without the named signal.
+    Examples: unknown key, value without a unit, parameter outside its bounds, DBC without the named signal.
     """
 
     def __init__(self, message: str, key: tuple[str, ...] = ()) -> None:
-        """``key`` is where in the machine file the fault begins, for a fault found by who does not know that file."""
+        """``key`` locates the fault in the machine file, for code that does not know the file itself."""
         super().__init__(message)
         self.key = key
 
@@ -31,24 +31,25 @@ class ConfigurationError(OtolithError):
 class DeviceError(OtolithError):
     """A device, bus or interface is missing or refuses.
 
-    Example scenarios: no such CAN interface, no permission on it, no route for the virtual bus.
+    Examples: no such CAN interface, no permission for it, no route for the virtual bus.
     """
 
 
 class ServiceError(OtolithError):
-    """The computer the daemon runs on refuses.
+    """The computer that runs the daemon refuses.
 
-    Example scenarios: the Zenoh port is in use, the recording folder is not writable.
+    Examples: the Zenoh port is in use, the recording folder is not writable.
     """
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """The end of a sentence that helps after a misspelt ``word``: the nearest known one, or the list of them."""
-    import difflib  # noqa: PLC0415 - only on the way to an error
+    """Return a hint for a misspelt ``word``: the most similar known name, or the list of known names."""
+    import difflib  # noqa: PLC0415 - only needed for an error
 
-    alike = {name.casefold(): name for name in known}
-    close = difflib.get_close_matches(word, known, n=1)
-    close = close or [alike[name] for name in difflib.get_close_matches(word.casefold(), list(alike), n=1)]
-    if close:
-        return f"did you mean {close[0]!r}?"
+    by_folded_name = {name.casefold(): name for name in known}
+    similar = difflib.get_close_matches(word, known, n=1) or [
+        by_folded_name[name] for name in difflib.get_close_matches(word.casefold(), list(by_folded_name), n=1)
+    ]
+    if similar:
+        return f"did you mean {similar[0]!r}?"
     return f"known: {', '.join(sorted(known))}" if known else "there are none"

@@ -1,4 +1,4 @@
-"""The table of drivers: one lazy row each, and the entry points of other people's packages."""
+"""The table of drivers, and the entry points through which other packages add theirs."""
 
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -9,7 +9,7 @@ from otolith_drivers.errors import ConfigurationError, nearest
 
 ENTRY_POINT_GROUP = "otolith.drivers"
 
-# The module is imported only when its driver is chosen.
+# A module is imported only when its driver is selected.
 DRIVERS: dict[str, str] = {
     "can": "otolith_drivers.canbus.driver",
     "modbus": "otolith_drivers.modbus.driver",
@@ -19,15 +19,15 @@ DRIVERS: dict[str, str] = {
 
 
 def known() -> list[str]:
-    """The names a machine file may give as ``driver.type``."""
+    """Return the names that a machine file may give as ``driver.type``."""
     return sorted({*DRIVERS, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))})
 
 
 def find(name: str) -> DriverType:
-    """The driver called ``name``.
+    """Return the driver module called ``name``.
 
     Raises:
-        ConfigurationError: there is none of that name, or its package cannot be imported.
+        ConfigurationError: no driver has this name, or its package cannot be imported.
     """
     try:
         if name in DRIVERS:

@@ -1,7 +1,7 @@
 """Physical quantities as people write them: ``"6.5 ohm"``, ``"11.7 g*cm^2"``, ``"2 s"``.
 
-Every number in a file carries its unit, is converted once on the way in, and is a plain float in its declared unit
-from there on. Parsing is pint's, behind a pattern that admits one number and one unit, so that nothing is evaluated.
+Each number in a file has a unit. It is converted once, when the file is read, to a float in the unit of its key.
+pint parses the units, behind a pattern that admits one number and one unit, so that no expression is evaluated.
 """
 
 import contextlib
@@ -18,15 +18,13 @@ from otolith_drivers.user_dirs import cache_directory
 if TYPE_CHECKING:
     import pint
 
-
-LONGEST = 100  # characters of a quantity
-QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*)")
-# Names, each with at most one small exponent, joined by * or /: nothing that pint could be kept busy with.
+MAX_LENGTH = 100  # characters of a quantity: engineering choice; bounds the time of the patterns below
+NUMBER_AND_UNIT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*)")
+# Unit names with one small exponent each, joined by * or /. A larger exponent would keep pint busy for minutes.
 FACTOR = r"[( ]*(?:1|[^\W\d][\w°%µμΩ]*|[°%][^\W\d]*)(?: ?(?:\^|\*\*) ?\(?-?\d(?:\.\d{1,3})?\)?)?[) ]*"
 UNIT = re.compile(rf"{FACTOR}(?:[*/· ]{FACTOR}){{0,12}}")
 
-# Units as drives and DBC files write them, where pint reads something else or nothing:
-# "Nm" alone would be read as "number meter".
+# Units as drives and DBC files write them, where pint reads something else ("Nm" is "number meter") or nothing.
 ALIASES = {
     "Nm": "N*m",
     "mNm": "mN*m",
@@ -49,15 +47,17 @@ ALIASES = {
     "1": "dimensionless",
     "-": "dimensionless",
 }
+RATES = ({"[time]": -1}, {"[time]": -2})
+"""Dimensions in which pint cannot tell turns from radians."""
 
 
 @cache
 def _registry() -> "pint.UnitRegistry[float]":
-    import pint  # noqa: PLC0415 - a quarter of a second, and not every command reads a quantity
+    import pint  # noqa: PLC0415 - takes a quarter of a second, and not every command reads a quantity
 
-    try:  # parsed units are kept, which saves most of the time; half a file of a process that died is made anew
+    try:  # pint keeps parsed units in a folder, which saves most of the time
         return pint.UnitRegistry(autoconvert_offset_to_baseunit=True, cache_folder=cache_directory("units"))
-    except Exception:  # noqa: BLE001 - whatever is wrong with the cache, the units are not
+    except Exception:  # noqa: BLE001 - any fault of the cache, such as a half-written file: work without it
         with contextlib.suppress(OtolithError):
             shutil.rmtree(cache_directory("units"), ignore_errors=True)
         return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
@@ -65,14 +65,14 @@ def _registry() -> "pint.UnitRegistry[float]":
 
 @cache
 def unit(text: str) -> "pint.Unit":
-    """The unit that ``text`` names.
+    """Return the unit that ``text`` names.
 
     Raises:
         ValueError: unknown or malformed unit.
     """
     short = re.sub(r"\s+", " ", text.strip())
     written = ALIASES.get(short.replace(" ", ""), short)
-    if len(text) > LONGEST or not UNIT.fullmatch(written):
+    if len(text) > MAX_LENGTH or not UNIT.fullmatch(written):
         raise ValueError(f"{text!r} is not a unit")
     try:
         return _registry().Unit(written)
@@ -81,29 +81,29 @@ def unit(text: str) -> "pint.Unit":
 
 
 def factor(source: str, target: str) -> tuple[float, float]:
-    """``(scale, offset)`` with ``value_in_target = scale * value_in_source + offset``.
+    """Return ``(scale, offset)`` with ``value_in_target = scale * value_in_source + offset``.
 
     Raises:
-        ValueError: the units measure different things; both are named.
+        ValueError: the units have different dimensions; the message names both.
     """
-    _same_dimension(source, target)
+    _check_dimension(source, target)
     zero = _registry().Quantity(0.0, unit(source)).to(unit(target)).magnitude
     one = _registry().Quantity(1.0, unit(source)).to(unit(target)).magnitude
     return one - zero, zero
 
 
 def to_base(text: str) -> tuple[float, float]:
-    """``(scale, offset)`` from the unit ``text`` to SI base units (with radians)."""
-    registry = _registry()
-    zero = registry.Quantity(0.0, unit(text)).to_base_units().magnitude
-    return registry.Quantity(1.0, unit(text)).to_base_units().magnitude - zero, zero
+    """Return ``(scale, offset)`` from the unit ``text`` to SI base units (with radians)."""
+    zero = _registry().Quantity(0.0, unit(text)).to_base_units().magnitude
+    one = _registry().Quantity(1.0, unit(text)).to_base_units().magnitude
+    return one - zero, zero
 
 
-def _same_dimension(source: str, target: str) -> None:
+def _check_dimension(source: str, target: str) -> None:
     if unit(source).dimensionality != unit(target).dimensionality:
         raise ValueError(f"unit {source!r} does not measure what {target!r} does: expected a unit like {target!r}")
-    # pint takes an angle for a plain number, so that 1 Hz or 1/s would become 1 rad/s: wrong by 2π if turns are meant.
-    if _is_angular(target) != _is_angular(source) and unit(target).dimensionality in _RATES:
+    # pint treats angles as dimensionless, so 1 Hz would become 1 rad/s: wrong by 2π if turns are meant.
+    if _is_angular(target) != _is_angular(source) and unit(target).dimensionality in RATES:
         raise ValueError(f"unit {source!r} leaves open whether turns or radians are meant: write {target!r} or 'rpm'")
 
 
@@ -111,24 +111,21 @@ def _is_angular(text: str) -> bool:
     return any(angle in str(unit(text)) for angle in ("radian", "degree", "revolution", "turn"))
 
 
-_RATES = ({"[time]": -1}, {"[time]": -2})
-
-
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A validator: text with a unit in, float in ``unit`` out, ``low <= value <= high``."""
+    """A validator: takes text with a unit, returns a float in ``unit`` with ``low <= value <= high``."""
 
     unit: str
     low: float = -math.inf
     high: float = math.inf
     difference: bool = False
-    """Of two such quantities, like a noise level: 0.1 degC is 0.1 K then."""
+    """Whether it is a difference of two such quantities, like a noise level: then 0.1 degC is 0.1 K."""
 
     def __call__(self, written: Any) -> float:
-        """The value in ``self.unit``.
+        """Return the value in ``self.unit``.
 
         Raises:
-            ValueError: no number, no unit, another dimension, or out of bounds (which are named).
+            ValueError: not a number, no unit, another dimension, or out of bounds; the message names the bounds.
         """
         value = self.convert(written)
         if not self.low <= value <= self.high:
@@ -136,12 +133,16 @@ class Quantity:
         return value
 
     def convert(self, written: Any) -> float:
-        """The value in ``self.unit``, its bounds not looked at."""
+        """Return the value in ``self.unit`` without checking its bounds.
+
+        Raises:
+            ValueError: not a number, no unit, or another dimension.
+        """
         example = f'write it with its unit, like "{1.0 if math.isinf(self.low) else max(self.low, 1.0):g} {self.unit}"'
         if isinstance(written, bool) or not isinstance(written, str | int | float):
             raise ValueError(f"{written!r} is not a quantity: {example}")  # noqa: TRY004 - a fault of a file, not a bug
         text = str(written).strip()
-        match = QUANTITY.fullmatch(text) if len(text) <= LONGEST else None
+        match = NUMBER_AND_UNIT.fullmatch(text) if len(text) <= MAX_LENGTH else None
         if match is None:
             raise ValueError(f"{written!r} is not a number with a unit: {example}")
         if not match[2] and not self._is_plain_number:

@@ -1,15 +1,14 @@
-"""Recorded rows make the windows that a live machine would have made of them."""
+"""Playback cuts the same windows from recorded rows as the daemon from live samples."""
 
 from itertools import pairwise
 
 import numpy as np
 
-from otolith.acquisition.alignment import Limits
 from otolith.acquisition.playback import Playback
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Array, Window
 from otolith_drivers.replay.readers import Rows
-from tests.acquisition.test_windower import PERIOD, RECORDS, cut_all
+from tests.acquisition.test_windower import LIMITS, PERIOD, RECORDS, cut_all
 
 
 def rows(times: Array, values: Array) -> Rows:
@@ -21,21 +20,21 @@ def played(playback: Playback, *parts: Rows) -> list[Window]:
     return [window for part in parts for window in playback.windows(part)] + list(playback.rest())
 
 
-def test_the_windows_are_those_of_the_daemon() -> None:
+def test_playback_cuts_the_windows_of_the_daemon() -> None:
     random = np.random.default_rng(3)
     times = 0.1 + np.arange(1000.0) * PERIOD + random.uniform(0.0, 0.002, 1000)
     values = np.arange(1000.0)
     live = cut_all(Rings(("a", "b"), 400), list(zip(times.tolist(), values.tolist(), strict=True)), until=10.3)
-    replayed = played(Playback(("a", "b"), RECORDS, PERIOD, Limits()), rows(times, values))
+    replayed = played(Playback(("a", "b"), RECORDS, PERIOD, LIMITS), rows(times, values))
     assert len(live) == len(replayed) == 20
     for one, other in zip(live, replayed, strict=True):
         assert np.array_equal(one.values, other.values)
         assert (one.index, one.quality.verdict) == (other.index, other.quality.verdict)
 
 
-def test_windows_may_change_their_length_from_one_to_the_next() -> None:
+def test_window_length_may_change_between_windows() -> None:
     times = np.arange(1000.0) * PERIOD
-    playback = Playback(("a", "b"), RECORDS, PERIOD, Limits())
+    playback = Playback(("a", "b"), RECORDS, PERIOD, LIMITS)
     lengths = iter([100, 20, 400, *[50] * 9])
     windows = []
     for window in playback.windows(rows(times, np.arange(1000.0))):
@@ -46,15 +45,15 @@ def test_windows_may_change_their_length_from_one_to_the_next() -> None:
     assert np.array_equal(np.concatenate([window.column("a") for window in windows]), np.arange(970.0))
 
 
-def test_where_rows_are_cut_into_stretches_does_not_matter() -> None:
+def test_windows_do_not_depend_on_chunks() -> None:
     random = np.random.default_rng(7)
     times = np.arange(2000.0) * PERIOD
     times[1200:] += 3.0
     times[1500:] += 200.0
     times[random.integers(0, 2000, 20)] -= 0.1
     values = np.where(random.random(2000) < 0.02, np.nan, np.arange(2000.0))
-    whole = Playback(("a", "b"), RECORDS, PERIOD, Limits())
-    pieces = Playback(("a", "b"), RECORDS, PERIOD, Limits())
+    whole = Playback(("a", "b"), RECORDS, PERIOD, LIMITS)
+    pieces = Playback(("a", "b"), RECORDS, PERIOD, LIMITS)
     first = played(whole, rows(times, values))
     cuts = [0, *sorted(random.integers(1, 2000, 60).tolist()), 2000]
     parts = [rows(times[a:b], values[a:b]) for a, b in pairwise(cuts)]
@@ -64,4 +63,4 @@ def test_where_rows_are_cut_into_stretches_does_not_matter() -> None:
         assert (one.start, one.quality) == (other.start, other.quality)
         assert np.array_equal(one.values, other.values)
     assert (whole.counts.lost, whole.counts.reordered) == (pieces.counts.lost, pieces.counts.reordered)
-    assert whole.counts.outages == pieces.counts.outages == 1
+    assert whole.counts.silences == pieces.counts.silences == 1

@@ -1,4 +1,4 @@
-"""Registers of different requests, read one after the other, come to stand at the same moments of the grid."""
+"""Registers read by successive requests are aligned to the same times of the grid."""
 
 import math
 import socket
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.windower import Windower
 from otolith_drivers.base import Sampling, Setup, Signal
@@ -18,46 +18,46 @@ from tests.waiting import PATIENCE
 
 PERIOD, RECORDS = 0.02, 100
 FREQUENCY = 2.0 * math.pi  # rad/s
-LATER = 0.006  # s that a request takes
-FULL = 10_000.0
+REQUEST_TIME = 0.006  # s
+FULL_SCALE = 10_000.0
 
 
-class Moving(dict[int, int]):
-    """Registers that all show the same sine at the moment at which they are asked."""
+class SineRegisters(dict[int, int]):
+    """Registers that all have the value of the same sine at the time of the request."""
 
     def get(self, address: int, default: object = 0) -> int:
         """The register at ``address``."""
-        return round(FULL * math.sin(FREQUENCY * time.monotonic())) & 0xFFFF
+        return round(FULL_SCALE * math.sin(FREQUENCY * time.monotonic())) & 0xFFFF
 
 
 def slow(reply: bytes) -> bytes:
-    time.sleep(LATER / 2)
+    time.sleep(REQUEST_TIME / 2)
     return reply
 
 
 def read_window(sampling: Sampling) -> float:
-    """Root mean square difference of two registers, 500 addresses apart, in a window of the sine; of its amplitude."""
+    """Return the RMS difference of two registers of separate requests in a window, relative to the amplitude."""
     port = free_port(socket.SOCK_STREAM)
     sources = [{"register": address, "type": "int16", "unit": "V"} for address in (0, 500)]
     signals = tuple(Signal(name, "V", Source.model_validate(s)) for name, s in zip("ab", sources, strict=True))
     rings = Rings(("a", "b"), 4 * RECORDS)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits(missing=1.0, gap=10.0, jitter=1.0), sampling)
+    windower = Windower(("a", "b"), RECORDS, PERIOD, QualityLimits(missing=1.0, gap=10.0, jitter=1.0), sampling)
     driver = build(Options(host="127.0.0.1", port=port), Setup(signals, Path(), PERIOD))
-    with odd_server(Behaviour(Moving(), spoil=slow), port):
+    with odd_server(Behaviour(SineRegisters(), corrupt=slow), port):
         driver.open(rings.deliver)
-        begun = time.monotonic()
+        deadline = time.monotonic() + 20.0
         while not (windower.begin(rings, time.monotonic(), 0.0) and windower.due(rings, time.monotonic())):
-            assert time.monotonic() < begun + PATIENCE
+            assert time.monotonic() < deadline
             time.sleep(0.01)
         window = windower.cut(rings, 0.0)
         driver.close()
-    there = ~window.missing.any(axis=1)
-    assert there.sum() > RECORDS / 2
-    apart = (window.values[:, 0] - window.values[:, 1])[there]
-    return float(np.sqrt(np.mean(apart**2)) / FULL)
+    present = ~window.missing.any(axis=1)
+    assert present.sum() > RECORDS / 2
+    apart = (window.values[:, 0] - window.values[:, 1])[present]
+    return float(np.sqrt(np.mean(apart**2)) / FULL_SCALE)
 
 
-def test_the_skew_between_requests_is_taken_out() -> None:
+def test_the_skew_between_requests_is_corrected() -> None:
     skewed, corrected = read_window(Sampling.CYCLIC), read_window(Sampling.POLLED)
-    assert skewed > 0.3 * FREQUENCY * LATER / 2  # what there is to correct
+    assert skewed > 0.3 * FREQUENCY * REQUEST_TIME / 2  # what there is to correct
     assert corrected < 0.5 * skewed

@@ -1,4 +1,4 @@
-"""Windows follow one another without a gap or an overlap, and rings count what falls out."""
+"""Windows follow one another without gap or overlap, and rings count lost samples."""
 
 from itertools import pairwise
 
@@ -7,13 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict, Window
-from otolith.acquisition.windower import GRACE, Windower
+from otolith.acquisition.windower import GRACE_PERIOD, Windower
 from otolith_drivers.base import Sample
 
 PERIOD, RECORDS = 0.01, 50
+LIMITS = QualityLimits(missing=0.05, gap=0.05, jitter=0.005)
 
 
 def feed(rings: Rings, samples: list[tuple[float, float]]) -> None:
@@ -23,7 +24,7 @@ def feed(rings: Rings, samples: list[tuple[float, float]]) -> None:
 
 def cut_all(rings: Rings, samples: list[tuple[float, float]], *, until: float) -> list[Window]:
     """Feed samples at their times and cut whatever is due, as the service does."""
-    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    windower = Windower(("a", "b"), RECORDS, PERIOD, LIMITS)
     windows, now, queue = [], 0.0, list(samples)
     while now < until:
         arrived = [sample for sample in queue if sample[0] <= now]
@@ -48,7 +49,7 @@ def test_every_sample_is_in_exactly_one_window() -> None:
 
 
 @pytest.mark.parametrize("drift", [-2e-3, -2e-4, 2e-4, 2e-3])
-def test_the_grid_follows_a_source_whose_clock_is_off(drift: float) -> None:
+def test_the_grid_follows_a_source_with_clock_drift(drift: float) -> None:
     samples = [(0.1 + index * PERIOD * (1 + drift), float(index)) for index in range(6000)]
     windows = cut_all(Rings(("a", "b"), 400), samples, until=60.0)
     values = np.concatenate([window.column("a") for window in windows])
@@ -56,7 +57,7 @@ def test_the_grid_follows_a_source_whose_clock_is_off(drift: float) -> None:
     assert all(window.quality.verdict is Verdict.GOOD for window in windows)
 
 
-def test_a_burst_over_the_end_of_a_window_is_put_back_on_both_sides() -> None:
+def test_a_burst_across_two_windows_returns_to_its_slots() -> None:
     """The computer stalls for 60 ms around the end of the third window."""
     end = 0.1 + 3 * RECORDS * PERIOD
     moments = [0.1 + index * PERIOD for index in range(300)]
@@ -66,22 +67,22 @@ def test_a_burst_over_the_end_of_a_window_is_put_back_on_both_sides() -> None:
     assert np.array_equal(values, np.arange(float(len(values))))
 
 
-def test_the_first_window_is_centred_though_its_first_sample_came_late() -> None:
+def test_a_late_first_sample_does_not_shift_the_first_window() -> None:
     samples = [(0.1 + index * PERIOD + (0.004 if index == 0 else 0.0), float(index)) for index in range(300)]
     first, second, *_ = cut_all(Rings(("a", "b"), 400), samples, until=3.2)
     assert first.start == pytest.approx(1000.1, abs=0.001)
     assert second.start == pytest.approx(first.end, abs=1e-3)
 
 
-def test_a_complete_window_is_not_waited_for() -> None:
+def test_a_complete_window_is_due_at_once() -> None:
     rings = Rings(("a", "b"), 400)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    windower = Windower(("a", "b"), RECORDS, PERIOD, LIMITS)
     feed(rings, [(index * PERIOD, 1.0) for index in range(RECORDS + 1)])
     assert windower.begin(rings, 0.5, 0.5)
     assert windower.due(rings, windower.next_end)
 
 
-def test_an_outage_gives_bad_windows_that_say_so_and_the_next_ones_are_good() -> None:
+def test_windows_are_bad_during_an_outage_and_good_after() -> None:
     samples = [(index * PERIOD, 1.0) for index in range(600) if not 200 <= index < 350]
     windows = cut_all(Rings(("a", "b"), 400), samples, until=6.2)
     verdicts = [window.quality.verdict for window in windows]
@@ -91,32 +92,32 @@ def test_an_outage_gives_bad_windows_that_say_so_and_the_next_ones_are_good() ->
     assert windows[5].quality.reasons == ("no samples of a, b",)
 
 
-def test_a_machine_that_never_speaks_gives_bad_windows() -> None:
+def test_a_silent_machine_gives_bad_windows() -> None:
     windows = cut_all(Rings(("a", "b"), 400), [], until=2.0)
     assert len(windows) >= 2
     assert {window.quality.verdict for window in windows} == {Verdict.BAD}
 
 
-def test_a_signal_that_never_comes_is_named() -> None:
+def test_the_reason_names_a_signal_that_never_comes() -> None:
     rings = Rings(("a", "b", "c"), 400)
-    windower = Windower(("a", "b", "c"), RECORDS, PERIOD, Limits())
+    windower = Windower(("a", "b", "c"), RECORDS, PERIOD, LIMITS)
     feed(rings, [(index * PERIOD, 1.0) for index in range(100)])
     assert not windower.begin(rings, 0.4, 0.4)
     assert windower.begin(rings, 1.0, 1.0)
     assert windower.cut(rings, 0.0).quality.reasons == ("no samples of c",)
 
 
-def test_a_window_is_not_waited_for_longer_than_the_grace() -> None:
+def test_an_incomplete_window_is_due_after_the_grace_period() -> None:
     rings = Rings(("a", "b"), 400)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, Limits())
+    windower = Windower(("a", "b"), RECORDS, PERIOD, LIMITS)
     feed(rings, [(index * PERIOD, 1.0) for index in range(RECORDS - 3)])
     assert windower.begin(rings, 0.48, 0.48)
-    assert not windower.due(rings, windower.next_end + 0.9 * GRACE)
-    assert windower.due(rings, windower.next_end + GRACE)
+    assert not windower.due(rings, windower.next_end + 0.9 * GRACE_PERIOD)
+    assert windower.due(rings, windower.next_end + GRACE_PERIOD)
 
 
-def test_a_gap_counts_again_once_the_grid_is_fine_again() -> None:
-    windower, rings = Windower(("a", "b"), RECORDS, PERIOD, Limits()), Rings(("a", "b"), 400)
+def test_the_gap_limit_returns_with_the_fine_grid() -> None:
+    windower, rings = Windower(("a", "b"), RECORDS, PERIOD, LIMITS), Rings(("a", "b"), 400)
     windower.regrid(RECORDS, 1.0)
     windower.regrid(RECORDS, PERIOD)
     feed(rings, [(index * PERIOD, 1.0) for index in range(2 * RECORDS) if not 20 <= index < 40])
@@ -124,15 +125,15 @@ def test_a_gap_counts_again_once_the_grid_is_fine_again() -> None:
     assert any("gap" in reason for reason in windower.cut(rings, unix_offset=0.0).quality.reasons)
 
 
-def test_a_sample_that_is_no_reading_is_not_received() -> None:
-    """Its driver has counted it as bad."""
+def test_a_sample_without_a_reading_is_not_counted() -> None:
+    """The driver counts it as bad."""
     rings = Rings(("a",), 100)
     rings.deliver([Sample("a", 0.0, 1.0), Sample("a", 0.1, float("nan"))])
     rings.deliver_columns({"a": (np.array([0.2, 0.3]), np.array([np.nan, 1.0]))})
     assert rings.counters().received == 2
 
 
-def test_rings_are_bounded_and_count_what_falls_out() -> None:
+def test_rings_are_bounded_and_count_overwritten_samples() -> None:
     rings = Rings(("a",), 100)
     rings.deliver([Sample("a", float(index), 0.0) for index in range(130)])
     rings.deliver([Sample("x", 0.0, 0.0)])
@@ -141,7 +142,7 @@ def test_rings_are_bounded_and_count_what_falls_out() -> None:
     times, _ = rings.between(0.0, 1000.0)["a"]
     assert len(times) == 100
     rings.deliver([Sample("a", 200.0, 0.0)])
-    assert rings.counters().overwritten == 30  # what was read before is not lost
+    assert rings.counters().overwritten == 30  # samples that were read are not lost
 
 
 @given(
@@ -149,9 +150,7 @@ def test_rings_are_bounded_and_count_what_falls_out() -> None:
     st.integers(1, 12),
     st.lists(st.floats(-10.0, 10.0), max_size=10),
 )
-def test_many_samples_at_once_are_the_same_as_one_by_one(
-    parts: list[list[float]], capacity: int, reads: list[float]
-) -> None:
+def test_deliver_columns_equals_deliver(parts: list[list[float]], capacity: int, reads: list[float]) -> None:
     one_by_one, at_once = Rings(("a",), capacity), Rings(("a",), capacity)
     for index, part in enumerate(parts):
         one_by_one.deliver([Sample(name, time, 2.0 * time) for time in part for name in ("a", "x")])

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array, Window
+from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
-from otolith.estimation.window_fit import estimate
+from otolith.estimation.window_fit import Search, estimate
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
 
@@ -44,7 +45,7 @@ def bound(problem: Problem, record: Window, initial: Array) -> Array:
     """(free,) the Cramer-Rao bound of the standard deviations, at the truth; the initial state is unknown."""
     truth = np.array([TRUTH[entry.name] for entry in problem.free])
     objective = Objective(problem, record, truth)
-    _, jacobian = objective.linearised(np.concatenate([truth, initial]))
+    _, jacobian = objective.linearise(np.concatenate([truth, initial]))
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))[: len(truth)])
 
 
@@ -59,7 +60,7 @@ def test_95_percent_are_95_percent(names: tuple[str, ...], windows: int) -> None
     inside, pulls = np.zeros(len(free)), []
     for index in range(windows):
         record, initial = window(random, index)
-        found = estimate(problem, record, 1.1 * truth, warm=True).parameters
+        found = estimate(problem, record, initial_prior(problem), 1.1 * truth, Search.IF_UNEXPLAINED).parameters
         errors = np.array([entry.value for entry in found]) - truth
         inside += np.abs(errors) <= 1.959964 * np.array([entry.sd for entry in found])
         pulls.append(errors / bound(problem, record, initial))

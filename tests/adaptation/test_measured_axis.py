@@ -1,7 +1,7 @@
-"""A measured machine: the servo axis of EMPS, with what its authors found in it.
+"""The measured servo axis EMPS, compared with the estimates of its authors.
 
 (A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System Identification
-Benchmarks, 2019.) The data is not ours: it is looked for where OTOLITH_DATA says, then in ../shared/data.
+Benchmarks, 2019.) The data is not part of this project: the tests read it from OTOLITH_DATA or ../shared/data.
 """
 
 import os
@@ -29,18 +29,15 @@ ROOT = Path(__file__).parents[2]
 PLACES = [*map(Path, filter(None, [os.environ.get("OTOLITH_DATA")])), ROOT.parent / "shared" / "data"]
 FILE = next((path for place in PLACES if (path := place / "emps" / "data_emps.csv").is_file()), None)
 pytestmark = pytest.mark.skipif(
-    FILE is None, reason="EMPS is not ours to carry: put emps/data_emps.csv in OTOLITH_DATA"
+    FILE is None, reason="EMPS is not part of this project: put emps/data_emps.csv into OTOLITH_DATA"
 )
 
 FORCE = 35.1507  # N/V
 PERIOD, RECORDS = 1e-3, 2000
 MASS = 95.1089  # kg
 DIRECTIONAL = {"F_v_up": 166.71, "F_c_up": 20.144, "F_v_down": 240.42, "F_c_down": 20.628}  # N*s/m and N
-TURN = 5e-4  # m/s: the authors' sign(v), as sharp as the record likes it (its likelihood grows down to here)
-WHOLE = 12  # windows of the record
-COUNTS = pytest.mark.parametrize("count", [4, pytest.param(WHOLE, marks=pytest.mark.full)])
-"""How many windows are adapted to: nearly each one is searched for components that the twin lacks, which takes long."""
-ONE_WAY = 1e-3  # of the path: what a window may go back and still be called so
+TURN = 5e-4  # m/s: width of the authors' sign(v); the likelihood of the record increases down to this width
+ONE_WAY = 1e-3  # of the path: largest share in the other direction of a one-way window
 
 
 @lru_cache
@@ -54,63 +51,56 @@ def windows() -> tuple[Window, ...]:
 
 def problem(twin: str) -> Problem:
     definition = find_twin(twin)
-    free = tuple(entry for entry in definition.parameters if entry.name != "v_s")
+    free = tuple(parameter for parameter in definition.parameters if parameter.name != "v_s")
     return Problem(definition, (("v_s", TURN),), free, noise=(definition.outputs[0].noise,))
 
 
 @lru_cache
-def learned(twin: str) -> IdentifiedNoise:
-    """From every other window; the rest have no part in it."""
+def identified(twin: str) -> IdentifiedNoise:
+    """From every other window."""
     return identify_noise(problem(twin), windows()[::2])
 
 
 @lru_cache
-def reports(twin: str, count: int) -> tuple[ReportDocument, ...]:
-    state, found = initial_state("axis", "lab", learned(twin).applied(problem(twin))), []
-    for window in windows()[:count]:
+def reports(twin: str) -> tuple[ReportDocument, ...]:
+    state, documents = initial_state("axis", "lab", identified(twin).applied(problem(twin))), []
+    for window in windows():
         state, report = adapt(state, window)
-        found.append(report.document)
-    return tuple(found)
+        documents.append(report.document)
+    return tuple(documents)
 
 
 def shares(window: Window) -> Array:
-    """Of the path, forwards and backwards."""
+    """Shares of the path forwards and backwards."""
     steps = np.diff(window.column("x"))
     paths = np.array([np.maximum(steps, 0.0).sum(), np.maximum(-steps, 0.0).sum()])
     return np.asarray(paths / paths.sum())
 
 
-def test_levels_of_noise_are_those_of_the_encoder_and_of_a_slow_error() -> None:
-    found = learned("servo_axis_directional")
-    assert found.outputs[0].value < 5e-8  # m: the encoder's step
-    assert 2e-3 < found.states[1].value < 1e-2  # m/s/s^0.5
-    assert found.consistency.before is not None
-    assert found.consistency.before > 10.0  # what white noise alone would have claimed
+def test_noise_levels_of_encoder_and_slow_model_error() -> None:
+    noise = identified("servo_axis_directional")
+    assert noise.outputs[0].value < 5e-8  # m: the encoder's step
+    assert 2e-3 < noise.states[1].value < 1e-2  # m/s/s^0.5
+    assert noise.consistency.before is not None
+    assert noise.consistency.before > 10.0  # what white noise alone would have claimed
 
 
-def test_the_record_has_so_many_windows() -> None:
-    assert len(windows()) == WHOLE
-
-
-@COUNTS
-def test_the_mass_is_found_as_soon_as_the_axis_has_moved_both_ways(count: int) -> None:
+def test_mass_is_right_once_the_axis_has_moved_both_ways() -> None:
     both = next(index for index, window in enumerate(windows()) if shares(window).min() > ONE_WAY)
     values = [report.parameters["M"].value for report in reports("servo_axis", count)[both:]]
     assert len(values) >= count - 2
     assert values == pytest.approx([MASS] * len(values), rel=0.015)
 
 
-@COUNTS
-def test_friction_that_differs_by_direction_is_what_the_authors_found(count: int) -> None:
-    last = reports("servo_axis_directional", count)[-1].parameters
-    found = {name: last[name].value for name in DIRECTIONAL}
-    assert found == pytest.approx(DIRECTIONAL, rel=0.05)
+def test_friction_by_direction_agrees_with_the_authors() -> None:
+    last = reports("servo_axis_directional")[-1].parameters
+    friction = {name: last[name].value for name in DIRECTIONAL}
+    assert friction == pytest.approx(DIRECTIONAL, rel=0.05)
     assert last["M"].value == pytest.approx(95.154, rel=0.015)
 
 
-@COUNTS
-def test_no_published_value_jumps_while_the_twin_lacks_the_direction(count: int) -> None:
-    """Held or invalid values do not count; what is called estimated stays within its own and the last interval."""
+def test_no_published_value_jumps_with_symmetric_friction() -> None:
+    """An estimated value stays within its own interval and the previous one; held and invalid values do not count."""
     published = 0
     for name in ("M", "F_v", "F_c", "offset"):
         history = [report.parameters[name] for report in reports("servo_axis", count)]
@@ -122,37 +112,40 @@ def test_no_published_value_jumps_while_the_twin_lacks_the_direction(count: int)
     assert published > {4: 2, WHOLE: 20}[count]
 
 
-def test_a_twin_that_lacks_the_direction_is_doubted_when_its_noise_is_learned() -> None:
-    assert DOUBTFUL in learned("servo_axis").consistency.remark
-    assert DOUBTFUL not in learned("servo_axis_directional").consistency.remark
+def test_noise_identification_doubts_symmetric_friction() -> None:
+    assert DOUBTFUL in identified("servo_axis").consistency.remark
+    assert DOUBTFUL not in identified("servo_axis_directional").consistency.remark
 
 
-def reach(entry: ParameterDocument) -> float:
-    """Half of the 95 % interval."""
-    assert entry.low is not None
-    assert entry.high is not None
-    return 0.5 * (entry.high - entry.low)
+def reach(parameter: ParameterDocument) -> float:
+    """Half the 95 % interval."""
+    assert parameter.low is not None
+    assert parameter.high is not None
+    return 0.5 * (parameter.high - parameter.low)
 
 
-def test_windows_that_were_not_learned_from_agree_as_much_as_they_claim() -> None:
+def test_windows_not_used_for_identification_are_consistent() -> None:
     twin = problem("servo_axis_directional")
-    told = learned("servo_axis_directional").applied(twin)
-    likelihood, levels = Likelihood(twin), np.array([*told.noise, *told.process_noise])
+    noisy = identified("servo_axis_directional").applied(twin)
+    likelihood, levels = Likelihood(twin), np.array([*noisy.noise, *noisy.process_noise])
     fits = [likelihood.fit(levels, window, [twin.nominal]) for window in windows()]
     for some in (fits, fits[1::2]):
-        found = consistency_test(some, likelihood.width)
-        assert found.degrees > 15
-        assert 0.5 <= found.reduced <= 2.0
+        test = consistency_test(some, likelihood.width)
+        assert test.degrees > 15
+        assert 0.5 <= test.reduced <= 2.0
 
 
-@COUNTS
-def test_the_reports_own_estimates_of_single_windows_agree(count: int) -> None:
-    """``raw`` and ``raw_sd``, parameter by parameter."""
+def test_reported_estimates_of_single_windows_are_consistent() -> None:
+    """Chi-square of ``raw`` with ``raw_sd``, per parameter."""
     squares, degrees = 0.0, 0
     for name in ("M", *DIRECTIONAL):
-        entries = [report.parameters[name] for report in reports("servo_axis_directional", count)]
-        told = [(entry.raw, entry.raw_sd) for entry in entries if entry.raw is not None and entry.raw_sd is not None]
-        values, sd = np.array(told, dtype=np.float64).T
+        parameters = [report.parameters[name] for report in reports("servo_axis_directional")]
+        estimates = [
+            (parameter.raw, parameter.raw_sd)
+            for parameter in parameters
+            if parameter.raw is not None and parameter.raw_sd is not None
+        ]
+        values, sd = np.array(estimates, dtype=np.float64).T
         mean = np.average(values, weights=sd**-2.0)
         squares += float((((values - mean) / sd) ** 2).sum())
         degrees += len(values) - 1
@@ -160,23 +153,21 @@ def test_the_reports_own_estimates_of_single_windows_agree(count: int) -> None:
     assert 0.5 <= squares / degrees <= 2.0
 
 
-@COUNTS
-def test_one_way_only_friction_and_offset_are_named_as_traded(count: int) -> None:
+def test_one_way_windows_trade_friction_with_offset() -> None:
     seen = 0
     for window, report in zip(windows()[:count], reports("servo_axis", count), strict=True):
         if shares(window).min() > ONE_WAY:
             continue
         seen += 1
         for name, other in (("F_c", "offset"), ("offset", "F_c")):
-            entry = report.parameters[name]
-            assert entry.identifiability is Identifiability.TRADED
-            assert f"traded with {other}" in entry.reason
-    assert seen == {4: 2, WHOLE: 5}[count]
+            parameter = report.parameters[name]
+            assert parameter.identifiability is Identifiability.TRADED
+            assert f"traded with {other}" in parameter.reason
+    assert seen == 5
 
 
-@COUNTS
-def test_dry_friction_that_the_twin_lacks_is_discovered(count: int) -> None:
-    """Viscous friction is in the twin, by direction; the dry one, 20.4 N on the average of both, is not."""
+def test_missing_dry_friction_is_discovered() -> None:
+    """The twin has viscous friction by direction, but no dry friction, 20.4 N in the mean of both directions."""
     full = find_twin("servo_axis_directional")
     bare = replace(
         full,
@@ -185,20 +176,19 @@ def test_dry_friction_that_the_twin_lacks_is_discovered(count: int) -> None:
             (name, re.sub(r" \+ F_c_(up|down)\*tanh\(v/v_s\)", "", text), meaning)
             for name, text, meaning in full.definitions
         ),
-        parameters=tuple(entry for entry in full.parameters if entry.name.startswith(("M", "F_v"))),
+        parameters=tuple(parameter for parameter in full.parameters if parameter.name.startswith(("M", "F_v"))),
     )
-    told = learned("servo_axis_directional")
-    levels = {entry.name: entry.value for entry in told.states}
-    process = tuple(levels[entry.name] for entry in bare.states)
+    noise = identified("servo_axis_directional")
+    levels = {level.name: level.value for level in noise.states}
+    process = tuple(levels[state.name] for state in bare.states)
     state = initial_state(
-        "axis", "lab", Problem(bare, (), bare.parameters, (told.outputs[0].value,), process_noise=process)
+        "axis", "lab", Problem(bare, (), bare.parameters, (noise.outputs[0].value,), process_noise=process)
     )
     documents = []
     for window in windows()[:count]:
         state, report = adapt(state, window)
         documents.append(report.document)
-    (found,) = documents[-1].components
-    assert (found.input, found.site) == ("v", "carriage")
-    assert found.family == "Coulomb" or count < WHOLE  # after four windows a flat power law explains as much
-    assert found.values["amplitude"].value == pytest.approx(-20.4, rel=0.1)
+    (component,) = documents[-1].components
+    assert (component.family, component.input, component.site) == ("Coulomb", "v", "carriage")
+    assert component.values["amplitude"].value == pytest.approx(-20.4, rel=0.1)
     assert documents[-1].parameters["M"].value == pytest.approx(MASS, rel=0.01)

@@ -1,4 +1,4 @@
-"""The paper's scenarios, shortened: what is found is right, the same every time, and drawn and told as promised."""
+"""The paper's drifting parameters, in shortened scenarios: estimates, repeatability, plots, tables, exit code."""
 
 import json
 import multiprocessing
@@ -9,14 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.paper import __main__ as comparison
-from benchmarks.paper import process_pool as crew
+from benchmarks.paper import process_pool
 from benchmarks.paper import study as studies
 from benchmarks.paper.__main__ import paper
 from benchmarks.paper.discovery import Search
 from benchmarks.paper.output import document, limit_in_words, pages
 from benchmarks.paper.plots import draw
-from benchmarks.paper.process_pool import Progress, perform
-from benchmarks.paper.scenarios import HIDING, NAMES, PEAK, ROWS, SENSORS, UNKNOWN_NAMES, live, plan_of, row_of
+from benchmarks.paper.process_pool import Progress, run_jobs
+from benchmarks.paper.scenarios import (
+    LIMITING_SIGNAL,
+    NAMES,
+    PEAK,
+    ROWS,
+    SENSORS,
+    UNKNOWN_NAMES,
+    machine_of,
+    row_of,
+    simulate_row,
+)
 from benchmarks.paper.study import Job, Kind, Limit, Spread, Study, study
 from click.testing import CliRunner, Result
 from matplotlib.image import imread
@@ -35,12 +45,12 @@ DRIFTING = ("armature-resistance", "bearing-wear", pytest.param("hydraulic-fluid
 PLOTTED = "armature-resistance"
 
 
-def quiet(_steps: int, _doing: str) -> None:
+def quiet(_steps: int, _activity: str) -> None:
     pass
 
 
 @cache
-def found(name: str) -> Study:
+def studied(name: str) -> Study:
     """A scenario with ideal sensors, in two lengths of windows."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(studies, "LENGTHS", LENGTHS)
@@ -50,9 +60,9 @@ def found(name: str) -> Study:
 
 
 @pytest.mark.parametrize("name", DRIFTING)
-def test_every_window_is_right(name: str) -> None:
-    """So short a run is mostly the onset of the drift, so that the target for 99 % is too hard for it."""
-    score, target = found(name).score, row_of(name).target
+def test_errors_are_within_the_targets(name: str) -> None:
+    """A short run is mostly the onset of the drift, which misses the target for 99 % of the windows."""
+    score, target = studied(name).score, row_of(name).target
     assert score.published.maximum is not None
     assert score.published.median is not None
     assert score.published.maximum <= PEAK * target
@@ -66,9 +76,9 @@ def test_every_window_is_right(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DRIFTING)
-def test_a_longer_window_costs_what_it_says_alone_more_than_what_is_published(name: str) -> None:
-    """The paper's trade-off: by its end, a window's own value is as old as half of it."""
-    short, long = found(name).scores
+def test_long_windows_lag_unless_published(name: str) -> None:
+    """The paper's trade-off: the estimate of a window lags by half its length."""
+    short, long = studied(name).scores
     assert short.raw.p99 is not None
     assert long.raw.p99 is not None
     assert long.published.p99 is not None
@@ -78,13 +88,14 @@ def test_a_longer_window_costs_what_it_says_alone_more_than_what_is_published(na
 
 @pytest.mark.parametrize("name", DRIFTING)
 def test_the_outputs_are_predicted_within_their_noise(name: str) -> None:
-    problem = plan_of(row_of(name)).problem
-    for entry, told in zip(problem.twin.outputs, problem.noise, strict=True):
-        assert found(name).score.rmse[entry.name] < told
+    problem = machine_of(row_of(name)).problem
+    for output, noise in zip(problem.twin.outputs, problem.noise, strict=True):
+        assert studied(name).score.rmse[output.name] < noise
 
 
-def test_plots_are_pictures_that_open(tmp_path: Path) -> None:
-    written = draw([found(PLOTTED)], [], tmp_path / "new")
+@pytest.mark.parametrize("name", DRIFTING[:1])
+def test_plots_are_pictures_that_open(name: str, tmp_path: Path) -> None:
+    written = draw([studied(name)], [], tmp_path / "new")
     assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(written)
     kinds = [path.stem.removeprefix(f"{PLOTTED}-") for path in written]
     assert kinds == ["value-fig-7", "error-fig-8", "outputs-fig-9", "windows"]
@@ -94,18 +105,18 @@ def test_plots_are_pictures_that_open(tmp_path: Path) -> None:
         assert np.ptp(picture[..., :3]) == 1.0  # something is drawn
 
 
-def test_a_plot_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_plot_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(ServiceError, match="cannot be made"):
-        draw([found(PLOTTED)], [], tmp_path / "file" / "folder")
+        draw([studied(DRIFTING[0])], [], tmp_path / "file" / "folder")
 
 
-def test_every_row_seeks_what_drifts_in_its_scenario() -> None:
+def test_every_row_estimates_what_drifts_in_its_scenario() -> None:
     for row in ROWS:
         scenario = load_scenario(examples_directory() / "scenarios" / f"{row.name}.toml")
         assert [getattr(fault, "parameter", None) for fault in scenario.faults] == [row.parameter]
         assert row.machine in SENSORS
-    assert {row.machine for row in ROWS} >= set(HIDING)
+    assert {row.machine for row in ROWS} >= set(LIMITING_SIGNAL)
 
 
 @pytest.mark.parametrize(
@@ -117,23 +128,23 @@ def test_every_row_seeks_what_drifts_in_its_scenario() -> None:
         (Spread(None, None, None, 3), False),
     ],
 )
-def test_a_target_is_met_by_most_and_by_the_largest(spread: Spread, *, met: bool) -> None:
+def test_a_target_bounds_the_99th_percentile_and_the_largest(spread: Spread, *, met: bool) -> None:
     assert spread.meets(2.0) is met
 
 
-def test_noisy_sensors_are_rounded_and_the_parameter_is_found_all_the_same() -> None:
+def test_noisy_sensors_are_rounded_and_estimates_stay_good() -> None:
     row = row_of("armature-resistance")
-    sensors, plan = SENSORS[row.machine], plan_of(row)
-    life = live(row, plan, SHORT, sensors, lambda: None)
-    ideal = live(row, plan, SHORT, (), lambda: None)
+    sensors, machine = SENSORS[row.machine], machine_of(row)
+    record = simulate_row(row, machine, SHORT, sensors, lambda: None)
+    ideal = simulate_row(row, machine, SHORT, (), lambda: None)
     for sensor in sensors:
-        column = life.signals.index(sensor.signal)
-        steps = (life.values[:, column] - sensor.low) / sensor.quantum
+        column = record.signals.index(sensor.signal)
+        steps = (record.values[:, column] - sensor.low) / sensor.adc_step
         assert np.abs(steps - np.rint(steps)).max() < 1e-6
-    still = slice(0, 900)  # the motor stands, so the ideal sensors say zero
-    speed = life.signals.index("omega")
+    still = slice(0, 900)  # the motor stands, so ideal sensors show zero
+    speed = record.signals.index("omega")
     assert not ideal.values[still, speed].any()
-    assert np.std(life.values[still, speed]) == pytest.approx(sensors[1].deviation, rel=0.15)
+    assert np.std(record.values[still, speed]) == pytest.approx(sensors[1].deviation, rel=0.15)
     noisy = study(Job(row, Kind.NOISY, SHORT), quiet)
     assert isinstance(noisy, Study)
     assert noisy.score.first == 5
@@ -141,7 +152,7 @@ def test_noisy_sensors_are_rounded_and_the_parameter_is_found_all_the_same() -> 
     assert 1e-5 < noisy.score.published.maximum < 0.01
 
 
-def test_the_noise_that_hides_damping_is_found() -> None:
+def test_limiting_noise_of_damping() -> None:
     limit = study(Job(row_of("hydraulic-fluid"), Kind.LIMIT, SHORT / 2), quiet)
     assert isinstance(limit, Limit)
     assert limit.alone.kept is not None
@@ -155,7 +166,7 @@ def test_the_noise_that_hides_damping_is_found() -> None:
     assert f"alone at {limit.alone.lost:.3g} Pa" in limit_in_words(limit)
 
 
-def test_jobs_are_those_that_were_asked_for() -> None:
+def test_jobs_follow_the_options() -> None:
     everything = comparison.jobs_of((), noise=True, quick=False)
     assert [job.row.name for job in everything if job.kind is Kind.IDEAL] == [*NAMES, *UNKNOWN_NAMES]
     assert [job.row.name for job in everything if isinstance(job, Search) and job.kind is Kind.NOISY] == [
@@ -166,34 +177,34 @@ def test_jobs_are_those_that_were_asked_for() -> None:
     assert (only.row.name, only.kind, only.seconds) == ("bearing-wear", Kind.IDEAL, comparison.QUICK)
 
 
-def test_processes_tell_how_far_they_are_and_what_is_wrong() -> None:
+def test_processes_report_progress_and_errors() -> None:
     wrong = Job(replace(ROWS[0], name="no-such"), Kind.IDEAL, SHORT)
     right = Job(row_of("hydraulic-fluid"), Kind.IDEAL, SHORT)
-    told: list[Progress] = []
+    messages: list[Progress] = []
     with pytest.raises(ConfigurationError, match="no-such"):
-        perform([right, wrong], told.append)
-    assert not [entry for entry in told if entry.job == wrong]
-    assert perform([right], told.append)
-    steps = [entry.steps for entry in told if entry.job == right]
+        run_jobs([right, wrong], messages.append)
+    assert not [message for message in messages if message.job == wrong]
+    assert run_jobs([right], messages.append)
+    steps = [message.steps for message in messages if message.job == right]
     assert steps[-1] == right.steps
     assert len(steps) > 3
 
 
-def test_a_process_that_dies_is_told() -> None:
+def test_a_process_that_dies_is_an_error() -> None:
     def kill(_: Progress) -> None:
         for child in multiprocessing.active_children():
             if child.name.startswith("otolith-paper-"):
                 child.kill()
 
     with pytest.raises(ServiceError, match="died"):
-        perform([Job(ROWS[0], Kind.IDEAL, BEYOND_ONSET)], kill)
+        run_jobs([Job(ROWS[0], Kind.IDEAL, BEYOND_ONSET)], kill)
 
 
 def run(*arguments: str) -> Result:
     return CliRunner().invoke(paper, ["--quick", "--scenario", "hydraulic-fluid", *arguments], standalone_mode=False)
 
 
-def test_the_command_says_the_same_as_any_other_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_is_repeatable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(comparison, "QUICK", SHORT)
     result = run("--json")
     assert result.return_value == 0, result.output
@@ -203,16 +214,16 @@ def test_the_command_says_the_same_as_any_other_run(monkeypatch: pytest.MonkeyPa
     (scenario,) = whole["scenarios"]
     assert whole["met"] is scenario["met"] is True
     assert scenario["published"]["maximum"] <= scenario["target"]["maximum"]
-    assert [entry["window_s"] for entry in scenario["window_study"]] == [0.1, 1.0, 2.0, 4.0, 10.0]
+    assert [score["window_s"] for score in scenario["window_study"]] == [0.1, 1.0, 2.0, 4.0, 10.0]
     assert len(whole["plots"]) == 4
     assert {Path(path).parent.parent for path in whole["plots"]} == {state_directory() / "paper"}
     assert all(Path(path).is_file() for path in whole["plots"])
 
 
 def test_a_missed_target_is_an_exit_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    right = found(PLOTTED)
+    right = studied(DRIFTING[0])
     missed = replace(right, job=replace(right.job, row=replace(right.job.row, target=1e-12)))
-    monkeypatch.setattr(crew, "perform", lambda _jobs, _hear: [missed])
+    monkeypatch.setattr(process_pool, "run_jobs", lambda _jobs, _on_progress: [missed])
     result = run("--plots", str(tmp_path / "plots"))
     assert result.return_value == 1, result.output
     assert "not met" in result.stdout
@@ -225,15 +236,15 @@ def test_plots_and_no_plots_exclude_each_other(tmp_path: Path) -> None:
     assert "exclude each other" in str(run("--no-plots", "--plots", str(tmp_path)).exception)
 
 
-def test_tables_of_nothing_are_drawn(capsys: pytest.CaptureFixture[str]) -> None:
-    """A motor that never turned: nothing was excited, nothing was said."""
+def test_tables_without_any_estimate(capsys: pytest.CaptureFixture[str]) -> None:
+    """A motor that never turns: nothing is excited, nothing is estimated."""
     still = study(Job(row_of("bearing-wear"), Kind.IDEAL, 10.0), quiet)
     assert isinstance(still, Study)
     assert still.score.first is None
     assert still.score.published == Spread(None, None, None, 0)
     for page in pages([still]):
         Console(width=110).print(page)
-    said = capsys.readouterr().out
-    assert "never" in said
-    assert "not met" in said
+    printed = capsys.readouterr().out
+    assert "never" in printed
+    assert "not met" in printed
     assert "first_excited" not in json.loads(document([still], []))["scenarios"][0]

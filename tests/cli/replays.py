@@ -1,4 +1,4 @@
-"""What the tests of replays share: a recorded motor as a table, and what a replay of it says."""
+"""Shared by the tests of replays: the simulated motor as a CSV table, and its reports or summary."""
 
 from itertools import islice
 from pathlib import Path
@@ -45,5 +45,5 @@ def summed_up(data: Path, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
-def values(found: list[ReportDocument]) -> list[float | None]:
-    return [document.parameters["R_a"].value for document in found]
+def values(documents: list[ReportDocument]) -> list[float | None]:
+    return [document.parameters["R_a"].value for document in documents]

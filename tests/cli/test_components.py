@@ -1,4 +1,4 @@
-"""``otolith components`` and ``otolith commission``: the specialist's word, kept over restarts."""
+"""``otolith components`` and ``otolith commission``: decisions of the operator survive restarts."""
 
 import io
 import json
@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-from benchmarks.discovery.motor import SIGNALS, Faults, live
+from benchmarks.discovery.motor import SIGNALS, Faults, simulate_motor
 from click.testing import CliRunner, Result
 
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state, restore_components
@@ -30,54 +30,53 @@ def torque(t: float, angle: float, *_: float) -> float:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A motor that has always been a little out of balance."""
-    told = live("sweep", 24.0, Faults(torque=torque), seed=5)
+    samples = simulate_motor("sweep", 24.0, Faults(torque=torque), seed=5)
     path = tmp_path_factory.mktemp("data") / "healthy.csv"
-    table = np.column_stack([0.01 * np.arange(len(told)), told])
+    table = np.column_stack([0.01 * np.arange(len(samples)), samples])
     np.savetxt(path, table, delimiter=",", header="t," + ",".join(SIGNALS), comments="", fmt="%.9g")
     return path
 
 
-def otolith(*arguments: str | Path, said: str = "") -> Result:
-    return CliRunner().invoke(cli, list(map(str, arguments)), input=said, catch_exceptions=False, standalone_mode=False)
-
-
-def test_what_was_found_in_other_signals_is_not_believed(data: Path) -> None:
-    """A unit that was wrong, and is put right, must not leave behind what it made the daemon find."""
-    assert otolith("commission", MACHINE, data, "--windows", "8", said="y\n").exit_code == 0
-    plan = load_machine(MACHINE, with_driver=False)
-    names, folder, found = (
-        (plan.file.machine.site, plan.file.machine.name),
-        keeper().known.parent,
-        keeper().components(),
+def otolith(*arguments: str | Path, answer: str = "") -> Result:
+    return CliRunner().invoke(
+        cli, list(map(str, arguments)), input=answer, catch_exceptions=False, standalone_mode=False
     )
-    StateStore(*names, plan.twin, folder, "before").keep(found)
-    assert StateStore(*names, plan.twin, folder, "before").components() == found
-    assert StateStore(*names, plan.twin, folder, "after").components() == ()
 
 
-def test_a_plan_knows_how_its_signals_are_said(tmp_path: Path) -> None:
-    """Scale, unit and place matter; over which wire they come does not."""
+def test_components_of_other_signals_are_not_restored(data: Path) -> None:
+    """Correcting a wrong unit must drop the components that it caused."""
+    assert otolith("commission", MACHINE, data, "--windows", "8", answer="y\n").exit_code == 0
+    machine = load_machine(MACHINE, with_driver=False)
+    names, folder = (machine.file.machine.site, machine.file.machine.name), store().components_path.parent
+    records = store().components()
+    StateStore(*names, machine.twin, folder, "before").save_components(records)
+    assert StateStore(*names, machine.twin, folder, "before").components() == records
+    assert StateStore(*names, machine.twin, folder, "after").components() == ()
+
+
+def test_signal_fingerprint_depends_on_scale_unit_and_place(tmp_path: Path) -> None:
+    """The port of the same device does not matter."""
     text = (EXAMPLES / "dc-motor-modbus.toml").read_text(encoding="utf-8")
-    heard = []
+    fingerprints = []
     changes = {"": "", "port = 1502": "port = 1503", 'unit = "A"': 'unit = "mA"', "register = 4": "register = 5"}
     for old, new in changes.items():
         path = tmp_path / "machine.toml"
         path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
-        heard.append(load_machine(path, with_driver=False).signal_fingerprint)
-    assert heard[0] == heard[1]
-    assert len(set(heard)) == 3
+        fingerprints.append(load_machine(path, with_driver=False).signal_fingerprint)
+    assert fingerprints[0] == fingerprints[1]
+    assert len(set(fingerprints)) == 3
 
 
-def keeper() -> StateStore:
-    plan = load_machine(MACHINE, with_driver=False)
-    return StateStore(plan.file.machine.site, plan.file.machine.name, plan.twin)
+def store() -> StateStore:
+    machine = load_machine(MACHINE, with_driver=False)
+    return StateStore(machine.file.machine.site, machine.file.machine.name, machine.twin)
 
 
-def test_what_belongs_to_the_machine_is_learned_and_obeyed(data: Path) -> None:
-    asked = otolith("commission", MACHINE, data, "--windows", "8", said="y\n")
-    assert "noise" in tomllib.loads(asked.stdout)  # nothing else goes where it may be redirected into the file
+def test_commission_approve_reject_and_forget(data: Path) -> None:
+    asked = otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
+    assert "noise" in tomllib.loads(asked.stdout)  # only lines of a machine file go to standard output
     assert f"found {KEY}: 0.0040" in asked.stderr or f"found {KEY}: 0.0039" in asked.stderr
-    assert KEY in keeper().decisions().approved
+    assert KEY in store().decisions().approved
 
     listed = otolith("components", "list", MACHINE)
     assert KEY in listed.stdout
@@ -86,72 +85,72 @@ def test_what_belongs_to_the_machine_is_learned_and_obeyed(data: Path) -> None:
     assert document["approved"] == [KEY]
     assert document["components"][0]["adopted"]["component"]["family"] == "periodic"
 
-    plan = load_machine(MACHINE, with_driver=False)
+    machine = load_machine(MACHINE, with_driver=False)
     state = apply_decisions(
-        restore_components(initial_state("m", "s", plan.problem), keeper().components()), keeper().decisions()
+        restore_components(initial_state("m", "s", machine.problem), store().components()), store().decisions()
     )
-    assert [entry.key for entry in state.problem.components] == [KEY]
+    assert [component.key for component in state.problem.components] == [KEY]
 
     otolith("components", "reject", MACHINE, KEY)
-    assert keeper().decisions() == OperatorDecisions(rejected=frozenset({KEY}))
+    assert store().decisions() == OperatorDecisions(rejected=frozenset({KEY}))
     state = apply_decisions(
-        restore_components(initial_state("m", "s", plan.problem), keeper().components()), keeper().decisions()
+        restore_components(initial_state("m", "s", machine.problem), store().components()), store().decisions()
     )
     assert state.problem.components == ()
     assert KEY in state.problem.excluded
 
     otolith("components", "forget", MACHINE, KEY)
-    assert not keeper().decisions().rejected
-    assert KEY in keeper().decisions().forgotten
+    assert not store().decisions().rejected
+    assert KEY in store().decisions().forgotten
 
 
-def test_a_question_that_nobody_answers_keeps_nothing_and_says_so(
+def test_commission_without_an_answer_keeps_nothing(
     data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
     with pytest.raises(click.Abort):
         cli.main(["commission", str(MACHINE), str(data), "--windows", "4"], standalone_mode=False)
     assert "nothing is kept" in capsys.readouterr().err
-    assert keeper().decisions() == OperatorDecisions()
-    assert keeper().components() == ()
+    assert store().decisions() == OperatorDecisions()
+    assert store().components() == ()
 
 
-def test_what_nobody_has_heard_of_is_refused() -> None:
+def test_an_unknown_component_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="no component 'shaft/periodic'"):
         otolith("components", "approve", MACHINE, "shaft/periodic")
 
 
-def test_a_machine_without_components_says_so() -> None:
+def test_list_of_a_machine_without_components() -> None:
     assert "no component has been found" in otolith("components", "list", MACHINE).output
 
 
-def test_a_file_that_is_not_ours_is_refused_by_name() -> None:
-    one = keeper()
-    one.known.parent.mkdir(parents=True, exist_ok=True)
-    one.known.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
+def test_an_invalid_state_file_is_refused_by_name() -> None:
+    files = store()
+    files.components_path.parent.mkdir(parents=True, exist_ok=True)
+    files.components_path.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
     with pytest.raises(ConfigurationError, match=r"components.0.adopted.*move it away"):
-        one.components()
-    one.said.write_text("half a fi", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=one.said.name):
-        one.decisions()
+        files.components()
+    files.decisions_path.write_text("half a fi", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=files.decisions_path.name):
+        files.decisions()
 
 
 @pytest.mark.parametrize(
     ("line", "word"),
     [
-        ('families = ["periodik"]', "'periodik' is none of them"),
+        ('families = ["periodik"]', "unknown name 'periodik'"),
         ('sites = ["shfat"]', "shaft"),
         ('inputs = ["angle(i)"]', "angle.omega."),
     ],
 )
-def test_a_restriction_that_cannot_be_meant_is_an_error(tmp_path: Path, line: str, word: str) -> None:
+def test_an_invalid_restriction_of_the_search_is_an_error(tmp_path: Path, line: str, word: str) -> None:
     machine = tmp_path / "machine.toml"
     machine.write_text(MACHINE.read_text(encoding="utf-8") + f"\n[discovery]\n{line}\n", encoding="utf-8")
     with pytest.raises(ConfigurationError, match=word):
         load_machine(machine, with_driver=False)
 
 
-def test_a_restricted_search_leaves_the_rest_out(tmp_path: Path) -> None:
+def test_a_restricted_search_excludes_the_rest(tmp_path: Path) -> None:
     machine = tmp_path / "machine.toml"
     text = MACHINE.read_text(encoding="utf-8") + '\n[discovery]\nfamilies = ["periodic"]\nsites = ["shaft"]\n'
     machine.write_text(text, encoding="utf-8")

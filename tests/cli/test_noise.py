@@ -1,4 +1,4 @@
-"""``otolith noise``: what it prints can be pasted into the machine file, and says what a user should know of it."""
+"""``otolith noise``: lines for the machine file, JSON, and refusals."""
 
 import json
 import tomllib
@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from otolith.cli.main import cli
-from otolith.cli.noise import _spread
+from otolith.cli.noise import evenly_spread
 from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -25,7 +25,7 @@ def noise(*arguments: str | Path) -> Result:
     return CliRunner().invoke(cli, ["noise", *map(str, arguments)], catch_exceptions=False, standalone_mode=False)
 
 
-def test_its_lines_are_a_machine_files_and_right(tmp_path: Path, data: Path) -> None:
+def test_printed_lines_are_valid_in_a_machine_file(tmp_path: Path, data: Path) -> None:
     result = noise(MACHINE, data)
     text = MACHINE.read_text(encoding="utf-8")
     machine = tmp_path / "machine.toml"
@@ -43,14 +43,14 @@ def test_its_lines_are_a_machine_files_and_right(tmp_path: Path, data: Path) -> 
 def test_json_has_units_and_uncertainties(data: Path) -> None:
     document = json.loads(noise(MACHINE, data, "--windows", "3", "--json").stdout)
     assert document["windows"] == 3
-    assert [entry["unit"] for entry in document["outputs"]] == ["A", "rad/s"]
-    assert [entry["unit"] for entry in document["states"]] == ["(A)/s^0.5", "(rad/s)/s^0.5"]
-    for entry in document["outputs"]:
-        assert 0.0 < entry["sd"] < 0.2 * entry["value"]
+    assert [level["unit"] for level in document["outputs"]] == ["A", "rad/s"]
+    assert [level["unit"] for level in document["states"]] == ["(A)/s^0.5", "(rad/s)/s^0.5"]
+    for level in document["outputs"]:
+        assert 0.0 < level["sd"] < 0.2 * level["value"]
     assert document["consistency"]["degrees"] > 0
 
 
-def test_data_without_a_usable_window_is_refused_with_the_reason(tmp_path: Path, scenario: MotorScenario) -> None:
+def test_data_without_a_usable_window_is_refused(tmp_path: Path, scenario: MotorScenario) -> None:
     rows = recorded(scenario)
     short = written(tmp_path, rows[:100])
     with pytest.raises(ConfigurationError, match="no window of 2 s can be used: the data is too short"):
@@ -64,9 +64,9 @@ def test_data_without_a_usable_window_is_refused_with_the_reason(tmp_path: Path,
 
 @pytest.mark.parametrize(("count", "most", "kept"), [(0, 3, 0), (2, 3, 2), (5, 1, 1), (100, 7, 7)])
 def test_windows_are_spread_over_the_data(count: int, most: int, kept: int) -> None:
-    found = _spread(range(count), most)
-    assert len(found) == kept == len(set(found))
-    gaps = [later - earlier for earlier, later in pairwise(found)]
+    chosen = evenly_spread(range(count), most)
+    assert len(chosen) == kept == len(set(chosen))
+    gaps = [later - earlier for earlier, later in pairwise(chosen)]
     assert max(gaps, default=0) <= 2 * min(gaps, default=0)
-    assert not found or found[0] == 0
-    assert kept < 2 or found[-1] >= 0.8 * (count - 1)
+    assert not chosen or chosen[0] == 0
+    assert kept < 2 or chosen[-1] >= 0.8 * (count - 1)

@@ -1,8 +1,8 @@
-"""Replay: recorded data says what the daemon would have said, to the last byte, whatever state the file is in.
+"""``otolith replay``: the same reports as the daemon, byte for byte; unusable files are refused.
 
 A golden case is a folder with ``data.*`` and ``error.txt``, where ``{file}`` stands for the data and ``{machine}`` for
 the machine file: its own, or the one that all cases without share.
-``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the sentences anew: read the difference.
+``OTOLITH_UPDATE_GOLDEN=1 make test`` rewrites the messages: check the difference.
 """
 
 import json
@@ -21,7 +21,7 @@ from otolith.adaptation.state import initial_state
 from otolith.cli.replay import replay
 from otolith.health.schema import ReportDocument
 from otolith.machine import load_machine
-from otolith.publishing.recorder import LEAST_FREE
+from otolith.publishing.recorder import MIN_FREE_BYTES
 from otolith.runtime.replay import Replay
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -54,22 +54,22 @@ def rows(scenario: MotorScenario) -> Lines:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_file_that_cannot_be_used_gets_its_sentence(case: Path) -> None:
+def test_an_unusable_file_gets_its_error_message(case: Path) -> None:
     (data,) = case.glob("data.*")
     machine = case / "machine.toml" if (case / "machine.toml").exists() else MACHINE
     with pytest.raises(ConfigurationError) as caught:
         replay(machine, data, None, as_json=True, stopped=lambda: False)
-    said = str(caught.value).replace(str(data), "{file}").replace(str(machine), "{machine}") + "\n"
+    message = str(caught.value).replace(str(data), "{file}").replace(str(machine), "{machine}") + "\n"
     if os.environ.get("OTOLITH_UPDATE_GOLDEN"):
-        (case / "error.txt").write_text(said, encoding="utf-8")
-    assert said == (case / "error.txt").read_text(encoding="utf-8")
+        (case / "error.txt").write_text(message, encoding="utf-8")
+    assert message == (case / "error.txt").read_text(encoding="utf-8")
 
 
-def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
+def test_a_binary_or_missing_file_is_refused(tmp_path: Path) -> None:
     for content in ("t,V_a\n0,1\n".encode("utf-16"), b"PK\3\4\0\0", b"x" * 300_000):
         path = tmp_path / "data.csv"
         path.write_bytes(content)
-        with pytest.raises(ConfigurationError, match=r"is no text|is this a CSV file\?"):
+        with pytest.raises(ConfigurationError, match=r"is not text|is this a CSV file\?"):
             replay(MACHINE, path, None, as_json=True, stopped=lambda: False)
     with pytest.raises(ConfigurationError, match="No such file"):
         replay(MACHINE, tmp_path / "none.csv", None, as_json=True, stopped=lambda: False)
@@ -77,32 +77,33 @@ def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
         replay(MACHINE, tmp_path, None, as_json=True, stopped=lambda: False)
 
 
-def test_only_a_replay_does_without_a_driver() -> None:
+def test_only_replay_needs_no_driver() -> None:
     file = MACHINE_FILES / "no-driver" / "machine.toml"
     with pytest.raises(ConfigurationError, match="loaded without its driver"):
         _ = load_machine(file, with_driver=False).driver
-    with pytest.raises(ConfigurationError, match="say where the signals come from"):
+    with pytest.raises(ConfigurationError, match=r"missing: write \[driver\]"):
         load_machine(file)
 
 
-def test_the_truth_comes_back_as_from_windows_without_a_file(
+def test_reports_equal_those_of_windows_without_a_file(
     tmp_path: Path, rows: Lines, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plan = load_machine(MACHINE, with_driver=False)
-    state = initial_state("motor", "site", plan.problem)
-    found = reports(written(tmp_path, rows), capsys)
-    assert len(found) == 5
-    with table.Table(tmp_path / "data.csv", {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
-        windows = list(Replay(plan, opened).windows())
-    for index, (window, document) in enumerate(zip(windows, found, strict=True)):
+    machine = load_machine(MACHINE, with_driver=False)
+    state = initial_state("motor", "site", machine.problem)
+    documents = reports(written(tmp_path, rows), capsys)
+    assert len(documents) == 5
+    with table.TableReader(tmp_path / "data.csv", {name: machine.twin.unit_of(name) for name in SIGNALS}) as opened:
+        windows = list(Replay(machine, opened).windows())
+    for index, (window, document) in enumerate(zip(windows, documents, strict=True)):
         own = np.array([row[1:] for row in rows[index * RECORDS : (index + 1) * RECORDS]], dtype=np.float64)
         assert np.array_equal(window.values, own)
         assert window.start == pytest.approx(index * RECORDS * PERIOD, abs=1e-9)
         state, report = adapt(state, window)
         assert report.document == document.model_copy(update={"counters": None})
         assert document.parameters["R_a"].value == pytest.approx(scenario.parameters.R_a, rel=0.005)
-    assert found[-1].counters is not None
-    assert (found[-1].counters.received, found[-1].counters.windows) == (4 * len(rows), 5)
+    counters = documents[-1].counters
+    assert counters is not None
+    assert (counters.received, counters.windows) == (4 * len(rows), 5)
 
 
 def test_two_runs_print_the_same_bytes(tmp_path: Path, rows: Lines) -> None:
@@ -129,14 +130,14 @@ def test_unknown_columns_are_named_and_ignored(tmp_path: Path, rows: Lines, caps
     assert capsys.readouterr().err == f"{data}: columns not used: Bemerkung\n"
 
 
-def test_the_summary_says_what_was_found(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_summary_has_parameters_and_counts(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
     text = summed_up(written(tmp_path, rows[:-50]), capsys)
     assert "motor at site, twin dc_motor (DT'), from 0 s to 8 s" in text
     assert "R_a" in text
     assert "ohm" in text
     assert "4 windows: 4 good, 0 bad; the twin explains 4 of 4" in text
     assert "950 rows read, 0 reordered" in text
-    assert "the last 1.5 s make no window of 2 s" in text
+    assert "the last 1.5 s are too short for a window of 2 s" in text
 
 
 def test_a_recording_is_written(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,15 +147,15 @@ def test_a_recording_is_written(tmp_path: Path, rows: Lines, capsys: pytest.Capt
     assert path.stat().st_size > 10_000
 
 
-def test_a_full_disk_ends_a_recording_with_a_sentence(
+def test_a_full_disk_ends_a_recording_with_an_error(
     tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("otolith.publishing.recorder.LEAST_FREE", LEAST_FREE << 40)
-    with pytest.raises(OtolithError, match="too little room"):
+    monkeypatch.setattr("otolith.publishing.recorder.MIN_FREE_BYTES", MIN_FREE_BYTES << 40)
+    with pytest.raises(OtolithError, match="MB are free on its disk"):
         replay(MACHINE, written(tmp_path, rows), tmp_path / "run.rrd", as_json=True, stopped=lambda: False)
 
 
-def test_control_c_ends_it_with_what_was_found(tmp_path: Path, rows: Lines) -> None:
+def test_ctrl_c_ends_a_replay_with_the_reports_so_far(tmp_path: Path, rows: Lines) -> None:
     later = [[f"{float(row[0]) + 10.0 * turn:.3f}", *row[1:]] for turn in range(100) for row in rows]
     command = [sys.executable, "-m", "otolith", "replay", str(MACHINE), str(written(tmp_path, later)), "--json"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -162,11 +163,11 @@ def test_control_c_ends_it_with_what_was_found(tmp_path: Path, rows: Lines) -> N
         assert process.stderr is not None
         ReportDocument.from_json(process.stdout.readline())
         process.send_signal(signal.SIGINT)
-        rest, said = process.stdout.read(), process.stderr.read()
+        rest, errors = process.stdout.read(), process.stderr.read()
     assert process.returncode == 130
     assert len(rest.splitlines()) < 499
-    assert "interrupted after" in said
-    assert "Traceback" not in said
+    assert "interrupted after" in errors
+    assert "Traceback" not in errors
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path: Path, rows: Lines) -> None:
@@ -188,33 +189,33 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path, rows: Lines) -> None
     assert large - small < 20_000  # kB
 
 
-def test_a_log_of_the_bus_says_what_the_table_says(
+def test_a_log_of_the_bus_gives_the_values_of_the_table(
     tmp_path: Path, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Values of the bus have the resolution of its frames, and the table has those."""
     frames = frames_of(scenario, 600)
-    heard: dict[float, dict[str, float]] = {}
+    received: dict[float, dict[str, float]] = {}
     for sample in live(frames):
-        heard.setdefault(round(sample.time, 2), {})[sample.signal] = sample.value
-    rows = [[f"{time:.2f}", *(repr(row[name]) for name in SIGNALS)] for time, row in heard.items()]
+        received.setdefault(round(sample.time, 2), {})[sample.signal] = sample.value
+    rows = [[f"{time:.2f}", *(repr(row[name]) for name in SIGNALS)] for time, row in received.items()]
     table_path = written(tmp_path, rows)
     machine = tmp_path / "machine.toml"
     text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
     machine.write_text(text.replace('"dc-motor.dbc"', f'"{EXAMPLES / "dc-motor.dbc"}"'), encoding="utf-8")
-    found = {}
+    estimates = {}
     for path in (
         table_path,
         *(written_log(tmp_path, frames, suffix) for suffix in (".log", ".asc", ".blf", ".trc.gz")),
     ):
         replay(machine, path, None, as_json=True, stopped=lambda: False)
         lines = capsys.readouterr().out.splitlines()
-        found[path.suffix] = values([ReportDocument.from_json(line) for line in lines])
-    assert len(found[".csv"]) == 3
-    for printed in found.values():
-        assert printed == pytest.approx(found[".csv"], rel=1e-6)
+        estimates[path.suffix] = values([ReportDocument.from_json(line) for line in lines])
+    assert len(estimates[".csv"]) == 3
+    for printed in estimates.values():
+        assert printed == pytest.approx(estimates[".csv"], rel=1e-6)
 
 
-def test_in_real_time_a_window_comes_when_it_would_have_ended(
+def test_real_time_waits_for_the_end_of_each_window(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     machine = tmp_path / "machine.toml"
@@ -228,10 +229,10 @@ def test_in_real_time_a_window_comes_when_it_would_have_ended(
         printed.append(capsys.readouterr().out)
     assert printed[0] == printed[1]
     assert len(printed[0].splitlines()) == 4
-    assert 2.0 <= time.monotonic() - begun < PATIENCE  # the silence in the middle is passed over
+    assert 2.0 <= time.monotonic() - begun < 20.0  # the gap in the middle is skipped
 
 
-def test_the_columns_of_a_replayed_machine_are_found_where_it_says(
+def test_columns_are_mapped_by_the_machine_file(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plain = values(reports(written(tmp_path, rows), capsys))
@@ -242,5 +243,5 @@ def test_the_columns_of_a_replayed_machine_are_found_where_it_says(
     driver = f'[driver]\ntype = "replay"\nfile = "{data.name}"\n\n[signals]\n{signals}\n'
     machine.write_text(MACHINE.read_text(encoding="utf-8").replace("[twin]", driver + "[twin]"), encoding="utf-8")
     replay(machine, data, None, as_json=True, stopped=lambda: False)
-    found = [ReportDocument.from_json(line) for line in capsys.readouterr().out.splitlines()]
-    assert values(found) == pytest.approx(plain, rel=1e-6)
+    documents = [ReportDocument.from_json(line) for line in capsys.readouterr().out.splitlines()]
+    assert values(documents) == pytest.approx(plain, rel=1e-6)

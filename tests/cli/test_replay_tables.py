@@ -1,4 +1,4 @@
-"""Tables as they are found: other ways to write one, rows and cells missing, out of order, senseless."""
+"""Replay of tables: formats, missing and bad cells, rows out of order, random text."""
 
 import gzip
 from itertools import pairwise
@@ -25,7 +25,7 @@ def rows(scenario: MotorScenario) -> Lines:
     return recorded(scenario)
 
 
-def test_how_the_file_is_read_does_not_matter(
+def test_table_result_does_not_depend_on_the_chunk_size(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows[250], rows[251], rows[300][2], rows[400][3] = rows[251], rows[250], "", "?"
@@ -35,7 +35,9 @@ def test_how_the_file_is_read_does_not_matter(
     assert reports(data, capsys) == whole
 
 
-def test_a_european_export_says_the_same(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_with_decimal_commas_units_and_cp1252(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
     plain = values(reports(written(tmp_path, rows), capsys))
     lines = ["# Prüfstand 3", "", "t [ms];V_a [mV];Bemerkung;T_load;i;omega [U/min];"]
     for t, voltage, load, current, speed in rows:
@@ -49,7 +51,7 @@ def test_a_european_export_says_the_same(tmp_path: Path, rows: Lines, capsys: py
 
 
 @pytest.mark.parametrize("style", ["tab", "quotes", "quoted decimal comma", "sep=", "gzip"])
-def test_other_ways_to_write_a_table(
+def test_table_separators_quotes_and_gzip(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str], style: str
 ) -> None:
     plain = values(reports(written(tmp_path, rows), capsys))
@@ -68,7 +70,7 @@ def test_other_ways_to_write_a_table(
     assert values(reports(path, capsys)) == plain
 
 
-def test_a_packed_table_that_is_cut_off_is_read_as_far_as_it_goes(
+def test_table_truncated_gzip_is_read_to_its_end(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "data.csv.gz"
@@ -78,36 +80,38 @@ def test_a_packed_table_that_is_cut_off_is_read_as_far_as_it_goes(
     assert "cut off: Compressed file ended" in text
 
 
-def test_what_is_missing_is_counted_and_told(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_counts_and_locates_bad_rows_and_cells(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
     rows[210][1], rows[220][2], rows[230][3] = "", "NaN", "#REF!"
     rows[240][4], rows[250][0] = "1_000", "yesterday"
     rows[260] = rows[260][:2]
     del rows[450:453]
     rows[300:300] = [["# a remark"], [""], ["", "", "", "", ""]]
     data = written(tmp_path, rows)
-    found = reports(data, capsys)
-    assert len(found) == 5
-    for document in found:  # two windows lack more than one record in a hundred, and are not estimated from
+    documents = reports(data, capsys)
+    assert len(documents) == 5
+    for document in documents:  # two windows lack more than 1 % of their records
         lacking = document.window.quality.missing > 0.01
         assert document.parameters["R_a"].status is (Status.HELD if lacking else Status.ESTIMATED)
-    assert [document.window.quality.missing > 0.01 for document in found] == [False, True, True, False, False]
-    assert found[-1].counters is not None
-    assert (found[-1].counters.bad, found[-1].counters.lost) == (4, 0)
+    assert [document.window.quality.missing > 0.01 for document in documents] == [False, True, True, False, False]
+    assert documents[-1].counters is not None
+    assert (documents[-1].counters.bad, documents[-1].counters.lost) == (4, 0)
     text = summed_up(data, capsys)
     assert f"{len(rows) - 5} rows read, 0 reordered, 2 bad rows, 2 bad cells, 2 cells blank" in text
     assert "bad cells: 2, bad rows: 2, the first in line 232: i is '#REF!', no number" in text
 
 
-def test_rows_out_of_order_are_put_back_while_their_window_is_open(
+def test_table_rows_are_reordered_within_the_window(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plain = values(reports(written(tmp_path, rows), capsys))
     for at in range(30, 190, 7):
         rows[at], rows[at + 3] = rows[at + 3], rows[at]
-    found = reports(written(tmp_path, rows), capsys)
-    assert values(found) == plain
-    assert found[-1].counters is not None
-    assert found[-1].counters.lost == 0
+    documents = reports(written(tmp_path, rows), capsys)
+    assert values(documents) == plain
+    assert documents[-1].counters is not None
+    assert documents[-1].counters.lost == 0
     late = rows.pop(100)
     rows.insert(700, late)
     text = summed_up(written(tmp_path, rows), capsys)
@@ -115,40 +119,40 @@ def test_rows_out_of_order_are_put_back_while_their_window_is_open(
     assert f"closed: 1, the first in line 702, with t = {float(late[0]):g} after t = 7 above" in text.replace("\n", " ")
 
 
-def test_a_stamp_far_ahead_spoils_what_follows_and_is_named(
-    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_table_locates_a_time_far_ahead(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
     rows[500][0] = "99999999"
     text = summed_up(written(tmp_path, rows), capsys)
     assert "2 windows: 2 good, 0 bad" in text
     assert "closed: 499, the first in line 503, with t = 5.01 after t = 99999999 above" in text
 
 
-def test_a_short_silence_gives_bad_windows_and_a_long_one_is_passed_over(
+def test_table_short_gap_is_bad_and_long_gap_is_skipped(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for silence, windows in ((10.0, 15), (1e5, 10)):
         again = [[f"{float(row[0]) + 10.0 + silence:.3f}", *row[1:]] for row in rows]
-        found = reports(written(tmp_path, rows + again), capsys)
-        assert [document.window.index for document in found] == list(range(windows))
-        assert sum(document.window.quality.verdict == "good" for document in found) == 10
-        assert found[-1].window.end == pytest.approx(20.0 + silence)
+        documents = reports(written(tmp_path, rows + again), capsys)
+        assert [document.window.index for document in documents] == list(range(windows))
+        assert sum(document.window.quality.verdict == "good" for document in documents) == 10
+        assert documents[-1].window.end == pytest.approx(20.0 + silence)
 
 
-def test_irregular_rows_and_slow_columns(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_with_irregular_rows_and_slow_columns(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
     random = np.random.default_rng(5)
     for index, row in enumerate(rows):
         row[0] = f"{float(row[0]) + random.uniform(0.0, 0.002):.6f}"
         row[2] = row[2] if index % 10 == 0 else ""
-    found = reports(written(tmp_path, rows), capsys)
-    assert len(found) == 5
-    assert all(document.window.quality.verdict == "good" for document in found)
-    for before, after in pairwise(found):
+    documents = reports(written(tmp_path, rows), capsys)
+    assert len(documents) == 5
+    assert all(document.window.quality.verdict == "good" for document in documents)
+    for before, after in pairwise(documents):
         assert after.window.start == pytest.approx(before.window.end, abs=PERIOD / 4)
-    assert found[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.005)
+    assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.005)
 
 
-def test_a_column_without_a_reading_gives_bad_windows_that_name_it(
+def test_table_blank_column_gives_bad_windows_naming_it(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = summed_up(written(tmp_path, [[*row[:4], ""] for row in rows]), capsys)
@@ -156,14 +160,14 @@ def test_a_column_without_a_reading_gives_bad_windows_that_name_it(
     assert "5 bad like: no samples of omega (window 0)" in text
 
 
-def test_rows_much_denser_than_the_grid_are_not_lost(
+def test_table_rows_denser_than_the_grid_are_not_lost(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     dense = [[f"{index * 1e-4:.4f}", *rows[index // 100][1:]] for index in range(len(rows) * 100)]
-    found = reports(written(tmp_path, dense), capsys)
-    assert len(found) == 5
-    assert found[-1].counters is not None
-    assert found[-1].counters.lost == 0
+    documents = reports(written(tmp_path, dense), capsys)
+    assert len(documents) == 5
+    assert documents[-1].counters is not None
+    assert documents[-1].counters.lost == 0
 
 
 JUNK = st.sampled_from(
@@ -179,7 +183,7 @@ ANYTHING = st.text(max_size=400) | st.builds(
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(ANYTHING)
-def test_no_text_whatever_does_more_than_complain(tmp_path: Path, text: str) -> None:
+def test_table_of_random_text_is_refused_or_read(tmp_path: Path, text: str) -> None:
     path = tmp_path / "data.csv"
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
     check_any(path)
@@ -190,7 +194,7 @@ ROW = st.tuples(st.floats(-0.2, 3.0), st.lists(JUNK | st.floats(-5, 5).map(repr)
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(ROW, min_size=2, max_size=80), st.booleans(), st.sampled_from([1.0, 0.1, 1e6]))
-def test_no_table_whatever_does_more_than_complain(
+def test_table_of_random_cells_is_refused_or_read(
     tmp_path: Path, rows: list[tuple[float, list[str]]], ordered: bool, pace: float
 ) -> None:
     lines = [[repr(time * pace), *cells] for time, cells in (sorted(rows) if ordered else rows)]
@@ -198,15 +202,15 @@ def test_no_table_whatever_does_more_than_complain(
 
 
 def check_any(path: Path) -> None:
-    """It is refused with its name, or every window gets its report."""
+    """Refused with its name, or every window gets its report."""
     machine = path.with_name("machine.toml")
     window = '[window]\nlength = "0.2 s"\nmissing_limit = "100 %"\ngap_limit = "1 s"\njitter_limit = "1 s"\n'
     swarm = "[swarm]\ngenerations = 2\nsize = 3\n"
     machine.write_text(MACHINE.read_text(encoding="utf-8") + window + swarm, encoding="utf-8")
     plan = load_machine(machine, with_driver=False)
-    said = str(path)
+    message = str(path)
     try:
-        with table.Table(path, {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
+        with table.TableReader(path, {name: plan.twin.unit_of(name) for name in SIGNALS}) as opened:
             for index, report in enumerate(Replay(plan, opened).reports()):
                 document = report.document
                 assert document.window.index == index
@@ -214,14 +218,14 @@ def check_any(path: Path) -> None:
                 assert document.counters.windows_missed == 0
                 assert ReportDocument.from_json(document.to_json()) == document
     except OtolithError as error:
-        said = str(error)
-    assert str(path) in said
+        message = str(error)
+    assert str(path) in message
 
 
 @pytest.mark.parametrize(
-    ("seconds", "told"),
+    ("seconds", "text"),
     [(-2.5, "-2.5 s"), (0.0, "0 s"), (3600.25, "3600.25 s"), (1.7e9, "2023-11-14 22:13:20Z"), (1.7e12, "1.7e+12 s")],
 )
-def test_times_that_can_be_dates_are_told_as_dates(seconds: float, told: str) -> None:
+def test_time_text_writes_unix_times_as_dates(seconds: float, text: str) -> None:
     """A column of milliseconds since 1970 is none."""
-    assert time_text(seconds) == told
+    assert time_text(seconds) == text

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.discovery.motor import Faults, J, live, windows
+from benchmarks.discovery.motor import Faults, J, simulate_motor, windows
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
@@ -19,8 +19,8 @@ from otolith.adaptation.state import (
     restore_components,
 )
 from otolith.discovery.adopted import Approval
+from otolith.discovery.decision import WindowDecision
 from otolith.discovery.hypotheses import FaultType
-from otolith.discovery.sequential_test import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
@@ -37,7 +37,7 @@ def problem(*names: str) -> Problem:
 
 
 def lived(kind: str, seconds: float, faults: Faults, seed: int = 3) -> list[Window]:
-    return windows(live(kind, seconds, faults, seed))
+    return windows(simulate_motor(kind, seconds, faults, seed))
 
 
 def run(state: AdaptationState, record: list[Window]) -> tuple[AdaptationState, list[ReportDocument]]:
@@ -84,7 +84,7 @@ def test_a_fixed_frequency_is_found_as_one_and_its_phase_stays_coherent() -> Non
     assert documents[-1].fit is not None
     assert documents[-1].fit.rmse_completed is not None
     assert documents[-1].fit.rmse_completed["omega"] < 0.1 * documents[-1].fit.rmse_estimated["omega"]
-    assert state.memory.case is None
+    assert state.test is None
 
 
 def test_coulomb_friction_is_told_from_what_looks_like_it() -> None:
@@ -132,7 +132,7 @@ def test_a_healthy_machine_grows_nothing(operation: str) -> None:
     state, documents = run(begun("R_a", "D"), lived(operation, 60, Faults(), seed=11))
     assert not any(document.components for document in documents)
     assert sum(document.decision is not WindowDecision.LEARNED for document in documents) == 0
-    assert state.catalogue == ()
+    assert state.adopted == ()
 
 
 def test_a_machine_with_an_unbalance_is_restored_after_a_restart_and_obeys_the_specialist() -> None:
@@ -209,7 +209,7 @@ def test_one_wrong_window_changes_nothing_but_confidence() -> None:
     assert documents[10].decision is WindowDecision.SUSPECTED
     assert documents[11].decision is WindowDecision.LEARNED
     assert documents[11].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
-    assert state.memory.belief.variance_ratio > before.memory.belief.variance_ratio
+    assert state.posterior.belief.variance_ratio > before.posterior.belief.variance_ratio
 
 
 def test_windows_that_contradict_each_other_never_become_a_step() -> None:
@@ -261,7 +261,7 @@ def test_of_several_components_one_that_goes_away_leaves_and_the_others_stay() -
     most = max(documents, key=lambda document: len(document.components))
     assert len(most.components) == 3
     assert {entry.id for entry in documents[-1].components} == two
-    assert {entry.component.key for entry in state.catalogue} == two
+    assert {entry.component.key for entry in state.adopted} == two
     assert WindowDecision.FADED in {
         document.decision for document in documents[7:9]
     }  # it went in the last moment of the seventh
@@ -272,7 +272,7 @@ def test_of_several_components_one_that_goes_away_leaves_and_the_others_stay() -
 def test_a_twin_that_is_full_goes_on() -> None:
     """Three components are in it: what comes then is said to be more than can be explained, and teaches nothing."""
     state, _ = run(begun("R_a", "D"), lived("reversing", 24, Faults(torque=two_terms, since=3.0)))
-    entry = state.catalogue[0]
+    entry = state.adopted[0]
     third = replace(entry, component=replace(entry.component, site="winding", family="linear", source="V_a"))
     keeping = (
         *component_records(state),

@@ -1,4 +1,4 @@
-"""A case in itself: what is dropped of it, and what a hypothesis cannot use."""
+"""The sequential test: which hypotheses are pruned, and which evidence a hypothesis cannot use."""
 
 from dataclasses import replace
 
@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis, is_usable, prune
-from otolith.discovery.phase_tracking import PhaseAdvance
 from otolith.estimation.arrival_cost import Evidence, Prior
 from otolith.estimation.augmented import augment
-from otolith.estimation.imm_filter import ImmPosterior, initial_posterior, set_all_modes
+from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import Component, Problem
 from otolith.machine import find_twin
 
@@ -21,18 +20,17 @@ SHAKING = Component("shaft", "periodic", "t", 0.004, 10.0, 1.0, 20.0)
 RUBBING = Component("shaft", "Coulomb", "omega", -0.003)
 
 
-def hypothesis(reason: FaultType, problem: Problem, **certain: tuple[float, float]) -> TrackedHypothesis:
+def hypothesis(kind: FaultType, problem: Problem, **certain: tuple[float, float]) -> TrackedHypothesis:
     """Of which some values are certain: (value, standard deviation) by name."""
     values = [certain.get(entry.name, (entry.nominal, 1e-3 * abs(entry.nominal))) for entry in problem.free]
     mean = np.array([value for value, _ in values] + [0.0] * len(values))
     deviations = np.array([sd for _, sd in values] + [1e-9] * len(values))
-    belief = set_all_modes(initial_posterior(problem), Prior(mean, np.diag(deviations**2)), problem)
-    return TrackedHypothesis(
-        FaultHypothesis(reason, reason.value), problem, belief, PhaseAdvance(0.0, 2.0, ()), 0.0, 1.0
-    )
+    posterior = Posterior.initial(problem).set_prior(Prior(mean, np.diag(deviations**2)))
+    posterior = replace(posterior, phase=PhaseAdvance(0.0, 2.0, ()))
+    return TrackedHypothesis(FaultHypothesis(kind, kind.value), posterior, 0.0, 1.0)
 
 
-def test_of_explanations_that_come_to_nothing_only_nothing_stays() -> None:
+def test_hypotheses_equal_to_the_null_hypothesis_are_pruned() -> None:
     calm = hypothesis(FaultType.NOTHING, BARE)
     shaken = augment(BARE, [SHAKING])
     amplitude = shaken.free[1].name
@@ -46,18 +44,18 @@ def test_of_explanations_that_come_to_nothing_only_nothing_stays() -> None:
     assert prune([calm, idle], [30.0, 0.0]) == [calm, idle]  # it explained the window, little as is known of it
 
 
-def test_that_a_component_has_gone_is_no_nothing() -> None:
+def test_a_component_that_is_gone_is_not_pruned() -> None:
     both, one = augment(BARE, [SHAKING, RUBBING]), augment(BARE, [RUBBING])
     calm, gone = hypothesis(FaultType.NOTHING, both), hypothesis(FaultType.PARAMETER, one)
     assert prune([calm, gone], [0.0, 0.0]) == [calm, gone]
 
 
 @pytest.mark.parametrize("sharpness", [1e20, float("inf"), float("nan")])
-def test_what_a_diverging_twin_says_is_not_used(sharpness: float) -> None:
-    def said(size: float) -> Evidence:
+def test_evidence_of_a_diverging_twin_is_not_used(sharpness: float) -> None:
+    def evidence(size: float) -> Evidence:
         return Evidence(np.array([6.5, 0.0]), np.full((2, 2), size), np.zeros(2))
 
-    belief: ImmPosterior = initial_posterior(BARE)
+    predicted = Posterior.initial(BARE)
     moved = FaultHypothesis(FaultType.PARAMETER, "R_a")
-    assert is_usable(moved, belief, said(1.0), BARE)
-    assert not is_usable(moved, belief, said(sharpness), BARE)
+    assert is_usable(moved, predicted, evidence(1.0))
+    assert not is_usable(moved, predicted, evidence(sharpness))

@@ -1,4 +1,4 @@
-"""What the page "Signals from a CAN bus" shows can be written as it shows it."""
+"""The examples on the page "Signals from a CAN bus" are valid options and sources."""
 
 import re
 import tomllib
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from otolith_drivers.canbus.driver import Options
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.driver import CanOptions
+from otolith_drivers.canbus.signals import CanSource
 
 PAGE = (Path(__file__).parents[2] / "docs" / "can.md").read_text(encoding="utf-8")
 BLOCKS = [
@@ -18,18 +18,18 @@ SIGNALS = re.findall(r"^    (?!checksum)\w+ = \{ (?:signal|id|node) = .*\}", PAG
 
 
 @pytest.mark.parametrize("line", SIGNALS)
-def test_signals(line: str) -> None:
+def test_signal_examples_are_valid(line: str) -> None:
     (source,) = tomllib.loads(line.strip()).values()
-    Source.model_validate(source)
+    CanSource.model_validate(source)
 
 
-def test_options() -> None:
+def test_driver_examples_are_valid() -> None:
     shown = 0
     for block in BLOCKS:
         table = tomllib.loads(re.sub(r"^# (?=[a-z_]+ = )", "", block, flags=re.MULTILINE))
         options = table.get("driver", {key: table[key] for key in ("dbc", "eds") if key in table})
         options.pop("type", None)
-        Options.model_validate(options)
+        CanOptions.model_validate(options)
         shown += bool(options)
     assert shown >= 5
     assert len(SIGNALS) >= 8

@@ -1,4 +1,4 @@
-"""The page "Describe your machine" does what it says: files are read, the twin estimates, its error is the error."""
+"""The guide docs/describe-your-machine.md: its files are read, its twin estimates, its error is the real one."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ from otolith.adaptation.state import initial_state
 from otolith.cli.check import describe
 from otolith.machine import load_machine, load_twin
 from otolith.twin.expressions import FUNCTIONS
-from otolith.twin.identifiability import structure_of
+from otolith.twin.identifiability import structural_identifiability
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.errors import ConfigurationError
 
@@ -33,15 +33,15 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_its_files_are_read_and_all_can_be_estimated(folder: Path) -> None:
-    assert all(entry.identifiable for entry in structure_of(load_twin(folder / "fan.toml")))
+def test_guide_files_are_read_and_identifiable(folder: Path) -> None:
+    assert all(parameter.identifiable for parameter in structural_identifiability(load_twin(folder / "fan.toml")))
     plan = load_machine(folder / "fan-3.toml")
-    assert [entry.name for entry in plan.problem.free] == ["T_c", "k"]
+    assert [parameter.name for parameter in plan.problem.free] == ["T_c", "k"]
     assert any("MotorSpeed [rpm]" in line for line in describe(plan))
 
 
-def test_its_error_is_the_error(folder: Path) -> None:
-    name, right, wrong, said = re.findall(
+def test_guide_prints_the_real_error(folder: Path) -> None:
+    name, right, wrong, message = re.findall(
         r"<!-- error: (\S+) \| (.*?) \| (.*?) -->\n```\n(.*?)\n```", GUIDE, re.DOTALL
     )[0]
     text = (folder / name).read_text(encoding="utf-8")
@@ -49,10 +49,10 @@ def test_its_error_is_the_error(folder: Path) -> None:
     (folder / name).write_text(text.replace(right, wrong), encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
         load_twin(folder / name)
-    assert str(caught.value).replace(f"{folder}/", "") == said
+    assert str(caught.value).replace(f"{folder}/", "") == message
 
 
-def test_its_twin_estimates(folder: Path) -> None:
+def test_guide_twin_estimates(folder: Path) -> None:
     plan = load_machine(folder / "fan-3.toml")
     random = np.random.default_rng(1)
     torque = np.repeat(random.uniform(2.0, 12.0, 10), 50)
@@ -61,9 +61,9 @@ def test_its_twin_estimates(folder: Path) -> None:
     values = np.column_stack([torque, omega + random.normal(0.0, 0.1, 500)])
     window = Window.whole(0, 0.0, 0.02, ("T_m", "omega"), values)
     _, report = adapt(initial_state("fan-3", "hall-2", plan.problem), window)
-    found = {name: entry.value for name, entry in report.document.parameters.items()}
-    assert found == pytest.approx({"T_c": 0.9, "k": 0.00031}, rel=0.02)
+    estimates = {name: parameter.value for name, parameter in report.document.parameters.items()}
+    assert estimates == pytest.approx({"T_c": 0.9, "k": 0.00031}, rel=0.02)
 
 
-def test_every_function_is_named() -> None:
+def test_guide_names_every_function() -> None:
     assert all(re.search(rf"\b{name}\b", GUIDE) for name in FUNCTIONS)

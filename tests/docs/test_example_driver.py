@@ -1,4 +1,4 @@
-"""The worked example of a driver of one's own: it keeps the contract, and an entry point is all it takes."""
+"""The example driver keeps the contract, and its entry point makes it a driver of machine files."""
 
 import os
 import subprocess
@@ -19,14 +19,14 @@ def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def test_it_keeps_the_contract() -> None:
+def test_example_driver_keeps_the_contract() -> None:
     done = run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(FOLDER), PYTHONDONTWRITEBYTECODE="1")
     assert done.returncode == 0, done.stdout
-    assert f"{len(CONTRACT) + 1} passed" in done.stdout  # and one of what comes over the wire
+    assert f"{len(CONTRACT) + 1} passed" in done.stdout  # and the test of bad datagrams
 
 
-def test_its_entry_point_makes_it_a_driver_of_machine_files(tmp_path: Path) -> None:
-    """As pip installs it: the module and its metadata in a folder of packages."""
+def test_entry_point_registers_the_example_driver(tmp_path: Path) -> None:
+    """The module and its metadata are in a folder of packages, as pip installs them."""
     (tmp_path / MODULE).write_bytes((FOLDER / MODULE).read_bytes())
     metadata = tmp_path / "otolith_udp_json-0.1.0.dist-info"
     metadata.mkdir()

@@ -1,4 +1,4 @@
-"""What the tests of the CAN decoder share: a decoder of a few signals, and frames for it."""
+"""Shared by the tests of the CAN decoder: a decoder of a few signals, and frames for it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,22 +9,22 @@ import can
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import FrameOptions
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 
-Wishes = Mapping[str, tuple[str, dict[str, Any]]]
+Requests = Mapping[str, tuple[str, dict[str, Any]]]
 """Name of each signal, its unit, and its source as in a machine file."""
 
 
-def signals(wishes: Wishes) -> tuple[Signal, ...]:
-    return tuple(Signal(name, unit, Source.model_validate(source)) for name, (unit, source) in wishes.items())
+def signals(requested: Requests) -> tuple[Signal, ...]:
+    return tuple(Signal(name, unit, CanSource.model_validate(source)) for name, (unit, source) in requested.items())
 
 
-def decoder(folder: Path, wishes: Wishes, text: str = "", suffix: str = "dbc", **options: Any) -> FrameDecoder:
-    """Of the signals in ``wishes``, by the database ``text``."""
+def decoder(folder: Path, requested: Requests, text: str = "", suffix: str = "dbc", **options: Any) -> FrameDecoder:
+    """A decoder of the ``requested`` signals, with the database ``text`` if there is one."""
     if text:
         (folder / f"drive.{suffix}").write_text(text, encoding="utf-8")
         options["dbc"] = f"drive.{suffix}"
-    return decoder_of(FrameOptions.model_validate(options), Setup(signals(wishes), folder, 0.01))
+    return decoder_of(FrameOptions.model_validate(options), Setup(signals(requested), folder, 0.01))
 
 
 def frame(identifier: int, data: bytes, *, extended: bool = False, fd: bool = False) -> can.Message:

@@ -1,4 +1,4 @@
-"""Drives that end with their test."""
+"""Simulated Modbus drives that end with their test."""
 
 import logging
 from collections.abc import Callable, Iterator

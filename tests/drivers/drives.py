@@ -24,13 +24,14 @@ from tests.waiting import PATIENCE
 
 PLANT = [sys.executable, "-m", "otolith", "plant"]
 REGISTERS, COUNTER = 9, 8
-TIMEOUT = 0.4  # s; a request that is answered at all is so within this, on a busy computer as well
+PATIENCE = 20.0  # s
+TIMEOUT = 0.4  # s; an answer arrives within this time even on a busy computer
 Client = ModbusTcpClient | ModbusSerialClient
 ORDERS = {"ABCD": [0, 1, 2, 3], "DCBA": [3, 2, 1, 0], "BADC": [1, 0, 3, 2], "CDAB": [2, 3, 0, 1]}
 
 
 class Drive:
-    """A machine as a Modbus drive, and what became of it."""
+    """A simulated machine as a Modbus drive, with its summary at the end."""
 
     def __init__(self, folder: Path, more: str = "", transport: str = "modbus-tcp", modbus: str = "") -> None:
         self.port, self.line = free_port(socket.SOCK_STREAM), folder / "ttyDrive"
@@ -61,8 +62,8 @@ class Drive:
     def end(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, dict[str, Any]]:
         """Exit code and summary."""
         self.process.send_signal(number)
-        _, self.said = self.process.communicate(timeout=PATIENCE)
-        assert "Traceback" not in self.said
+        _, self.stderr = self.process.communicate(timeout=PATIENCE)
+        assert "Traceback" not in self.stderr
         return self.process.returncode, json.loads(self.summary.read_text(encoding="utf-8"))
 
     def close(self) -> None:
@@ -72,13 +73,13 @@ class Drive:
 
 
 def floats(registers: Sequence[int], order: str = "ABCD") -> list[float]:
-    """The four signals, by another way than the drive's own."""
+    """The four signals, decoded independently of the drive's code."""
     data = np.array(registers[:COUNTER], ">u2").view("u1").reshape(4, 4)[:, np.argsort(ORDERS[order])]
     return list(np.ascontiguousarray(data).view(">f4").ravel().astype(float))
 
 
 def wait_for(client: Client, condition: Callable[[ModbusPDU], bool]) -> ModbusPDU:
-    """The first answer that fulfils ``condition``; the client connects again where it must."""
+    """The first answer that meets ``condition``; the client reconnects if it must."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         try:
@@ -88,7 +89,7 @@ def wait_for(client: Client, condition: Callable[[ModbusPDU], bool]) -> ModbusPD
         except ModbusException:
             pass
         time.sleep(0.01)
-    raise AssertionError("the drive never said that")
+    raise AssertionError(f"no such answer within {PATIENCE:g} s")
 
 
 def past(index: int) -> Callable[[ModbusPDU], bool]:
@@ -96,7 +97,7 @@ def past(index: int) -> Callable[[ModbusPDU], bool]:
 
 
 def line_says(line: int, enough: int) -> bytes:
-    """Bytes from a line, until there are enough."""
+    """At least ``enough`` bytes from a line."""
     data = b""
     while len(data) < enough:
         assert select.select([line], [], [], PATIENCE)[0], data.hex()

@@ -14,7 +14,7 @@ import can
 from otolith_drivers.base import Driver, Setup, Signal
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 from otolith_drivers.modbus import driver as modbus_poller
 from tests.conftest import EXAMPLES, free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
@@ -35,12 +35,10 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
         opened[:] = [bus]
         return bus
 
-    vars(can_receiver).update(open_bus=open_and_remember, BACKOFF_FIRST=SHORT)
-    signals = (Signal("i", "A", Source(signal="ArmatureCurrent")),)
-    driver = can_receiver.build(
-        can_receiver.Options(**options.model_dump(), dbc=Path("dc-motor.dbc")), Setup(signals, EXAMPLES, PERIOD)
-    )
-    sender, stop = open_bus(options), threading.Event()
+    vars(can_receiver).update(open_bus=remembered, BACKOFF_FIRST=SHORT)
+    options = can_receiver.Options(**place.model_dump(), dbc=Path("dc-motor.dbc"))
+    signals = (Signal("i", "A", CanSource(signal="ArmatureCurrent")),)
+    sender, stop = open_bus(place), threading.Event()
 
     def send() -> None:
         counter = 0

@@ -1,4 +1,4 @@
-"""Logs of a CAN bus as python-can writes them, from the frames of the simulated motor."""
+"""CAN logs written by python-can from the frames of the simulated motor."""
 
 import gzip
 import shutil
@@ -16,7 +16,7 @@ from otolith_drivers.canbus.driver import Options, Source
 from otolith_drivers.plant.can_node import ALIVE_COUNTER
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import simulate
-from otolith_drivers.replay.can_log import CanLog, open_log
+from otolith_drivers.replay.can_log import CanLogReader, open_log
 from otolith_drivers.replay.readers import Rows
 from otolith_drivers.units import factor
 from tests.conftest import EXAMPLES, SIGNALS
@@ -33,19 +33,19 @@ WRITERS: dict[str, Any] = {
 }
 
 
-def frames_of(scenario: MotorScenario, ticks: int, begun: float = BEGUN) -> list[can.Message]:
-    """What the motor would have sent, each message with a delay of its own, with frames of others in between."""
+def frames_of(scenario: MotorScenario, count: int, begun: float = BEGUN) -> list[can.Message]:
+    """Frames that the motor would send, each message with its own delay, and frames of another node."""
     messages = load_dbc(EXAMPLES / "dc-motor.dbc").messages
     units = scenario.SIGNALS
-    found = []
-    for index, tick in enumerate(islice(simulate(scenario), ticks)):
+    frames = []
+    for index, sample in enumerate(islice(simulate(scenario), count)):
         for place, message in enumerate(messages):
             time = begun + 0.01 * index + 0.0002 * (place + 1)
-            found.append(_frame(message, tick.measured, index, units, time))
-        found.append(
-            can.Message(arbitration_id=0x7FF, data=b"other", timestamp=found[-1].timestamp, is_extended_id=False)
+            frames.append(_frame(message, sample.measured, index, units, time))
+        frames.append(
+            can.Message(arbitration_id=0x7FF, data=b"other", timestamp=frames[-1].timestamp, is_extended_id=False)
         )
-    return found
+    return frames
 
 
 def _frame(message: Message, measured: Any, index: int, units: dict[str, str], time: float) -> can.Message:
@@ -67,13 +67,13 @@ def _frame(message: Message, measured: Any, index: int, units: dict[str, str], t
 
 
 def live(frames: list[can.Message]) -> list[Sample]:
-    """What the driver would have delivered of ``frames``."""
+    """The samples that the CAN driver would deliver."""
     decoder = decoder_of(FRAMES, SETUP)
     return [sample for frame in frames for sample in decoder.decode(frame, frame.timestamp)]
 
 
 def written(folder: Path, frames: list[can.Message], suffix: str) -> Path:
-    """``frames`` in a file of the format that ``suffix`` names, packed if it ends so."""
+    """``frames`` in a file of the format of ``suffix``, compressed if it ends in ``.gz``."""
     plain = suffix.removesuffix(".gz")
     path = folder / f"bus{plain}"
     with WRITERS[plain](path) as writer:
@@ -87,14 +87,14 @@ def written(folder: Path, frames: list[can.Message], suffix: str) -> Path:
     return packed
 
 
-def opened(path: Path) -> CanLog:
+def opened(path: Path) -> CanLogReader:
     return open_log(path, SETUP, FRAMES)
 
 
-def samples_of(stretches: list[Rows]) -> list[tuple[str, float]]:
-    """Signal and value, in the order of the rows."""
-    found = []
-    for rows in stretches:
+def samples_of(chunks: list[Rows]) -> list[tuple[str, float]]:
+    """Signal and value of each reading, in the order of the rows."""
+    samples = []
+    for rows in chunks:
         for index in range(len(rows.times)):
-            found += [(name, float(c[index])) for name, c in rows.columns.items() if c[index] == c[index]]
-    return found
+            samples += [(name, float(c[index])) for name, c in rows.columns.items() if c[index] == c[index]]
+    return samples

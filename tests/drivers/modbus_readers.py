@@ -1,4 +1,4 @@
-"""Pollers of a server of our own, and who takes what they read."""
+"""Modbus drivers for tests, and a context manager that keeps what they deliver."""
 
 import struct
 from collections.abc import Callable, Sequence
@@ -23,9 +23,16 @@ def source(**keys: object) -> Source:
 
 
 def poller(port: int, sources: Sequence[Source], period: float = PERIOD, **options: object) -> ModbusPoller:
-    signals = tuple(Signal(f"s{index}", "V", entry) for index, entry in enumerate(sources))
-    found = Options.model_validate({"host": "127.0.0.1", "port": port, "timeout": f"{TIMEOUT} s", **options})
-    return build(found, Setup(signals, Path(), period))
+    signals = tuple(Signal(f"s{index}", "V", source) for index, source in enumerate(sources))
+    parsed = Options.model_validate({"host": "127.0.0.1", "port": port, "timeout": "0.1 s", **options})
+    return build(parsed, Setup(signals, Path(), period))
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {seconds:g} s"
+        time.sleep(0.005)
 
 
 class Listener:

@@ -1,4 +1,4 @@
-"""Modbus servers for tests: pymodbus's own, and one that misbehaves as no well-kept library would."""
+"""Modbus servers for tests: pymodbus's own, and one that can misbehave."""
 
 import asyncio
 import socket
@@ -23,15 +23,15 @@ Words = dict[int, int]
 def library_server(words: Words, moving: Callable[[int], Words] | None = None) -> Iterator[int]:
     """Pymodbus serving ``words`` (by address) as device 1; the port.
 
-    Only those registers are there: a request that touches another one is refused. ``moving`` gives new words for each
-    request, of which it is told the first address.
+    A request for any other register is refused. ``moving`` takes the first address of each request and returns its new
+    words.
     """
     port = free_port(socket.SOCK_STREAM)
 
     async def before(_: int, start: int, *others: Any) -> None:
-        held = others[2]  # what is at ``start`` and behind it; after the address and length of the request
+        registers = others[2]  # from ``start`` on; after the address and length of the request
         for at, word in moving(start).items() if moving else ():
-            held[at - start] = word
+            registers[at - start] = word
 
     blocks = [list(run) for _, run in groupby(sorted(words), key=_place_less_rank())]
     data = [SimData(run[0], values=[words[at] for at in run], datatype=DataType.REGISTERS) for run in blocks]
@@ -59,24 +59,24 @@ def library_server(words: Words, moving: Callable[[int], Words] | None = None) -
 
 
 def _place_less_rank() -> Callable[[int], int]:
-    """The same for addresses that follow each other, when called for all of them in order."""
+    """A key that is equal for adjacent addresses, if it is called for all of them in order."""
     rank = count()
     return lambda address: address - next(rank)
 
 
 @dataclass
 class Behaviour:
-    """What a server says; changed by tests while it serves."""
+    """How a server answers; tests change it while it serves."""
 
     words: Words
     refuse: Callable[[int, int, int], int | None] = lambda device, address, count: None
-    """From device, address and count to an exception code."""
+    """Takes device, address and count; returns an exception code, None to answer."""
     silent: Callable[[int], bool] = lambda device: False
     """Whether a device does not answer."""
-    spoil: Callable[[bytes], bytes] = lambda reply: reply
-    """What happens to a whole reply on its way."""
+    corrupt: Callable[[bytes], bytes] = lambda reply: reply
+    """Takes a reply and returns the bytes to send."""
     functions: list[int] = field(default_factory=list)
-    """Function codes asked for."""
+    """Function codes of all requests."""
     asked: list[tuple[int, int, int, int]] = field(default_factory=list)
     """Device, function code, address and count of each request."""
 
@@ -118,11 +118,11 @@ class _Handler(socketserver.BaseRequestHandler):
             words = [behaviour.words.get(at, 0) for at in range(address, address + count)]
             body = bytes([function, 2 * count]) + struct.pack(f">{count}H", *words)
         reply = struct.pack(">HHHB", transaction, 0, len(body) + 1, device) + body
-        self.request.sendall(behaviour.spoil(reply))
+        self.request.sendall(behaviour.corrupt(reply))
 
 
 class OddServer(socketserver.ThreadingTCPServer):
-    """Each connection in a thread of its own."""
+    """A server that serves each connection in its own thread."""
 
     allow_reuse_address = True
     daemon_threads = True
@@ -135,7 +135,7 @@ class OddServer(socketserver.ThreadingTCPServer):
 
 @contextmanager
 def odd_server(behaviour: Behaviour, port: int) -> Iterator["OddServer"]:
-    """A server on ``port`` that behaves so; at the end its connections are cut."""
+    """A server on ``port`` with this behaviour; its connections are closed at the end."""
     server = OddServer(port, behaviour)
     thread = threading.Thread(target=server.serve_forever, args=(0.01,), name="odd-server")
     thread.start()

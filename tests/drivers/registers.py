@@ -1,16 +1,16 @@
-"""Numbers as a device has them in its registers, and items that read them."""
+"""Numbers as a device has them in its registers, and signals that read them."""
 
 import struct
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus.options import Item, Options, Source, item_of
+from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.protocol import LETTERS, Order, TypeName
 
 KINDS: list[TypeName] = list(LETTERS)
 
 
 def registers(number: float, kind: TypeName, order: Order) -> list[int]:
-    """The inverse of what is tested, written byte by byte."""
+    """The inverse of ``reader``, written byte by byte."""
     data = list(struct.pack(f">{LETTERS[kind]}", number if kind.startswith("float") else int(number)))
     words = [data[at : at + 2] for at in range(0, len(data), 2)]
     if order in ("BADC", "DCBA"):
@@ -20,6 +20,6 @@ def registers(number: float, kind: TypeName, order: Order) -> list[int]:
     return [high << 8 | low for high, low in words]
 
 
-def item(name: str = "s", **keys: object) -> Item:
-    source = Source.model_validate({"register": 0, "type": "float32", "unit": "V", **keys})
-    return item_of(Signal(name, "V", source), Options(host="localhost"))
+def item(name: str = "s", **keys: object) -> RegisterSignal:
+    source = ModbusSource.model_validate({"register": 0, "type": "float32", "unit": "V", **keys})
+    return register_signal(Signal(name, "V", source), ModbusOptions(host="localhost"))

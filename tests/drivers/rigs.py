@@ -1,4 +1,4 @@
-"""A rig for each driver of the registry: the driver, and a real source that it can hear."""
+"""A rig for each driver of the registry: the driver, and a real source for it."""
 
 import struct
 from collections.abc import Callable, Iterator
@@ -9,19 +9,18 @@ from pathlib import Path
 import can
 
 from otolith_drivers.base import Setup, Signal
-from otolith_drivers.canbus import driver as can_receiver
+from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
-from otolith_drivers.canbus.signals import Source
 from otolith_drivers.conformance import Rig
-from otolith_drivers.modbus import driver as modbus_poller
-from otolith_drivers.plant import driver as in_process
-from otolith_drivers.replay import driver as replayer
+from otolith_drivers.modbus import driver as modbus_driver
+from otolith_drivers.plant import driver as plant_driver
+from otolith_drivers.replay import driver as replay_driver
 from tests.conftest import EXAMPLES, OwnMachine
 from tests.drivers.modbus_servers import library_server
 
 SIGNALS = (
-    Signal("i", "A", Source(signal="ArmatureCurrent")),
-    Signal("omega", "rpm", Source(signal="RotorSpeed")),
+    Signal("i", "A", can_driver.Source(signal="ArmatureCurrent")),
+    Signal("omega", "rpm", can_driver.Source(signal="RotorSpeed")),
 )
 SETUP = Setup(SIGNALS, EXAMPLES, 0.01)
 EXPECTED = {"i": 2.0, "omega": 10.0 * 60 / (2 * 3.141592653589793)}
@@ -29,12 +28,12 @@ EXPECTED = {"i": 2.0, "omega": 10.0 * 60 / (2 * 3.141592653589793)}
 
 @contextmanager
 def can_rig(machine: OwnMachine) -> Iterator[Rig]:
-    options = can_receiver.Options(
+    options = can_driver.Options(
         interface="udp_multicast", channel=machine.group, port=machine.port, dbc=Path("dc-motor.dbc")
     )
     bus = open_bus(BusOptions(**options.model_dump(include=set(BusOptions.model_fields))))
 
-    def say() -> None:
+    def emit() -> None:
         bus.send(
             can.Message(
                 arbitration_id=385, data=bytes(2) + (2000).to_bytes(2, "little") + bytes(4), is_extended_id=False
@@ -42,31 +41,26 @@ def can_rig(machine: OwnMachine) -> Iterator[Rig]:
         )
         bus.send(can.Message(arbitration_id=641, data=(1000).to_bytes(2, "little") + bytes(6), is_extended_id=False))
 
-    yield Rig(can_receiver.build(options, SETUP), EXPECTED, say)
+    yield Rig(can_driver.build(options, SETUP), EXPECTED, emit)
     bus.shutdown()
 
 
-def modbus_source(register: int, unit: str) -> modbus_poller.Source:
-    return modbus_poller.Source.model_validate({"register": register, "type": "float32", "unit": unit})
+def modbus_source(register: int, unit: str) -> modbus_driver.Source:
+    return modbus_driver.Source.model_validate({"register": register, "type": "float32", "unit": unit})
 
 
 @contextmanager
 def modbus_rig(_: OwnMachine) -> Iterator[Rig]:
     words = dict(enumerate(struct.unpack(">4H", struct.pack(">ff", 2.0, 10.0))))
-    signals = (
-        Signal("i", "A", modbus_poller.Source.model_validate({"register": 0, "type": "float32", "unit": "A"})),
-        Signal(
-            "omega", "rpm", modbus_poller.Source.model_validate({"register": 2, "type": "float32", "unit": "rad/s"})
-        ),
-    )
+    signals = (Signal("i", "A", modbus_source(0, "A")), Signal("omega", "rpm", modbus_source(2, "rad/s")))
     with library_server(words) as port:
-        options = modbus_poller.Options(host="127.0.0.1", port=port)
-        driver = modbus_poller.build(options, replace(SETUP, signals=signals))
+        options = modbus_driver.Options(host="127.0.0.1", port=port)
+        driver = modbus_driver.build(options, replace(SETUP, signals=signals))
         yield Rig(driver, EXPECTED)
         driver.close()
 
 
-PLANT_SAYS = """
+PLANT_FAULT = """
 [[faults]]
 kind = "{kind}"
 signal = "{signal}"
@@ -77,32 +71,32 @@ start = "0 s"
 
 @contextmanager
 def plant_rig(machine: OwnMachine) -> Iterator[Rig]:
-    """Sensors that lie say what the rig wants to hear."""
+    """Faulty sensors of the plant measure the expected values."""
     wanted = {"ArmatureCurrent": "2 A", "RotorSpeed": "10 rad/s"}
     for signal, value in wanted.items():
         with machine.scenario.open("a", encoding="utf-8") as file:
-            file.write(PLANT_SAYS.format(kind="gain", signal=signal, change="factor = 0"))
-            file.write(PLANT_SAYS.format(kind="offset", signal=signal, change=f'amount = "{value}"'))
+            file.write(PLANT_FAULT.format(kind="gain", signal=signal, change="factor = 0"))
+            file.write(PLANT_FAULT.format(kind="offset", signal=signal, change=f'amount = "{value}"'))
     signals = tuple(
-        Signal(signal.name, signal.unit, in_process.Source(signal=name))
+        Signal(signal.name, signal.unit, plant_driver.Source(signal=name))
         for signal, name in zip(SIGNALS, wanted, strict=True)
     )
-    options = in_process.Options(scenario=machine.scenario)
-    yield Rig(in_process.build(options, replace(SETUP, signals=signals)), EXPECTED)
+    options = plant_driver.Options(scenario=machine.scenario)
+    yield Rig(plant_driver.build(options, replace(SETUP, signals=signals)), EXPECTED)
 
 
 @contextmanager
 def replay_rig(machine: OwnMachine) -> Iterator[Rig]:
-    """A file speaks by itself."""
+    """A file sends by itself."""
     path = machine.machine.with_name("drive.csv")
     lines = ["t,ArmatureCurrent [A],RotorSpeed", *(f"{0.01 * index:.2f},2.0,10.0" for index in range(10_000))]
     path.write_text("\n".join(lines), encoding="utf-8")
     sources = ({"column": "ArmatureCurrent"}, {"column": "RotorSpeed", "unit": "rad/s"})
     signals = tuple(
-        replace(signal, source=replayer.Source.model_validate(source))
+        replace(signal, source=replay_driver.Source.model_validate(source))
         for signal, source in zip(SIGNALS, sources, strict=True)
     )
-    yield Rig(replayer.build(replayer.Options(file=path), replace(SETUP, signals=signals)), EXPECTED)
+    yield Rig(replay_driver.build(replay_driver.Options(file=path), replace(SETUP, signals=signals)), EXPECTED)
 
 
 RIGS: dict[str, Callable[[OwnMachine], AbstractContextManager[Rig]]] = {

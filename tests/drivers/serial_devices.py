@@ -1,4 +1,4 @@
-"""A Modbus device on a serial line, for tests: a pseudo-terminal with somebody at its other end."""
+"""A Modbus RTU device for tests: a thread at the other end of a pseudo-terminal."""
 
 import os
 import select
@@ -15,7 +15,7 @@ from tests.drivers.modbus_servers import Words
 
 @contextmanager
 def serial_device(words: Words, device: int) -> Iterator[str]:
-    """A Modbus RTU device at the end of a pseudo-terminal; the path of the port. Nobody else is on the line."""
+    """The only Modbus RTU device on a pseudo-terminal; yields the path of the port."""
     ours, theirs = os.openpty()
     tty.setraw(theirs)
     done = threading.Event()
@@ -28,8 +28,8 @@ def serial_device(words: Words, device: int) -> Iterator[str]:
             asked, function, address, count = struct.unpack(">BBHH", request[:6])
             if asked != device or request[6:] != _checksum(request[:6]):
                 continue
-            found = [words.get(at, 0) for at in range(address, address + count)]
-            reply = bytes([device, function, 2 * count]) + struct.pack(f">{count}H", *found)
+            registers = [words.get(at, 0) for at in range(address, address + count)]
+            reply = bytes([device, function, 2 * count]) + struct.pack(f">{count}H", *registers)
             os.write(ours, reply + _checksum(reply))
 
     thread = threading.Thread(target=serve, name="serial-device")

@@ -1,4 +1,4 @@
-"""Files as closed models: a fault names file, line and key, and the nearest key that exists."""
+"""TOML files as closed models: each fault names file, line, key and remedy."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BeforeValidator
 
-from otolith_drivers.config_files import SourceFile, StrictModel, load, parse, validate
+from otolith_drivers.config_files import SourceFile, StrictModel, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
 
 
@@ -24,6 +24,11 @@ class Outer(StrictModel):
     named: dict[str, Annotated[Inner, BeforeValidator(lambda value: value)]] | None = None
 
 
+def load(path: Path) -> Outer:
+    file = read(path)
+    return validate(parse(file), Outer, file)
+
+
 FAULTS = [
     ("name = 'x'\n\n[inner]\nsped = 2.0\n", "4: inner.sped: unknown key 'sped': did you mean 'speed'?"),
     ("nam = 'x'\n", "1: nam: unknown key 'nam': did you mean 'name'?"),
@@ -36,43 +41,43 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("text", "sentence"), FAULTS)
-def test_a_fault_says_where_and_what(tmp_path: Path, text: str, sentence: str) -> None:
+def test_fault_names_file_line_key_and_remedy(tmp_path: Path, text: str, sentence: str) -> None:
     path = tmp_path / "file.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
-        load(path, Outer)
+        load(path)
     assert str(caught.value).startswith(str(path))
     assert sentence in str(caught.value)
 
 
-def test_two_faults_are_two_lines(tmp_path: Path) -> None:
+def test_each_fault_is_a_line(tmp_path: Path) -> None:
     path = tmp_path / "file.toml"
     path.write_text("nam = 'x'\n[inner]\nsped = 1\n", encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
-        load(path, Outer)
+        load(path)
     assert len(str(caught.value).splitlines()) == 3  # the misspelt name is also a missing one
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"a" * (2 << 20)])
-def test_what_is_no_text_file_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_binary_or_huge_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "file.toml"
     path.write_bytes(content)
     with pytest.raises(ConfigurationError, match=str(path)):
-        load(path, Outer)
+        load(path)
 
 
-def test_missing_file_and_folder(tmp_path: Path) -> None:
+def test_missing_file_or_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="No such file"):
-        load(tmp_path / "none.toml", Outer)
+        load(tmp_path / "none.toml")
     with pytest.raises(ConfigurationError, match="directory"):
-        load(tmp_path, Outer)
+        load(tmp_path)
 
 
 @given(st.text(max_size=300))
-def test_any_text_is_read_or_refused(text: str) -> None:
-    page = SourceFile(Path("any.toml"), text)
+def test_any_text_is_parsed_or_refused(text: str) -> None:
+    file = SourceFile(Path("any.toml"), text)
     try:
-        validate(parse(page), Outer, page)
+        validate(parse(file), Outer, file)
     except ConfigurationError as error:
         assert str(error).startswith("any.toml")  # noqa: PT017 - either outcome is right, another error is not
 
@@ -81,5 +86,5 @@ def test_any_text_is_read_or_refused(text: str) -> None:
     ("word", "hint"),
     [("cna", "did you mean 'can'?"), ("CAN", "did you mean 'can'?"), ("xyz", "known: can, modbus")],
 )
-def test_the_nearest_name_is_found_whatever_its_case(word: str, hint: str) -> None:
+def test_nearest_name_ignores_case(word: str, hint: str) -> None:
     assert nearest(word, ["modbus", "can"]) == hint

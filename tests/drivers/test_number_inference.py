@@ -1,4 +1,4 @@
-"""Which numbers are in bytes: told where they move, called likely where they hardly do, never claimed where still."""
+"""Number inference: certain where bytes move, likely where they hardly do, none where they are still."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from otolith_drivers.modbus.probe import Block, Number, Words, numbers_of
+from otolith_drivers.modbus.probe import Block, Words
+from otolith_drivers.modbus.probe_numbers import Number, numbers_of
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, is_float, orders_of
 from otolith_drivers.number_inference import FRAMES, REGISTERS, Layout, LayoutVerdict, Part, parts
 from tests.drivers.registers import registers
@@ -19,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 def moving(random: np.random.Generator) -> dict[str, Floats]:
-    """Signals as machines have them."""
+    """Typical signals of machines."""
     time, noise = 0.012 * np.arange(READINGS), random.standard_normal(READINGS)
     return {
         "voltage with noise": 24.0 + 0.01 * noise,
@@ -47,69 +48,69 @@ def still(*values: int) -> Words:
     return np.tile(np.array(values, dtype=np.uint16), (READINGS, 1))
 
 
-def found_in(*columns: Words) -> list[Number]:
+def inferred(*columns: Words) -> list[Number]:
     together = np.hstack(columns)
     return numbers_of({Block(0, together.shape[1]): together})
 
 
 def same(layout: Layout | None, kind: TypeName, order: Order) -> bool:
-    """Signed or not is another question: half of the numbers are the same."""
+    """Whether type and order agree; signed and unsigned count as one, as half of their numbers are the same."""
     return layout is not None and layout.kind.lstrip("u") == kind.lstrip("u") and layout.order == order
 
 
 @pytest.mark.parametrize("name", SIGNALS)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("order", ORDERS)
-def test_a_number_among_registers_that_stand_still(name: str, kind: TypeName, order: Order) -> None:
+def test_number_among_still_registers(name: str, kind: TypeName, order: Order) -> None:
     if order not in orders_of(kind) or (name, kind) == ("noise around zero", "uint16"):
-        pytest.skip("a register has no order of words, and this noise no unsigned form")
+        pytest.skip("a single register has no word order, and this noise has no unsigned form")
     column = words(SIGNALS[name], kind, order)
-    numbers = [number for number in found_in(still(0x1234, 0), column, still(0, 7)) if number.part.layout]
+    numbers = [number for number in inferred(still(0x1234, 0), column, still(0, 7)) if number.part.layout]
     for number in numbers:
         layout = number.part.layout
-        if number.part.verdict is LayoutVerdict.TOLD:
-            # The high half of an integer may stand still: then its low half is all that can be told of it.
+        if number.part.verdict is LayoutVerdict.CERTAIN:
+            # The high half of an integer may be still: then only its low half can be recognised.
             half = kind == "int32" and layout is not None and layout.kind in ("int16", "uint16")
             assert half or (number.address == 2 and same(layout, kind, order))
     if is_float(kind) and name not in ("set-point in halves", "one step in the last decimal"):
-        assert [number.part.verdict for number in numbers] == [LayoutVerdict.TOLD]
+        assert [number.part.verdict for number in numbers] == [LayoutVerdict.CERTAIN]
         assert numbers[0].part.latest == pytest.approx(SIGNALS[name][-1], rel=1e-6)
 
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("seed", range(5))
-def test_numbers_of_all_types_side_by_side(order: Order, seed: int) -> None:
-    """They move, and a device has one order: every one is told, in its place."""
+def test_adjacent_numbers_of_all_types(order: Order, seed: int) -> None:
+    """All move and have one order, so each is recognised in its place."""
     random = np.random.default_rng(seed)
     kinds: list[TypeName] = ["float32", "int16", "int32", "float64", "float32", "float32", "int16", "int16"]
     signals = list(moving(random).values())
     wanted, columns, address = [], [still(0x0237)], 1
     for kind in kinds:
-        # An integer that keeps near its mean has a high half that stands still, which is another test.
+        # An integer that stays near its mean has a still high half, which is another test.
         number = signals[int(random.choice([2, 3] if kind == "int32" else [0, 2, 3, 6]))]
         kept = order if kind != "int16" else "ABCD"
         columns.append(words(number + 0.01 * random.standard_normal(READINGS), kind, kept))
         wanted.append((address, kind, kept))
         address += columns[-1].shape[1]
-    told = {
+    recognised = {
         (number.address, layout.kind.lstrip("u"), layout.order)
-        for number in found_in(*columns)
+        for number in inferred(*columns)
         if (layout := number.part.layout) is not None
     }
-    assert told == set(wanted)
+    assert recognised == set(wanted)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_nothing_is_claimed_of_what_stands_still(seed: int) -> None:
+def test_still_registers_have_no_type(seed: int) -> None:
     random = np.random.default_rng(seed)
     column = still(*random.integers(0, 1 << 16, 40).tolist(), *registers(23.5, "float32", "ABCD"))
-    assert {number.part.verdict for number in found_in(column)} == {LayoutVerdict.STILL}
+    assert {number.part.verdict for number in inferred(column)} == {LayoutVerdict.STILL}
 
 
-def test_noise_of_all_bits_is_no_signal() -> None:
+def test_noise_in_all_bits_is_erratic() -> None:
     random = np.random.default_rng(2)
     column = random.integers(0, 1 << 16, (READINGS, 3)).astype(np.uint16)
-    assert {number.part.verdict for number in found_in(column)} == {LayoutVerdict.WILD}
+    assert {number.part.verdict for number in inferred(column)} == {LayoutVerdict.ERRATIC}
 
 
 def frames(*columns: Floats | NDArray[np.int_], layout: str) -> NDArray[np.uint8]:
@@ -124,7 +125,7 @@ def in_frames(data: NDArray[np.uint8]) -> list[Part]:
 
 
 @pytest.mark.parametrize(("mark", "order"), [("<", "little"), (">", "big")])
-def test_fields_of_a_frame(mark: str, order: str) -> None:
+def test_fields_of_a_can_frame(mark: str, order: str) -> None:
     speed, current = 1000.0 * SIGNALS["speed that changes its sign"] / 30.0, 2000.0 + 300.0 * SIGNALS["noisy ramp"]
     count = np.arange(READINGS) % 256
     data = frames(speed.round(), current.round(), np.zeros(READINGS), count, layout=f"{mark}i2 {mark}i2 {mark}i2 u1")
@@ -133,14 +134,14 @@ def test_fields_of_a_frame(mark: str, order: str) -> None:
         (0, f"int16 {order}"),
         (2, f"int16 {order}"),
     ]
-    assert (one.verdict, counter.start, counter.verdict) == (LayoutVerdict.TOLD, 6, LayoutVerdict.COUNTS)
+    assert (one.verdict, counter.start, counter.verdict) == (LayoutVerdict.CERTAIN, 6, LayoutVerdict.COUNTER)
 
 
-def test_fields_of_three_and_four_bytes() -> None:
+def test_can_fields_of_three_and_four_bytes() -> None:
     position = (1e6 * SIGNALS["speed that changes its sign"]).round().astype(np.int64)
     data = np.hstack([frames(position, layout="<i4"), frames((position // 10) << 8, layout="<i4")[:, 1:]])
-    found = in_frames(data)
-    assert [(part.start, part.layout and part.layout.name) for part in found] == [
+    fields = in_frames(data)
+    assert [(part.start, part.layout and part.layout.name) for part in fields] == [
         (0, "int32 little"),
         (4, "int24 little"),
     ]
@@ -148,15 +149,15 @@ def test_fields_of_three_and_four_bytes() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 12).flatmap(lambda width: arrays(np.uint16, st.tuples(st.integers(0, 12), st.just(width)))))
-def test_any_registers_are_covered_once_and_in_order(readings: Words) -> None:
-    found = numbers_of({Block(100, readings.shape[1]): readings})
-    places = [at for number in found for at in range(number.address, number.address + number.count)]
+def test_any_registers_are_covered_once(readings: Words) -> None:
+    numbers = numbers_of({Block(100, readings.shape[1]): readings})
+    places = [at for number in numbers for at in range(number.address, number.address + number.count)]
     assert places == (list(range(100, 100 + readings.shape[1])) if len(readings) else [])
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 12).flatmap(lambda width: arrays(np.uint8, st.tuples(st.integers(1, 12), st.just(width)))))
-def test_any_bytes_are_covered_once_and_in_order(data: NDArray[np.uint8]) -> None:
+def test_any_bytes_are_covered_once(data: NDArray[np.uint8]) -> None:
     places = [at for part in parts(data, FRAMES, 1) for at in range(part.start, part.start + part.width)]
     assert places == list(range(data.shape[1]))
     assert all(layout.width <= 8 for layout in REGISTERS)

@@ -1,4 +1,4 @@
-"""Quantities: what people write comes in as the right number or is refused with a sentence."""
+"""Quantities with units: parsed and converted, or refused with a message."""
 
 import math
 
@@ -29,7 +29,7 @@ from otolith_drivers.units import Quantity, factor, unit
         (0.25, "1", 0.25),
     ],
 )
-def test_reads_what_people_write(written: object, target: str, value: float) -> None:
+def test_quantity_in_usual_notations(written: object, target: str, value: float) -> None:
     assert Quantity(target)(written) == pytest.approx(value, rel=1e-12)
 
 
@@ -56,7 +56,7 @@ def test_reads_what_people_write(written: object, target: str, value: float) -> 
         ("1 __import__('os')", "s", "is not a unit"),
     ],
 )
-def test_refuses_with_a_sentence(written: object, target: str, sentence: str) -> None:
+def test_invalid_quantity_names_the_fault(written: object, target: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         Quantity(target)(written)
     assert sentence in str(caught.value)
@@ -67,18 +67,18 @@ def test_bounds_are_named_with_their_unit() -> None:
         Quantity("s", 0.1, 600.0)("1 ms")
 
 
-def test_newton_metres_are_not_number_metres() -> None:
+def test_nm_is_newton_metre() -> None:
     assert unit("Nm").dimensionality == unit("N*m").dimensionality
 
 
 @given(st.floats(-1e12, 1e12), st.sampled_from([("ohm", "kohm"), ("rpm", "rad/s"), ("degC", "kelvin"), ("Nm", "mN*m")]))
-def test_conversion_there_and_back_changes_nothing(value: float, units: tuple[str, str]) -> None:
+def test_conversion_is_invertible(value: float, units: tuple[str, str]) -> None:
     there, back = factor(units[0], units[1]), factor(units[1], units[0])
     assert back[0] * (there[0] * value + there[1]) + back[1] == pytest.approx(value, rel=1e-9, abs=1e-9)
 
 
 @given(st.text(max_size=80))
-def test_any_text_is_read_or_refused(text: str) -> None:
+def test_any_text_is_a_quantity_or_refused(text: str) -> None:
     try:
         value = Quantity("ohm")(text)
     except ValueError as error:

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.sequential_test import WindowDecision
-from otolith.estimation.data_checks import SHORTEST_REPEATED_RUN, drop_repeats, repeated_records
+from otolith.discovery.decision import WindowDecision
+from otolith.estimation.data_checks import MIN_REPEATED_RUN, drop_repeats, repeated_records
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
@@ -128,7 +128,7 @@ def test_long_runs_in_all_channels_are_repeats_and_nothing_else_is(
     values[start : start + length, :channels] = values[start, :channels]
     window = Window.whole(0, 0.0, 0.01, TWIN.signals, values)
     found = np.flatnonzero(repeated_records(window, SENSORS)).tolist()
-    long = channels == 4 and length > SHORTEST_REPEATED_RUN
+    long = channels == 4 and length > MIN_REPEATED_RUN
     assert found == (list(range(start + 1, start + length - 1)) if long else [])
     counted, notes = drop_repeats(window, TWIN)
     assert bool(notes) == long

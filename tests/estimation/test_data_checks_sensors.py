@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.discovery.sequential_test import WindowDecision
+from otolith.discovery.decision import WindowDecision
 from otolith.estimation.data_checks import spike_records
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
@@ -78,7 +78,7 @@ def test_a_lying_sensor_teaches_nothing(quiet: MotorScenario, windows: Cut, faul
     after, documents = run(state, [sick])
     held(documents, word)
     assert documents[0].decision is WindowDecision.SENSOR
-    assert after.memory.belief is state.memory.belief
+    assert after.posterior is state.posterior
 
 
 LIES: dict[str, tuple[str, Change]] = {
@@ -162,4 +162,4 @@ def test_a_healthy_machine_has_honest_sensors(quiet: MotorScenario, windows: Cut
         initial_state("motor", "here", problem("R_a", "D")), [window for window, _ in windows(quiet, 300)]
     )
     assert {document.decision for document in documents} == {WindowDecision.LEARNED}
-    assert state.memory.contradictions == 0
+    assert state.contradictions == 0

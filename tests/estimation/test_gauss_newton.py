@@ -1,4 +1,4 @@
-"""The polish finds the floor of a valley, also where a bound lies across it."""
+"""Gauss-Newton finds the minimum within bounds."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ class Linear:
     def __init__(self, rows: Array, told: Array, low: Array, high: Array) -> None:
         self._rows, self._told, self.low, self.high = rows, told, low, high
 
-    def linearised(self, guess: Array) -> tuple[Array, Array]:
+    def linearise(self, guess: Array) -> tuple[Array, Array]:
         return self._told - self._rows @ guess, -self._rows
 
 
@@ -25,7 +25,7 @@ def test_a_bound_across_the_valley_does_not_stop_it(seed: int) -> None:
     rows = random.normal(size=(60, 2)) @ random.normal(size=(2, 5)) + 0.03 * random.normal(size=(60, 5))
     told = rows @ random.uniform(-3.0, 3.0, 5) + random.normal(size=60)
     box = Linear(rows, told, -np.ones(5), np.ones(5))
-    found = gauss_newton(box, random.uniform(-1.0, 1.0, 5), steps=200)
+    found = gauss_newton(box, random.uniform(-1.0, 1.0, 5), max_steps=200)
     best = lsq_linear(rows, told, (-1.0, 1.0), method="bvls")
     assert found.converged
     assert found.chi_square == pytest.approx(2.0 * best.cost, rel=1e-3)

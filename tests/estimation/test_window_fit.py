@@ -9,11 +9,12 @@ import pytest
 from otolith.acquisition.window import Quality, Verdict, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.discovery.sequential_test import WindowDecision
-from otolith.estimation.information import Identifiability, inflation
+from otolith.discovery.decision import WindowDecision
+from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import Identifiability, inflation_of
 from otolith.estimation.objective import PENALTY, Objective
 from otolith.estimation.problem import Problem, SwarmOptions
-from otolith.estimation.window_fit import estimate
+from otolith.estimation.window_fit import Search, WindowEstimate, estimate
 from otolith.health.schema import Status
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
@@ -28,6 +29,10 @@ def problem_for(*names: str) -> Problem:
     free = tuple(entry for entry in DC_MOTOR.parameters if entry.name in names)
     known = tuple((entry.name, entry.nominal) for entry in DC_MOTOR.parameters if entry.name not in names)
     return Problem(DC_MOTOR, known, free, (0.005, 0.02), swarm=SwarmOptions(generations=400))
+
+
+def estimated(problem: Problem, window: Window, start: list[float], search: Search = Search.ALWAYS) -> WindowEstimate:
+    return estimate(problem, window, initial_prior(problem), np.array(start), search)
 
 
 def state_for(*names: str) -> AdaptationState:
@@ -48,7 +53,7 @@ def test_resistance_comes_back_within_half_a_percent_in_every_window(scenario: M
 def test_any_subset_can_be_estimated(scenario: MotorScenario, windows: Cut, names: tuple[str, ...]) -> None:
     quiet = scenario.model_copy(update={"faults": ()})
     window, _ = windows(quiet, 11)[-1]  # the set-point has just doubled: everything moves
-    found = estimate(problem_for(*names), window, np.array([DC_MOTOR.parameter(name).nominal for name in names]))
+    found = estimated(problem_for(*names), window, [DC_MOTOR.parameter(name).nominal for name in names])
     for entry in found.parameters:
         assert entry.identifiability is Identifiability.DETERMINED
         assert entry.value == pytest.approx(DC_MOTOR.parameter(entry.name).nominal, rel=0.02)
@@ -72,7 +77,7 @@ def test_a_motor_at_rest_says_nothing_about_its_resistance() -> None:
 
 def test_parameters_that_only_act_together_are_named_as_traded(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 4)[-1]
-    found = estimate(problem_for("J", "K_t", "D"), window, np.array([0.001171, 0.038, 0.00143]))
+    found = estimated(problem_for("J", "K_t", "D"), window, [0.001171, 0.038, 0.00143])
     traded = {entry.name: entry.reason for entry in found.parameters}
     assert Identifiability.TRADED in {entry.identifiability for entry in found.parameters}
     assert any("can be traded with" in reason for reason in traded.values())
@@ -84,7 +89,7 @@ def test_a_bad_window_teaches_nothing(scenario: MotorScenario, windows: Cut) -> 
     bad = replace(next_one, quality=Quality(Verdict.BAD, 1.0, 2.0, 0.0, 0.0, ("no samples of i",)))
     after, report = adapt(state, bad)
     found = report.document.parameters["R_a"]
-    assert after.memory is state.memory
+    assert after.posterior is state.posterior
     assert found.status is Status.HELD
     assert "no samples of i" in found.reason
     assert report.document.fit is None
@@ -113,7 +118,7 @@ def test_a_window_that_contradicts_the_twin_teaches_nothing(scenario: MotorScena
     assert not report.document.fit.explained
     assert found.status is Status.HELD
     assert "nothing explains" in found.reason
-    assert after.memory.belief is state.memory.belief
+    assert after.posterior is state.posterior
     again = adapt(after, replace(wrong, start=wrong.end))[1].document.parameters["R_a"]
     assert again.status is Status.INVALID
 
@@ -125,7 +130,7 @@ def test_lost_first_records_do_not_bias(scenario: MotorScenario, windows: Cut, l
     missing, values = window.missing.copy(), window.values.copy()
     missing[:lost], values[:lost] = True, values[lost]
     told = replace(problem_for("R_a"), input_noise=(0.0, 0.0002))
-    entry = estimate(told, replace(window, values=values, missing=missing), np.array([6.5])).parameters[0]
+    entry = estimated(told, replace(window, values=values, missing=missing), [6.5]).parameters[0]
     assert entry.sd < 0.005
     assert entry.value == pytest.approx(6.5, abs=4.0 * entry.sd)
 
@@ -152,7 +157,7 @@ def test_a_constant_equilibrium_cannot_tell_resistance_from_the_electromotive_fo
     row = [6.5 * i + 0.038 * omega, 0.06, i, omega]
     values = np.tile(row, (200, 1))
     window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
-    found = estimate(problem_for("R_a", "K_e"), window, np.array([6.5, 0.038]))
+    found = estimated(problem_for("R_a", "K_e"), window, [6.5, 0.038])
     assert {entry.identifiability for entry in found.parameters} == {Identifiability.TRADED}
 
 
@@ -166,7 +171,7 @@ def test_a_fast_motor_is_integrated_finely_enough() -> None:
     values = np.column_stack([inputs, outputs + random.normal(size=(200, 2)) * [0.005, 0.02]])
     window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     known = tuple((name, value) for name, value in truth.items() if name != "R_a")
-    entry = estimate(replace(problem_for("R_a"), known=known), window, np.array([6.0])).parameters[0]
+    entry = estimated(replace(problem_for("R_a"), known=known), window, [6.0]).parameters[0]
     assert entry.value == pytest.approx(6.5, abs=4.0 * entry.sd)
     assert entry.sd < 0.01
 
@@ -180,7 +185,7 @@ def test_noise_of_a_measured_input_widens_the_interval(scenario: MotorScenario, 
         changed = scenario.model_copy(update={"seed": seed, "faults": ()})
         window, _ = windows(changed, 5)[-1]
         for knows, problem in ((True, told), (False, problem_for("R_a"))):
-            entry = estimate(problem, window, np.array([6.5]), warm=True).parameters[0]
+            entry = estimated(problem, window, [6.5], Search.IF_UNEXPLAINED).parameters[0]
             inside[knows] += abs(entry.value - 6.5) <= 1.96 * entry.sd
     assert inside[True] >= 0.87 * count  # the binomial's 0.5 % quantile for 95 %
     assert inside[False] < 0.75 * count
@@ -188,9 +193,9 @@ def test_noise_of_a_measured_input_widens_the_interval(scenario: MotorScenario, 
 
 def test_a_residual_beyond_the_noise_widens_the_interval(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 5)[-1]
-    told = estimate(problem_for("R_a"), window, np.array([6.5])).parameters[0]
+    told = estimated(problem_for("R_a"), window, [6.5]).parameters[0]
     optimist = replace(problem_for("R_a"), noise=(0.005 / 3.0, 0.02 / 3.0))
-    doubted = estimate(optimist, window, np.array([6.5])).parameters[0]
+    doubted = estimated(optimist, window, [6.5]).parameters[0]
     assert doubted.sd == pytest.approx(told.sd, rel=0.15)
 
 
@@ -200,7 +205,7 @@ def test_only_a_residual_that_lasts_widens_the_interval_beyond_its_size() -> Non
     lasting = np.cumsum(random.standard_normal((200, 2)), axis=0)
     for residuals, low, high in ((white, 0.95, 1.1), (lasting, 3.0, 20.0)):
         cost = float(np.sqrt(np.mean(residuals**2)))
-        assert low <= inflation(3.0 / cost * residuals, 3.0) / 3.0 <= high
+        assert low <= inflation_of(3.0 / cost * residuals, 3.0) / 3.0 <= high
 
 
 def test_a_guess_that_diverges_never_wins(scenario: MotorScenario, windows: Cut) -> None:
@@ -226,7 +231,7 @@ def test_spread_over_seeds_is_what_the_report_claims(scenario: MotorScenario, wi
     for seed in range(40):
         changed = scenario.model_copy(update={"seed": seed, "noise": quiet, "faults": ()})
         window, _ = windows(changed, 3)[-1]
-        entry = estimate(problem, window, np.array([6.5])).parameters[0]
+        entry = estimated(problem, window, [6.5]).parameters[0]
         pulls.append((entry.value - 6.5) / entry.sd)
     assert np.std(pulls) == pytest.approx(1.0, abs=0.35)
     assert abs(np.mean(pulls)) < 0.6

@@ -1,7 +1,7 @@
-"""Machine files: the golden folder of wrong ones, each with the sentence it gets, and what a right one means.
+"""Machine files: each invalid file of the golden folder gives its error message, and valid files load.
 
-A case is a folder with ``machine.toml`` and ``error.txt``; in the latter ``{file}`` stands for the file and ``*`` for
-what differs between computers. ``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the sentences anew: read the difference.
+A case is a folder with ``machine.toml`` and ``error.txt``, in which ``{file}`` stands for the path and ``*`` for
+what differs between computers. ``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the messages anew: review the diff.
 """
 
 import os
@@ -20,51 +20,51 @@ CASES = sorted(path.parent for path in GOLDEN.glob("*/machine.toml"))
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_wrong_file_gets_its_sentence(case: Path) -> None:
+def test_an_invalid_file_gives_its_error_message(case: Path) -> None:
     file = case / "machine.toml"
     with pytest.raises(OtolithError) as caught:
         load_machine(file).driver.open(lambda _: None)
     assert caught.value.exit_code == 2
-    said = str(caught.value).replace(str(file), "{file}").replace(str(case), "{folder}")
+    message = str(caught.value).replace(str(file), "{file}").replace(str(case), "{folder}")
     expected = case / "error.txt"
     if os.environ.get("OTOLITH_UPDATE_GOLDEN") and not (expected.exists() and "*" in expected.read_text()):
-        expected.write_text(said + "\n", encoding="utf-8")
-    assert fnmatchcase(said, expected.read_text(encoding="utf-8").rstrip("\n").replace("[", "[[]"))
+        expected.write_text(message + "\n", encoding="utf-8")
+    assert fnmatchcase(message, expected.read_text(encoding="utf-8").rstrip("\n").replace("[", "[[]"))
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
-def test_every_machine_file_to_copy_can_be_loaded(path: Path) -> None:
-    plan = load_machine(path)
-    lines = describe(plan)
-    assert all(any(line.startswith(f"{signal} ") for line in lines) for signal in plan.twin.signals)
+def test_every_example_loads(path: Path) -> None:
+    machine = load_machine(path)
+    lines = describe(machine)
+    assert all(any(line.startswith(f"{signal} ") for line in lines) for signal in machine.twin.signals)
 
 
-def test_all_machine_files_to_copy_can_run_on_one_computer() -> None:
-    """Each publishes on a port of its own; only the two of the same motor share theirs."""
+def test_all_examples_can_run_on_one_computer() -> None:
+    """Each listens on its own port, except that the two files of the same motor share one."""
     others = [path for path in sorted(EXAMPLES.glob("*.toml")) if path.stem != "dc-motor-in-process"]
     endpoints = [endpoint for path in others for endpoint in load_machine(path).file.zenoh.listen]
     assert len(set(endpoints)) == len(others)
 
 
-def test_the_example_means_what_it_says() -> None:
-    plan = load_machine(EXAMPLES / "dc-motor.toml")
-    assert [entry.name for entry in plan.problem.free] == ["R_a"]
-    assert dict(plan.problem.known)["J"] == pytest.approx(0.001171)
-    assert plan.problem.noise == (0.005, 0.02)
-    assert plan.records == 200
-    assert any("MotorMechanical.RotorSpeed" in line for line in describe(plan))
+def test_the_example_gives_its_estimation_problem() -> None:
+    machine = load_machine(EXAMPLES / "dc-motor.toml")
+    assert [parameter.name for parameter in machine.problem.free] == ["R_a"]
+    assert dict(machine.problem.known)["J"] == pytest.approx(0.001171)
+    assert machine.problem.noise == (0.005, 0.02)
+    assert machine.records == 200
+    assert any("MotorMechanical.RotorSpeed" in line for line in describe(machine))
 
 
-def test_the_simplest_machine_file_needs_no_bus() -> None:
-    """The machine of dc-motor.toml, simulated in the daemon; what the shorter file leaves out is as the twin says."""
+def test_the_in_process_example_needs_no_bus() -> None:
+    """It has the machine of dc-motor.toml, simulated in the daemon; the twin gives what the shorter file leaves out."""
     simple, whole = load_machine(EXAMPLES / "dc-motor-in-process.toml"), load_machine(EXAMPLES / "dc-motor.toml")
-    assert [entry.name for entry in simple.problem.free] == ["R_a", "D"]
+    assert [parameter.name for parameter in simple.problem.free] == ["R_a", "D"]
     assert simple.problem.noise == whole.problem.noise
     assert any("omega from RotorSpeed [rad/s]" in line for line in describe(simple))
 
 
-def test_every_commented_default_of_the_example_is_the_default(tmp_path: Path) -> None:
-    """What a user gets by taking the '# ' off is what there was before."""
+def test_every_commented_default_is_the_default(tmp_path: Path) -> None:
+    """Removing '# ' from a line of the example changes nothing."""
     text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
     plain = load_machine(EXAMPLES / "dc-motor.toml").file
     uncommented = "\n".join(
@@ -86,13 +86,13 @@ def test_every_commented_default_of_the_example_is_the_default(tmp_path: Path) -
         ("canopen-drive", "x [m] from node 5 Position actual value (0x6064:00), TPDO 2 * 1e-06 [m], frame 0x285"),
     ],
 )
-def test_the_examples_of_drives_are_in_order(name: str, line: str) -> None:
-    said = describe(load_machine(EXAMPLES / f"{name}.toml"))
-    assert line in said
-    assert not any("warning" in text for text in said)
+def test_the_drive_examples_find_their_signals(name: str, line: str) -> None:
+    lines = describe(load_machine(EXAMPLES / f"{name}.toml"))
+    assert line in lines
+    assert not any("warning" in text for text in lines)
 
 
-def test_units_of_the_file_are_free(own_machine: OwnMachine) -> None:
+def test_any_unit_of_the_dimension_is_accepted(own_machine: OwnMachine) -> None:
     text = own_machine.machine.read_text(encoding="utf-8")
     other = text.replace('"6.5 ohm"', '"6500 mohm"').replace('"0.02 rad/s"', '"0.190985932 rpm"')
     own_machine.machine.write_text(other, encoding="utf-8")
@@ -101,6 +101,6 @@ def test_units_of_the_file_are_free(own_machine: OwnMachine) -> None:
     assert problem.noise[1] == pytest.approx(0.02)
 
 
-def test_an_unreadable_file_is_refused(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="No such file"):
         load_machine(tmp_path / "none.toml")

@@ -1,4 +1,4 @@
-"""A recording of ours, heard again, says what was said when it was made."""
+"""Recorder: the replay of a recording gives the reports that were made when it was recorded."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.replay import open_recorded
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.replay.recording import Recorded
+from otolith_drivers.replay.recording import RecordingReader
 from tests.cli.replays import MACHINE, PERIOD, RECORDS, Lines, recorded, reports, summed_up, written
 
 UNITS = {"V_a": "V", "T_load": "N*m", "i": "A", "omega": "rad/s"}
@@ -29,7 +29,7 @@ def rows(scenario: MotorScenario) -> Lines:
 
 
 @pytest.fixture
-def plan() -> LoadedMachine:
+def machine() -> LoadedMachine:
     return load_machine(MACHINE, with_driver=False)
 
 
@@ -39,11 +39,11 @@ def record(folder: Path, rows: Lines, name: str = "run.rrd") -> Path:
     return path
 
 
-def same(found: list[ReportDocument], again: list[ReportDocument]) -> None:
-    """But for what a recording does not hold: how samples came, and how many there were."""
-    assert len(found) == len(again)
-    for one, other in zip(found, again, strict=True):
-        assert other.window.start == pytest.approx(one.window.start, abs=PERIOD / 2)  # how jitter moves the grid
+def assert_same(first: list[ReportDocument], again: list[ReportDocument]) -> None:
+    """Compare reports, except for what a recording does not contain: arrival times and counts of samples."""
+    assert len(first) == len(again)
+    for one, other in zip(first, again, strict=True):
+        assert other.window.start == pytest.approx(one.window.start, abs=PERIOD / 2)  # jitter moves the grid
         assert other.window.quality.verdict is one.window.quality.verdict
         assert other.decision is one.decision
         for name, parameter in one.parameters.items():
@@ -53,10 +53,10 @@ def same(found: list[ReportDocument], again: list[ReportDocument]) -> None:
 
 
 @pytest.mark.parametrize("begun", [0.0, 1_700_000_000.0])
-def test_the_reports_are_the_same_again(
+def test_a_replayed_recording_gives_the_same_reports(
     tmp_path: Path, rows: Lines, begun: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With cells blank, a spike, and one window that lacks too much and one that came with jitter."""
+    """The data have blank cells, a spike, a window with too many missing samples and one with jitter."""
     random = np.random.default_rng(3)
     for index, row in enumerate(rows):
         jitter = random.uniform(0.0, 0.02) if 2 * RECORDS < index < 3 * RECORDS else 0.0
@@ -66,13 +66,13 @@ def test_the_reports_are_the_same_again(
         row[2] = ""
     path = record(tmp_path, rows)
     capsys.readouterr()
-    found, again = reports(tmp_path / "data.csv", capsys), reports(path, capsys)
-    assert {document.window.quality.verdict for document in found} == {"good", "bad"}
-    same(found, again)
+    first, again = reports(tmp_path / "data.csv", capsys), reports(path, capsys)
+    assert {document.window.quality.verdict for document in first} == {"good", "bad"}
+    assert_same(first, again)
     assert "windows that were bad when they were recorded, left out: 2" in summed_up(path, capsys)
 
 
-def test_two_replays_of_a_recording_print_the_same(
+def test_two_replays_of_a_recording_are_identical(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = record(tmp_path, rows)
@@ -81,17 +81,17 @@ def test_two_replays_of_a_recording_print_the_same(
     assert "1000 records read, 0 reordered, 0 bad; 4000 samples, 0 lost" in text
 
 
-def test_a_recording_of_a_recording_is_no_worse(tmp_path: Path, rows: Lines, plan: LoadedMachine) -> None:
+def test_a_recording_of_a_replay_has_the_same_samples(tmp_path: Path, rows: Lines, machine: LoadedMachine) -> None:
     first = record(tmp_path, rows)
     second = tmp_path / "again.rrd"
     replay(MACHINE, first, second, as_json=True, stopped=lambda: False)
-    with open_recorded(plan, first) as one, open_recorded(plan, second) as other:
-        for left, right in zip(one.stretches(), other.stretches(), strict=True):
+    with open_recorded(machine, first) as one, open_recorded(machine, second) as other:
+        for left, right in zip(one.chunks(), other.chunks(), strict=True):
             assert left.times == pytest.approx(right.times, abs=2e-9)
             assert all(np.array_equal(left.columns[name], right.columns[name]) for name in UNITS)
 
 
-def test_what_rerun_makes_of_a_recording_is_read_as_well(
+def test_a_recording_optimised_by_rerun_is_read(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, better = record(tmp_path, rows), tmp_path / "better.rrd"
@@ -99,7 +99,7 @@ def test_what_rerun_makes_of_a_recording_is_read_as_well(
     assert reports(better, capsys) == reports(path, capsys)
 
 
-def test_a_recording_whose_writer_was_killed_is_read_and_a_torn_one_has_a_way_out(
+def test_an_unclosed_recording_is_read_a_torn_one_repaired(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, killed, torn = record(tmp_path, rows), tmp_path / "killed.rrd", tmp_path / "torn.rrd"
@@ -116,34 +116,34 @@ def test_a_recording_whose_writer_was_killed_is_read_and_a_torn_one_has_a_way_ou
     assert reports(killed, capsys) == reports(path, capsys)
     assert "never closed by the recorder" in summed_up(killed, capsys)
     torn.write_bytes(path.read_bytes()[:-20_000])
-    with pytest.raises(ConfigurationError, match=r"torn\.rrd: torn, .*'rerun rrd optimize --continue-on-error") as said:
+    with pytest.raises(ConfigurationError, match=r"torn\.rrd: damaged, .*'rerun rrd optimize --continue") as info:
         summed_up(torn, capsys)
-    command = str(said.value).split("'")[1].replace("whole.rrd", str(tmp_path / "whole.rrd"))
+    command = str(info.value).split("'")[1].replace("whole.rrd", str(tmp_path / "whole.rrd"))
     subprocess.run([RERUN.with_name(command.split()[0]), *command.split()[1:]], capture_output=True, check=True)
     assert len(reports(tmp_path / "whole.rrd", capsys)) >= 2
 
 
-def test_other_recordings_are_refused(tmp_path: Path) -> None:
+def test_a_recording_of_another_application_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.rrd"
     with pytest.raises(ConfigurationError, match="No such file"):
-        Recorded(path, UNITS)
+        RecordingReader(path, UNITS)
     stream = rr.RecordingStream("somebody_else", recording_id="x")
     stream.save(path)
     stream.log("signals/i", rr.Scalars([1.0]))
     stream.disconnect()
     with pytest.raises(ConfigurationError, match="of application 'somebody_else': one of Otolith is needed"):
-        Recorded(path, UNITS)
+        RecordingReader(path, UNITS)
 
 
-def test_a_signal_that_was_not_recorded_is_named(tmp_path: Path, rows: Lines) -> None:
+def test_the_error_names_a_signal_that_was_not_recorded(tmp_path: Path, rows: Lines) -> None:
     path = record(tmp_path, rows)
     with pytest.raises(ConfigurationError, match=r"no signal 'p' \(Pa\) was recorded: it has T_load, V_a, i, omega"):
-        Recorded(path, {**UNITS, "p": "Pa"})
+        RecordingReader(path, {**UNITS, "p": "Pa"})
     with pytest.raises(ConfigurationError, match=r"signal 'i': unit 'A' does not measure what 'V' does"):
-        Recorded(path, {**UNITS, "i": "V"})
-    with Recorded(path, {**UNITS, "i": "mA"}) as milli, Recorded(path, UNITS) as plain:
-        ampere = np.concatenate([part.columns["i"] for part in plain.stretches()])
-        assert np.concatenate([part.columns["i"] for part in milli.stretches()]) == pytest.approx(1e3 * ampere)
+        RecordingReader(path, {**UNITS, "i": "V"})
+    with RecordingReader(path, {**UNITS, "i": "mA"}) as milli, RecordingReader(path, UNITS) as plain:
+        ampere = np.concatenate([part.columns["i"] for part in plain.chunks()])
+        assert np.concatenate([part.columns["i"] for part in milli.chunks()]) == pytest.approx(1e3 * ampere)
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -160,7 +160,7 @@ def test_a_damaged_recording_is_refused_or_read(
     path = tmp_path / "damaged.rrd"
     path.write_bytes(content[: int(end * len(content))])
     try:
-        with Recorded(path, UNITS) as damaged:
-            assert all(len(part.times) for part in damaged.stretches())
+        with RecordingReader(path, UNITS) as damaged:
+            assert all(len(part.times) for part in damaged.chunks())
     except ConfigurationError as error:
         assert str(path) in str(error)  # noqa: PT017 - either is right

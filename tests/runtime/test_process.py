@@ -1,4 +1,4 @@
-"""Companions: a process that cannot be started, or dies, is counted and tried again with growing pauses."""
+"""Child processes: a process that cannot be started, or dies, is restarted with growing pauses."""
 
 import signal
 import time
@@ -6,75 +6,75 @@ from typing import Any
 
 import pytest
 
-from otolith.runtime import process as companion
-from otolith.runtime.process import ChildProcess
-from tests.waiting import PATIENCE, within
+from otolith.runtime.process import FIRST_RESTART_PAUSE, MAX_RESTART_PAUSE, ChildProcess
+from tests.runtime.conftest import wait_for
 
 
-def test_a_failure_to_spawn_counts_as_a_death(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_more(*_: object) -> None:
+def test_a_failed_spawn_counts_as_a_death(monkeypatch: pytest.MonkeyPatch) -> None:
+    def out_of_descriptors(*_: object) -> None:
         raise OSError(24, "Too many open files")
 
-    tried = ChildProcess("nobody", "time:sleep", room=1)
-    monkeypatch.setattr(ChildProcess, "_spawn", no_more)
-    tried.start()
-    assert not tried.alive
-    assert tried.replies() == []
-    assert tried.may_start_again(100.0)
-    tried.start()
-    assert not tried.may_start_again(100.0)
-    assert tried.may_start_again(100.0 + companion.FIRST_PAUSE)
-    tried.stop(0.1)
-    assert tried.starts == 2
+    child = ChildProcess("child", "time:sleep", room=1)
+    monkeypatch.setattr(ChildProcess, "_spawn", out_of_descriptors)
+    child.start()
+    assert not child.alive
+    assert child.replies() == []
+    assert child.may_restart(100.0)
+    child.start()
+    assert not child.may_restart(100.0)
+    assert child.may_restart(100.0 + FIRST_RESTART_PAUSE)
+    child.stop(0.1)
+    assert child.starts == 2
 
 
-def test_pauses_grow_with_every_death_until_it_thrives(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_restart_pauses_double_until_the_backoff_is_reset(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ChildProcess, "_spawn", lambda *_: None)
-    tried, pauses = ChildProcess("nobody", "time:sleep", room=1), []
+    child, pauses = ChildProcess("child", "time:sleep", room=1), []
     for _ in range(9):
         now = 0.0
-        while not tried.may_start_again(now):
+        while not child.may_restart(now):
             now += 0.25
         pauses.append(now)
-        tried.start()
+        child.start()
     assert pauses[:4] == [0.0, 0.5, 1.0, 2.0]
-    assert pauses[-1] == companion.LONGEST_PAUSE
-    tried.has_thrived()
-    assert tried.may_start_again(0.0)
+    assert pauses[-1] == MAX_RESTART_PAUSE
+    child.reset_backoff()
+    assert child.may_restart(0.0)
 
 
 def echo(connection: Any) -> None:
-    """What the companion of the tests below does."""
+    """Main function of a child: return each message, and whether SIGTERM is blocked."""
     while (message := connection.recv()) is not None:
         connection.send((message, signal.SIGTERM in signal.pthread_sigmask(signal.SIG_BLOCK, [])))
 
 
-def test_signals_to_the_group_do_not_reach_it_and_messages_do() -> None:
-    running = ChildProcess("echo", "tests.runtime.test_process:echo", room=2)
-    running.start()
-    assert running.offer("a")
-    deadline = time.monotonic() + PATIENCE
-    said: list[object] = []
-    while not said and time.monotonic() < deadline:
-        said = running.replies()
-        time.sleep(0.01)
-    assert said == [("a", True)]
-    running.stop(PATIENCE)
-    assert not running.alive
+def test_a_child_gets_messages_but_no_group_signals() -> None:
+    child = ChildProcess("echo", "tests.runtime.test_process:echo", room=2)
+    child.start()
+    assert child.offer("a")
+    replies: list[object] = []
+
+    def has_replied() -> bool:
+        replies.extend(child.replies())
+        return bool(replies)
+
+    wait_for(has_replied)
+    assert replies == [("a", True)]
+    child.stop(2.0)
+    assert not child.alive
 
 
-@pytest.mark.timed
-def test_a_companion_that_does_not_read_is_not_waited_for() -> None:
-    stuck = ChildProcess("stuck", "tests.runtime.test_process:sleep", room=2)
-    stuck.start()
+def test_offer_never_waits_for_a_child_that_does_not_read() -> None:
+    child = ChildProcess("stuck", "tests.runtime.test_process:sleep", room=2)
+    child.start()
     begun = time.monotonic()
-    taken = [stuck.offer(bytes(1 << 20)) for _ in range(20)]
-    assert time.monotonic() - begun < within(0.5)
-    assert not all(taken)
-    stuck.kill()
+    accepted = [child.offer(bytes(1 << 20)) for _ in range(20)]
+    assert time.monotonic() - begun < 0.5
+    assert not all(accepted)
+    child.kill()
 
 
 def sleep(connection: Any) -> None:
-    """Never reads."""
+    """Main function of a child that never reads."""
     del connection
     time.sleep(60.0)

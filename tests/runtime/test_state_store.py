@@ -1,4 +1,4 @@
-"""What the daemon keeps and hears of components while it runs, in real files and behind a disk that does not answer."""
+"""State store and writer thread, with real files and with a disk that does not answer."""
 
 import contextlib
 import os
@@ -13,92 +13,93 @@ from otolith.discovery.adopted import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import find_twin
 from otolith.runtime.state_store import StateStore, WriterThread
-from tests.waiting import PATIENCE, wait_for, within
+from tests.runtime.conftest import wait_for
 
-DRY = Component("shaft", "Coulomb", "omega", -0.004)
-KEPT = (ComponentRecord(AdoptedComponent(DRY, 5.0), (-0.004,), (1e-5,)),)
-AT_ONCE = within(0.1)  # s: far less than a disk that does not answer
+FRICTION = Component("shaft", "Coulomb", "omega", -0.004)
+SAVED = (ComponentRecord(AdoptedComponent(FRICTION, 5.0), (-0.004,), (1e-5,)),)
+IMMEDIATELY = 0.1  # s: far less than a disk that does not answer
 
 
-def is_being_read(pipe: Path, held: list[int]) -> bool:
-    """Whether somebody waits for what is written into ``pipe``; the end to close is put into ``held`` then."""
+def is_being_read(pipe: Path, descriptors: list[int]) -> bool:
+    """Return whether a thread waits to read from ``pipe``, and append a descriptor that keeps it waiting."""
     with contextlib.suppress(OSError):
-        held.append(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
-    return bool(held)
+        descriptors.append(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
+    return bool(descriptors)
 
 
 @pytest.fixture
-def keeper(tmp_path: Path) -> StateStore:
+def store(tmp_path: Path) -> StateStore:
     return StateStore("here", "motor", find_twin("dc_motor"), tmp_path / "components")
 
 
 @pytest.fixture
-def house(keeper: StateStore) -> Iterator[WriterThread]:
-    found = WriterThread(keeper, keeper.stamp())
-    found.start()
-    yield found
-    found.stop(1.0)
+def writer(store: StateStore) -> Iterator[WriterThread]:
+    thread = WriterThread(store, store.decisions_time())
+    thread.start()
+    yield thread
+    thread.stop(1.0)
 
 
-def test_the_latest_is_on_disk_when_it_stops(keeper: StateStore, house: WriterThread) -> None:
+def test_the_latest_components_are_on_disk_after_stop(store: StateStore, writer: WriterThread) -> None:
     for amplitude in (-0.001, -0.002, -0.003, -0.004):
-        house.keep((ComponentRecord(AdoptedComponent(DRY, 5.0), (amplitude,), (1e-5,)),))
-    house.stop(PATIENCE)
-    assert keeper.components() == KEPT
+        writer.save((ComponentRecord(AdoptedComponent(FRICTION, 5.0), (amplitude,), (1e-5,)),))
+    writer.stop(5.0)
+    assert store.components() == SAVED
 
 
-def test_the_specialist_is_heard_once_for_every_word(keeper: StateStore, house: WriterThread) -> None:
-    assert house.new_decisions() is None
-    for word in (OperatorDecisions(approved=frozenset({DRY.key})), OperatorDecisions(rejected=frozenset({DRY.key}))):
-        keeper.decide(word)
-        heard: list[OperatorDecisions | None] = []
+def test_every_change_of_decisions_is_returned_once(store: StateStore, writer: WriterThread) -> None:
+    assert writer.new_decisions() is None
+    key = frozenset({FRICTION.key})
+    for decisions in (OperatorDecisions(approved=key), OperatorDecisions(rejected=key)):
+        store.save_decisions(decisions)
+        received: list[OperatorDecisions] = []
 
-        def is_heard(heard: list[OperatorDecisions | None] = heard) -> bool:
-            heard.append(house.new_decisions())
-            return heard[-1] is not None
+        def has_changed(received: list[OperatorDecisions] = received) -> bool:
+            change = writer.new_decisions()
+            received.extend([] if change is None else [change])
+            return bool(received)
 
-        wait_for(is_heard)
-        assert heard[-1] == word
-        assert house.new_decisions() is None
-
-
-def test_what_was_known_at_the_start_is_not_heard_again(keeper: StateStore) -> None:
-    keeper.decide(OperatorDecisions(approved=frozenset({DRY.key})))
-    house = WriterThread(keeper, keeper.stamp())
-    house.start()
-    house.keep(KEPT)
-    wait_for(keeper.known.exists)
-    house.stop(PATIENCE)
-    assert house.new_decisions() is None
+        wait_for(has_changed)
+        assert received == [decisions]
+        assert writer.new_decisions() is None
 
 
-@pytest.mark.timed
-def test_nobody_waits_for_a_disk_that_does_not_answer(keeper: StateStore, house: WriterThread) -> None:
-    """A pipe into which nobody writes, where the specialist's file is expected: who reads it is held up."""
-    keeper.said.parent.mkdir(parents=True)
-    os.mkfifo(keeper.said)
-    held: list[int] = []
-    wait_for(lambda: is_being_read(keeper.said, held))
+def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> None:
+    store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
+    writer = WriterThread(store, store.decisions_time())
+    writer.start()
+    writer.save(SAVED)
+    wait_for(store.components_path.exists)
+    writer.stop(5.0)
+    assert writer.new_decisions() is None
+
+
+def test_callers_do_not_wait_for_a_disk_that_hangs(store: StateStore, writer: WriterThread) -> None:
+    """A named pipe without a writer stands in for the decisions file: reading it blocks."""
+    store.decisions_path.parent.mkdir(parents=True)
+    os.mkfifo(store.decisions_path)
+    descriptors: list[int] = []
+    wait_for(lambda: is_being_read(store.decisions_path, descriptors))
     begun = time.monotonic()
-    house.keep(KEPT)
-    assert house.new_decisions() is None
-    assert time.monotonic() - begun < AT_ONCE
-    house.stop(0.2)
-    assert time.monotonic() - begun < 0.2 + AT_ONCE
-    assert not keeper.known.exists()
-    os.close(held.pop())
-    wait_for(keeper.known.exists)  # late, but all the same
-    assert keeper.components() == KEPT
+    writer.save(SAVED)
+    assert writer.new_decisions() is None
+    assert time.monotonic() - begun < IMMEDIATELY
+    writer.stop(0.2)
+    assert time.monotonic() - begun < 0.2 + IMMEDIATELY
+    assert not store.components_path.exists()
+    os.close(descriptors.pop())
+    wait_for(store.components_path.exists)  # written late, but not lost
+    assert store.components() == SAVED
 
 
-def test_what_the_disk_does_not_take_is_tried_again(
-    keeper: StateStore, house: WriterThread, caplog: pytest.LogCaptureFixture
+def test_a_failed_write_is_tried_again_and_logged_once(
+    store: StateStore, writer: WriterThread, caplog: pytest.LogCaptureFixture
 ) -> None:
-    folder = keeper.known.parent
+    folder = store.components_path.parent
     folder.write_text("a file where a folder should be", encoding="utf-8")
-    house.keep(KEPT)
-    wait_for(lambda: "components are not kept" in caplog.text)
+    writer.save(SAVED)
+    wait_for(lambda: "components are not saved" in caplog.text)
     folder.unlink()
-    house.stop(PATIENCE)
-    assert keeper.components() == KEPT
-    assert caplog.text.count("components are not kept") == 1
+    writer.stop(5.0)
+    assert store.components() == SAVED
+    assert caplog.text.count("components are not saved") == 1

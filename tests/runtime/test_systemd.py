@@ -1,4 +1,4 @@
-"""sd_notify: what systemd would read from its socket."""
+"""Notifications to systemd: what arrives at its socket."""
 
 import os
 import socket
@@ -12,29 +12,27 @@ from otolith.runtime.systemd import Notifier
 
 @pytest.fixture
 def manager(tmp_path: Path) -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
-        listening.bind(str(tmp_path / "notify"))
-        listening.settimeout(2.0)
-        yield listening
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(tmp_path / "notify"))
+        receiver.settimeout(2.0)
+        yield receiver
 
 
-def notifier(manager: socket.socket, **more: str) -> Notifier:
-    return Notifier({"NOTIFY_SOCKET": manager.getsockname(), **more})
+def notifier_for(manager: socket.socket, **environment: str) -> Notifier:
+    return Notifier({"NOTIFY_SOCKET": manager.getsockname(), **environment})
 
 
-def test_readiness_status_watchdog_and_stop(manager: socket.socket) -> None:
-    said = notifier(manager)
-    said.ready("listening:\nCAN")
-    said.status("window 3 good")
-    said.progress()
-    said.stopping()
-    said.close()
-    got = [manager.recv(4096).decode() for _ in range(4)]
-    assert got == [
+def test_every_notification_arrives_with_one_line_per_assignment(manager: socket.socket) -> None:
+    notifier = notifier_for(manager)
+    notifier.send("READY=1", "STATUS=listening:\nCAN", f"MAINPID={os.getpid()}")
+    notifier.send("STATUS=window 3 good")
+    notifier.send("WATCHDOG=1")
+    notifier.close()
+    received = [manager.recv(4096).decode() for _ in range(3)]
+    assert received == [
         f"READY=1\nSTATUS=listening: CAN\nMAINPID={os.getpid()}",
         "STATUS=window 3 good",
         "WATCHDOG=1",
-        "STOPPING=1",
     ]
 
 
@@ -42,23 +40,23 @@ def test_readiness_status_watchdog_and_stop(manager: socket.socket) -> None:
     ("environment", "seconds"),
     [({"WATCHDOG_USEC": "30000000"}, 30.0), ({"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": "1"}, None), ({}, None)],
 )
-def test_the_watchdog_is_the_one_meant_for_us(
+def test_a_watchdog_for_another_process_is_ignored(
     manager: socket.socket, environment: dict[str, str], seconds: float | None
 ) -> None:
-    said = notifier(manager, **environment)
-    assert said.watchdog == seconds
-    said.close()
+    notifier = notifier_for(manager, **environment)
+    assert notifier.watchdog == seconds
+    notifier.close()
 
 
-def test_a_manager_that_does_not_read_blocks_nobody(manager: socket.socket) -> None:
-    said = notifier(manager)
+def test_send_never_blocks_on_a_full_queue(manager: socket.socket) -> None:
+    notifier = notifier_for(manager)
     for _ in range(1000):
-        said.status("x" * 1000)
-    said.close()
+        notifier.send("STATUS=" + "x" * 1000)
+    notifier.close()
 
 
-def test_without_systemd_it_is_silent() -> None:
-    said = Notifier({})
-    said.ready("")
-    said.close()
-    assert said.watchdog is None
+def test_without_systemd_nothing_is_sent() -> None:
+    notifier = Notifier({})
+    notifier.send("READY=1")
+    notifier.close()
+    assert notifier.watchdog is None

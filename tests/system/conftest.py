@@ -1,4 +1,4 @@
-"""Real processes: plant and daemon as a user starts them, watched from outside."""
+"""Real processes: plant and daemon, started as a user starts them, observed from outside."""
 
 import os
 import queue
@@ -32,43 +32,42 @@ class Running:
         wait_for(lambda: "reports on" in self.log.read_text() or self.daemon.poll() is not None)
         plays = [*machine.plays, "--truth", str(self.truth), "--summary", str(self.summary)]
         self.plant = self._start("plant", "plant", *plays) if machine.plays else None
-        self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._listener = Listener([machine.endpoint], "otolith/**/report", self._heard.put)
+        self.daemon = self._start("daemon", "run", str(machine.machine), "--recording", str(self.recording))
+        self._received: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._listener = Listener([machine.endpoint], "otolith/**/report", self._received.put)
         self.reports: list[ReportDocument] = []
 
     def _start(self, name: str, *arguments: str) -> "subprocess.Popen[bytes]":
         with (self.folder / f"{name}.log").open("wb") as log:
             return subprocess.Popen([*OTOLITH, *arguments], stdout=log, stderr=subprocess.STDOUT)
 
-    def wait_for(
-        self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 2 * PATIENCE
-    ) -> list[ReportDocument]:
-        """The reports, once there are enough of them; fails with the daemon's log after ``seconds``."""
+    def wait_for(self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 60.0) -> list[ReportDocument]:
+        """Return all reports once ``enough`` accepts them; fail with the daemon's log after ``seconds``."""
         deadline = time.monotonic() + seconds
         while not enough(self.reports):
             left = deadline - time.monotonic()
             assert self.daemon.poll() is None, self.log.read_text()
             assert left > 0, f"{len(self.reports)} reports; {self.log.read_text()}"
             try:
-                self.reports.append(ReportDocument.from_json(self._heard.get(timeout=min(left, 1.0))))
+                self.reports.append(ReportDocument.from_json(self._received.get(timeout=min(left, 1.0))))
             except queue.Empty:
                 continue
         return self.reports
 
     def child(self, name: str) -> psutil.Process:
-        """A process that the daemon has started, by what it is: ``worker`` or ``recorder``."""
-        found = {"worker": 0, "recorder": 1}[name]
+        """Return a child process of the daemon: ``worker`` or ``recorder``."""
+        index = {"worker": 0, "recorder": 1}[name]
         spawned = [p for p in psutil.Process(self.daemon.pid).children() if "spawn_main" in " ".join(p.cmdline())]
-        return sorted(spawned, key=lambda process: process.create_time())[found]
+        return sorted(spawned, key=lambda process: process.create_time())[index]
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, float]:
-        """The daemon's exit code and the seconds it took to end."""
+        """Stop the daemon; return its exit code and the seconds until it ended."""
         begun = time.monotonic()
         self.daemon.send_signal(number)
         return self.daemon.wait(timeout=PATIENCE), time.monotonic() - begun
 
     def close(self) -> None:
-        """End whatever still runs."""
+        """End all processes."""
         self._listener.__exit__(None, None, None)
         for process in (self.daemon, self.plant):
             if process is not None and process.poll() is None:
@@ -78,12 +77,12 @@ class Running:
 
 @pytest.fixture
 def running(own_machine: OwnMachine, tmp_path: Path) -> Iterator[Running]:
-    """A plant and a daemon, ended with the test."""
+    """A plant and a daemon; both end with the test."""
     machine = Running(own_machine, tmp_path)
     yield machine
     machine.close()
 
 
 def descendants() -> set[int]:
-    """Every process below this one."""
+    """Return the ids of all descendants of this process."""
     return {process.pid for process in psutil.Process(os.getpid()).children(recursive=True)}

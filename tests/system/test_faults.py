@@ -1,7 +1,7 @@
-"""Every fault of bus and sensor while the daemon runs: it recovers without a restart, and counts exactly what it lost.
+"""Every fault of bus and sensor: the daemon recovers without a restart and counts exactly what it lost.
 
-One run of a healthy motor over CAN and one over Modbus TCP, side by side, in which one fault follows another.
-``pytest tests/system/test_faults.py -m full -rP`` prints how long each took to be overcome.
+One run of a healthy motor over CAN and one over Modbus TCP, in parallel; the faults follow one another.
+``pytest tests/system/test_faults.py -rP`` prints how long each recovery took.
 """
 
 import csv
@@ -25,7 +25,7 @@ BOTH, CAN, MODBUS = ("can", "modbus-tcp"), ("can",), ("modbus-tcp",)
 
 @dataclass(frozen=True)
 class Injected:
-    """A fault, and until when (s of the plant's time) it acts."""
+    """A fault, active from ``start`` until ``until``, seconds of the plant's time."""
 
     kind: str
     start: float
@@ -33,10 +33,10 @@ class Injected:
     keys: str = ""
     on: tuple[str, ...] = BOTH
     within: float = 5 * WINDOW
-    """s, from its end to the beginning of the next window that is estimated from."""
+    """s, from its end to the start of the next window with an estimate."""
 
     def __str__(self) -> str:
-        """As a scenario has it."""
+        """TOML of the fault in a scenario."""
         until = "" if self.kind == "clock_step" else f'until = "{self.until} s"\n'
         return f'\n[[faults]]\nkind = "{self.kind}"\nstart = "{self.start} s"\n{until}{self.keys}\n'
 
@@ -57,18 +57,18 @@ SCENARIOS = {"two": (TWO, 48.0), "all": (FAULTS, 92.0)}
 
 
 @pytest.fixture(scope="module")
-def lives(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Running]]:
-    """Both machines, after all faults of a scenario."""
-    running, (scenario, end) = {}, SCENARIOS[request.param]
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Running]]:
+    """Both machines, after all faults."""
+    running = {}
     monkeypatch = pytest.MonkeyPatch()
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))  # nobody's components
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))  # no saved components
     for transport in BOTH:
         folder = tmp_path_factory.mktemp(transport)
         faults = "".join(str(fault) for fault in scenario if transport in fault.on)
         running[transport] = Running(OwnMachine(folder / "machine", transport, faults=faults), folder)
     try:
         for one in running.values():
-            one.wait_for(partial(has_recovered, one, end), 240.0)
+            one.wait_for(lambda reports, one=one: reports and reports[-1].window.end > start_time(one) + END, 180.0)  # type: ignore[misc]
         yield running
     finally:
         monkeypatch.undo()
@@ -76,8 +76,8 @@ def lives(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
             one.close()
 
 
-def began(one: Running) -> float:
-    """Unix seconds of the plant's first tick."""
+def start_time(one: Running) -> float:
+    """Return the Unix time of the plant's first tick, s."""
     with one.truth.open(encoding="utf-8") as file:
         return float(next(csv.DictReader(file))["t"])
 
@@ -92,27 +92,19 @@ def is_sound(report: ReportDocument) -> bool:
     return report.window.quality.verdict is Verdict.GOOD and parameter.status is Status.ESTIMATED
 
 
-LONG = (pytest.mark.full, pytest.mark.timed)
-EITHER = pytest.mark.parametrize("lives", ["two", pytest.param("all", marks=LONG)], indirect=True, scope="module")
-EACH = [
-    pytest.param(name, transport, fault, marks=LONG if name == "all" else (), id=f"{name}-{transport}-{fault.kind}")
-    for name, (scenario, _) in SCENARIOS.items()
-    for transport in BOTH
-    for fault in scenario
-    if transport in fault.on
-]
+RUNS = [(transport, fault) for transport in BOTH for fault in FAULTS if transport in fault.on]
 
 
-@pytest.mark.parametrize(("lives", "transport", "fault"), EACH, indirect=["lives"], scope="module")
-def test_it_recovers_without_a_restart(lives: dict[str, Running], transport: str, fault: Injected) -> None:
-    one = lives[transport]
-    start = began(one)
+@pytest.mark.parametrize(("transport", "fault"), RUNS, ids=lambda value: getattr(value, "kind", value))
+def test_the_daemon_recovers_from_a_fault_by_itself(runs: dict[str, Running], transport: str, fault: Injected) -> None:
+    one = runs[transport]
+    start = start_time(one)
     assert any(is_sound(report) for report in one.reports if report.window.end < start + fault.start)
     after = [report for report in one.reports if report.window.start >= start + fault.until]
     sound = next(report for report in after if is_sound(report))
     waited = sound.window.start - (start + fault.until)
-    print(f"{transport}, {fault.kind}: estimated again from the window that begins {waited:.1f} s after its end")  # noqa: T201 - for -rP
-    assert waited <= within(fault.within)
+    print(f"{transport}, {fault.kind}: estimated again in the window that starts {waited:.1f} s after its end")  # noqa: T201 - for -rP
+    assert waited <= fault.within
     value = sound.parameters["R_a"].value
     assert value is not None
     assert value == pytest.approx(TRUE, rel=0.005)
@@ -120,22 +112,21 @@ def test_it_recovers_without_a_restart(lives: dict[str, Running], transport: str
 
 @EITHER
 @pytest.mark.parametrize("transport", BOTH)
-def test_nothing_is_estimated_from_what_was_spoiled(lives: dict[str, Running], transport: str) -> None:
-    """Whatever happened, no report claimed a resistance that was wrong, and the machine grew no component."""
-    for report in lives[transport].reports:
-        found = report.parameters["R_a"]
-        if found.value is not None and found.sd is not None:
-            assert abs(found.value - TRUE) <= max(4.0 * found.sd, 0.005 * TRUE), report.window
+def test_no_fault_gives_a_wrong_estimate(runs: dict[str, Running], transport: str) -> None:
+    """No report has a wrong resistance, and no component is adopted."""
+    for report in runs[transport].reports:
+        parameter = report.parameters["R_a"]
+        if parameter.value is not None and parameter.sd is not None:
+            assert abs(parameter.value - TRUE) <= max(4.0 * parameter.sd, 0.005 * TRUE), report.window
         assert not report.components
-    last = lives[transport].reports[-1].counters
+    last = runs[transport].reports[-1].counters
     assert last is not None
     assert last.worker_restarts == 0
 
 
-@EITHER
-def test_lost_samples_are_counted_exactly_on_can(lives: dict[str, Running]) -> None:
-    """By the messages' alive counters, over an outage longer than their cycle too: two signals in each frame."""
-    one = lives["can"]
+def test_lost_samples_are_counted_exactly_on_can(runs: dict[str, Running]) -> None:
+    """The alive counters show losses, even in an outage longer than their cycle; a frame has two signals."""
+    one = runs["can"]
     counters = one.reports[-1].counters
     assert one.plant is not None
     one.plant.terminate()
@@ -147,10 +138,9 @@ def test_lost_samples_are_counted_exactly_on_can(lives: dict[str, Running]) -> N
     assert counters.lost == 2 * withheld
 
 
-@EITHER
-def test_the_drive_was_only_ever_read(lives: dict[str, Running]) -> None:
-    """By its own count of function codes, through all that has happened."""
-    one = lives["modbus-tcp"]
+def test_the_drive_received_only_read_requests(runs: dict[str, Running]) -> None:
+    """The drive counts requests by function code."""
+    one = runs["modbus-tcp"]
     assert one.plant is not None
     one.plant.terminate()
     one.plant.wait(timeout=PATIENCE)
@@ -159,10 +149,9 @@ def test_the_drive_was_only_ever_read(lives: dict[str, Running]) -> None:
     assert not summary["refused"]
 
 
-@EITHER
-def test_what_was_not_read_over_modbus_is_counted(lives: dict[str, Running]) -> None:
-    """At least what was asked for while the drive was gone; and its way back is told."""
-    counters = lives["modbus-tcp"].reports[-1].counters
+def test_unread_registers_count_as_lost_on_modbus(runs: dict[str, Running]) -> None:
+    """At least the readings due while the drive was gone are lost; the reconnection is counted."""
+    counters = runs["modbus-tcp"].reports[-1].counters
     assert counters is not None
     assert counters.reconnects >= 1
     assert counters.lost >= 0.6 * 4 * 3.0 / within(PERIOD)  # a slow computer reads on a coarser grid

@@ -1,4 +1,4 @@
-"""The main job over real parts: bus, worker, Zenoh and recording, with foreign processes looking on."""
+"""The main job over real parts: bus, worker, Zenoh and recording, observed by independent processes."""
 
 import csv
 import json
@@ -23,8 +23,8 @@ from tests.conftest import OwnMachine
 from tests.system.conftest import Running
 from tests.waiting import PATIENCE, within
 
-FOREIGN_CAN = """
-import can, cantools, json, sys
+CAN_LISTENER = """
+import can, cantools, sys, json, time
 database = cantools.database.load_file(sys.argv[1])
 bus = can.Bus(interface="udp_multicast", channel=sys.argv[2], port=int(sys.argv[3]), hop_limit=0, fd=False)
 seen = []
@@ -40,24 +40,22 @@ print(json.dumps([
 ]))
 """
 
-FOREIGN_ZENOH = """
+ZENOH_LISTENER = """
 import json, sys, time, zenoh
 config = zenoh.Config()
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
 config.insert_json5("scouting/multicast/enabled", "false")
-heard, alive = [], []
+received, alive = [], []
 with zenoh.open(config) as session:
-    session.declare_subscriber("otolith/**", lambda s: heard.append((str(s.key_expr), s.payload.to_string())))
-    end = time.monotonic() + 60.0
-    while sum(key.endswith("/report") for key, _ in heard) < 3 and time.monotonic() < end:
-        time.sleep(0.1)
+    session.declare_subscriber("otolith/**", lambda s: received.append((str(s.key_expr), s.payload.to_string())))
+    time.sleep(5)
     latest = [reply.ok.payload.to_string() for reply in session.get("otolith/demo/dc-motor/report") if reply.ok]
     alive = [str(reply.ok.key_expr) for reply in session.liveliness().get("otolith/*/*/alive") if reply.ok]
-print(json.dumps({"heard": heard, "latest": latest, "alive": alive}))
+print(json.dumps({"received": received, "latest": latest, "alive": alive}))
 """
 
 
-def foreign(program: str, *arguments: object) -> Any:
+def independent(program: str, *arguments: object) -> Any:
     command = [sys.executable, "-c", program, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=3 * PATIENCE, check=True)
     return json.loads(done.stdout)
@@ -75,23 +73,21 @@ def series(path: Path, entity: str) -> tuple[Array, Array]:
     return np.concatenate(times)[order], np.concatenate(values)[order]
 
 
-@pytest.mark.timed
-def test_foreign_processes_see_frames_and_reports_and_the_recording_is_whole(running: Running) -> None:
+def test_frames_reports_and_recording_are_complete(running: Running) -> None:
     running.wait_for(lambda reports: len(reports) >= 2)
     machine = running.machine
-    frames = foreign(FOREIGN_CAN, machine.dbc, machine.group, machine.port)
-    assert {"MotorElectrical", "MotorMechanical"} == {name for name, _, _ in frames}
-    electrical = [(stamp, values) for name, stamp, values in frames if name == "MotorElectrical"]
-    counters = [values["ElectricalAliveCounter"] for _, values in electrical]
+    frames = independent(CAN_LISTENER, machine.dbc, machine.group, machine.port)
+    assert {"MotorElectrical", "MotorMechanical"} == set(frames)
+    counters = [frame["ElectricalAliveCounter"] for frame in frames["MotorElectrical"]]
     assert set(np.diff(counters) % 256) == {1}
     seconds = electrical[-1][0] - electrical[0][0]
     assert seconds == pytest.approx(0.01 * (len(electrical) - 1), abs=within(0.1))
 
-    published = foreign(FOREIGN_ZENOH, machine.endpoint)
-    heard = [json.loads(text) for key, text in published["heard"] if key.endswith("/report")]
-    assert len(heard) >= 2
-    assert all(report["schema"] == "otolith.report/1" for report in heard)
-    assert {key for key, _ in published["heard"]} >= {"otolith/demo/dc-motor/parameter/R_a"}
+    published = independent(ZENOH_LISTENER, machine.endpoint)
+    documents = [json.loads(text) for key, text in published["received"] if key.endswith("/report")]
+    assert len(documents) >= 2
+    assert all(report["schema"] == "otolith.report/1" for report in documents)
+    assert {key for key, _ in published["received"]} >= {"otolith/demo/dc-motor/parameter/R_a"}
     assert json.loads(published["latest"][0])["machine"] == "dc-motor"
     assert published["alive"] == ["otolith/demo/dc-motor/alive"]
 
@@ -107,7 +103,7 @@ def test_foreign_processes_see_frames_and_reports_and_the_recording_is_whole(run
         half = 0.5 * (report.window.end - report.window.start) / report.window.records
         inside = (times >= report.window.start - half) & (times < report.window.end - half)
         assert inside.sum() == report.window.records
-        estimated = report.window.quality.verdict is Verdict.GOOD  # a bad window has no twin beside it
+        estimated = report.window.quality.verdict is Verdict.GOOD  # a bad window has no prediction
         whole = np.isfinite(values[inside][:, : 2 if estimated else 1]).all(axis=1)
         assert whole.mean() >= 1.0 - report.window.quality.missing
     known = [value for report in reports if (value := report.parameters["R_a"].value) is not None]
@@ -129,8 +125,7 @@ def check_accuracy(running: Running) -> None:
     assert max(report.cost.latency_s for report in running.reports[1:]) < within(1.0)
 
 
-@pytest.mark.timed
-def test_the_worker_can_be_killed_at_any_time(running: Running) -> None:
+def test_a_killed_worker_is_restarted(running: Running) -> None:
     running.wait_for(lambda reports: len(reports) >= 2)
     running.child("worker").kill()
     reports = running.wait_for(lambda reports: len(reports) >= 6 and is_estimated(reports[-1]))
@@ -145,8 +140,8 @@ def test_the_worker_can_be_killed_at_any_time(running: Running) -> None:
             assert after.window.start == pytest.approx(before.window.end, abs=0.005)  # half a period
 
 
-def test_a_killed_recorder_disturbs_nobody_and_overwrites_nothing(running: Running) -> None:
-    before = running.wait_for(lambda reports: len(reports) >= 2)[-1].counters
+def test_a_killed_recorder_changes_nothing_else(running: Running) -> None:
+    running.wait_for(lambda reports: len(reports) >= 2)
     running.child("recorder").kill()
     reports = running.wait_for(lambda reports: len(reports) >= 5)
     last = reports[-1].counters
@@ -161,9 +156,7 @@ def test_a_killed_recorder_disturbs_nobody_and_overwrites_nothing(running: Runni
 
 @pytest.mark.timed
 @pytest.mark.parametrize("moment", [0.02, 0.2, 0.5, 1.0, 1.5, 3.5])
-def test_ctrl_c_at_any_moment_ends_everything_within_three_seconds(
-    own_machine: OwnMachine, tmp_path: Path, moment: float
-) -> None:
+def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine, tmp_path: Path, moment: float) -> None:
     """The whole process group gets the signal, as from a terminal."""
     command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine), "--recording", str(tmp_path / "a.rrd")]
     shared = set(Path("/dev/shm").iterdir())  # noqa: S108 - looked at, not written to
@@ -173,9 +166,9 @@ def test_ctrl_c_at_any_moment_ends_everything_within_three_seconds(
     begun = time.monotonic()
     for process in [psutil.Process(daemon.pid), *children]:
         process.send_signal(signal.SIGINT)
-    _, errors = daemon.communicate(timeout=PATIENCE)
-    assert time.monotonic() - begun < within(3.0)
-    # In the first hundredths of a second the interpreter is still on its way to us, and says so in its own words.
+    _, errors = daemon.communicate(timeout=10)
+    assert time.monotonic() - begun < 3.0
+    # In the first hundredths of a second the interpreter has not reached our code, and may print its own traceback.
     assert "otolith" not in errors.partition("Traceback")[2]
     assert daemon.returncode in (130, -signal.SIGINT) or (daemon.returncode == 1 and "Traceback" in errors)
     _, left = psutil.wait_procs(children, timeout=within(1.0))
@@ -184,8 +177,8 @@ def test_ctrl_c_at_any_moment_ends_everything_within_three_seconds(
     assert set(Path("/dev/shm").iterdir()) <= shared  # noqa: S108
 
 
-def test_demo_names_what_was_injected(tmp_path: Path, own_machine: OwnMachine) -> None:
-    command = [sys.executable, "-m", "otolith", "demo", "--duration", "20", "--json"]
+def test_demo_estimates_what_was_injected(tmp_path: Path, own_machine: OwnMachine) -> None:
+    command = [sys.executable, "-m", "otolith", "demo", "--duration", "10", "--json"]
     command += ["--machine", str(own_machine.machine), "--scenario", str(own_machine.scenario)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=3 * PATIENCE, check=False)
     assert done.returncode == 0, done.stderr
@@ -196,7 +189,7 @@ def test_demo_names_what_was_injected(tmp_path: Path, own_machine: OwnMachine) -
     assert Path(verdict["recording"]).is_relative_to(tmp_path)
 
 
-def test_demo_says_when_the_estimate_is_wrong(own_machine: OwnMachine) -> None:
+def test_demo_is_exit_code_one_for_a_wrong_estimate(own_machine: OwnMachine) -> None:
     text = own_machine.machine.read_text(encoding="utf-8").replace('K_t = "0.038 N*m/A"', 'K_t = "0.045 N*m/A"')
     own_machine.machine.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "otolith", "demo", "--duration", "10", "--json"]

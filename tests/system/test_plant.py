@@ -1,4 +1,4 @@
-"""The plant as a user meets it: one per bus, ended cleanly, errors in one line."""
+"""``otolith plant``: one per bus, clean end, errors in one line."""
 
 import json
 import signal
@@ -23,7 +23,7 @@ def test_a_second_plant_on_the_same_bus_is_refused(own_machine: OwnMachine) -> N
     assert first.stderr is not None
     assert "frames of dc-motor.dbc" in first.stderr.readline()
     with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus:
-        assert bus.recv(PATIENCE) is not None  # it listens before it speaks
+        assert bus.recv(10.0) is not None  # the plant sends after it has listened for other nodes
     second = subprocess.run(
         [*PLANT, str(own_machine.scenario)], capture_output=True, text=True, timeout=PATIENCE, check=False
     )
@@ -34,14 +34,14 @@ def test_a_second_plant_on_the_same_bus_is_refused(own_machine: OwnMachine) -> N
     assert "another node already sends frame" in second.stderr
 
 
-def test_it_keeps_its_rate_and_ends_by_itself(own_machine: OwnMachine) -> None:
+def test_the_plant_keeps_its_rate_and_ends_after_duration(own_machine: OwnMachine) -> None:
     command = [*PLANT, str(own_machine.scenario), "--duration", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 0
     assert "200 frames in 1.0 s of simulated time, 0 stalls" in done.stderr
 
 
-def test_ctrl_c(own_machine: OwnMachine) -> None:
+def test_ctrl_c_ends_the_plant_with_code_130(own_machine: OwnMachine) -> None:
     process = subprocess.Popen([*PLANT, str(own_machine.scenario)], stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     process.stderr.readline()
@@ -70,23 +70,23 @@ start = "0 s"
 """
 
 
-def test_what_is_withheld_from_the_bus_is_counted_to_the_last_frame(own_machine: OwnMachine, tmp_path: Path) -> None:
-    """Alive counters go on, so that who listens can count as well; frames of strangers are nobody else's."""
+def test_every_withheld_frame_is_counted(own_machine: OwnMachine, tmp_path: Path) -> None:
+    """Alive counters advance during a fault, so a listener can count too; garbage frames are counted apart."""
     own_machine.scenario.write_text(own_machine.scenario.read_text(encoding="utf-8") + FAULTS, encoding="utf-8")
     command = [*PLANT, str(own_machine.scenario), "--duration", "2", "--summary", str(tmp_path / "summary.json")]
-    heard: list[can.Message] = []
+    received: list[can.Message] = []
     with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus:
         node = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         while (frame := bus.recv(0.2)) is not None or node.poll() is None:
-            heard += [frame] if frame is not None else []
-    assert node.wait(timeout=PATIENCE) == 0
+            received += [frame] if frame is not None else []
+    assert node.wait(timeout=5) == 0
     done = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     dropouts, gone, garbage = done["faults"]
-    assert len(heard) == done["frames"] + garbage["ticks"]
+    assert len(received) == done["frames"] + garbage["ticks"]
     assert done["ticks"] == 200
     assert done["frames"] + dropouts["withheld"] + gone["withheld"] == 2 * done["ticks"]
     assert gone["ticks"] == 30
-    counts = [frame.data[7] for frame in heard if frame.arbitration_id == 385]
+    counts = [frame.data[7] for frame in received if frame.arbitration_id == 385]
     skipped = sum((after - before) % 256 - 1 for before, after in pairwise(counts))
     assert skipped + counts[0] == (dropouts["withheld"] + gone["withheld"]) / 2
 
@@ -94,14 +94,14 @@ def test_what_is_withheld_from_the_bus_is_counted_to_the_last_frame(own_machine:
 @pytest.mark.parametrize(
     "command", [["plant", "none.toml"], ["run", "none.toml"], ["check", "none.toml"], ["view", "none.rrd"]]
 )
-def test_a_missing_file_is_one_line(command: list[str]) -> None:
+def test_a_missing_file_gives_a_one_line_error(command: list[str]) -> None:
     done = subprocess.run([sys.executable, "-m", "otolith", *command], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert command[1] in done.stderr
 
 
-def test_a_port_in_use_is_one_line(own_machine: OwnMachine) -> None:
+def test_a_port_in_use_gives_a_one_line_error(own_machine: OwnMachine) -> None:
     import socket  # noqa: PLC0415 - only to take the port away
 
     host, port = own_machine.endpoint.removeprefix("tcp/").split(":")
@@ -113,8 +113,8 @@ def test_a_port_in_use_is_one_line(own_machine: OwnMachine) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_the_lift_speaks_in_the_units_of_its_database(own_machine: OwnMachine, tmp_path: Path) -> None:
-    """The plant computes in metres; its DBC says millimetres."""
+def test_the_lift_sends_in_the_units_of_its_database(own_machine: OwnMachine, tmp_path: Path) -> None:
+    """The plant computes in metres; its DBC has millimetres."""
     text = (EXAMPLES / "scenarios" / "hydraulic-fluid.toml").read_text(encoding="utf-8")
     bus = (
         f'[bus]\ninterface = "udp_multicast"\nchannel = "{own_machine.group}"\nport = {own_machine.port}\n\n[[faults]]'
@@ -125,14 +125,14 @@ def test_the_lift_speaks_in_the_units_of_its_database(own_machine: OwnMachine, t
     (tmp_path / "lift.toml").write_text(text, encoding="utf-8")
     node = subprocess.Popen([*PLANT, str(tmp_path / "lift.toml")], stderr=subprocess.DEVNULL)
     database = load_dbc(EXAMPLES / "hydraulic-actuator.dbc")
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus_:
-        while len(found) < 6:
-            frame = bus_.recv(PATIENCE)
+        while len(values) < 6:
+            frame = bus_.recv(10.0)
             assert frame is not None
-            found |= database.decode_message(frame.arbitration_id, frame.data)  # type: ignore[arg-type]
+            values |= database.decode_message(frame.arbitration_id, frame.data)  # type: ignore[arg-type]
     node.terminate()
-    assert node.wait(timeout=PATIENCE) == 0
-    assert found["ValveArea"] == pytest.approx(63.28, abs=5.0)  # mm², in balance at first
-    assert found["LoadForce"] == pytest.approx(9806.65)
-    assert found["SystemPressure"] == pytest.approx(49945.0, abs=50.0)
+    assert node.wait(timeout=5) == 0
+    assert values["ValveArea"] == pytest.approx(63.28, abs=5.0)  # mm², in balance at first
+    assert values["LoadForce"] == pytest.approx(9806.65)
+    assert values["SystemPressure"] == pytest.approx(49945.0, abs=50.0)

@@ -1,4 +1,4 @@
-"""The service towards systemd, its recorder and its disk."""
+"""The service with systemd, its recorder and its disk."""
 
 import os
 import re
@@ -19,29 +19,30 @@ from otolith.discovery.adopted import AdoptedComponent, Approval
 from otolith.estimation.problem import Component
 from otolith.machine import find_twin, load_machine
 from otolith.publishing import recorder
+from otolith.runtime.service import STALL_TIMEOUT, Service
 from otolith.runtime.state_store import StateStore
-from otolith.runtime.worker import COMPILING
+from otolith.runtime.worker import COMPILE_TIMEOUT
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
 from tests.waiting import PATIENCE, within
 
-# Seen only while the shaft all but stands, so that nothing makes it fade.
-DRY = Component("shaft", "Stribeck", "omega", -0.004, inner=0.01, low=0.005, high=0.02)
+# Friction near standstill: a turning shaft gives no evidence against it, so it is not removed during the test.
+FRICTION = Component("shaft", "Stribeck", "omega", -0.004, inner=0.01, low=0.005, high=0.02)
 
 
 @pytest.fixture
 def running_with_component(own_machine: OwnMachine, tmp_path: Path) -> Iterator[tuple[Running, StateStore]]:
-    """A daemon that knows of friction at rest."""
-    plan = load_machine(own_machine.machine, with_driver=False)
-    keeper = StateStore(plan.file.machine.site, plan.file.machine.name, plan.twin)
-    keeper.keep((ComponentRecord(AdoptedComponent(DRY, 5.0), (-0.004, 0.01), (1e-3, 1e-3)),))
+    """A daemon that starts with a saved component."""
+    machine = load_machine(own_machine.machine, with_driver=False)
+    store = StateStore(machine.file.machine.site, machine.file.machine.name, machine.twin)
+    store.save_components((ComponentRecord(AdoptedComponent(FRICTION, 5.0), (-0.004, 0.01), (1e-3, 1e-3)),))
     running = Running(own_machine, tmp_path)
-    yield running, keeper
+    yield running, store
     running.close()
 
 
-def test_it_tells_systemd_when_it_is_ready_and_of_every_progress(own_machine: OwnMachine, tmp_path: Path) -> None:
-    """A datagram socket stands in for systemd's; in a booted one the unit is tried by hand."""
+def test_systemd_gets_readiness_progress_and_stop(own_machine: OwnMachine, tmp_path: Path) -> None:
+    """A datagram socket stands in for systemd; tests/vm runs the unit in a booted system."""
     plant = subprocess.Popen(
         [sys.executable, "-m", "otolith", "plant", str(own_machine.scenario)], stderr=subprocess.DEVNULL
     )
@@ -51,27 +52,25 @@ def test_it_tells_systemd_when_it_is_ready_and_of_every_progress(own_machine: Ow
         environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "4000000"}
         command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
         daemon = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
-        said: list[str] = []
-        while sum("WATCHDOG=1" in text for text in said) < 4 or not any(
-            re.search(r"window \d+ good", text) for text in said
+        messages: list[str] = []
+        while sum("WATCHDOG=1" in text for text in messages) < 4 or not any(
+            "window 1 good" in text for text in messages
         ):
-            said.append(manager.recv(4096).decode())
+            messages.append(manager.recv(4096).decode())
         daemon.send_signal(signal.SIGTERM)
-        assert daemon.wait(timeout=PATIENCE) == 0
-        while not any("STOPPING=1" in text for text in said):
-            said.append(manager.recv(4096).decode())
+        assert daemon.wait(timeout=10) == 0
+        while not any("STOPPING=1" in text for text in messages):
+            messages.append(manager.recv(4096).decode())
     plant.terminate()
-    plant.wait(timeout=PATIENCE)
-    assert said[0].startswith("READY=1\nSTATUS=listening: CAN bus udp_multicast")
-    assert f"MAINPID={daemon.pid}" in said[0]
+    plant.wait(timeout=10)
+    assert messages[0].startswith("READY=1\nSTATUS=listening: CAN bus udp_multicast")
+    assert f"MAINPID={daemon.pid}" in messages[0]
 
 
-def test_a_stopped_worker_starves_the_watchdog(
+def test_the_watchdog_is_fed_by_finished_windows_only(
     own_machine: OwnMachine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Fed by finished windows only: the rule itself, without waiting for half a minute."""
-    from otolith.runtime import service as module  # noqa: PLC0415
-
+    """The rule itself, without waiting for half a minute."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.setblocking(False)
@@ -79,7 +78,7 @@ def test_a_stopped_worker_starves_the_watchdog(
         monkeypatch.setenv("WATCHDOG_USEC", "4000000")
         text = own_machine.machine.read_text(encoding="utf-8") + "\n[recording]\nenabled = false\n"
         own_machine.machine.write_text(text, encoding="utf-8")
-        watched = module.Service(load_machine(own_machine.machine))
+        service = Service(load_machine(own_machine.machine))
 
         def fed() -> bool:
             try:
@@ -87,33 +86,32 @@ def test_a_stopped_worker_starves_the_watchdog(
             except BlockingIOError:
                 return False
 
-        watched._progress = 1000.0
-        watched._watch(1002.0)
+        service._progress_at = 1000.0
+        service._feed_watchdog(1002.0)
         assert fed()
-        patience = module.STALL + 3 * 2.0 + COMPILING
-        watched._watch(1000.0 + patience - 0.1)
+        patience = STALL_TIMEOUT + 3 * 2.0 + COMPILE_TIMEOUT
+        service._feed_watchdog(1000.0 + patience - 0.1)
         assert fed()
-        watched._watch(1000.0 + patience + 0.1)
+        service._feed_watchdog(1000.0 + patience + 0.1)
         assert not fed()
-        watched._supervisor.missed += 1
-        watched._watch(1000.0 + patience + 3.0)
+        service._supervisor.missed += 1
+        service._feed_watchdog(1000.0 + patience + 3.0)
         assert not fed()
-        watched._supervisor.finished += 1
-        watched._watch(1000.0 + patience + 6.0)
+        service._supervisor.finished += 1
+        service._feed_watchdog(1000.0 + patience + 6.0)
         assert fed()
-        watched._watch(1000.0 + patience + 6.0 + module.STALL + 3 * 2.0 + 0.1)  # nothing is compiled any more
+        service._feed_watchdog(1000.0 + patience + 6.0 + STALL_TIMEOUT + 3 * 2.0 + 0.1)  # nothing is compiled any more
         assert not fed()
-        watched._notifier.close()
+        service._notifier.close()
 
 
-@pytest.mark.timed
-def test_windows_without_a_recorder_are_counted(running: Running) -> None:
-    before = running.wait_for(lambda reports: len(reports) >= 2)[-1].counters
+def test_windows_without_a_recorder_are_counted_as_dropped(running: Running) -> None:
+    running.wait_for(lambda reports: len(reports) >= 2)
     os.kill(running.child("recorder").pid, signal.SIGKILL)
     shutil.rmtree(running.folder / "state", ignore_errors=True)
     (running.folder / "state").write_text("no folder any more", encoding="utf-8")
     reports = running.wait_for(
-        lambda found: bool(found and found[-1].counters and found[-1].counters.recordings_dropped >= 2)
+        lambda reports: bool(reports and reports[-1].counters and reports[-1].counters.recordings_dropped >= 2)
     )
     last = reports[-1].counters
     assert before is not None
@@ -124,32 +122,29 @@ def test_windows_without_a_recorder_are_counted(running: Running) -> None:
     assert seconds < within(3.0)
 
 
-@pytest.mark.timed
-def test_components_are_kept_and_the_specialist_is_heard_while_it_runs(
+def test_components_are_saved_and_decisions_apply_at_run_time(
     running_with_component: tuple[Running, StateStore],
 ) -> None:
-    running, keeper = running_with_component
+    running, store = running_with_component
     first = running.wait_for(lambda reports: len(reports) >= 1)
-    assert [entry.id for entry in first[0].components] == [DRY.key]
-    assert f"begun with what was found earlier: {DRY.key}; 'otolith components forget'" in running.log.read_text()
-    keeper.known.unlink()
-    keeper.decide(OperatorDecisions(approved=frozenset({DRY.key})))
+    assert [component.id for component in first[0].components] == [FRICTION.key]
+    assert f"started with saved components: {FRICTION.key}; 'otolith components forget'" in running.log.read_text()
+    store.components_path.unlink()
+    store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
     running.wait_for(lambda reports: reports[-1].components[0].approval is Approval.APPROVED)
     code, seconds = running.stop()
-    assert (code, seconds < within(3.0)) == (0, True)
-    assert [entry.adopted.component.key for entry in keeper.components()] == [DRY.key]  # known better now
+    assert (code, seconds < 3.0) == (0, True)
+    assert [record.adopted.component.key for record in store.components()] == [FRICTION.key]  # saved again at the end
 
 
 class Pipe:
-    """A connection on which reports would come for ever."""
+    """A connection on which nothing must be received."""
 
     def recv(self) -> object:
         raise AssertionError
 
 
-def test_a_full_disk_ends_the_recorder_before_it_ends_in_silence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_recorder_ends_before_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", ["total", "used", "free"])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(1 << 40, 1 << 40, 1 << 20))
     twin = find_twin("dc_motor")
@@ -157,7 +152,7 @@ def test_a_full_disk_ends_the_recorder_before_it_ends_in_silence(
     assert not (tmp_path / "full.rrd").exists()
 
 
-def test_nohup_is_respected(own_machine: OwnMachine) -> None:
+def test_sighup_is_ignored_under_nohup(own_machine: OwnMachine) -> None:
     command = ["/usr/bin/nohup", sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
     daemon = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     assert daemon.stderr is not None

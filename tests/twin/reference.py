@@ -1,6 +1,6 @@
-"""An independent way to the same trajectories: the page's text evaluated by Python, integrated by SciPy.
+"""An independent reference: the expressions of a twin file evaluated by Python and integrated by SciPy.
 
-Nothing of the generator, of SymPy or of numba is used, so an error there cannot hide here.
+It uses neither the generator nor SymPy nor numba, so it shares none of their errors.
 """
 
 import math
@@ -27,11 +27,11 @@ class Reference:
     def __init__(self, definition: Definition, parameters: Array) -> None:
         self._definition = definition
         self._scale = {name: to_base(unit)[0] for name, unit in definition.units().items()}
-        self._known = {entry.name: entry.value * self._scale[entry.name] for entry in definition.constants}
-        names = [entry.name for entry in definition.parameters]
+        self._known = {c.name: c.value * self._scale[c.name] for c in definition.constants}
+        names = [parameter.name for parameter in definition.parameters]
         self._known |= {n: float(v) * self._scale[n] for n, v in zip(names, parameters, strict=True)}
-        self._states = [entry.name for entry in definition.states]
-        self._inputs = [entry.name for entry in definition.inputs]
+        self._states = [state.name for state in definition.states]
+        self._inputs = [driven.name for driven in definition.inputs]
         texts = [text for _, text, _ in definition.definitions] + list(dict(definition.equations).values())
         self._compiled = {text: compile(text.replace("^", "**"), "page", "eval") for text in texts}
 
@@ -59,10 +59,8 @@ class Reference:
         values, right = self._values(state, driven), dict(self._definition.equations)
         return np.array(
             [
-                values[entry.name] / self._scale[entry.name]
-                if entry.name in self._states
-                else self._evaluate(right[entry.name], values) / self._scale[entry.name]
-                for entry in self._definition.outputs
+                (values[name] if name in self._states else self._evaluate(right[name], values)) / self._scale[name]
+                for name in (output.name for output in self._definition.outputs)
             ]
         )
 
@@ -71,7 +69,7 @@ class Reference:
 
         ``drifts`` has parameters that move, in their unit per second, to the given value at the last record.
         """
-        state, found, nominal = np.asarray(initial, dtype=float), [], dict(self._known)
+        state, outputs, nominal = np.asarray(initial, dtype=float), [], dict(self._known)
 
         def move(time: float) -> None:
             for name, rate in (drifts or {}).items():
@@ -79,7 +77,7 @@ class Reference:
 
         for record in range(len(inputs)):
             move(record * period)
-            found.append(self.outputs(state, inputs[record]))
+            outputs.append(self.outputs(state, inputs[record]))
             if record + 1 < len(inputs):
                 drive = self._drive(inputs[record], inputs[record + 1], period)
 
@@ -90,8 +88,8 @@ class Reference:
                 done = solve_ivp(rates, (0.0, period), state, method="DOP853", rtol=1e-12, atol=1e-14)
                 state = done.y[:, -1]
         self._known = nominal
-        return np.array(found)
+        return np.array(outputs)
 
     def _drive(self, now: Array, then: Array, period: float) -> Callable[[float], Array]:
-        held = np.array([entry.hold == "zoh" for entry in self._definition.inputs])
+        held = np.array([driven.hold == "zoh" for driven in self._definition.inputs])
         return lambda t: np.where(held, now, now + (then - now) * t / period)

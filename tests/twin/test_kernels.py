@@ -1,4 +1,4 @@
-"""Compiled kernels of every library twin: against an independent integrator, their order, their derivatives."""
+"""Compiled kernels of every library twin: predictions, order, derivatives and Kalman gains against references."""
 
 from dataclasses import replace
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Array
-from otolith.machine import find_twin, names
+from otolith.machine import find_twin
+from otolith.machine import library_twins as library
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import Excitation, NoiseModel, kernel_of
 from tests.twin.reference import Reference
@@ -17,27 +18,27 @@ RECORDS = 60
 
 
 def nominal(definition: Definition) -> Array:
-    return np.array([entry.nominal for entry in definition.parameters])
+    return np.array([parameter.nominal for parameter in definition.parameters])
 
 
 def initial(definition: Definition) -> Array:
-    return np.array([entry.initial for entry in definition.states])
+    return np.array([state.initial for state in definition.states])
 
 
 def excitation(definition: Definition, records: int = RECORDS, seed: int = 5) -> Excitation:
-    """Random levels within the inputs' ranges, each held for ten records or run through."""
+    """Random levels within the inputs' ranges, each held for ten records or interpolated."""
     random = np.random.default_rng(seed)
     columns = [np.repeat(random.uniform(e.low, e.high, records // 10 + 1), 10)[:records] for e in definition.inputs]
     return Excitation(np.column_stack(columns), PERIODS[definition.name])
 
 
-@pytest.fixture(params=names())
+@pytest.fixture(params=library())
 def twin(request: pytest.FixtureRequest) -> Definition:
     return find_twin(request.param)
 
 
 def resolved(twin: Definition, drive: Excitation) -> tuple[Excitation, Array, Array]:
-    """With substeps for a ten-millionth of each signal's range; the reference, and that range."""
+    """The excitation with substeps for errors of 1e-7 of a signal's range, the reference prediction, the ranges."""
     expected = Reference(twin, nominal(twin)).simulate(initial(twin), drive.inputs, drive.sample_period)
     extent = np.ptp(expected, axis=0)
     assert (extent > 0.0).all(), "the excitation does not move every signal"
@@ -45,13 +46,13 @@ def resolved(twin: Definition, drive: Excitation) -> tuple[Excitation, Array, Ar
     return replace(drive, substeps=substeps), expected, extent
 
 
-def test_it_agrees_with_an_independent_integrator(twin: Definition) -> None:
+def test_prediction_agrees_with_independent_integrator(twin: Definition) -> None:
     drive, expected, extent = resolved(twin, excitation(twin))
-    found = kernel_of(twin).simulate(nominal(twin)[None], initial(twin)[None], drive)[0]
-    assert (np.abs(found - expected).max(axis=0) / extent).max() < 1e-6
+    predicted = kernel_of(twin).simulate(nominal(twin)[None], initial(twin)[None], drive)[0]
+    assert (np.abs(predicted - expected).max(axis=0) / extent).max() < 1e-6
 
 
-def test_sensitivities_are_the_derivatives_of_the_reference(twin: Definition) -> None:
+def test_sensitivities_are_derivatives_of_the_reference(twin: Definition) -> None:
     drive, expected, _ = resolved(twin, excitation(twin, records=30))
     drive = replace(drive, substeps=8 * drive.substeps)  # a derivative is less smooth than what it is the derivative of
     predicted, slopes, _, _ = kernel_of(twin).sensitivities(nominal(twin), initial(twin), drive)
@@ -74,18 +75,21 @@ def test_sensitivities_are_the_derivatives_of_the_reference(twin: Definition) ->
 
 
 @pytest.mark.parametrize("name", ["dc_motor", "hydraulic_actuator", "pmsm"])
-def test_drifts_are_the_derivatives_by_a_parameter_that_moves(name: str) -> None:
-    """Against the reference with a parameter that runs straight through the window to its value at the last record."""
+def test_drifts_are_derivatives_by_a_moving_parameter(name: str) -> None:
+    """Against the reference with a parameter that moves linearly to its value at the last record."""
     twin = find_twin(name)
     drive, _, _ = resolved(twin, excitation(twin, records=20))
     drive = replace(drive, substeps=8 * drive.substeps)
     slopes = kernel_of(twin).sensitivities(nominal(twin), initial(twin), drive, drifts=True).slopes
     base = len(twin.parameters) + len(twin.states)
-    for index, entry in enumerate(twin.parameters):
-        reach = min(entry.high - entry.low, max(abs(entry.nominal), 0.01 * (entry.high - entry.low)))
+    for index, parameter in enumerate(twin.parameters):
+        width = parameter.high - parameter.low
+        reach = min(width, max(abs(parameter.nominal), 0.01 * width))
         rate = 1e-4 * reach / (20 * drive.sample_period)
         ahead, behind = (
-            Reference(twin, nominal(twin)).simulate(initial(twin), drive.inputs, drive.sample_period, {entry.name: r})
+            Reference(twin, nominal(twin)).simulate(
+                initial(twin), drive.inputs, drive.sample_period, {parameter.name: r}
+            )
             for r in (rate, -rate)
         )
         change = (ahead - behind) / (2.0 * rate)
@@ -94,7 +98,7 @@ def test_drifts_are_the_derivatives_by_a_parameter_that_moves(name: str) -> None
 
 
 @pytest.mark.parametrize("name", ["dc_motor", "two_mass", "pmsm"])
-def test_order_four(name: str) -> None:
+def test_integrator_has_order_four(name: str) -> None:
     """Halving the step divides the error by sixteen."""
     twin = find_twin(name)
     drive = excitation(twin, records=20)
@@ -107,22 +111,22 @@ def test_order_four(name: str) -> None:
     assert order == pytest.approx(4.0, abs=0.4)
 
 
-def test_euler_is_the_papers_equations_to_rounding() -> None:
+def test_euler_is_the_papers_equations() -> None:
     twin = find_twin("dc_motor")
     drive = excitation(twin)
     held = replace(drive, inputs=np.repeat(drive.inputs[::10], 10, axis=0)[: len(drive.inputs)])
     held.inputs[:, 1] = 0.05  # the paper holds the load torque too
-    found = kernel_of(twin).euler(nominal(twin)[None], initial(twin)[None], held, 1e-4)[0]
+    predicted = kernel_of(twin).euler(nominal(twin)[None], initial(twin)[None], held, 1e-4)[0]
     R_a, L_a, J, K_e, K_t, D = nominal(twin)  # noqa: N806 - as in the source equation
     i = w = 0.0
     for record in range(RECORDS):
-        assert found[record] == pytest.approx([i, w], rel=1e-11, abs=1e-13)
+        assert predicted[record] == pytest.approx([i, w], rel=1e-11, abs=1e-13)
         for _ in range(100):
             i += 1e-4 * (held.inputs[record, 0] - R_a * i - K_e * w) / L_a
             w += 1e-4 * (i * K_t - 0.05 - D * w) / J
 
 
-def test_a_swarm_is_its_particles_one_by_one(twin: Definition) -> None:
+def test_swarm_equals_its_particles_one_by_one(twin: Definition) -> None:
     random = np.random.default_rng(1)
     swarm = nominal(twin) * random.uniform(0.95, 1.05, (5, len(twin.parameters)))
     starts = np.tile(initial(twin), (5, 1))
@@ -132,24 +136,25 @@ def test_a_swarm_is_its_particles_one_by_one(twin: Definition) -> None:
     assert np.array_equal(together, np.array(alone), equal_nan=True)
 
 
-def test_the_innovation_form_is_a_kalman_filters_prediction() -> None:
-    """Record by record: predict, compare, correct, go on; a record without a measurement is only predicted."""
+def test_innovation_form_is_a_kalman_prediction() -> None:
+    """Predict, compare and correct record by record; a missing measurement corrects nothing."""
     twin = find_twin("dc_motor")
     kernel, drive = kernel_of(twin), excitation(twin)
     random = np.random.default_rng(2)
     measured = random.normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
     gain = random.uniform(-0.3, 0.3, (RECORDS, 2, 2))
-    found = kernel.simulate(nominal(twin)[None], initial(twin)[None], replace(drive, measured=measured, gain=gain))[0]
+    corrected = replace(drive, measured=measured, gain=gain)
+    predicted = kernel.simulate(nominal(twin)[None], initial(twin)[None], corrected)[0]
     state = initial(twin)
     for record in range(RECORDS - 1):
-        assert found[record] == pytest.approx(state, rel=1e-12)
+        assert predicted[record] == pytest.approx(state, rel=1e-12)
         state = state + gain[record] @ np.nan_to_num(measured[record] - state)
         piece = replace(drive, inputs=drive.inputs[record : record + 2])
         state = kernel.simulate(nominal(twin)[None], state[None], piece)[0, 1]
 
 
-def test_the_innovation_forms_sensitivities_are_its_derivatives() -> None:
+def test_innovation_form_sensitivities_are_derivatives() -> None:
     twin = find_twin("dc_motor")
     kernel, drive = kernel_of(twin), excitation(twin)
     random = np.random.default_rng(2)
@@ -166,15 +171,15 @@ def test_the_innovation_forms_sensitivities_are_its_derivatives() -> None:
         assert slopes[:, :, column] == pytest.approx(change, rel=1e-5, abs=1e-6 * np.abs(change).max())
 
 
-def test_the_gain_is_that_of_an_extended_kalman_filter() -> None:
-    """Against the textbook's matrices, record by record, with a missing measurement and a noisy input on the way."""
+def test_gain_is_that_of_an_extended_kalman_filter() -> None:
+    """Against the textbook's matrices, record by record, with a missing measurement and a noisy input."""
     twin = find_twin("dc_motor")
     kernel, drive = kernel_of(twin), excitation(twin)
     random = np.random.default_rng(4)
     measured = kernel.simulate(nominal(twin)[None], initial(twin)[None], drive)[0] + random.normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
     noise = NoiseModel(np.array([0.5, 1.0]), np.array([0.0, 0.01]), np.array([0.2, 3.0]))
-    found = kernel.correction(nominal(twin), initial(twin), replace(drive, measured=measured), noise)
+    model = kernel.innovation_model(nominal(twin), initial(twin), replace(drive, measured=measured), noise)
     state, covariance, log_determinant = initial(twin), np.zeros((2, 2)), 0.0
     for record in range(RECORDS):
         seen = np.flatnonzero(np.isfinite(measured[record]))
@@ -182,8 +187,8 @@ def test_the_gain_is_that_of_an_extended_kalman_filter() -> None:
         innovation = output @ covariance @ output.T + np.diag(noise.outputs**2)[np.ix_(seen, seen)]
         gain = covariance @ output.T @ np.linalg.inv(innovation)
         log_determinant += np.linalg.slogdet(innovation)[1]
-        assert found.gain[record][:, seen] == pytest.approx(gain, rel=1e-6, abs=1e-12)
-        whitening = found.whitening[record][np.ix_(seen, seen)]
+        assert model.gain[record][:, seen] == pytest.approx(gain, rel=1e-6, abs=1e-12)
+        whitening = model.whitening[record][np.ix_(seen, seen)]
         assert whitening @ innovation @ whitening.T == pytest.approx(np.eye(len(seen)), abs=1e-9)
         if record + 1 == RECORDS:
             break
@@ -196,10 +201,10 @@ def test_the_gain_is_that_of_an_extended_kalman_filter() -> None:
         transition = step.last_slopes[:, 6:]
         strays = np.diag(noise.states**2 * drive.sample_period) + np.outer(driven, driven)
         state, covariance = step.last, transition @ covariance @ transition.T + strays
-    assert found.log_determinant == pytest.approx(log_determinant, rel=1e-6)
+    assert model.log_determinant == pytest.approx(log_determinant, rel=1e-6)
 
 
-def test_fewer_substeps_would_be_too_few() -> None:
+def test_substeps_are_the_fewest_that_suffice() -> None:
     twin = find_twin("pmsm")
     drive = excitation(twin)
     tolerance = np.array([1e-6, 1e-6, 1e-6])

@@ -1,7 +1,7 @@
-"""The twin language: wrong pages get one precise sentence each, hostile ones are never evaluated.
+"""The twin language: each wrong file gets one precise error, and hostile expressions are never evaluated.
 
 A case is a folder with ``twin.toml`` and ``error.txt``, in which ``{file}`` stands for the file.
-``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the sentences anew: read the difference.
+``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the errors anew: read the difference.
 """
 
 import ast
@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith.machine import LIBRARY, find_twin, load_twin
-from otolith.machine import names as library
-from otolith.twin.dimensions import describe, dimension_of, measure
-from otolith.twin.expressions import FUNCTIONS, ExpressionError, names, parse
+from otolith.machine import library_twins as library
+from otolith.twin.dimensions import describe, dimension_of, infer_dimension
+from otolith.twin.expressions import FUNCTIONS, ExpressionError, names_in, parse
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twin.kernel_sources import kernel_source
 from otolith.twin.language import read_twin
@@ -32,28 +32,28 @@ BASE = (LIBRARY / "dc_motor.toml").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_wrong_page_gets_its_sentence(case: Path) -> None:
+def test_wrong_file_gets_its_error(case: Path) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load_twin(case / "twin.toml")
-    said = str(caught.value).replace(str(case / "twin.toml"), "{file}")
+    message = str(caught.value).replace(str(case / "twin.toml"), "{file}")
     if os.environ.get("OTOLITH_UPDATE_GOLDEN"):
-        (case / "error.txt").write_text(said + "\n", encoding="utf-8")
-    assert said + "\n" == (case / "error.txt").read_text(encoding="utf-8")
+        (case / "error.txt").write_text(message + "\n", encoding="utf-8")
+    assert message + "\n" == (case / "error.txt").read_text(encoding="utf-8")
 
 
-def test_there_are_at_least_thirty_wrong_pages() -> None:
+def test_there_are_at_least_thirty_wrong_files() -> None:
     assert len(CASES) >= 30
 
 
 @pytest.mark.parametrize("name", library())
-def test_library_twins_say_all_that_a_reader_needs(name: str) -> None:
+def test_library_twins_are_fully_described(name: str) -> None:
     twin = find_twin(name)
     assert twin.name == name
     assert twin.source
     assert twin.validity
     assert twin.sites
     groups = (twin.states, twin.inputs, twin.outputs, twin.parameters, twin.sites)
-    assert all(entry.meaning for group in groups for entry in group)
+    assert all(row.meaning for group in groups for row in group)
     assert all(meaning for _, _, meaning in twin.definitions)
 
 
@@ -63,8 +63,8 @@ ALPHABET = st.sampled_from([*"iVRxJ_019.+-*/^()[]{}<>=,'\"\\:;@ \t", *FUNCTIONS,
 
 @settings(max_examples=500)
 @given(st.lists(ALPHABET, max_size=60).map("".join) | st.text(max_size=80))
-def test_any_expression_is_refused_or_is_one_of_the_language(text: str) -> None:
-    """And if it is one, it is made of the allowed nodes only and can be turned into algebra."""
+def test_any_expression_is_refused_or_parsed(text: str) -> None:
+    """A parsed expression has allowed nodes only and can be turned into algebra."""
     try:
         tree = parse(text)
     except ExpressionError as error:
@@ -74,25 +74,25 @@ def test_any_expression_is_refused_or_is_one_of_the_language(text: str) -> None:
     allowed = (ast.Constant, ast.Name, ast.UnaryOp, ast.BinOp, ast.Call, ast.Compare, ast.operator, ast.unaryop,
                ast.cmpop, ast.expr_context)  # fmt: skip
     assert all(isinstance(node, allowed) for node in ast.walk(tree))
-    known = dict.fromkeys(names(tree), dimension_of("1"))
-    measure(tree, known)
+    known = dict.fromkeys(names_in(tree), dimension_of("1"))
+    infer_dimension(tree, known)
     to_sympy(tree, {name: to_sympy(parse("1 + 1"), {}) for name in known})
 
 
 @settings(max_examples=200)
 @given(st.lists(st.sampled_from(BASE.split()), max_size=80).map(" ".join) | st.text(max_size=200))
-def test_any_page_is_read_or_refused(text: str) -> None:
+def test_any_file_is_read_or_refused(text: str) -> None:
     for page in (text, BASE + "\n" + text, BASE.replace("(K_t*i - T_load - D*omega) / J", text.replace('"', "'"))):
         try:
             read_twin(SourceFile(Path("any.toml"), page))
         except ConfigurationError as error:
-            assert str(error).startswith("any.toml")  # noqa: PT017 - either outcome is right, another error is not
+            assert str(error).startswith("any.toml")  # noqa: PT017 - both outcomes are right, another error is not
 
 
 @pytest.mark.parametrize(
     "case", [case for case in CASES if case.name.startswith("hostile")], ids=lambda case: case.name
 )
-def test_nothing_is_ever_evaluated(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_expression_is_never_evaluated(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*_: object, **__: object) -> None:
         raise AssertionError
 
@@ -118,7 +118,7 @@ def test_nothing_is_ever_evaluated(case: Path, monkeypatch: pytest.MonkeyPatch) 
         ("x + 1e99", 5),
     ],
 )
-def test_the_position_is_that_of_the_fault(text: str, column: int) -> None:
+def test_error_names_the_column_of_the_fault(text: str, column: int) -> None:
     with pytest.raises(ExpressionError) as caught:
         parse(text)
     assert caught.value.column == column
@@ -142,21 +142,20 @@ def test_the_position_is_that_of_the_fault(text: str, column: int) -> None:
         ("i^1.1/i^0.4/i^0.7*R", "ohm"),
     ],
 )
-def test_dimensions(text: str, unit: str | None) -> None:
+def test_expression_has_its_dimension(text: str, unit: str | None) -> None:
     known = {"R": dimension_of("ohm"), "i": dimension_of("A"), "L": dimension_of("H")}
-    found = measure(parse(text), known)
-    assert found == (dimension_of("W") ** 0.5 if unit is None else dimension_of(unit))
+    assert infer_dimension(parse(text), known) == (dimension_of("W") ** 0.5 if unit is None else dimension_of(unit))
 
 
-def test_dimensions_are_told_in_units_people_know() -> None:
+def test_dimensions_are_described_in_common_units() -> None:
     assert describe(dimension_of("kg*m^2/(s^3*A)")) == "V"
     assert describe(dimension_of("kg*m^2/s^2")) == "N*m"
     assert describe(dimension_of("mol*m^5/s^7")) == "m^5*mol/s^7"
     assert describe(dimension_of("1")) == "a plain number"
 
 
-def test_a_page_in_other_units_is_the_same_machine() -> None:
-    """Millihenry, rpm and g·cm² in the page: the equations still hold, as every symbol enters with its factor."""
+def test_other_units_give_the_same_machine() -> None:
+    """Millihenry, rpm and kg·cm²: the equations still hold, because each symbol enters with the factor of its unit."""
     other = BASE
     for old, new in (
         ('unit = "H", nominal = 0.673, bounds = [0.2, 2]', 'unit = "mH", nominal = 673, bounds = [200, 2000]'),
@@ -170,12 +169,12 @@ def test_a_page_in_other_units_is_the_same_machine() -> None:
         other = other.replace(old, new)
     twins = [read_twin(SourceFile(Path("a.toml"), BASE)), read_twin(SourceFile(Path("b.toml"), other))]
     drive = Excitation(np.column_stack([np.full(100, 12.0), np.full(100, 0.02)]), 0.01)
-    found = []
+    predicted = []
     for twin in twins:
-        parameters = np.array([[entry.nominal for entry in twin.parameters]])
-        found.append(kernel_of(twin).simulate(parameters, np.zeros((1, 2)), drive)[0])
-    assert found[1][:, 0] == pytest.approx(found[0][:, 0], rel=1e-9)
-    assert found[1][:, 1] == pytest.approx(found[0][:, 1] * 60 / (2 * np.pi), rel=1e-9)
+        parameters = np.array([[parameter.nominal for parameter in twin.parameters]])
+        predicted.append(kernel_of(twin).simulate(parameters, np.zeros((1, 2)), drive)[0])
+    assert predicted[1][:, 0] == pytest.approx(predicted[0][:, 0], rel=1e-9)
+    assert predicted[1][:, 1] == pytest.approx(predicted[0][:, 1] * 60 / (2 * np.pi), rel=1e-9)
 
 
 FORMULAS = [
@@ -186,8 +185,8 @@ FORMULAS = [
 
 
 @pytest.mark.parametrize("formula", FORMULAS)
-def test_every_kind_of_formula_is_what_it_says(formula: str) -> None:
-    """Value and derivatives of an output, against Python's own evaluation of the text and its differences."""
+def test_every_kind_of_formula_is_compiled_right(formula: str) -> None:
+    """Value and derivatives of an output agree with Python's evaluation of the text and its differences."""
     page = f"""
 [twin]
 name = "any"
@@ -210,18 +209,18 @@ y = "{formula}"
     twin = read_twin(SourceFile(Path("any.toml"), page))
     parameters, initial = np.array([0.7, 1.9, 0.3]), np.array([1.3])
     drive = Excitation(np.array([[0.4], [2.3], [-1.1], [0.9], [0.2]]), 0.1, 8)
-    found = kernel_of(twin).sensitivities(parameters, initial, drive)
+    result = kernel_of(twin).sensitivities(parameters, initial, drive)
     expected = Reference(twin, parameters).simulate(initial, drive.inputs, 0.1)
-    assert found.outputs == pytest.approx(expected, rel=1e-9, abs=1e-11)
+    assert result.outputs == pytest.approx(expected, rel=1e-9, abs=1e-11)
     for column, step in enumerate(1e-6 * np.eye(4)):
         ahead, behind = (
             Reference(twin, parameters + sign * step[:3]).simulate(initial + sign * step[3:], drive.inputs, 0.1)
             for sign in (1.0, -1.0)
         )
-        assert found.slopes[:, :, column] == pytest.approx((ahead - behind) / 2e-6, rel=1e-5, abs=1e-7)
+        assert result.slopes[:, :, column] == pytest.approx((ahead - behind) / 2e-6, rel=1e-5, abs=1e-7)
 
 
-def test_definitions_that_swell_are_refused() -> None:
+def test_definitions_that_grow_too_large_are_refused() -> None:
     swelling = "\n".join(f'd{n} = "d{n - 1}*(d{n - 1} + i)"' for n in range(2, 15))
     page = BASE.replace("[equations]", f'[definitions]\nd1 = "i"\n{swelling}\n\n[equations]').replace(
         "K_e*omega)", "K_e*omega + 0*d14*V_a)"
@@ -230,9 +229,9 @@ def test_definitions_that_swell_are_refused() -> None:
         read_twin(SourceFile(Path("any.toml"), page.replace('d1 = "i"', 'd1 = "i/i"').replace(" + i)", " + 1)")))
 
 
-def test_nothing_but_checked_names_reaches_the_generated_code() -> None:
+def test_only_checked_names_reach_generated_code() -> None:
     page = BASE.replace('title = "', 'title = "\\"\\"\\"\\nINJECTED ').replace('source = "', 'source = "INJECTED ')
     assert "INJECTED" not in kernel_source(read_twin(SourceFile(Path("any.toml"), page)))
     for name in ('x\\"\\"\\"\\nimport os', "a b", "a.b", "1a", ""):
-        with pytest.raises(ConfigurationError, match="is no name"):
+        with pytest.raises(ConfigurationError, match="is not a name"):
             read_twin(SourceFile(Path("any.toml"), BASE.replace('name = "dc_motor"', f'name = "{name}"', 1)))

@@ -1,8 +1,8 @@
-"""Rows of a table through the rings and the windower of the daemon, with the data's own time as the clock.
+"""Recorded rows through the rings and the windower of the daemon, with the time of the data as the clock.
 
-Between two looks at the rings the daemon's thread sleeps and samples come in. Here the looks are where they can
-matter: half a sample period after the end of a window, when all that is on the grid has come, and then as samples come
-until the window waits no longer. So the windows depend on the rows alone, not on how they are read.
+The daemon's thread checks the rings at the moments of the wall clock. Here they are checked only when the result can
+change: half a sample period after the end of a window, when all on-time samples have come, and then with each new
+sample until the grace period ends. So the windows depend on the rows alone, not on how the rows are split into chunks.
 """
 
 import math
@@ -11,15 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Array, Window
-from otolith.acquisition.windower import GRACE, Windower
+from otolith.acquisition.windower import GRACE_PERIOD, Windower
 from otolith_drivers.replay.readers import Integers, Rows
 
-ROOM = 16  # windows that the rings hold
-MOST_ROOM = 1 << 20  # samples of each signal, however many there are in a window
-OUTAGE = 100  # windows; a longer silence is not told window by window
+# Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
+RING_WINDOWS = 16  # windows that the rings hold
+MAX_RING_SAMPLES = 1 << 20  # samples of each signal, however many a window has
+MAX_SILENT_WINDOWS = 100  # window lengths; a longer silence is skipped instead of reported window by window
 
 
 @dataclass(slots=True)
@@ -28,99 +29,99 @@ class PlaybackCounts:
 
     rows: int = 0
     received: int = 0
-    """Samples in them."""
+    """Finite samples in the rows."""
     lost: int = 0
-    """Samples that came too late for their window, or fell out of a full ring."""
+    """Samples that came after their window was closed, or were overwritten in a full ring."""
     bad: int = 0
-    """See :attr:`otolith_drivers.replay.readers.Rows.bad`, up to the last row that was taken."""
+    """See :attr:`otolith_drivers.replay.readers.Rows.bad`, up to the last row delivered."""
     reordered: int = 0
-    """Rows with a time before that of a row above."""
+    """Rows with a time before that of an earlier row."""
     late: int = 0
-    """Of these, the ones whose window was closed."""
+    """Reordered rows whose window was closed already."""
     first_late: tuple[int, float, float] | None = None
-    """Line and time (s) of the first of them, and the latest time (s) above it."""
-    outages: int = 0
-    """Silences that were passed over."""
+    """Line and time (s) of the first late row, and the latest time (s) before it."""
+    silences: int = 0
+    """Silences that were skipped."""
 
 
-def usual_step(times: Array) -> float:
-    """How far (s) rows are apart, those aside that go back; infinity if time stands still."""
+def median_step(times: Array) -> float:
+    """Return the median time between rows in s, without steps back; infinity if no step is positive."""
     steps = np.diff(times)
-    onward = steps[steps > 0.0]
-    return float(np.median(onward)) if len(onward) else math.inf
+    positive = steps[steps > 0.0]
+    return float(np.median(positive)) if len(positive) else math.inf
 
 
 class Playback:
-    """Times are seconds, as the rows have them; ``windower.records`` may be set between two windows."""
+    """Cuts windows from rows; times are seconds of the data. ``windower.records`` may be set between two windows."""
 
-    def __init__(self, signals: tuple[str, ...], records: int, sample_period: float, limits: Limits) -> None:
+    def __init__(self, signals: tuple[str, ...], records: int, sample_period: float, limits: QualityLimits) -> None:
         self.windower = Windower(signals, records, sample_period, limits)
         self.counts = PlaybackCounts()
         self._limits = limits
         self._rings = Rings(signals, 1)
-        self._cut = 0
-        self._clock = -math.inf  # latest time of a row that was delivered
-        self._begun = self._looked = -math.inf
+        self._windows = 0
+        self._clock = -math.inf  # latest time of a delivered row
+        self._begun = self._checked = -math.inf
         self._step = math.inf
 
     def windows(self, rows: Rows) -> Iterator[Window]:
-        """The windows that are complete once ``rows`` have come; a generator that must be exhausted."""
+        """Yield the windows that ``rows`` complete; the generator must be exhausted."""
         clock = np.maximum.accumulate(np.maximum(rows.times, self._clock))
         self.counts.reordered += int(np.count_nonzero(rows.times < clock))
         at = 0
         while at < len(clock):
-            if clock[at] - self._clock > OUTAGE * self.windower.length:
+            if clock[at] - self._clock > MAX_SILENT_WINDOWS * self.windower.length:
                 yield from self.rest()
-                self._begin(rows, at)
-            look = self._next_look(float(clock[at]))
-            until = at + int(np.searchsorted(clock[at:], look))
+                self._restart(rows, at)
+            check = self._next_check(float(clock[at]))
+            until = at + int(np.searchsorted(clock[at:], check))
             self._deliver(rows, slice(at, until), clock)
             at = until
             if at < len(clock):
-                yield from self._look(look)
+                yield from self._cut_due(check)
 
     def rest(self) -> Iterator[Window]:
-        """The windows that are complete if nothing more comes for a while."""
+        """Yield the windows that are complete if no further row comes."""
         if self._begun > -math.inf:
-            yield from self._look(self._clock + 1.5 * self.windower.sample_period + GRACE)
+            yield from self._cut_due(self._clock + 1.5 * self.windower.sample_period + GRACE_PERIOD)
 
     @property
-    def left(self) -> float:
-        """How many seconds of data are too few for another window."""
-        return max(0.0, self._clock + self.windower.sample_period - self._start) if self._cut else 0.0
+    def unused_seconds(self) -> float:
+        """Length of the data since the end of the last window, s."""
+        return max(0.0, self._clock + self.windower.sample_period - self._start) if self._windows else 0.0
 
     @property
     def _start(self) -> float:
         return self.windower.next_end - self.windower.length
 
-    def _begin(self, rows: Rows, at: int) -> None:
-        """As a daemon that is started with the row ``at``."""
-        self.counts.outages += self._begun > -math.inf
+    def _restart(self, rows: Rows, at: int) -> None:
+        """Begin anew with row ``at``, like a daemon that is started then."""
+        self.counts.silences += self._begun > -math.inf
         old = self.windower
         self.windower = Windower(old.signals, old.records, old.sample_period, self._limits)
         if math.isinf(self._step):
-            self._step = usual_step(rows.times)
-        in_window = max(old.records, old.length / self._step)
-        self._rings = Rings(old.signals, int(min(ROOM * in_window, MOST_ROOM)))
-        self._clock = self._begun = self._looked = float(rows.times[at])
+            self._step = median_step(rows.times)
+        rows_per_window = max(old.records, old.length / self._step)
+        self._rings = Rings(old.signals, int(min(RING_WINDOWS * rows_per_window, MAX_RING_SAMPLES)))
+        self._clock = self._begun = self._checked = float(rows.times[at])
 
-    def _next_look(self, coming: float) -> float:
-        """When (s) the rings are worth a look, if the next row takes the clock to ``coming``."""
+    def _next_check(self, coming: float) -> float:
+        """Return when to check the rings (s), if the next row moves the clock to ``coming``."""
         period, end = self.windower.sample_period, self.windower.next_end
-        deadline = end + GRACE
+        deadline = end + GRACE_PERIOD
         if math.isinf(end):
             deadline = self._begun + self.windower.length
-        elif self._looked < end + period / 2:
+        elif self._checked < end + period / 2:
             return end + period / 2
-        return max(self._looked + period, min(coming, deadline))
+        return max(self._checked + period, min(coming, deadline))
 
-    def _look(self, now: float) -> Iterator[Window]:
-        self._looked = now
+    def _cut_due(self, now: float) -> Iterator[Window]:
+        self._checked = now
         begun = self.windower.begin(self._rings, now, now - self._begun)
         while begun and self.windower.due(self._rings, now):
             window = self.windower.cut(self._rings, unix_offset=0.0)
-            self._cut += 1
-            yield replace(window, index=self._cut - 1)
+            self._windows += 1
+            yield replace(window, index=self._windows - 1)
 
     def _deliver(self, rows: Rows, part: slice, clock: Array) -> None:
         times = rows.times[part]
@@ -129,23 +130,23 @@ class Playback:
         oldest = self._start - self.windower.sample_period / 2
         if math.isinf(oldest):
             oldest = self._begun - self.windower.length
-        in_time = times >= oldest
+        on_time = times >= oldest
         columns = {}
         for signal, values in rows.columns.items():
-            there = np.isfinite(values[part])
-            self.counts.received += int(np.count_nonzero(there))
-            self.counts.lost += int(np.count_nonzero(there & ~in_time))
-            columns[signal] = (times[there & in_time], values[part][there & in_time])
-        fallen = self._rings.counters().overwritten
+            present = np.isfinite(values[part])
+            self.counts.received += int(np.count_nonzero(present))
+            self.counts.lost += int(np.count_nonzero(present & ~on_time))
+            columns[signal] = (times[present & on_time], values[part][present & on_time])
+        overwritten = self._rings.counters().overwritten
         self._rings.deliver_columns(columns)
-        self.counts.lost += self._rings.counters().overwritten - fallen
+        self.counts.lost += self._rings.counters().overwritten - overwritten
         self.counts.rows += len(times)
         self.counts.bad = int(rows.bad[part][-1])
-        if not in_time.all():
-            self._note_late(rows, part.start + np.flatnonzero(~in_time), clock)
+        if not on_time.all():
+            self._count_late(rows, part.start + np.flatnonzero(~on_time), clock)
         self._clock = float(clock[part][-1])
 
-    def _note_late(self, rows: Rows, late: Integers, clock: Array) -> None:
+    def _count_late(self, rows: Rows, late: Integers, clock: Array) -> None:
         self.counts.late += len(late)
         if self.counts.first_late is None:
             first = int(late[0])

@@ -1,4 +1,4 @@
-"""Bounded ring buffers between a driver's thread and the service's: one per signal, every loss counted."""
+"""Bounded ring buffers between a driver's thread and the main thread: one per signal; every loss is counted."""
 
 import math
 import threading
@@ -13,14 +13,14 @@ from otolith_drivers.base import Sample
 
 @dataclass(frozen=True, slots=True)
 class RingCounters:
-    """What has passed through the rings since the start."""
+    """Counts of samples since the start."""
 
     received: int = 0
-    """Readings; a sample without one was counted by its driver."""
+    """Samples with a finite value; the driver counts the others as bad."""
     overwritten: int = 0
-    """Samples that fell out of a full ring before a window took them."""
+    """Samples that were overwritten in a full ring before a window had read them."""
     unknown: int = 0
-    """Samples of signals that nobody asked for."""
+    """Samples of signals that have no ring."""
 
 
 class Ring:
@@ -34,49 +34,46 @@ class Ring:
         self.overwritten = 0
 
     def append(self, time: float, value: float) -> None:
-        """Add a sample; ``time`` in s, ``value`` not a number where the source had no reading."""
-        place = self._count % len(self._times)
-        if self._count >= len(self._times) and self._times[place] > self._read_up_to:
+        """Add a sample: ``time`` in s, ``value`` NaN where the source had no reading."""
+        slot = self._count % len(self._times)
+        if self._count >= len(self._times) and self._times[slot] > self._read_up_to:
             self.overwritten += 1
-        self._times[place] = time
-        self._values[place] = value
+        self._times[slot] = time
+        self._values[slot] = value
         self._count += 1
 
     def extend(self, times: Array, values: Array) -> None:
-        """The same as :meth:`append` for each sample (s, value), at once."""
+        """Add many samples (s, value) at once, with the same result as :meth:`append` for each."""
         capacity = len(self._times)
-        for begun in range(0, len(times), capacity):
-            part = slice(begun, begun + capacity)
-            places = np.arange(self._count, self._count + len(times[part]))
-            full = places[places >= capacity] % capacity
-            self.overwritten += int(np.count_nonzero(self._times[full] > self._read_up_to))
-            self._times[places % capacity] = times[part]
-            self._values[places % capacity] = values[part]
-            self._count += len(places)
+        for first in range(0, len(times), capacity):
+            part = slice(first, first + capacity)
+            slots = np.arange(self._count, self._count + len(times[part]))
+            reused = slots[slots >= capacity] % capacity
+            self.overwritten += int(np.count_nonzero(self._times[reused] > self._read_up_to))
+            self._times[slots % capacity] = times[part]
+            self._values[slots % capacity] = values[part]
+            self._count += len(slots)
 
     def between(self, start: float, end: float) -> tuple[Array, Array]:
-        """Times (s) and values of the samples with ``start <= time < end``, by time; they count as read."""
-        kept = min(self._count, len(self._times))
-        order = np.argsort(self._times[:kept], kind="stable")
-        times, values = self._times[:kept][order], self._values[:kept][order]
-        chosen = (times >= start) & (times < end)
+        """Return times (s) and values with ``start <= time < end``, sorted by time, and mark them as read."""
+        filled = min(self._count, len(self._times))
+        order = np.argsort(self._times[:filled], kind="stable")
+        times, values = self._times[:filled][order], self._values[:filled][order]
+        inside = (times >= start) & (times < end)
         self._read_up_to = max(self._read_up_to, end)
-        return times[chosen], values[chosen]
+        return times[inside], values[inside]
 
-    @property
-    def last_time(self) -> float:
-        """Of the newest sample (s); minus infinity before the first."""
-        return float(self._times[(self._count - 1) % len(self._times)]) if self._count else -math.inf
-
-    @property
     def first_time(self) -> float:
-        """Of the oldest sample still held (s); infinity before the first."""
-        kept = min(self._count, len(self._times))
-        return float(self._times[:kept].min()) if kept else math.inf
+        """Return the time of the oldest sample still held, s; infinity if there is none."""
+        return float(self._times[: min(self._count, len(self._times))].min(initial=math.inf))
+
+    def last_time(self) -> float:
+        """Return the time of the newest sample, s; minus infinity if there is none."""
+        return float(self._times[(self._count - 1) % len(self._times)]) if self._count else -math.inf
 
 
 class Rings:
-    """The rings of all signals of a machine, behind one lock."""
+    """The rings of all signals of a machine, guarded by one lock."""
 
     def __init__(self, signals: Sequence[str], capacity: int) -> None:
         self._lock = threading.Lock()
@@ -85,7 +82,7 @@ class Rings:
         self._unknown = 0
 
     def deliver(self, samples: Sequence[Sample]) -> None:
-        """Take the samples of a driver; called from its thread."""
+        """Take the samples of a driver; called from the driver's thread."""
         with self._lock:
             for sample in samples:
                 ring = self._rings.get(sample.signal)
@@ -107,22 +104,22 @@ class Rings:
                     self._received += int(np.count_nonzero(np.isfinite(values)))
 
     def between(self, start: float, end: float) -> dict[str, tuple[Array, Array]]:
-        """See :meth:`Ring.between`, for every signal."""
+        """Return the result of :meth:`Ring.between` for every signal."""
         with self._lock:
             return {signal: ring.between(start, end) for signal, ring in self._rings.items()}
 
-    def first_times(self) -> dict[str, float]:
-        """Of the oldest sample of each signal (s); infinity for a signal never seen."""
+    def first_times(self) -> list[float]:
+        """Return the result of :meth:`Ring.first_time` for every signal."""
         with self._lock:
-            return {signal: ring.first_time for signal, ring in self._rings.items()}
+            return [ring.first_time() for ring in self._rings.values()]
 
-    def last_times(self) -> dict[str, float]:
-        """Of the newest sample of each signal (s); minus infinity for a signal never seen."""
+    def last_times(self) -> list[float]:
+        """Return the result of :meth:`Ring.last_time` for every signal."""
         with self._lock:
-            return {signal: ring.last_time for signal, ring in self._rings.items()}
+            return [ring.last_time() for ring in self._rings.values()]
 
     def counters(self) -> RingCounters:
-        """What has passed so far."""
+        """Return the counts since the start."""
         with self._lock:
             overwritten = sum(ring.overwritten for ring in self._rings.values())
             return RingCounters(self._received, overwritten, self._unknown)

@@ -1,7 +1,8 @@
-"""What adaptation works on: a window of uniformly sampled signals, and the verdict on how well they were sampled."""
+"""A window: uniformly sampled signals of a machine, and the quality of their sampling."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ Mask = NDArray[np.bool_]
 
 
 class Verdict(StrEnum):
-    """Whether a window may be estimated from."""
+    """Whether parameters may be estimated from a window."""
 
     GOOD = "good"
     BAD = "bad"
@@ -19,46 +20,46 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """How well a window was sampled; the worst signal counts."""
+    """How well a window was sampled; each number is that of the worst signal."""
 
     verdict: Verdict
     missing: float
     """Share of records without a sample, 0 to 1."""
     longest_gap: float
-    """s without a sample."""
+    """Longest time without a sample, s."""
     jitter: float
     """Root mean square distance of the samples from the grid, s."""
     skew: float
     """Largest difference between two signals' median distances from the grid, s."""
     reasons: tuple[str, ...] = ()
-    """Why the verdict is not good, in words."""
+    """Why the verdict is bad, one sentence per limit; empty if it is good."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Uniform records of all signals of a machine. Plain and frozen: it pickles, and a replay gives the same."""
+    """Uniform records of all signals of a machine. Frozen and picklable."""
 
     index: int
     start: float
     """Unix seconds of the first record."""
     sample_period: float
-    """s."""
+    """Time between two records, s."""
     signals: tuple[str, ...]
     values: Array
-    """(records, signals), each in the unit of its signal; gaps are bridged."""
+    """(records, signals), each in the unit of its signal; gaps are interpolated."""
     missing: Mask
-    """(records, signals), true where a value was bridged and is no measurement."""
+    """(records, signals), true where a value is interpolated and no measurement."""
     quality: Quality
 
     @classmethod
-    def whole(cls, index: int, start: float, sample_period: float, signals: tuple[str, ...], values: Array) -> "Window":
-        """Without gaps and sampled to perfection, as simulations and files on a grid are."""
+    def whole(cls, index: int, start: float, sample_period: float, signals: tuple[str, ...], values: Array) -> Self:
+        """Return a window without gaps and jitter, as simulations and files on a grid give it."""
         missing = np.zeros(values.shape, dtype=np.bool_)
         return cls(index, start, sample_period, signals, values, missing, Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0))
 
     @property
     def records(self) -> int:
-        """How many."""
+        """Number of records."""
         return len(self.values)
 
     @property
@@ -66,19 +67,19 @@ class Window:
         """Unix seconds at which the last record ends."""
         return self.start + self.records * self.sample_period
 
-    def since(self, record: int) -> "Window":
-        """What is left of the window from a record on."""
+    def since(self, record: int) -> Self:
+        """Return the part of the window from ``record`` on."""
         start = self.start + record * self.sample_period
         return replace(self, start=start, values=self.values[record:], missing=self.missing[record:])
 
-    def until(self, record: int) -> "Window":
-        """The window up to a record."""
+    def until(self, record: int) -> Self:
+        """Return the part of the window before ``record``."""
         return replace(self, values=self.values[:record], missing=self.missing[:record])
 
     def column(self, signal: str) -> Array:
-        """(records,) of one signal."""
+        """Return the values of one signal, (records,) in its unit."""
         return self.values[:, self.signals.index(signal)]
 
     def missing_in(self, signal: str) -> Mask:
-        """(records,) of one signal."""
+        """Return where one signal is missing, (records,)."""
         return self.missing[:, self.signals.index(signal)]

@@ -1,7 +1,4 @@
-"""From what was learned of a window to the report of it.
-
-From adopted components and open cases to what is published of them.
-"""
+"""The report of a window: from the result of the adaptation to the published document and the recorded traces."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,14 +8,16 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import AdaptationState
-from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives, describe_hypothesis
+from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives_of, with_approvals
+from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
-from otolith.discovery.hypotheses import FaultType
-from otolith.discovery.sequential_test import FilterState, SequentialTest, WindowDecision
+from otolith.discovery.hypotheses import FaultType, describe_hypothesis
+from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import base_model, equation, indices, input_matrix, site_of, source_of
+from otolith.estimation.augmented import base_model, equation, indices, site_of, source_of
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import EXPLAINED
+from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import WindowEstimate
 from otolith.health.schema import (
@@ -30,6 +29,7 @@ from otolith.health.schema import (
     FitDocument,
     NumberDocument,
     ParameterDocument,
+    Report,
     ReportDocument,
     Severity,
     Status,
@@ -37,25 +37,234 @@ from otolith.health.schema import (
     window_document,
 )
 from otolith.health.status import MarginalPosterior, PreviousStatus, WindowEvidence, publish
-from otolith.twin.component_families import Kind
+from otolith.twin.component_families import SourceKind
+
+MAX_VARIANCE_RATIO = 3.0  # ratio of variances above which windows disagree with each other
+DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
+UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
+NEVER_EXPLAINED = "are the signals and [noise] what the machine file says, in unit and size?"
+UNDECIDED = frozenset({WindowDecision.SUSPECTED, WindowDecision.SENSOR, WindowDecision.REFUSED})
+OPEN_CONDITION = "something has happened that is not decided yet"
 
 
-def component_documents(
-    problem: Problem, known: Prior, catalogue: Sequence[AdoptedComponent]
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowResult:
+    """What a window led to."""
+
+    decision: WindowDecision
+    posterior: Posterior
+    """For the next window."""
+    before: Prior
+    """What was known at the end of the window, without the window."""
+    after: Prior
+    """What is known there with the window."""
+    adopted: tuple[AdoptedComponent, ...]
+    estimate: WindowEstimate | None = None
+    """None for a window that was not estimated from."""
+    test: SequentialTest | None = None
+    """The competing hypotheses, if the window raises the question."""
+    reason: str = ""
+    """Why the window was not estimated from."""
+    notes: tuple[str, ...] = ()
+    """What the data checks left out."""
+    searched: bool = False
+    """Whether other hypotheses were compared."""
+
+    @classmethod
+    def unchanged(  # noqa: PLR0913 - the optional parts of a result
+        cls,
+        state: AdaptationState,
+        predicted: Posterior,
+        decision: WindowDecision,
+        *,
+        estimate: WindowEstimate | None = None,
+        test: SequentialTest | None = None,
+        reason: str = "",
+    ) -> "WindowResult":
+        """Return the result of a window that does not update the posterior."""
+        prior = predicted.prior()
+        return cls(decision, state.posterior, prior, prior, state.adopted, estimate, test, reason)
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether the window updated the posterior."""
+        return self.decision in ACCEPTED
+
+
+def make_report(
+    state: AdaptationState, window: Window, result: WindowResult
+) -> tuple[dict[str, PreviousStatus], Report]:
+    """Return the status of each free parameter by its label, and the report of ``window`` after ``state``."""
+    problem = result.posterior.problem
+    traces = _traces(state.problem, window, result.estimate)
+    situation = _situation(result.estimate)
+    previous, parameters = _parameters(state, result)
+    _add_advice(parameters, result, situation)
+    adopted = with_approvals(result.adopted, state.approved)
+    components = _component_documents(problem, result.after, adopted)
+    undecided = result.test if result.decision in UNDECIDED else None
+    explanations = _explanations(undecided)
+    document = ReportDocument(
+        machine=state.machine,
+        site=state.site,
+        twin=problem.twin.name,
+        model=_model_name(problem, previous),
+        window=window_document(window),
+        decision=result.decision,
+        parameters=parameters,
+        components=components,
+        explanations=explanations,
+        findings=_findings(components, explanations, result.test, _experiment(undecided, situation)),
+        **_fit_and_cost(problem, result),
+    )
+    return previous, Report(document, traces)
+
+
+def _situation(estimated: WindowEstimate | None) -> Situation | None:
+    """Return where the machine is at the end of the window, or None if that is not known."""
+    if estimated is None or not np.isfinite(estimated.last_state).all():
+        return None
+    inputs, window = estimated.fit.objective.excitation.inputs[-1], estimated.fit.window
+    return Situation(inputs, estimated.last_state, window.records, window.sample_period)
+
+
+def _parameters(
+    state: AdaptationState, result: WindowResult
+) -> tuple[dict[str, PreviousStatus], dict[str, ParameterDocument]]:
+    """Return status and document of each free parameter."""
+    problem, estimated = result.posterior.problem, result.estimate
+    documents: dict[str, ParameterDocument] = {}
+    previous: dict[str, PreviousStatus] = {}
+    required = problem.determined_within * problem.scale
+    doubted = result.test is None or result.test.doubts_parameters
+    contradictions = _contradictions(state, result) if doubted else 0
+    variance_ratio, reason = result.posterior.belief.variance_ratio, _reason(state, result)
+    for index, (parameter, marginal) in enumerate(zip(problem.free, _marginals(result), strict=True)):
+        alone = None if estimated is None else estimated.parameters[index]
+        evidence = WindowEvidence(alone, result.decision, contradictions, variance_ratio, reason)
+        before = state.previous.get(parameter.label, PreviousStatus())
+        previous[parameter.label], document = publish(parameter, float(required[index]), marginal, evidence, before)
+        if not parameter.name.startswith("_"):
+            documents[parameter.name] = document
+    return previous, documents
+
+
+def _contradictions(state: AdaptationState, result: WindowResult) -> int:
+    """Return consecutive windows, this one included, that contradict the posterior."""
+    if result.is_accepted:
+        return 0
+    return state.contradictions + (result.decision is not WindowDecision.BAD)
+
+
+def _marginals(result: WindowResult) -> list[MarginalPosterior]:
+    """Return what is known of each free parameter at the end of the window."""
+    after = result.after
+    free = len(after.mean) // 2
+    sd, sd_before = (np.sqrt(np.diag(prior.covariance)) for prior in (after, result.before))
+    return [
+        MarginalPosterior(
+            value=float(after.mean[index]),
+            sd=float(sd[index]),
+            trend=float(after.mean[free + index]),
+            trend_sd=float(sd[free + index]),
+            variance_left=float((sd[index] / sd_before[index]) ** 2),
+        )
+        for index in range(free)
+    ]
+
+
+def _reason(state: AdaptationState, result: WindowResult) -> str:
+    """Return what there is to say of the window as a whole."""
+    if result.estimate is None:
+        return result.reason
+    decision, test = result.decision, result.test
+    reasons = [*result.notes]
+    if decision is not WindowDecision.LEARNED:
+        reasons.append(decision.value)
+    if test is not None and decision in (WindowDecision.SENSOR, WindowDecision.SUSPECTED):
+        others = [f"or {other.text} ({other.probability:.0%})" for other in alternatives_of(test, test.best)[:2]]
+        reasons.append("; ".join([f"{describe_hypothesis(test.best)} ({test.probabilities[0]:.0%})", *others]))
+    if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:
+        reasons.append(UNEXPLAINED)
+    variance_ratio = result.posterior.belief.variance_ratio
+    if variance_ratio > MAX_VARIANCE_RATIO:
+        reasons.append(DISAGREEMENT.format(variance_ratio**0.5))
+    if decision is WindowDecision.REFUSED and not state.is_determined:
+        reasons.append(NEVER_EXPLAINED)
+    return "; ".join(reasons)
+
+
+def _add_advice(documents: dict[str, ParameterDocument], result: WindowResult, situation: Situation | None) -> None:
+    """Add the experiment that would determine each parameter that this window did not."""
+    wanted = [name for name, item in documents.items() if item.status in (Status.UNESTIMATED, Status.HELD)]
+    if situation is None or result.decision is not WindowDecision.LEARNED or not wanted:
+        return
+    for name, text in advise(result.posterior.problem, result.after, situation, wanted).items():
+        documents[name] = documents[name].model_copy(update={"advice": text})
+
+
+def _model_name(problem: Problem, previous: Mapping[str, PreviousStatus]) -> str:
+    """Return the paper's name of the twin: as configured, with estimated parameters, or with components."""
+    if problem.components:
+        return "DT''"
+    return "DT'" if any(status.known for status in previous.values()) else "DT"
+
+
+def _fit_and_cost(problem: Problem, result: WindowResult) -> dict[str, FitDocument | CostDocument]:
+    """Return the documents of fit and cost by their keys; none for a window that was not estimated from."""
+    estimated = result.estimate
+    if estimated is None:
+        return {}
+    outputs = tuple(output.name for output in problem.twin.outputs)
+    completed = _finite(outputs, estimated.rmse_completed) if problem.components else None
+    fit = FitDocument(
+        rmse_configured=_finite(outputs, estimated.rmse_configured),
+        rmse_estimated=_finite(outputs, estimated.rmse_estimated),
+        rmse_completed=completed,
+        explained=estimated.cost <= EXPLAINED,
+        cost=estimated.cost,
+        variance_ratio=result.posterior.belief.variance_ratio,
+        outcome=estimated.outcome,
+    )
+    cost = CostDocument(evaluations=estimated.evaluations, generations=estimated.generations, searched=result.searched)
+    return {"fit": fit, "cost": cost}
+
+
+def _finite(names: tuple[str, ...], values: tuple[float, ...]) -> dict[str, float]:
+    return {name: value for name, value in zip(names, values, strict=True) if np.isfinite(value)}
+
+
+def _component_documents(
+    problem: Problem, known: Prior, adopted: Sequence[AdoptedComponent]
 ) -> tuple[ComponentDocument, ...]:
-    """Of the components in the twin, of whose numbers ``known`` is known."""
-    entries = {entry.component.key: entry for entry in catalogue}
-    found = []
+    """Return the documents of the components in the twin whose values are finite."""
+    histories = {item.component.key: item for item in adopted}
+    documents = []
     for slot, component in enumerate(problem.components):
-        entry = entries.get(component.key, AdoptedComponent(component, component.origin))
-        numbers = numbers_of(problem, known, slot)
-        if all(math.isfinite(number.value + number.sd) for number in numbers.values()):
-            found.append(_document(problem, component, numbers, entry))
-    return tuple(found)
+        history = histories.get(component.key, AdoptedComponent(component, component.origin))
+        values = _component_values(problem, known, slot)
+        if all(math.isfinite(number.value + number.sd) for number in values.values()):
+            documents.append(_component_document(problem, component, values, history))
+    return tuple(documents)
 
 
-def _document(
-    problem: Problem, component: Component, numbers: Mapping[str, NumberDocument], entry: AdoptedComponent
+def _component_values(problem: Problem, known: Prior, slot: int) -> dict[str, NumberDocument]:
+    """Return amplitude, inner parameter and phase, as far as the component has them."""
+    component = problem.components[slot]
+    place = source_of(base_model(problem), component.source).kind is SourceKind.PLACE
+    inner = component.model.inner
+    inner_name = "order" if component.periodic and place else "inner" if inner is None else inner.meaning
+    deviations = np.sqrt(np.maximum(np.diag(known.covariance), 0.0))
+    values = {}
+    for name, at in zip(("amplitude", inner_name, "phase"), indices(problem, slot), strict=False):
+        value, sd = float(known.mean[at]), float(deviations[at])
+        low, high = value - QUANTILE * sd, value + QUANTILE * sd
+        values[name] = NumberDocument(value=value, sd=sd, low=low, high=high, unit=problem.free[at].unit)
+    return values
+
+
+def _component_document(
+    problem: Problem, component: Component, values: Mapping[str, NumberDocument], history: AdoptedComponent
 ) -> ComponentDocument:
     twin = base_model(problem)
     site = site_of(twin, component.site)
@@ -66,236 +275,96 @@ def _document(
         mode=site.mode,
         family=component.family,
         input=component.source,
-        equation=equation(twin, component, [number.value for number in numbers.values()]),
-        values=dict(numbers),
+        equation=equation(twin, component, [number.value for number in values.values()]),
+        values=dict(values),
         conditions=component.model.conditions,
         domain=component.model.domain,
-        status=ComponentStatus.FADING if entry.fading else ComponentStatus.ADOPTED,
-        approval=entry.approval,
-        probability=entry.probability,
-        onset=entry.onset,
-        alternatives=_documents(entry.alternatives),
+        status=ComponentStatus.FADING if history.fading else ComponentStatus.ADOPTED,
+        approval=history.approval,
+        probability=history.probability,
+        onset=history.onset,
+        alternatives=_alternative_documents(history.alternatives),
     )
 
 
-def numbers_of(problem: Problem, known: Prior, slot: int) -> dict[str, NumberDocument]:
-    """Amplitude, and inner number and phase as far as the component has them."""
-    component = problem.components[slot]
-    periodic = component.repeats
-    place = source_of(base_model(problem), component.source).kind is Kind.PLACE
-    inner = component.model.inner
-    names = ["amplitude", "order" if periodic and place else "inner" if inner is None else inner.meaning, "phase"]
-    deviations = np.sqrt(np.maximum(np.diag(known.covariance), 0.0))
-    found = {}
-    for name, at in zip(names, indices(problem, slot), strict=False):
-        value, sd = float(known.mean[at]), float(deviations[at])
-        low, high = value - QUANTILE * sd, value + QUANTILE * sd
-        found[name] = NumberDocument(value=value, sd=sd, low=low, high=high, unit=problem.free[at].unit)
-    return found
-
-
-def explanations_of(case: SequentialTest | None) -> tuple[AlternativeDocument, ...]:
-    """What could have happened, the most probable first, while it is not decided."""
-    if case is None or case.best.reason is FaultType.NOTHING:
+def _explanations(test: SequentialTest | None) -> tuple[AlternativeDocument, ...]:
+    """Return the competing hypotheses, the most probable first."""
+    if test is None or test.best.type is FaultType.NOTHING:
         return ()
-    share = case.probabilities[0]
-    best = Alternative(case.best.reason, describe_hypothesis(case.best), share)
-    return _documents((best, *alternatives(case, case.best)))
+    best = Alternative(test.best.type, describe_hypothesis(test.best), test.probabilities[0])
+    return _alternative_documents((best, *alternatives_of(test, test.best)))
 
 
-def _documents(found: Sequence[Alternative]) -> tuple[AlternativeDocument, ...]:
+def _alternative_documents(alternatives: Sequence[Alternative]) -> tuple[AlternativeDocument, ...]:
     return tuple(
-        AlternativeDocument(reason=entry.reason, text=entry.text, probability=entry.probability) for entry in found
+        AlternativeDocument(reason=item.type, text=item.text, probability=item.probability) for item in alternatives
     )
 
 
-def findings_of(
+def _findings(
     components: Sequence[ComponentDocument],
     explanations: Sequence[AlternativeDocument],
-    case: SequentialTest | None,
+    test: SequentialTest | None,
     experiment: str,
 ) -> tuple[FindingDocument, ...]:
-    """What an operator should read: one line for each component that is new, and one for an open case.
+    """Return a finding for each component that is not approved, and one for an open test.
 
-    ``experiment`` is what would decide it.
+    ``experiment`` is what would decide the test.
     """
-    found = [_of_component(entry) for entry in components if entry.approval is Approval.OPEN]
-    if explanations and case is not None:
+    findings = [_component_finding(component) for component in components if component.approval is Approval.OPEN]
+    if explanations and test is not None:
         best = explanations[0]
-        others = "".join(f"; or {entry.text} ({entry.probability:.0%})" for entry in explanations[1:3])
-        text = f"{best.reason}: {best.text} ({best.probability:.0%}){others}"
-        severity = Severity.WARNING if best.reason is not FaultType.SENSOR else Severity.FAULT
-        found.append(FindingDocument(
-            id="case", severity=severity, condition="something has happened that is not decided yet", text=text,
-            since=case.onset, advice="; ".join(filter(None, (experiment, _of_the_file(case)))),
-        ))  # fmt: skip
-    return tuple(found)
+        others = "".join(f"; or {other.text} ({other.probability:.0%})" for other in explanations[1:3])
+        findings.append(
+            FindingDocument(
+                id="case",
+                severity=Severity.FAULT if best.reason is FaultType.SENSOR else Severity.WARNING,
+                condition=OPEN_CONDITION,
+                text=f"{best.reason}: {best.text} ({best.probability:.0%}){others}",
+                since=test.onset,
+                advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),
+            )
+        )
+    return tuple(findings)
 
 
-def _of_the_file(case: SequentialTest) -> str:
-    """What to do where a parameter seems to have moved that the machine file takes as known."""
-    known = {name for entry in case.hypotheses if entry.reason is FaultType.NOTHING for name, _ in entry.problem.known}
-    if case.best.reason is not FaultType.PARAMETER:
+def _component_finding(component: ComponentDocument) -> FindingDocument:
+    return FindingDocument(
+        id=component.id,
+        severity=Severity.WARNING,
+        condition=component.conditions,
+        text=f"new {component.meaning}: {component.equation}",
+        since=component.onset,
+    )
+
+
+def _machine_file_advice(test: SequentialTest) -> str:
+    """Return what to do where a parameter seems to have moved that the machine file gives as known."""
+    null = [item.problem.known for item in test.hypotheses if item.type is FaultType.NOTHING]
+    known = {name for pairs in null for name, _ in pairs}
+    if test.best.type is not FaultType.PARAMETER:
         return ""
-    names = ", ".join(entry.name for entry in case.best.problem.free if entry.name in known)
+    names = ", ".join(parameter.name for parameter in test.best.problem.free if parameter.name in known)
     return names and f"if nothing has happened to the machine, {names} in its file is off: correct it or estimate it"
 
 
-def _of_component(entry: ComponentDocument) -> FindingDocument:
-    text = f"new {entry.meaning}: {entry.equation}"
-    return FindingDocument(
-        id=entry.id, severity=Severity.WARNING, condition=entry.conditions, text=text, since=entry.onset
-    )
+def _experiment(test: SequentialTest | None, situation: Situation | None) -> str:
+    """Return the experiment that would tell the most probable hypothesis from the next one."""
+    if test is None or situation is None:
+        return ""
+    others = test.alternatives(test.best)
+    return deciding_experiment(test.best, others[0][0], situation) if others else ""
 
 
-@dataclass(frozen=True, slots=True)
-class WindowResult:
-    """What is known after a window, and how it came about."""
-
-    memory: FilterState
-    before: Prior
-    """What was known at the end of the window, but for the window."""
-    after: Prior
-    """What is known then."""
-    problem: Problem
-    """With the components that are in the twin then."""
-    catalogue: tuple[AdoptedComponent, ...] = ()
-    """Of these components."""
-    found: WindowEstimate | None = None
-    """None for a window that was not estimated from."""
-    decision: WindowDecision = WindowDecision.BAD
-    reason: str = ""
-    """What there is to say of the window as a whole."""
-    case: SequentialTest | None = None
-    """What could have happened, if that is a question."""
-    searched: bool = False
-    """Whether it was asked what else could have happened."""
+def _traces(problem: Problem, window: Window, estimated: WindowEstimate | None) -> Traces:
+    """Return the curves of the window as it was recorded, spikes included, so that it can be replayed from them."""
+    twin = base_model(problem)
+    outputs, inputs = tuple(output.name for output in twin.outputs), tuple(source.name for source in twin.inputs)
+    predicted = None if estimated is None else estimated.predicted
+    return Traces(outputs, _measured(window, outputs), predicted, problem.noise, inputs, _measured(window, inputs))
 
 
-def document_of(
-    state: AdaptationState, window: Window, learned: WindowResult
-) -> tuple[dict[str, PreviousStatus], ReportDocument]:
-    """The report of ``window`` after ``state``, and what it says of each parameter."""
-    problem, memory, found = learned.problem, learned.memory, learned.found
-    parameters: dict[str, ParameterDocument] = {}
-    standing: dict[str, PreviousStatus] = {}
-    allowed = problem.determined_within * problem.scale
-    sure = learned.case is not None and not learned.case.doubts_parameters
-    contradictions = 0 if sure else memory.contradictions
-    for index, (entry, fused) in enumerate(zip(problem.free, _fused(learned), strict=True)):
-        said = None if found is None else found.parameters[index]
-        heard = WindowEvidence(said, learned.decision, contradictions, memory.belief.variance_ratio, learned.reason)
-        before = state.standing.get(entry.label, PreviousStatus())
-        standing[entry.label], said_of_it = publish(entry, float(allowed[index]), fused, heard, before)
-        if not entry.name.startswith("_"):
-            parameters[entry.name] = said_of_it
-    _advise(problem, window, learned, parameters)
-    components = component_documents(problem, learned.after, learned.catalogue)
-    undecided = (
-        learned.case
-        if learned.decision in (WindowDecision.SUSPECTED, WindowDecision.SENSOR, WindowDecision.REFUSED)
-        else None
-    )
-    explanations = explanations_of(undecided)
-    experiment = _experiment(window, learned, undecided)
-    document = ReportDocument(
-        machine=state.machine,
-        site=state.site,
-        twin=problem.twin.name,
-        model=_model(problem, standing),
-        window=window_document(window),
-        decision=learned.decision,
-        parameters=parameters,
-        components=components,
-        explanations=explanations,
-        findings=findings_of(components, explanations, learned.case, experiment),
-    )
-    if found is not None:
-        cost = CostDocument(evaluations=found.evaluations, generations=found.generations, searched=learned.searched)
-        document = document.model_copy(update={"fit": _fit(problem, found, memory), "cost": cost})
-    return standing, document
-
-
-def _model(problem: Problem, standing: dict[str, PreviousStatus]) -> str:
-    """The paper's names."""
-    if problem.components:
-        return "DT''"
-    return "DT'" if any(entry.known for entry in standing.values()) else "DT"
-
-
-def traces_of(state: AdaptationState, window: Window, learned: WindowResult) -> Traces:
-    """The curves behind the report; of the window as it came, with its spikes, so that it can be replayed from them."""
-    found, twin = learned.found, base_model(state.problem)
-    outputs, inputs = tuple(entry.name for entry in twin.outputs), tuple(entry.name for entry in twin.inputs)
-    predicted = None if found is None else found.predicted
-    return Traces(outputs, _present(window, outputs), predicted, state.problem.noise, inputs, _present(window, inputs))
-
-
-def _present(window: Window, names: tuple[str, ...]) -> Array:
-    """(records, names): not a number where nothing was measured."""
+def _measured(window: Window, names: tuple[str, ...]) -> Array:
+    """Return (records, names), not-a-number where nothing was measured."""
     columns = [np.where(window.missing_in(name), np.nan, window.column(name)) for name in names]
     return np.column_stack(columns) if columns else np.zeros((window.records, 0))
-
-
-def _fused(learned: WindowResult) -> list[MarginalPosterior]:
-    """Of each free parameter, what is known at the end of the window, and what this window did to it."""
-    after = learned.after
-    free = len(after.mean) // 2
-    sd, sd_before = (np.sqrt(np.diag(known.covariance)) for known in (after, learned.before))
-    return [
-        MarginalPosterior(
-            value=float(after.mean[index]),
-            sd=float(sd[index]),
-            trend=float(after.mean[free + index]),
-            trend_sd=float(sd[free + index]),
-            kept=float((sd[index] / sd_before[index]) ** 2),
-        )
-        for index in range(free)
-    ]
-
-
-def _advise(problem: Problem, window: Window, learned: WindowResult, documents: dict[str, ParameterDocument]) -> None:
-    """Add what would pin down the parameters that this window did not."""
-    found = learned.found
-    wanted = [name for name, entry in documents.items() if entry.status in (Status.UNESTIMATED, Status.HELD)]
-    if (
-        found is None
-        or learned.decision is not WindowDecision.LEARNED
-        or not wanted
-        or not np.isfinite(found.last_state).all()
-    ):
-        return
-    inputs = input_matrix(problem.twin, window)[-1]
-    situation = Situation(inputs, found.last_state, window.records, window.sample_period)
-    for name, text in advise(problem, learned.after, situation, wanted).items():
-        documents[name] = documents[name].model_copy(update={"advice": text})
-
-
-def _experiment(window: Window, learned: WindowResult, case: SequentialTest | None) -> str:
-    """What would tell the most probable explanation from the next one."""
-    found = learned.found
-    if case is None or found is None or not np.isfinite(found.last_state).all():
-        return ""
-    others = case.alternatives(case.best)
-    if not others:
-        return ""
-    inputs = input_matrix(learned.problem.twin, window)[-1]
-    situation = Situation(inputs, found.last_state, window.records, window.sample_period)
-    return deciding_experiment(case.best, others[0][0], situation)
-
-
-def _fit(problem: Problem, found: WindowEstimate, memory: FilterState) -> FitDocument:
-    outputs = tuple(entry.name for entry in problem.twin.outputs)
-    return FitDocument(
-        rmse_configured=_finite(outputs, found.rmse_configured),
-        rmse_estimated=_finite(outputs, found.rmse_estimated),
-        rmse_completed=_finite(outputs, found.rmse_completed) if problem.components else None,
-        explained=found.cost <= EXPLAINED,
-        cost=found.cost,
-        variance_ratio=memory.belief.variance_ratio,
-        outcome=found.outcome,
-    )
-
-
-def _finite(names: tuple[str, ...], values: tuple[float, ...]) -> dict[str, float]:
-    return {name: value for name, value in zip(names, values, strict=True) if np.isfinite(value)}

@@ -1,85 +1,122 @@
-"""What is carried from window to window. Plain and frozen: it pickles, and no process owns it.
-
-What the specialist says of components, made part of the state: pure, as the heart.
-"""
+"""The state that is carried from window to window, and what operator decisions change in it. Plain: it pickles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from otolith.discovery.adopted import AdoptedComponent, Approval, slot_of
-from otolith.discovery.phase_tracking import phase_unknown, without_slot
-from otolith.discovery.sequential_test import FilterState, initial_filter_state
-from otolith.estimation.augmented import augment, indices
-from otolith.estimation.imm_filter import moment_match, remap_parameters, reset_marginal
+from otolith.discovery.adopted import AdoptedComponent, Approval, keep_present
+from otolith.discovery.sequential_test import SequentialTest
+from otolith.estimation.augmented import augment, indices, slot_of
+from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
 from otolith.health.status import PreviousStatus
 
-FEWEST_ON_A_COARSE_GRID = 50  # records; a window of fewer says little, however long the sample period
+MIN_COARSE_RECORDS = 50  # records of a window on a coarser grid: fewer say little, however long the sample period
+RESTART_FACTOR = 3.0  # on the standard deviations before a restart: nothing was observed meanwhile
+PHASE = 2  # position of the phase among the values of a component
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdaptationState:
-    """All that is carried from window to window. Plain and frozen: it pickles."""
+    """Everything that is carried from window to window."""
 
     machine: str
     site: str
-    problem: Problem
-    memory: FilterState
-    standing: dict[str, PreviousStatus]
-    """Of each free parameter, by its label."""
+    posterior: Posterior
+    previous: dict[str, PreviousStatus]
+    """Status of each free parameter in the report before, by its label."""
     records: int
     """Of the next window."""
+    test: SequentialTest | None = None
+    """The competing hypotheses, while they are undecided."""
+    contradictions: int = 0
+    """Consecutive windows that did not update the posterior because they contradict it."""
     restricted: frozenset[str] = frozenset()
-    """Keys of components that the machine file rules out."""
+    """Keys of components that the machine file excludes."""
     approved: frozenset[str] = frozenset()
-    """Keys of components that the specialist has approved."""
-    catalogue: tuple[AdoptedComponent, ...] = ()
-    """Of the components in the twin."""
+    """Keys of components that the operator approved."""
+    adopted: tuple[AdoptedComponent, ...] = ()
+    """The components in the twin."""
 
+    @property
+    def problem(self) -> Problem:
+        """The estimation problem, with the components in the twin."""
+        return self.posterior.problem
 
-def with_sample_grid(state: AdaptationState, configured: WindowOptions, ratio: float) -> AdaptationState:
-    """The state for windows with ``ratio`` times the configured sample period: as long in seconds, never too short."""
-
-    def scaled(records: int) -> int:
-        return max(round(records / ratio), min(records, FEWEST_ON_A_COARSE_GRID))
-
-    window = WindowOptions(scaled(configured.records), scaled(configured.shortest), scaled(configured.longest))
-    return replace(state, problem=replace(state.problem, window=window), records=window.records)
+    @property
+    def is_determined(self) -> bool:
+        """Whether any parameter has been determined."""
+        return any(status.known for status in self.previous.values())
 
 
 def initial_state(machine: str, site: str, problem: Problem) -> AdaptationState:
-    """The state before the first window."""
-    standing = {entry.label: PreviousStatus() for entry in problem.free}
-    memory, records = initial_filter_state(problem), problem.window.records
-    return AdaptationState(machine, site, problem, memory, standing, records, problem.excluded)
+    """Return the state before the first window."""
+    previous = {parameter.label: PreviousStatus() for parameter in problem.free}
+    return AdaptationState(
+        machine, site, Posterior.initial(problem), previous, problem.window.records, restricted=problem.excluded
+    )
+
+
+def with_problem(state: AdaptationState, problem: Problem) -> AdaptationState:
+    """Return the state with other options of the problem; its free parameters must be the same."""
+    return replace(state, posterior=replace(state.posterior, problem=problem))
+
+
+def with_sample_grid(state: AdaptationState, configured: WindowOptions, ratio: float) -> AdaptationState:
+    """Return the state for ``ratio`` times the configured sample period; windows keep their length in seconds."""
+
+    def scaled(records: int) -> int:
+        return max(round(records / ratio), min(records, MIN_COARSE_RECORDS))
+
+    window = WindowOptions(scaled(configured.records), scaled(configured.shortest), scaled(configured.longest))
+    return replace(with_problem(state, replace(state.problem, window=window)), records=window.records)
+
+
+def with_posterior(state: AdaptationState, posterior: Posterior) -> AdaptationState:
+    """Return the state with a posterior of fewer components; an open test was about another twin and is dropped."""
+    if posterior is state.posterior:
+        return state
+    return replace(
+        state, posterior=posterior, test=None, adopted=keep_present(state.adopted, posterior.problem.components)
+    )
 
 
 def without_component(state: AdaptationState, component: Component) -> AdaptationState:
-    """The state without a component; a case, which was about another twin, is dropped."""
-    rest = tuple(entry for entry in state.catalogue if entry.component.key != component.key)
+    """Return the state without a component."""
     slot = slot_of(state.problem, component)
     if slot is None:
-        return replace(state, catalogue=rest)
-    problem, belief, turned = without_slot(state.problem, state.memory.belief, state.memory.turned, slot)
-    memory = replace(state.memory, belief=belief, turned=turned, case=None)
-    return replace(state, problem=problem, memory=memory, catalogue=rest)
-
-
-OLDER = 3.0  # times the standard deviations before a restart: nobody has looked meanwhile
+        rest = tuple(item for item in state.adopted if item.component.key != component.key)
+        return replace(state, adopted=rest)
+    return with_posterior(state, state.posterior.without_slot(slot))
 
 
 @dataclass(frozen=True, slots=True)
 class OperatorDecisions:
-    """What the specialist has said, by the keys of components."""
+    """What the operator decided, by the keys of components."""
 
     approved: frozenset[str] = frozenset()
     """They belong to the healthy machine."""
     rejected: frozenset[str] = frozenset()
-    """They are no components, and not to be looked for."""
+    """They are no components, and discovery leaves them out."""
     forgotten: Mapping[str, float] = field(default_factory=dict)
-    """Unix seconds: what was found before then is to be found anew."""
+    """Unix seconds: a component discovered before then has to be discovered again."""
+
+
+def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
+    """Return the state after the operator's decisions."""
+    for item in state.adopted:
+        key = item.component.key
+        if key in decisions.rejected or decisions.forgotten.get(key, -np.inf) > item.onset:
+            state = without_component(state, item.component)
+    adopted = tuple(
+        replace(item, approval=Approval.APPROVED if item.component.key in decisions.approved else Approval.OPEN)
+        for item in state.adopted
+    )
+    excluded = state.restricted | decisions.rejected
+    if excluded != state.problem.excluded:  # an open test was searched with other exclusions
+        state = replace(with_problem(state, replace(state.problem, excluded=excluded)), test=None)
+    return replace(state, adopted=adopted, approved=decisions.approved)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,51 +125,33 @@ class ComponentRecord:
 
     adopted: AdoptedComponent
     values: tuple[float, ...]
-    """Amplitude, and inner number and phase as far as it has them."""
+    """Amplitude, inner parameter and phase, as far as it has them."""
     deviations: tuple[float, ...]
 
 
-def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
-    """The state after the specialist's word."""
-    for entry in state.catalogue:
-        key = entry.component.key
-        if key in decisions.rejected or decisions.forgotten.get(key, -np.inf) > entry.onset:
-            state = without_component(state, entry.component)
-    approvals = tuple(
-        replace(entry, approval=Approval.APPROVED if entry.component.key in decisions.approved else Approval.OPEN)
-        for entry in state.catalogue
-    )
-    problem, memory = replace(state.problem, excluded=state.restricted | decisions.rejected), state.memory
-    if problem.excluded != state.problem.excluded:  # an open case was sought under other rules
-        memory = replace(memory, case=None)
-    return replace(state, problem=problem, memory=memory, catalogue=approvals, approved=decisions.approved)
-
-
-def restore_components(state: AdaptationState, kept: tuple[ComponentRecord, ...]) -> AdaptationState:
-    """A state that begins with what is ``kept`` of components; their phases have to be found again."""
-    if not kept:
-        return state
-    problem = augment(state.problem, [entry.adopted.component for entry in kept])
-    belief = remap_parameters(state.memory.belief, state.problem, problem)
-    for slot, entry in enumerate(kept):
-        where = indices(problem, slot)
-        for number, (at, value, sd) in enumerate(zip(where, entry.values, entry.deviations, strict=True)):
-            if number == 2:
-                belief = phase_unknown(belief, problem, at)  # a phase
-            else:
-                belief = reset_marginal(belief, at, OLDER * sd / problem.scale[at], value / problem.scale[at])
-    catalogue = tuple(entry.adopted for entry in kept)
-    return replace(state, problem=problem, memory=replace(state.memory, belief=belief), catalogue=catalogue)
-
-
 def component_records(state: AdaptationState) -> tuple[ComponentRecord, ...]:
-    """What is to be kept of the components in the twin."""
-    problem, found = state.problem, []
-    known = moment_match(state.memory.belief, problem)
-    deviations = np.sqrt(np.diag(known.covariance))
-    for entry in state.catalogue:
-        slot = slot_of(problem, entry.component)
+    """Return what is stored of the components in the twin."""
+    prior = state.posterior.prior()
+    deviations, records = np.sqrt(np.diag(prior.covariance)), []
+    for item in state.adopted:
+        slot = slot_of(state.problem, item.component)
         if slot is not None:
-            at = indices(problem, slot)
-            found.append(ComponentRecord(entry, tuple(known.mean[at].tolist()), tuple(deviations[at].tolist())))
-    return tuple(found)
+            at = indices(state.problem, slot)
+            records.append(ComponentRecord(item, tuple(prior.mean[at].tolist()), tuple(deviations[at].tolist())))
+    return tuple(records)
+
+
+def restore_components(state: AdaptationState, records: tuple[ComponentRecord, ...]) -> AdaptationState:
+    """Return the state with stored components; their phases are unknown."""
+    if not records:
+        return state
+    problem = augment(state.problem, [record.adopted.component for record in records])
+    posterior = state.posterior.remap_parameters(problem)
+    for slot, record in enumerate(records):
+        values = zip(indices(problem, slot), record.values, record.deviations, strict=True)
+        for number, (index, value, sd) in enumerate(values):
+            if number == PHASE:
+                posterior = posterior.forget_phase(index)
+            else:
+                posterior = posterior.reset_value(index, value, RESTART_FACTOR * sd)
+    return replace(state, posterior=posterior, adopted=tuple(record.adopted for record in records))

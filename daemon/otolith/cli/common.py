@@ -1,47 +1,59 @@
-"""What commands have in common as processes: how they are asked to end, and where they log."""
+"""What the commands share: arguments, the signal to stop, logging, a line of progress, and folders."""
 
 import logging
 import os
+import queue
 import signal
 import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+import click
 
-class NobodyReads(Exception):  # noqa: N818 - the reader of our output has seen enough, which is no error
-    """Not an OSError, as click would make exit code 1 of a broken pipe."""
+INTERRUPTED = 128 + signal.SIGINT  # exit code of a command that Ctrl-C ended, as a shell reports it
+FILE = click.Path(path_type=Path, dir_okay=False)
+MACHINE_FILE = click.argument("file", type=FILE)
+DATA_FILE = click.argument("data", type=FILE)
+AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 
 
 class StopSignal:
     """Remembers the signal that asks this command to end."""
 
     def __init__(self) -> None:
-        self.number: int | None = None
+        self._number: int | None = None
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves SIGHUP
-                signal.signal(number, self._take)
+            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP, and that stays so
+                signal.signal(number, self._receive)
+
+    def received(self) -> bool:
+        """Whether a signal has come."""
+        return self._number is not None
 
     def code(self, clean: int | None = None) -> int:
-        """The exit code, as a shell counts signals; 0 for the signal that is the ordinary way to end."""
-        return 0 if self.number is None or self.number == clean else 128 + self.number
+        """Exit code: 0 without a signal and for the signal ``clean``, else 128 plus the number of the signal."""
+        return 0 if self._number is None or self._number == clean else 128 + self._number
 
-    def _take(self, number: int, _: FrameType | None) -> None:
-        self.number = number
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        self._number = number
 
 
 def log_to_stderr(*, verbose: bool) -> None:
-    """To standard error; under systemd with the priority that journald understands."""
+    """Log to standard error; under systemd with the priority prefix that journald reads."""
     handler = logging.StreamHandler(sys.stderr)
     if "JOURNAL_STREAM" in os.environ:
-        handler.setFormatter(_Journal("%(name)s: %(message)s"))
+        handler.setFormatter(_JournalFormatter("%(name)s: %(message)s"))
     else:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
-    logging.getLogger("otolith").setLevel(logging.DEBUG if verbose else logging.INFO)
-    logging.getLogger("otolith_drivers").setLevel(logging.DEBUG if verbose else logging.INFO)
+    for name in ("otolith", "otolith_drivers"):
+        logging.getLogger(name).setLevel(logging.DEBUG if verbose else logging.INFO)
 
 
-class _Journal(logging.Formatter):
+class _JournalFormatter(logging.Formatter):
     PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
     def format(self, record: logging.LogRecord) -> str:
@@ -49,7 +61,40 @@ class _Journal(logging.Formatter):
         return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
 
 
+@contextmanager
+def progress_line(first: str, *, enabled: bool = True) -> Iterator[Callable[[str], None]]:
+    """A function that shows a text on a line of standard error, if that is a terminal and ``enabled``."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    console.quiet = not (enabled and console.is_terminal)
+    with console.status(first) as status:
+        yield status.update
+
+
+def drain(texts: "queue.Queue[str]", timeout: float) -> list[str]:
+    """All texts in the queue; waits up to ``timeout`` s for the first."""
+    drained = []
+    try:
+        drained.append(texts.get(timeout=timeout))
+        while True:
+            drained.append(texts.get_nowait())
+    except queue.Empty:
+        return drained
+
+
+def echo_warnings(data: Path, lines: Iterable[str]) -> None:
+    """Print what a replay of ``data`` warns of, to standard error."""
+    for line in lines:
+        click.echo(f"{data}: {line}", err=True)
+
+
+def local_time(seconds: float) -> str:
+    """Unix ``seconds`` as date and time of this computer's time zone."""
+    return time.strftime("%F %T", time.localtime(seconds))
+
+
 def examples_directory() -> Path:
-    """The machine files to copy from: inside an installed package, or beside the sources of a checkout."""
+    """The folder of example machine files: in an installed package, or beside the sources of a checkout."""
     installed = Path(__file__).parents[1] / "config"
     return installed if installed.is_dir() else Path(__file__).parents[3] / "config"

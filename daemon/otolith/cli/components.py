@@ -1,13 +1,16 @@
 """``otolith components`` and ``otolith commission``: what the twin of a machine lacks, and what belongs to it."""
 
+import json
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
+from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, local_time
 
 if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
@@ -15,14 +18,11 @@ if TYPE_CHECKING:
     from otolith.runtime.state_store import StateStore
 
 
-FILE = click.Path(path_type=Path, dir_okay=False)
-
-
 @click.group()
 def components() -> None:
-    """List the components that were found in a machine, and say what they are.
+    """List discovered components, and decide what becomes of them.
 
-    A running daemon hears what is said here with its next window, and a later one when it starts.
+    A running daemon obeys a decision from its next window on.
 
     \b
     Examples:
@@ -34,189 +34,198 @@ def components() -> None:
 
 
 @components.command("list")
-@click.argument("file", type=FILE)
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
-def list_them(file: Path, as_json: bool) -> None:
-    """List the components of the machine in FILE."""
-    import json
+@MACHINE_FILE
+@AS_JSON
+def list_(file: Path, as_json: bool) -> None:
+    """List components: key, equation, onset and decision.
 
+    \b
+    Example:
+      otolith components list my-machine.toml
+    """
     from pydantic import TypeAdapter
 
     from otolith.adaptation.state import ComponentRecord
 
-    plan, keeper = _keeper(file)
-    found, decisions = keeper.components(), keeper.decisions()
+    machine, store = _store(file)
+    records, decisions = store.components(), store.decisions()
     if as_json:
-        rows = [TypeAdapter(ComponentRecord).dump_python(entry, mode="json") for entry in found]
-        said = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
-        click.echo(json.dumps({"components": rows, **said}, ensure_ascii=False))
+        rows = [TypeAdapter(ComponentRecord).dump_python(record, mode="json") for record in records]
+        keys = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
+        click.echo(json.dumps({"components": rows, **keys}, ensure_ascii=False))
         return
-    for entry in found:
-        key = entry.adopted.component.key
-        word = "approved" if key in decisions.approved else "rejected" if key in decisions.rejected else "open"
-        if decisions.forgotten.get(key, 0.0) > entry.adopted.onset:
-            word = "forgotten: it will be found anew if it is there"
-        click.echo(f"{key}  {_words(plan, entry)}  since {_moment(entry.adopted.onset)}  {word}")
-    known = {entry.adopted.component.key for entry in found}
-    for key in sorted(decisions.rejected - known):
-        click.echo(f"{key}  is not looked for: rejected")
-    if not found and not decisions.rejected:
-        click.echo(f"{plan.file.machine.name}: no component has been found", err=True)
+    for record in records:
+        onset = record.adopted.onset
+        decision = _decision(record, decisions)
+        click.echo(f"{_key(record)}  {_equation(machine, record)}  since {local_time(onset)}  {decision}")
+    for key in sorted(decisions.rejected - {_key(record) for record in records}):
+        click.echo(f"{key}  rejected: not searched for")
+    if not records and not decisions.rejected:
+        click.echo(f"{machine.file.machine.name}: no component has been found", err=True)
 
 
-def _moment(seconds: float) -> str:
-    return time.strftime("%F %T", time.localtime(seconds))
+def _key(record: "ComponentRecord") -> str:
+    return record.adopted.component.key
 
 
-def _words(plan: "LoadedMachine", entry: "ComponentRecord") -> str:
+def _decision(record: "ComponentRecord", decisions: "OperatorDecisions") -> str:
+    key = _key(record)
+    if decisions.forgotten.get(key, 0.0) > record.adopted.onset:
+        return "forgotten: it will be discovered again if it is present"
+    return "approved" if key in decisions.approved else "rejected" if key in decisions.rejected else "open"
+
+
+def _equation(machine: "LoadedMachine", record: "ComponentRecord") -> str:
     from otolith.estimation.augmented import equation
+    from otolith.health.text import half_width_text
 
-    sd = f" (amplitude ± {1.96 * entry.deviations[0]:.2g})"
-    return equation(plan.twin, entry.adopted.component, entry.values) + sd
+    text = equation(machine.twin, record.adopted.component, record.values)
+    return f"{text} (amplitude ± {half_width_text(record.deviations[0])})"
 
 
 @components.command()
-@click.argument("file", type=FILE)
+@MACHINE_FILE
 @click.argument("component")
 def approve(file: Path, component: str) -> None:
-    """COMPONENT belongs to the healthy machine: it stays in the twin and is no finding."""
-    _say(file, component, "approved", lambda said: replace(said, approved=said.approved | {component}))
+    """Decide that COMPONENT belongs to the healthy machine.
+
+    It stays in the twin and is no longer reported as a finding.
+
+    \b
+    Example:
+      otolith components approve my-machine.toml shaft/periodic/t
+    """
+    _decide(file, component, "approved", lambda rest: replace(rest, approved=rest.approved | {component}))
 
 
 @components.command()
-@click.argument("file", type=FILE)
+@MACHINE_FILE
 @click.argument("component")
 def reject(file: Path, component: str) -> None:
-    """COMPONENT is none: it leaves the twin and is not looked for again."""
-    _say(file, component, "rejected", lambda said: replace(said, rejected=said.rejected | {component}))
+    """Decide that COMPONENT does not exist.
+
+    It leaves the twin and is not searched for again.
+
+    \b
+    Example:
+      otolith components reject my-machine.toml shaft/Coulomb/omega
+    """
+    _decide(file, component, "rejected", lambda rest: replace(rest, rejected=rest.rejected | {component}))
 
 
 @components.command()
-@click.argument("file", type=FILE)
+@MACHINE_FILE
 @click.argument("component")
 def forget(file: Path, component: str) -> None:
-    """Forget COMPONENT and what was said of it: if it is there, it will be found anew."""
-    moment = time.time()
-    _say(file, component, "forgotten", lambda said: replace(said, forgotten={**said.forgotten, component: moment}))
+    """Forget COMPONENT and the decision on it.
+
+    If the component is present, it will be discovered again.
+
+    \b
+    Example:
+      otolith components forget my-machine.toml shaft/periodic/t
+    """
+    now = time.time()
+    _decide(file, component, "forgotten", lambda rest: replace(rest, forgotten={**rest.forgotten, component: now}))
 
 
-def _say(file: Path, component: str, word: str, more: "Callable[[OperatorDecisions], OperatorDecisions]") -> None:
-    """Keep ``more`` in the place of what has been said of ``component``."""
-    _, keeper = _keeper(file)
-    keeper.decide(more(_unsaid(keeper, component)))
-    click.echo(f"{component} is {word}")
-
-
-def _keeper(file: Path) -> "tuple[LoadedMachine, StateStore]":
-    from otolith.machine import load_machine
-    from otolith.runtime.state_store import StateStore
-
-    plan = load_machine(file, with_driver=False)
-    return plan, StateStore(
-        plan.file.machine.site, plan.file.machine.name, plan.twin, signal_fingerprint=plan.signal_fingerprint
-    )
-
-
-def _unsaid(keeper: "StateStore", component: str) -> "OperatorDecisions":
-    """What has been said, but for what was said of ``component``.
+def _decide(file: Path, component: str, decision: str, add: "Callable[[OperatorDecisions], OperatorDecisions]") -> None:
+    """Replace the decision on ``component``; ``add`` takes the decisions without it.
 
     Raises:
-        ConfigurationError: it has never been heard of; with the nearest one that has.
+        ConfigurationError: no such component was ever found; the message has the nearest one.
     """
     from otolith_drivers.errors import ConfigurationError, nearest
 
-    said = keeper.decisions()
-    known = {entry.adopted.component.key for entry in keeper.components()} | said.approved | said.rejected
+    _, store = _store(file)
+    decisions = store.decisions()
+    known = {_key(record) for record in store.components()} | decisions.approved | decisions.rejected
     if component not in known:
         raise ConfigurationError(f"no component {component!r}: {nearest(component, sorted(known))}")
-    return replace(said, approved=said.approved - {component}, rejected=said.rejected - {component})
+    rest = replace(decisions, approved=decisions.approved - {component}, rejected=decisions.rejected - {component})
+    store.save_decisions(add(rest))
+    click.echo(f"{component} is {decision}")
+
+
+def _store(file: Path) -> "tuple[LoadedMachine, StateStore]":
+    from otolith.machine import load_machine
+    from otolith.runtime.state_store import StateStore
+
+    machine = load_machine(file, with_driver=False)
+    names = machine.file.machine
+    return machine, StateStore(names.site, names.name, machine.twin, signal_fingerprint=machine.signal_fingerprint)
 
 
 @click.command()
-@click.argument("file", type=FILE)
-@click.argument("data", type=FILE)
-@click.option("--yes", is_flag=True, help="Every component that is found belongs to the healthy machine.")
-@click.option("--windows", type=click.IntRange(1, 1000), default=30, show_default=True, help="To learn noise from.")
+@MACHINE_FILE
+@DATA_FILE
+@click.option("--yes", is_flag=True, help="Approve every component that is found.")
+@click.option("--windows", type=click.IntRange(1, 1000), default=30, help="At most so many windows for the noise.")
 def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
-    """Learn what is normal for the machine in FILE from the table DATA, recorded while it was in good health.
+    """Identify what is normal for the machine in FILE.
 
-    Looks for components that the twin lacks, and learns the levels of noise. You say of each component whether it
-    belongs to the machine; afterwards only change is a finding. The daemon knows what you approved when it starts.
+    Searches DATA, recorded from the healthy machine, for components that the twin lacks, and identifies the noise
+    levels. You decide for each component whether
+    it belongs to the machine; afterwards only a change is a finding. The daemon reads approvals when it starts.
 
     \b
     Examples:
       otolith commission my-machine.toml monday.csv
       otolith commission my-machine.toml monday.csv --yes
     """
-    from otolith.cli.noise import learned_noise, lines_of
-    from otolith.commissioning.identification import with_noise
+    from otolith.cli.noise import identified_noise, noise_lines
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    plan, keeper = _keeper(file)
-    state = _lived(plan, data)
-    found = learned_noise(plan, data, windows)
-    if not state.catalogue:  # what the noise of the file may have hidden
-        state = _lived(replace(plan, problem=with_noise(plan.problem, found)), data)
-    for line in lines_of(plan, found):
-        click.echo(line)
-    if state.catalogue:
-        click.echo(
-            "# process noise was learned without the components below and contains them: keep what the file says"
-        )
+    machine, store = _store(file)
+    state = _replayed(machine, data)
+    identified = identified_noise(machine, data, windows)
+    if not state.adopted:  # the file's noise levels may have hidden a component, so search again with these
+        state = _replayed(replace(machine, problem=identified.applied(machine.problem)), data)
+    click.echo("\n".join(noise_lines(machine, identified)))
+    if state.adopted:
+        click.echo("# this process noise contains the components below: keep that of the file if you approve them")
     click.echo("# put these tables into the machine file in place of its own", err=True)
-    _ask(plan, keeper, state, yes=yes)
+    _review(machine, store, state, approve_all=yes)
 
 
-def _lived(plan: "LoadedMachine", data: Path) -> "AdaptationState":
-    """The state after all windows of the table."""
+def _replayed(machine: "LoadedMachine", data: Path) -> "AdaptationState":
+    """The state after all windows of the data; findings and warnings are printed to standard error."""
     from otolith.runtime.replay import Replay, open_recorded
 
-    with open_recorded(plan, data) as recorded:
-        run = Replay(plan, recorded)
+    with open_recorded(machine, data) as recorded:
+        run = Replay(machine, recorded)
         for report in run.reports():
-            for line in _told(report.document.findings):
-                click.echo(f"window {report.document.window.index}: {line}", err=True)
-        for line in run.warnings():
-            click.echo(f"{data}: {line}", err=True)
+            for finding in report.document.findings:
+                click.echo(f"window {report.document.window.index}: {finding.text}", err=True)
+        echo_warnings(data, run.warnings())
         return run.state
 
 
-def _told(findings: object) -> Iterator[str]:
-    for finding in findings if isinstance(findings, tuple) else ():
-        yield finding.text
-
-
-def _ask(plan: "LoadedMachine", keeper: "StateStore", state: "AdaptationState", *, yes: bool) -> None:
+def _review(machine: "LoadedMachine", store: "StateStore", state: "AdaptationState", *, approve_all: bool) -> None:
+    """Ask for a decision on each component, keep the approved ones, and print the estimated parameters."""
     from otolith.adaptation.state import component_records
+    from otolith.health.text import interval_text
 
-    said = keeper.decisions()
-    approved, rejected = set[str](), set[str]()
-    found = component_records(state)
-    for entry in found:
-        key = entry.adopted.component.key
-        click.echo(f"found {key}: {_words(plan, entry)}", err=True)
-        (approved if yes or _belongs() else rejected).add(key)
-    keeper.keep(tuple(entry for entry in found if entry.adopted.component.key in approved))
-    keeper.decide(replace(said, approved=said.approved | approved, rejected=(said.rejected | rejected) - approved))
-    if not found:
+    records, approved, rejected = component_records(state), set[str](), set[str]()
+    for record in records:
+        click.echo(f"found {_key(record)}: {_equation(machine, record)}", err=True)
+        (approved if approve_all or _is_healthy() else rejected).add(_key(record))
+    decisions = store.decisions()
+    store.save_components(tuple(record for record in records if _key(record) in approved))
+    rejected = {*decisions.rejected, *rejected} - approved
+    store.save_decisions(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))
+    if not records:
         click.echo("no component was found: the twin explains the machine up to the noise", err=True)
-    for name, parameter in _parameters(state):
-        click.echo(f"{name} = {parameter}", err=True)
+    posterior = state.posterior.prior()
+    for index, parameter in enumerate(state.problem.free):
+        if not parameter.name.startswith("_"):
+            mean, variance = float(posterior.mean[index]), float(posterior.covariance[index, index])
+            click.echo(f"{parameter.name} = {interval_text(mean, variance**0.5, parameter.unit)}", err=True)
 
 
-def _belongs() -> bool:
+def _is_healthy() -> bool:
     try:
         return click.confirm("does it belong to the healthy machine?", err=True)
     except click.Abort:
-        click.echo("\nnot answered: nothing is kept; answer y or n, or give --yes", err=True)
+        click.echo("\nno answer: nothing is kept; answer y or n, or give --yes", err=True)
         raise
-
-
-def _parameters(state: "AdaptationState") -> Iterator[tuple[str, str]]:
-    from otolith.estimation.imm_filter import moment_match
-
-    known = moment_match(state.memory.belief, state.problem)
-    for index, entry in enumerate(state.problem.free):
-        if not entry.name.startswith("_"):
-            sd = float(known.covariance[index, index]) ** 0.5
-            yield entry.name, f"{known.mean[index]:.5g} ± {1.96 * sd:.2g} {entry.unit}"

@@ -1,39 +1,41 @@
-"""What people see in a terminal: the live table of a machine, fed by its reports."""
+"""The live table of a machine in a terminal, drawn from its published reports."""
 
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from datetime import datetime
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
 from otolith.acquisition.window import Verdict
-from otolith.estimation.information import QUANTILE
+from otolith.cli.common import local_time
 from otolith.health.schema import DriverDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.text import interval_text, value_cells
 
-HISTORY = 200  # windows that the curve can show
-WITHOUT_HISTORY = 72  # columns of the table beside the curve
-SILENT_WINDOWS = 3  # lengths of a window without a report, after which the table says so
+HISTORY = 200  # windows that the curve of a parameter can show
+OTHER_COLUMNS = 72  # characters that the table needs beside the curve
+SILENT_WINDOWS = 3  # lengths of a window without a report until a warning; engineering choice, no test
 BARS = "▁▂▃▄▅▆▇█"
 STYLES = {Status.ESTIMATED: "green", Status.HELD: "yellow", Status.INVALID: "red", Status.UNESTIMATED: "dim"}
+VALUE_COLUMNS = ("parameter", "value", "± 95 %", "unit", "change")
+RIGHT = {"value", "± 95 %", "change"}
 
 
 class LiveTable:
-    """Takes reports from any thread, and draws; ``state`` says in words what is waited for."""
+    """Takes reports from any thread, and draws itself; ``state`` returns what is waited for, in words."""
 
     def __init__(self, state: Callable[[], str]) -> None:
         self._state = state
-        self._heard_at = 0.0
         self._lock = threading.Lock()
         self._latest: ReportDocument | None = None
+        self._latest_at = 0.0
         self._histories: dict[str, deque[float]] = {}
         self._unreadable = 0
 
-    def hear(self, text: str) -> ReportDocument | None:
-        """Take a published report; None, and counted, if it is not one that this version can read."""
+    def add(self, text: str) -> ReportDocument | None:
+        """Take a published report; None, and counted, if this version cannot read it."""
         try:
             document = ReportDocument.from_json(text)
         except ValueError:
@@ -41,8 +43,7 @@ class LiveTable:
                 self._unreadable += 1
             return None
         with self._lock:
-            self._latest = document
-            self._heard_at = time.monotonic()
+            self._latest, self._latest_at = document, time.monotonic()
             for name, parameter in document.parameters.items():
                 if parameter.value is not None:
                     self._histories.setdefault(name, deque(maxlen=HISTORY)).append(parameter.value)
@@ -51,78 +52,79 @@ class LiveTable:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The table as it is now."""
         del console
-        yield self._drawn(options.max_width)
+        yield self._draw(options.max_width)
 
-    def _drawn(self, width: int) -> RenderableType:
+    def _draw(self, width: int) -> RenderableType:
         with self._lock:
             document, unreadable = self._latest, self._unreadable
-            silence = time.monotonic() - self._heard_at
+            silence = time.monotonic() - self._latest_at
             histories = {name: tuple(values) for name, values in self._histories.items()}
         if document is None:
             return Text(self._state(), style="dim")
-        parts: list[RenderableType] = [*_heading(document), _parameters(document, histories, width)]
-        if document.components:
-            parts.append(_components(document))
-        parts += _words(document)
-        length = document.window.end - document.window.start
-        if silence > SILENT_WINDOWS * length:
+        parts: list[RenderableType] = [*_heading(document), _parameters(document.parameters, histories, width)]
+        parts += [_components(document)] if document.components else []
+        parts += [*_messages(document), *_counters(document)]
+        if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
             parts.insert(0, Text(f"no report for {silence:.0f} s: {self._state()}", style="bold red"))
         if unreadable:
-            parts.append(Text(f"{unreadable} reports could not be read: another version publishes here", style="red"))
+            parts.append(Text(f"{unreadable} reports cannot be read: another version publishes here", style="red"))
         return Group(*parts)
+
+
+def title(document: ReportDocument, rest: str = "") -> Text:
+    """The machine of a report, its site, twin and model."""
+    text = f" at {document.site}, twin {document.twin} ({document.model}){rest}"
+    return Text.assemble((document.machine, "bold"), text)
+
+
+def parameter_table(*columns: str) -> Table:
+    """A table of parameters: the columns of :func:`value_cells`, then ``columns``; status counts are numbers."""
+    table = Table(expand=False)
+    for column in (*VALUE_COLUMNS, *columns):
+        right = column in RIGHT or column in set(Status)
+        table.add_column(column, justify="right" if right else "left", no_wrap=True)
+    return table
 
 
 def _heading(document: ReportDocument) -> list[Text]:
     window, quality = document.window, document.window.quality
-    text = Text.assemble((document.machine, "bold"), f" at {document.site}, twin {document.twin} ({document.model})")
     line = Text(f"window {window.index} ")
     line.append(quality.verdict, style="green" if quality.verdict is Verdict.GOOD else "red")
     line.append(f", {window.records} records, {quality.missing:.1%} missing, jitter {quality.jitter_s * 1e3:.1f} ms")
     if document.fit is not None:
         line.append(f", {document.cost.seconds * 1e3:.0f} ms")
-    return [text, line]
+    return [title(document), line]
 
 
-def _parameters(document: ReportDocument, histories: Mapping[str, tuple[float, ...]], width: int) -> Table:
-    table = Table(expand=False)
-    for column in ("parameter", "value", "± 95 %", "unit", "change", "status", "history"):
-        table.add_column(column, justify="right" if column in ("value", "± 95 %", "change") else "left", no_wrap=True)
-    room = max(8, width - WITHOUT_HISTORY)
-    for name, parameter in document.parameters.items():
+def _parameters(
+    parameters: Mapping[str, ParameterDocument], histories: Mapping[str, tuple[float, ...]], width: int
+) -> Table:
+    table = parameter_table("status", "history")
+    length = max(8, width - OTHER_COLUMNS)
+    for name, parameter in parameters.items():
         status = Text(parameter.status, style=STYLES[parameter.status])
-        table.add_row(name, *value_cells(parameter), status, sparkline(histories.get(name, ())[-room:]))
+        table.add_row(name, *value_cells(parameter), status, sparkline(histories.get(name, ())[-length:]))
     return table
 
 
 def _components(document: ReportDocument) -> Table:
     table = Table(expand=False)
     for column in ("component", "equation", "amplitude ± 95 %", "since", "status"):
-        table.add_column(column, overflow="fold")  # an equation that is cut off is none
-    for entry in document.components:
-        amplitude = entry.values["amplitude"]
-        text = f"{amplitude.value:.4g} ± {QUANTILE * amplitude.sd:.2g} {amplitude.unit}"
-        moment = datetime.fromtimestamp(entry.onset).astimezone().strftime("%F %T")
-        table.add_row(entry.meaning, entry.equation, text, moment, f"{entry.status}, {entry.approval}")
+        table.add_column(column, overflow="fold")  # a truncated equation would be a wrong one
+    for component in document.components:
+        amplitude = component.values["amplitude"]
+        text = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
+        status = f"{component.status}, {component.approval}"
+        table.add_row(component.meaning, component.equation, text, local_time(component.onset), status)
     return table
 
 
-def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
-    """Value, half of its interval, unit and change against nominal, as a table shows them."""
-    if parameter.value is None or parameter.sd is None:
-        return "unknown", "", parameter.unit, ""
-    change = f"{parameter.value / parameter.nominal - 1:+.2%}" if parameter.nominal else ""
-    return (
-        f"{parameter.value:.5g}",
-        f"{QUANTILE * parameter.sd:.2g}",
-        parameter.unit,
-        change.replace("-0.00%", "0.00%").replace("+0.00%", "0.00%"),
-    )
-
-
-def _words(document: ReportDocument) -> list[Text]:
-    lines = [Text(f"bad window: {reason}", style="red") for reason in document.window.quality.reasons]
+def _messages(document: ReportDocument) -> list[Text]:
+    """Reasons, advice, findings, and how well the twin explains the window."""
+    bad = document.window.quality.reasons
+    lines = [Text(f"bad window: {reason}", style="red") for reason in bad]
     for name, parameter in document.parameters.items():
-        if parameter.reason and not document.window.quality.reasons:
+        if parameter.reason and not bad:
             lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
         if parameter.advice:
             lines.append(Text(f"{name}: {parameter.advice}", style="cyan"))
@@ -132,32 +134,30 @@ def _words(document: ReportDocument) -> list[Text]:
             lines.append(Text(f"  {finding.advice}", style="cyan"))
     if document.fit is not None:
         errors = ", ".join(f"{name} {value:.3g}" for name, value in document.fit.rmse_estimated.items())
-        explained = "explained up to the noise" if document.fit.explained else "more than noise is left"
+        explained = "explained up to the noise" if document.fit.explained else "larger than the noise"
         lines.append(Text(f"residual (RMSE): {errors}: {explained}"))
-    if document.driver is not None:
-        lines += _of_driver(document.driver)
-    if document.counters is not None:
-        counters = document.counters
-        lines += [
-            Text(f"samples: {counters.received}, lost {counters.lost}, bad {counters.bad}", style="dim"),
-            Text(
-                f"windows: {counters.windows}, bad {counters.windows_bad}, missed {counters.windows_missed}; "
-                f"worker restarts {counters.worker_restarts}, bus reconnects {counters.reconnects}",
-                style="dim",
-            ),
-        ]
     return lines
 
 
-def _of_driver(driver: DriverDocument) -> list[Text]:
-    lines = [Text(f"driver: {complaint}", style="yellow") for complaint in driver.warnings]
+def _counters(document: ReportDocument) -> list[Text]:
+    lines = _driver(document.driver) if document.driver is not None else []
+    if (counters := document.counters) is not None:
+        windows = f"windows: {counters.windows}, bad {counters.windows_bad}, missed {counters.windows_missed}"
+        restarts = f"worker restarts {counters.worker_restarts}, bus reconnects {counters.reconnects}"
+        samples = f"samples: {counters.received}, lost {counters.lost}, bad {counters.bad}"
+        lines += [Text(samples, style="dim"), Text(f"{windows}; {restarts}", style="dim")]
+    return lines
+
+
+def _driver(driver: DriverDocument) -> list[Text]:
+    lines = [Text(f"driver: {warning}", style="yellow") for warning in driver.warnings]
     if not driver.up:
         return [*lines, Text(f"driver: {driver.reason}", style="bold red")]
     return [*lines, Text(f"driver: {driver.plan}", style="dim")] if driver.plan else lines
 
 
 def sparkline(values: tuple[float, ...]) -> str:
-    """A curve of one line; flat where the values hardly differ."""
+    """A curve of one line; flat where the values differ by less than a millionth."""
     if not values:
         return ""
     low, high = min(values), max(values)

@@ -1,11 +1,10 @@
-"""The command line: speech only. Each command imports what it needs, so that ``otolith --help`` is quick.
-
-``otolith plant``: a simulated machine on a bus of its own.
-"""
+"""The group ``otolith`` and its simple commands. Each command imports what it needs, so that help is quick."""
 
 import math
+import os
 import re
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,139 +13,101 @@ from typing import Any
 import click
 
 from otolith import __version__
-from otolith.cli.common import NobodyReads, StopSignal, log_to_stderr
+from otolith.cli.common import (
+    DATA_FILE,
+    FILE,
+    INTERRUPTED,
+    MACHINE_FILE,
+    StopSignal,
+    examples_directory,
+    log_to_stderr,
+)
 from otolith.cli.components import commission, components
 from otolith.cli.noise import noise
 from otolith.cli.probe import probe
 from otolith.cli.twin import twin
 
-FILE = click.Path(path_type=Path, dir_okay=False)
-TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.nodes.NODES, which takes time to import
-
-
-@click.command()
-@click.argument("scenario", type=FILE)
-@click.option(
-    "--as",
-    "transport",
-    type=click.Choice(TRANSPORTS),
-    default="can",
-    show_default=True,
-    help="What to be: a node on the CAN bus, or a Modbus drive on a port or a serial line of its own.",
-)
-@click.option("--truth", type=FILE, help="Write the parameters as they really are into this CSV file.")
-@click.option("--summary", type=FILE, help="Write at the end what was sent, asked and withheld into this JSON file.")
-@click.option("--duration", type=click.FloatRange(0.1), default=math.inf, metavar="SECONDS", help="End by then.")
-def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | None, duration: float) -> int:
-    """Be the simulated machine of SCENARIO, a device on its bus, in real time.
-
-    \b
-    Examples:
-      otolith plant config/scenarios/demo.toml
-      otolith plant config/scenarios/bus-dropouts.toml --as modbus-tcp --summary withheld.json
-    """
-    from contextlib import ExitStack, closing
-
-    from otolith_drivers.plant.realtime import TruthFile, open_node, write_summary
-    from otolith_drivers.plant.scenario import load_scenario
-    from otolith_drivers.user_dirs import complain_unless_writable
-
-    loaded = load_scenario(scenario)
-    if summary is not None:
-        complain_unless_writable(summary.absolute().parent)
-    stop = StopSignal()
-    with ExitStack() as stack:
-        true = stack.enter_context(closing(TruthFile(truth))) if truth is not None else None
-        node = stack.enter_context(closing(open_node(transport, loaded)))
-        click.echo(f"{node.title()}; Ctrl-C ends it", err=True)
-        done = node.run(true, lambda: stop.number is not None, duration)
-    if summary is not None:
-        write_summary(summary, loaded, transport, done)
-    click.echo(node.say(done), err=True)
-    return stop.code(clean=signal.SIGTERM)
-
-
-INTERRUPTED = 128 + signal.SIGINT
+TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.realtime.NODES, which is slow to import
 EXIT_CODES = """\b
 Exit codes:
   0    done; run and plant also when stopped by SIGTERM
-  1    the demo's estimate was wrong, probe has found nothing, or check missed a signal
-  2    a file, option, bus or port cannot be used; the message says which and what to do
-  130  interrupted by Ctrl-C (128 + the number of any other signal)"""
+  1    demo: an estimate was wrong; probe: nothing answered or was received;
+       check: a signal was missing
+  2    a file, option, bus or port cannot be used; the message says which, why
+       and what to do
+  130  interrupted by Ctrl-C (128 + n by another signal n)"""
 
 
-def _endpoints(_: click.Context, __: click.Parameter, written: tuple[str, ...]) -> tuple[str, ...]:
-    for endpoint in written:
+def _endpoints(_: click.Context, __: click.Parameter, endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    for endpoint in endpoints:
         if not re.fullmatch(r"[a-z-]+/\S+", endpoint):
             raise click.BadParameter(f"{endpoint!r} is no endpoint: write it like tcp/127.0.0.1:7447")
-    return written
+    return endpoints
 
 
-def _rrd(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+def _new_recording(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
     if path is not None and path.suffix != ".rrd":
-        raise click.BadParameter(f"{str(path)!r}: a recording ends in .rrd")
+        raise click.BadParameter(f"{str(path)!r}: the name of a recording ends in .rrd")
     if path is not None and path.exists():
-        raise click.BadParameter(f"{str(path)!r} is there already and would be lost")
+        raise click.BadParameter(f"{str(path)!r} exists and would be overwritten")
     return path
 
 
 def _machine_name(_: click.Context, __: click.Parameter, name: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_\-*]+", name):
-        raise click.BadParameter(f"{name!r} is no name of a machine")
+        raise click.BadParameter(f"{name!r} is no machine name: use letters, digits, '_', '-' and '*'")
     return name
 
 
-class _Commands(click.Group):
-    def make_context(self, *arguments: Any, **more: Any) -> click.Context:
-        with _read_or_not():
-            return super().make_context(*arguments, **more)
-
-    def invoke(self, ctx: click.Context) -> object:
-        with _read_or_not():
-            return super().invoke(ctx)
-
-
 @contextmanager
-def _read_or_not() -> Iterator[None]:
+def _output_may_close() -> Iterator[None]:
+    """Exit code 0 where the reader of standard output has closed it, as ``head`` does; click would exit with 1."""
     try:
         yield
     except BrokenPipeError as error:
-        raise NobodyReads from error
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still buffered
+        raise click.exceptions.Exit(0) from error
+
+
+class _Commands(click.Group):
+    @_output_may_close()
+    def make_context(self, *arguments: Any, **options: Any) -> click.Context:
+        return super().make_context(*arguments, **options)
+
+    @_output_may_close()
+    def invoke(self, ctx: click.Context) -> object:
+        return super().invoke(ctx)
 
 
 @click.group(
-    cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog=EXIT_CODES
+    cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}, epilog=EXIT_CODES
 )
 @click.version_option(__version__, prog_name="otolith")
 def cli() -> None:
-    """Otolith makes an industrial machine aware of itself.
+    """Otolith estimates the physical parameters of a machine while it runs.
 
-    It listens to the drive, fits a white-box twin to every window of a few seconds, and says in physical terms what has
-    changed.
+    It listens to the drive, fits a white-box twin to every window of a few seconds, and reports in physical terms
+    what has changed.
 
     \b
     Start here:
-      otolith demo                          a simulated motor, a daemon and a live table, for 90 s
-      otolith check config/dc-motor.toml    read a machine file and say what would be done
-      otolith run config/dc-motor.toml      the daemon, in the foreground
+      otolith demo                        a simulated motor, daemon and live table
+      otolith check config/dc-motor.toml  read a machine file, explain it, listen
+      otolith run config/dc-motor.toml    the daemon, in the foreground
     """
 
 
 @cli.command()
-@click.argument("file", type=FILE)
-@click.option(
-    "--listen",
-    multiple=True,
-    callback=_endpoints,
-    metavar="ENDPOINT",
-    help="Publish here instead of where the file says.",
-)
-@click.option(
-    "--recording", type=FILE, callback=_rrd, help="Record into this file instead of a new one in the state directory."
-)
-@click.option("-v", "--verbose", is_flag=True, help="Say more.")
+@MACHINE_FILE
+@click.option("--listen", multiple=True, callback=_endpoints, metavar="ENDPOINT",
+              help="Publish here instead of where the file says; may be repeated.")  # fmt: skip
+@click.option("--recording", type=FILE, callback=_new_recording,
+              help="Record into this file instead of a new one in the state directory.")  # fmt: skip
+@click.option("-v", "--verbose", is_flag=True, help="Log more.")
 def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bool) -> int:
-    """Run the daemon for the machine in FILE until SIGTERM or Ctrl-C.
+    """Run the daemon for the machine in FILE.
+
+    It runs until SIGTERM or Ctrl-C.
 
     \b
     Examples:
@@ -162,10 +123,10 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
 
 
 @cli.command()
-@click.argument("file", type=FILE)
-@click.option("--no-device", is_flag=True, help="Do not try to open the machine's bus.")
+@MACHINE_FILE
+@click.option("--no-device", is_flag=True, help="Do not open the machine's bus.")
 def check(file: Path, no_device: bool) -> int:
-    """Read the machine file FILE, say what the daemon would do, and listen whether the signals come.
+    """Explain the machine file FILE, and listen for its signals.
 
     \b
     Examples:
@@ -178,17 +139,17 @@ def check(file: Path, no_device: bool) -> int:
 
 
 @cli.command()
-@click.argument("file", type=FILE)
-@click.argument("data", type=FILE)
+@MACHINE_FILE
+@DATA_FILE
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a summary.")
-@click.option("--recording", type=FILE, callback=_rrd, help="Record into this file, as the daemon does.")
-@click.option("--real-time", is_flag=True, help="Let every window come when it would have ended.")
+@click.option("--recording", type=FILE, callback=_new_recording, help="Record into this file, as the daemon does.")
+@click.option("--real-time", is_flag=True, help="Wait for the end of each window, as in operation.")
 def replay(file: Path, data: Path, as_json: bool, recording: Path | None, real_time: bool) -> int:
-    """Let the daemon of the machine in FILE hear the recorded DATA, as fast as it can, and sum up what it says.
+    """Run recorded DATA through the daemon for the machine in FILE.
 
     DATA is a table (CSV: a column 't' in seconds and one for each signal of the twin, in its unit or the one in
-    brackets), a recording of ours (.rrd) or a log of a CAN bus (.log of candump, .asc, .blf, .trc, also with .gz).
-    FILE needs [driver] and [signals] only for a log of a bus: they say what is in its frames.
+    brackets), a recording (.rrd) or a log of a CAN bus (.log of candump, .asc, .blf, .trc, also with .gz). FILE needs
+    [driver] and [signals] only for a log of a bus: they describe its frames.
 
     \b
     Examples:
@@ -200,24 +161,17 @@ def replay(file: Path, data: Path, as_json: bool, recording: Path | None, real_t
     from otolith.cli.replay import replay
 
     stop = StopSignal()
-    replay(file, data, recording, as_json=as_json, stopped=lambda: stop.number is not None, real_time=real_time)
+    replay(file, data, recording, as_json=as_json, stopped=stop.received, real_time=real_time)
     return stop.code()
 
 
 @cli.command()
-@click.option(
-    "--connect",
-    multiple=True,
-    default=["tcp/127.0.0.1:7447"],
-    show_default=True,
-    callback=_endpoints,
-    metavar="ENDPOINT",
-    help="Where daemons are; may be given more than once.",
-)
+@click.option("--connect", multiple=True, default=["tcp/127.0.0.1:7447"], callback=_endpoints,
+              metavar="ENDPOINT", help="Where daemons publish; may be repeated.")  # fmt: skip
 @click.option("--machine", default="*", callback=_machine_name, metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
 def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
-    """Show the live table of a running daemon, from any process that reaches it.
+    """Show the live table of running daemons, over Zenoh.
 
     \b
     Examples:
@@ -227,61 +181,87 @@ def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
     from otolith.cli.watch import watch_reports
 
     stop = StopSignal()
-    watch_reports(connect, machine, as_json=as_json, stopped=lambda: stop.number is not None)
+    watch_reports(connect, machine, as_json=as_json, stopped=stop.received)
     return stop.code()
 
 
 @cli.command()
 @click.argument("file", type=FILE, required=False)
-@click.option("--list", "listing", is_flag=True, help="Only list the recordings there are.")
-def view(file: Path | None, listing: bool) -> int:
-    """Open the recording FILE in the Rerun viewer; without FILE, the newest one.
+@click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
+def view(file: Path | None, only_list: bool) -> int:
+    """Open FILE, or the newest recording, in the Rerun viewer.
 
     \b
     Examples:
       otolith view
       otolith view --list
     """
-    from otolith.cli.watch import open_viewer, recordings
-    from otolith_drivers.user_dirs import state_directory
+    from otolith.cli.watch import list_recordings, open_viewer
 
-    if listing:
-        found = recordings()
-        for path in found:
-            click.echo(path)
-        if not found:
-            click.echo(f"no recordings under {state_directory()}", err=True)
+    if only_list:
+        list_recordings()
         return 0
     return open_viewer(file)
 
 
 @cli.command()
-@click.option("--duration", type=click.FloatRange(8, 3600), default=90.0, show_default=True, help="Seconds.")
-@click.option("--machine", type=FILE, help="Machine file; the one of the DC motor if not given.")
-@click.option("--scenario", type=FILE, help="What happens to the machine; a falling armature resistance if not given.")
+@click.argument("scenario", type=FILE)
+@click.option("--as", "transport", type=click.Choice(TRANSPORTS), default="can",
+              help="A node on the CAN bus, or a Modbus drive on its own port or serial line.")  # fmt: skip
+@click.option("--truth", type=FILE, help="Write the true parameters and states into this CSV file.")
+@click.option("--summary", type=FILE, help="At the end, write counts of frames and requests into this JSON file.")
+@click.option("--duration", type=click.FloatRange(0.1), default=math.inf, show_default=False, metavar="SECONDS",
+              help="End after so many seconds.")  # fmt: skip
+def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | None, duration: float) -> int:
+    """Simulate the machine of SCENARIO in real time, on its bus.
+
+    \b
+    Examples:
+      otolith plant config/scenarios/demo.toml
+      otolith plant config/scenarios/bus-dropouts.toml --as modbus-tcp
+    """
+    from contextlib import ExitStack, closing
+
+    from otolith_drivers.plant.realtime import TruthFile, open_node, write_summary
+    from otolith_drivers.plant.scenario import load_scenario
+    from otolith_drivers.user_dirs import check_writable
+
+    loaded = load_scenario(scenario)
+    if summary is not None:
+        check_writable(summary.absolute().parent)
+    stop = StopSignal()
+    with ExitStack() as stack:
+        truth_file = stack.enter_context(closing(TruthFile(truth))) if truth is not None else None
+        node = stack.enter_context(closing(open_node(transport, loaded)))
+        click.echo(f"{node.title()}; Ctrl-C ends it", err=True)
+        counts = node.run(truth_file, stop.received, duration)
+    if summary is not None:
+        write_summary(summary, loaded, transport, counts)
+    click.echo(node.summary_line(counts), err=True)
+    return stop.code(clean=signal.SIGTERM)
+
+
+@cli.command()
+@click.option("--duration", type=click.FloatRange(8, 3600), default=90.0, help="Seconds.")
+@click.option("--machine", type=FILE, help="Machine file.  [default: dc-motor.toml]")
+@click.option("--scenario", type=FILE, help="What happens to the machine.  [default: scenarios/demo.toml]")
 @click.option("--json", "as_json", is_flag=True, help="Print the verdict as JSON, and no table.")
 def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: bool) -> int:
-    """Run plant and daemon as processes on a bus, watch, and compare what was found with what was injected.
+    """Run plant and daemon, and compare estimates with the truth.
 
     \b
     Examples:
       otolith demo
       otolith demo --duration 30 --json
     """
-    from otolith.cli.common import examples_directory
     from otolith.cli.demo import Demo
 
-    examples = examples_directory()
     stop = StopSignal()
-    machine = machine or examples / "dc-motor.toml"
-    scenario = scenario or examples / "scenarios" / "demo.toml"
-    code = Demo(machine, scenario, duration, as_json=as_json).run(lambda: stop.number is not None)
-    return code if stop.number is None else stop.code()
+    machine = machine or examples_directory() / "dc-motor.toml"
+    scenario = scenario or examples_directory() / "scenarios" / "demo.toml"
+    code = Demo(machine, scenario, duration, as_json=as_json).run(stop.received)
+    return stop.code() or code
 
 
-cli.add_command(commission)
-cli.add_command(components)
-cli.add_command(noise)
-cli.add_command(plant)
-cli.add_command(probe)
-cli.add_command(twin)
+for command in (commission, components, noise, probe, twin):
+    cli.add_command(command)

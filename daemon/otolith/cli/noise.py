@@ -1,4 +1,4 @@
-"""``otolith noise``: levels of noise, learned from recorded data of a healthy machine, ready for its machine file."""
+"""``otolith noise``: noise levels identified from recorded data of a healthy machine, as lines of its machine file."""
 
 import json
 import signal
@@ -8,32 +8,26 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, progress_line
+
 if TYPE_CHECKING:
     from otolith.acquisition.window import Window
     from otolith.commissioning.identification import IdentifiedNoise, NoiseLevel
     from otolith.machine import LoadedMachine
 
-
-Entry = TypeVar("Entry")
-FILE = click.Path(path_type=Path, dir_okay=False)
+Item = TypeVar("Item")
 
 
 @click.command()
-@click.argument("file", type=FILE)
-@click.argument("data", type=FILE)
-@click.option(
-    "--windows",
-    type=click.IntRange(1, 1000),
-    default=30,
-    show_default=True,
-    help="Learn from so many at most, spread over the data.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@MACHINE_FILE
+@DATA_FILE
+@click.option("--windows", type=click.IntRange(1, 1000), default=30, help="Use at most so many, spread over the data.")
+@AS_JSON
 def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
-    """Learn the noise of the machine in FILE from the table DATA, and print it as lines for FILE.
+    """Identify the noise of the machine in FILE from DATA.
 
-    DATA was recorded from the machine in good health and in motion, and is written as for 'otolith replay'. What is
-    printed replaces the tables [noise] and [process_noise] of FILE.
+    DATA is recorded from the healthy machine in motion, in a format of 'otolith replay'. The output replaces the
+    tables [noise] and [process_noise] of FILE.
 
     \b
     Examples:
@@ -42,48 +36,38 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
     """
     from otolith.machine import load_machine
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # so that the line of progress is put away
-    plan = load_machine(file, with_driver=False)
-    found = learned_noise(plan, data, windows)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # so that Ctrl-C removes the line of progress
+    machine = load_machine(file, with_driver=False)
+    identified = identified_noise(machine, data, windows)
     if as_json:
-        click.echo(json.dumps(_document(plan, found), indent=2, ensure_ascii=False))
+        click.echo(json.dumps(_document(machine, identified), indent=2, ensure_ascii=False))
     else:
-        for line in lines_of(plan, found):
-            click.echo(line)
+        click.echo("\n".join(noise_lines(machine, identified)))
 
 
-def learned_noise(plan: "LoadedMachine", data: Path, windows: int) -> "IdentifiedNoise":
-    """From at most so many windows of the table.
+def identified_noise(machine: "LoadedMachine", data: Path, count: int) -> "IdentifiedNoise":
+    """Noise levels from at most ``count`` windows of the data.
 
     Raises:
-        ConfigurationError: it has none that can be used.
+        ConfigurationError: no window can be used.
     """
     from otolith.commissioning.identification import identify_noise
     from otolith_drivers.errors import ConfigurationError
 
-    with _progress() as told:
-        found = identify_noise(plan.problem, _windows(plan, data, windows), told=told.update)
-    if plan.problem.open_loop:
-        click.echo(f"{plan.path}: as long as open_loop is true, process noise will not be used", err=True)
-    if not found.windows:
-        raise ConfigurationError(f"{data}: {'; '.join(found.remarks)}")
-    return found
+    with progress_line("reading") as show:
+        identified = identify_noise(machine.problem, _good_windows(machine, data, count), progress=show)
+    if machine.problem.open_loop:
+        click.echo(f"{machine.path}: open_loop is true, so the process noise will not be used", err=True)
+    if not identified.windows:
+        raise ConfigurationError(f"{data}: {'; '.join(identified.remarks)}")
+    return identified
 
 
-def _progress() -> Any:
-    """On standard error, if somebody sees it."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    console.quiet = not console.is_terminal
-    return console.status("reading")
-
-
-def _windows(plan: "LoadedMachine", data: Path, most: int) -> list["Window"]:
-    """At most so many windows of the table that can be used, spread over it.
+def _good_windows(machine: "LoadedMachine", data: Path, count: int) -> list["Window"]:
+    """At most ``count`` windows of good quality, spread over the data.
 
     Raises:
-        ConfigurationError: there is none; with the reason of the last one, if it has one.
+        ConfigurationError: there is none; the message has the reason of the last bad one.
     """
     from otolith.runtime.replay import Replay, open_recorded
     from otolith_drivers.errors import ConfigurationError
@@ -98,56 +82,58 @@ def _windows(plan: "LoadedMachine", data: Path, most: int) -> list["Window"]:
             else:
                 yield window
 
-    with open_recorded(plan, data) as recorded:
-        run = Replay(plan, recorded)
-        found = _spread(good(run.windows()), most)
-        warnings = run.warnings()
-    for line in warnings:
-        click.echo(f"{data}: {line}", err=True)
-    if not found:
-        length = f"no window of {plan.file.window.length:g} s can be used"
+    with open_recorded(machine, data) as recorded:
+        run = Replay(machine, recorded)
+        chosen = evenly_spread(good(run.windows()), count)
+        echo_warnings(data, run.warnings())
+    if not chosen:
+        length = f"no window of {machine.file.window.length:g} s can be used"
         raise ConfigurationError(f"{data}: {length}: {'; '.join(reasons) or 'the data is too short'}")
-    return found
+    return chosen
 
 
-def _spread(entries: Iterable[Entry], most: int) -> list[Entry]:
-    """Evenly, without holding more than twice as many at any time, however long the table is."""
-    kept: list[Entry] = []
+def evenly_spread(items: Iterable[Item], count: int) -> list[Item]:
+    """At most ``count`` items, evenly spread; holds at most twice as many at a time, however many there are."""
+    kept: list[Item] = []
     stride = 1
-    for index, entry in enumerate(entries):
+    for index, item in enumerate(items):
         if index % stride == 0:
-            kept.append(entry)
-        if len(kept) > 2 * most:
+            kept.append(item)
+        if len(kept) > 2 * count:
             kept, stride = kept[::2], 2 * stride
-    count = min(most, len(kept))
+    count = min(count, len(kept))
     return [kept[round(index * (len(kept) - 1) / max(count - 1, 1))] for index in range(count)]
 
 
-def lines_of(plan: "LoadedMachine", found: "IdentifiedNoise") -> Iterator[str]:
-    """Both tables, with what there is to know of them as comments."""
-    twin, problem = plan.twin, plan.problem
+def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iterator[str]:
+    """The tables ``[noise]`` and ``[process_noise]``, with uncertainties and remarks as comments."""
+    twin, problem = machine.twin, machine.problem
     yield "[noise]"
-    rows = [_row(level, twin.unit_of(level.name)) for level in found.outputs]
-    given = zip(twin.inputs, problem.input_noise, strict=True)
-    rows += [(f'{entry.name} = "{level:.3g} {entry.unit}"', "as it was") for entry, level in given if level]
+    rows = [_row(level, twin.unit_of(level.name)) for level in identified.outputs]
+    rows += [
+        (f'{signal.name} = "{level:.3g} {signal.unit}"', "unchanged: not identified from data")
+        for signal, level in zip(twin.inputs, problem.input_noise, strict=True)
+        if level
+    ]
     yield from _aligned(rows)
     yield ""
     yield "[process_noise]"
-    yield from _aligned([_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in found.states])
+    yield from _aligned([_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in identified.states])
     yield ""
-    consistency = found.consistency
-    yield f"# learned from {found.windows} windows of {plan.file.window.length:g} s"
+    yield f"# identified from {identified.windows} windows of {machine.file.window.length:g} s"
+    consistency = identified.consistency
     if consistency.before is not None and consistency.after is not None:
         after = f", now {consistency.after:.3g}" if consistency.after != consistency.before else ""
         factor = f"; process noise times {consistency.factor:.3g}" if (consistency.factor or 1.0) != 1.0 else ""
         yield f"# chi-square between windows, per degree of freedom: {consistency.before:.3g}{after}{factor}"
     yield f"# {consistency.remark}"
-    yield from (f"# {remark}" for remark in found.remarks)
+    yield from (f"# {remark}" for remark in identified.remarks)
 
 
 def _row(level: "NoiseLevel", unit: str) -> tuple[str, str]:
-    exactness = f"± {level.sd / level.value:.1%}" if level.sd is not None and level.value else ""
-    return f'{level.name} = "{level.value:.3g} {unit}"', "; ".join(filter(None, [exactness, level.remark]))
+    """A line of the machine file, and its comment."""
+    uncertainty = f"± {level.sd / level.value:.1%}" if level.sd is not None and level.value else ""
+    return f'{level.name} = "{level.value:.3g} {unit}"', "; ".join(filter(None, [uncertainty, level.remark]))
 
 
 def _aligned(rows: list[tuple[str, str]]) -> list[str]:
@@ -155,13 +141,13 @@ def _aligned(rows: list[tuple[str, str]]) -> list[str]:
     return [f"{line:{width}}  # {comment}" if comment else line for line, comment in rows]
 
 
-def _document(plan: "LoadedMachine", found: "IdentifiedNoise") -> dict[str, Any]:
+def _document(machine: "LoadedMachine", identified: "IdentifiedNoise") -> dict[str, Any]:
     from dataclasses import asdict
 
-    units = plan.twin.units()
-    document = asdict(found)
-    for entry in document["outputs"]:
-        entry["unit"] = units[entry["name"]]
-    for entry in document["states"]:
-        entry["unit"] = f"({units[entry['name']]})/s^0.5"
+    units = machine.twin.units()
+    document = asdict(identified)
+    for level in document["outputs"]:
+        level["unit"] = units[level["name"]]
+    for level in document["states"]:
+        level["unit"] = f"({units[level['name']]})/s^0.5"
     return document

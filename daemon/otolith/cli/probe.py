@@ -1,48 +1,60 @@
-"""``otolith probe``: what is on this bus, and lines for the machine file."""
+"""``otolith probe``: what is on a bus, and lines for the machine file."""
 
+import contextlib
 import json
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from otolith.cli.common import StopSignal
+from otolith.cli.common import AS_JSON, FILE, StopSignal, progress_line
 
-FILE = click.Path(path_type=Path, dir_okay=False)
-NOTHING_THERE = 1
-MOST_ASKED = 1000  # registers in one go
+if TYPE_CHECKING:
+    from otolith.cli.probe_view import DeviceProbe
+    from otolith_drivers.canbus.bus import BusOptions
+    from otolith_drivers.canbus.probe import Picture
+    from otolith_drivers.modbus.probe import Answer
+    from otolith_drivers.modbus.probe_numbers import Place
+
+NOTHING_THERE = 1  # exit code
+MAX_REGISTERS = 1000  # in one call
+MAX_NUMBER_REGISTERS = 4  # registers of the longest number, of 64 bits
+MODBUS_PORT = 502
+DEVICES = (1, 247)  # device numbers that the Modbus specification allows
+RECEIVE_TIMEOUT = 0.1  # s; how late a stop is noticed
+REFRESH = 4.0  # Hz of the live table
 Span = tuple[int, int]
 
 
 class Range(click.ParamType[Span]):
-    """``"7"`` or ``"0..63"``, within bounds."""
+    """``"7"`` or ``"0..63"``: the first and the last number, within bounds."""
 
     name = "N | LOW..HIGH"
 
-    def __init__(self, low: int, high: int, most: int) -> None:
-        self._low, self._high, self._most = low, high, most
+    def __init__(self, low: int, high: int, max_count: int) -> None:
+        self._low, self._high, self._max_count = low, high, max_count
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Span:
         """First and last."""
-        if isinstance(value, tuple):
-            return value
         match = re.fullmatch(r"(\d{1,5})(?:\.\.(\d{1,5}))?", str(value).strip())
         if match is None:
             self.fail(f"{value!r}: write one number like 7, or the first and the last like 0..63", param, ctx)
         first, last = int(match[1]), int(match[2] or match[1])
         if not self._low <= first <= last <= self._high:
             self.fail(f"{value!r}: from {self._low} to {self._high}, the lower one first", param, ctx)
-        if last - first >= self._most:
-            self.fail(f"{value!r}: at most {self._most} at once", param, ctx)
+        if last - first >= self._max_count:
+            self.fail(f"{value!r}: at most {self._max_count} at once", param, ctx)
         return first, last
 
 
 @click.group()
 def probe() -> None:
-    """Look what is on a bus, and print lines for the machine file. Only listens, or reads; never writes.
+    """Show what is on a bus, and print lines for the machine file.
+
+    The commands only listen or read; they never write.
 
     \b
     Examples:
@@ -55,27 +67,23 @@ def probe() -> None:
 
 @probe.command()
 @click.argument("target", metavar="HOST[:PORT]|/dev/ttyUSB0")
-@click.option(
-    "--device", type=Range(0, 255, 256), help="Device number (unit, slave); with --scan a range.  [default: 1]"
-)
-@click.option("--registers", type=Range(0, 65536, MOST_ASKED),
-              help="Which; a single one is shown in every type and order.  [default: the first 64]")  # fmt: skip
-@click.option("--table", type=click.Choice(["holding", "input"]), default="holding", show_default=True)
-@click.option("--first-address", type=click.IntRange(0, 1), default=0, show_default=True,
-              help="What the manual calls the first register.")  # fmt: skip
-@click.option(
-    "--baudrate", type=click.IntRange(300, 4_000_000), default=19200, show_default=True, help="Of a serial line."
-)
-@click.option("--parity", type=click.Choice(["N", "E", "O"]), default="E", show_default=True, help="Of a serial line.")
-@click.option("--stop-bits", type=click.Choice(["1", "2"]), default="1", show_default=True, help="Of a serial line.")
-@click.option("--framing", type=click.Choice(["tcp", "rtu"]), default="tcp", show_default=True,
+@click.option("--device", type=Range(0, 255, 256),
+              help="Device number (unit, slave); with --scan a range.  [default: 1]")  # fmt: skip
+@click.option("--registers", type=Range(0, 65536, MAX_REGISTERS),
+              help="Which, or one to show in every type and order.  [default: the first 64]")  # fmt: skip
+@click.option("--table", type=click.Choice(["holding", "input"]), default="holding")
+@click.option("--first-address", type=click.IntRange(0, 1), default=0, help="What the manual calls the first register.")
+@click.option("--baudrate", type=click.IntRange(300, 4_000_000), default=19200, help="Of a serial line.")
+@click.option("--parity", type=click.Choice(["N", "E", "O"]), default="E", help="Of a serial line.")
+@click.option("--stop-bits", type=click.Choice(["1", "2"]), default="1", help="Of a serial line.")
+@click.option("--framing", type=click.Choice(["tcp", "rtu"]), default="tcp",
               help="Of a host; rtu for a gateway that passes serial frames on.")  # fmt: skip
 @click.option("--timeout", type=click.FloatRange(0.01, 10.0), metavar="SECONDS",
               help="How long a device may take.  [default: 0.5; with --scan 0.2]")  # fmt: skip
-@click.option("--seconds", type=click.FloatRange(0.0, 3600.0), default=3.0, show_default=True, help="How long to read.")
+@click.option("--seconds", type=click.FloatRange(0.0, 3600.0), default=3.0, help="How long to read.")
 @click.option("--wide", is_flag=True, help="Show numbers of 64 bits as well.")
 @click.option("--scan", is_flag=True, help="Ask all devices of a line for one register, and list those that answer.")
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@AS_JSON
 def modbus(
     target: str,
     device: Span | None,
@@ -92,63 +100,126 @@ def modbus(
     scan: bool,
     as_json: bool,
 ) -> int:
-    """Read the registers of a Modbus device again and again, and say which numbers are in them.
+    """Read Modbus registers repeatedly, and infer their numbers.
 
-    What changes tells its type and the order of its bytes; so let the machine move meanwhile. Registers that the device
-    refuses are found out. TARGET is a host, with a port unless it is 502, or a serial port.
+    Type and byte order are inferred from values that change, so let the machine move meanwhile. Registers that the
+    device refuses are listed. TARGET is a host, with a port unless it is 502, or a serial port.
 
     \b
     Examples:
       otolith probe modbus 192.168.0.10
-      otolith probe modbus plc:1502 --registers 100..163 --table input --seconds 10
-      otolith probe modbus 192.168.0.10 --registers 100        one register in every type and order
+      otolith probe modbus plc:1502 --registers 100..163 --table input
+      otolith probe modbus 192.168.0.10 --registers 100
       otolith probe modbus /dev/ttyUSB0 --baudrate 9600 --parity N --device 5
-      otolith probe modbus /dev/ttyUSB0 --scan                 which devices are on the line
+      otolith probe modbus /dev/ttyUSB0 --scan
     """
-    from otolith.cli.probe_view import console, modbus_document, probe_device, scan_line, show_device, show_scan
+    from otolith.cli.probe_view import modbus_document, show_device, stdout_console
     from otolith_drivers.config_files import validated
     from otolith_drivers.modbus.options import LineOptions
-    from otolith_drivers.modbus.probe import Place
+    from otolith_drivers.modbus.probe_numbers import Place
 
     if device is not None and device[0] != device[1] and not scan:
-        raise click.BadParameter("a range of devices goes with --scan", param_hint="--device")
-    registers = registers or (first_address, first_address + 63)
-    if registers[0] < first_address:
+        raise click.BadParameter("a range of devices needs --scan", param_hint="--device")
+    first, last = registers or (first_address, first_address + 63)
+    if first < first_address:
         raise click.BadParameter("with --first-address 1 there is no register 0", param_hint="--registers")
-    keys = _address(target) | {"timeout": f"{timeout or (0.2 if scan else 0.5)} s", "framing": framing}
-    options = validated(keys | {"baudrate": baudrate, "parity": parity, "stop_bits": int(stop_bits)}, LineOptions, ())
-    devices = device or ((1, 247) if scan else (1, 1))
-    place = Place(options, devices[0], "holding" if table == "holding" else "input", first_address)
-    on_wire = (registers[0] - first_address, registers[1] - first_address)
+    keys = {"framing": framing, "baudrate": baudrate, "parity": parity, "stop_bits": int(stop_bits)}
+    keys |= _address(target) | {"timeout": f"{timeout or (0.2 if scan else 0.5)} s"}
+    devices = device or (DEVICES if scan else (1, 1))
+    place = Place(validated(keys, LineOptions, ()), devices[0], "holding" if table == "holding" else "input",
+                  first_address)  # fmt: skip
     stop = StopSignal()
     if scan:
-        with _progress() as told:
-            answers = scan_line(place, devices, on_wire[0], lambda: stop.number is not None, told)
+        answers = _scan(place, devices, first - first_address, stop)
         if as_json:
-            click.echo(json.dumps({"devices": [{"device": entry.device, "refused": entry.reply} for entry in answers]}))
+            rows = [{"device": answer.device, "refused": answer.reply} for answer in answers]
+            click.echo(json.dumps({"devices": rows}))
         else:
-            show_scan(place, devices, answers, console())
+            click.echo("\n".join(_scan_lines(place, devices, answers)))
         return stop.code() or (0 if answers else NOTHING_THERE)
-    with _progress() as told:
-        found = probe_device(place, on_wire, seconds, lambda: stop.number is not None, told)
+    probed = _read(place, (first - first_address, last - first_address), seconds, stop)
     if as_json:
-        click.echo(json.dumps(modbus_document(found), ensure_ascii=False))
+        click.echo(json.dumps(modbus_document(probed), ensure_ascii=False))
     else:
-        show_device(found, console(), wide=wide)
-    return stop.code() or (0 if found.survey.blocks else NOTHING_THERE)
+        show_device(probed, stdout_console(), wide=wide)
+    return stop.code() or (0 if probed.survey.blocks else NOTHING_THERE)
+
+
+def _address(target: str) -> dict[str, Any]:
+    """Host and port, or serial port, as keys of the machine file."""
+    if target.startswith(("/", "COM")):
+        return {"serial": target}
+    match = re.fullmatch(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([^\s:/\[\]]+))(?::(\d{1,5}))?", target)
+    port = int(match[3] or MODBUS_PORT) if match else 0
+    if match is None or not 1 <= port <= 65535:
+        raise click.BadParameter(f"{target!r} is no HOST, HOST:PORT or /dev/tty...", param_hint="TARGET")
+    return {"host": match[1] or match[2], "port": port}
+
+
+def _scan(place: "Place", devices: Span, address: int, stop: StopSignal) -> "list[Answer]":
+    """The devices on a line that answer a request for the register at ``address`` (on the wire).
+
+    Raises:
+        DeviceError: the line cannot be opened.
+    """
+    from otolith_drivers.modbus.probe import ProbeClient, opened, scan
+
+    with progress_line("opening") as show, opened(place.options, show) as line:
+        client = ProbeClient(line, place.options, devices[0], place.table)
+        return scan(client, range(devices[0], devices[1] + 1), address, stop.received, show)
+
+
+def _scan_lines(place: "Place", devices: Span, answers: "list[Answer]") -> Iterator[str]:
+    from otolith_drivers.modbus.probe import spans
+
+    asked = devices[1] - devices[0] + 1
+    yield f"{place.options.title()}: {len(answers)} of {asked} devices answer"
+    for reply in dict.fromkeys(answer.reply for answer in answers):
+        alike = spans([answer.device for answer in answers if answer.reply == reply], "device")
+        yield alike + (f" (that register is refused: {reply})" if reply else "")
+    if len(answers) == asked > 1:
+        yield "all of them answer: this host seems to ignore the device number"
+    if not answers and place.options.host is None:
+        yield "are baud rate, parity and stop bits right, and the two wires not swapped?"
+    elif not answers:
+        yield "is it the right host, or is it a gateway with framing = rtu?"
+
+
+def _read(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> "DeviceProbe":
+    """What the registers at ``addresses`` (on the wire) of a device hold over ``seconds`` s.
+
+    Raises:
+        DeviceError: the line cannot be opened, or the device does not answer.
+    """
+    from otolith.cli.probe_view import DeviceProbe
+    from otolith_drivers.modbus.options import HIGHEST_ADDRESS
+    from otolith_drivers.modbus.probe import ProbeClient, opened, speeds, survey, watch
+    from otolith_drivers.modbus.probe_numbers import numbers_of
+
+    with progress_line("opening") as show, opened(place.options, show) as line:
+        client = ProbeClient(line, place.options, place.device, place.table)
+        first, last = addresses
+        if first == last:
+            last = min(first + MAX_NUMBER_REGISTERS - 1, HIGHEST_ADDRESS)
+        surveyed = survey(client, first, last, stop.received, show)
+        client.round_trips.clear()  # the first requests take longer
+        begun = time.monotonic()
+        readings = watch(client, surveyed.blocks, seconds, stop.received, show)
+        elapsed = time.monotonic() - begun
+        show("comparing")
+        times = speeds(client, surveyed.blocks)
+        return DeviceProbe(place, addresses, surveyed, readings, times, elapsed, numbers_of(readings))
 
 
 @probe.command("can")
-@click.option(
-    "--interface", default="auto", show_default=True, help="Of python-can: socketcan, pcan, kvaser, slcan ..."
-)
+@click.option("--interface", default="auto", help="Of python-can: socketcan, pcan, kvaser, slcan ...")
 @click.option("--channel", help="As 'ip link' or python-can names it.  [default: vcan0]")
-@click.option("--port", type=click.IntRange(1024, 65535), default=43113, show_default=True, help="Of udp_multicast.")
+@click.option("--port", type=click.IntRange(1024, 65535), default=43113, help="Of udp_multicast.")
 @click.option("--bitrate", type=click.IntRange(1000, 1_000_000), help="For interfaces that set it themselves.")
-@click.option("--fd", is_flag=True, help="Hear frames of CAN FD as well.")
-@click.option("--database", type=FILE, help="A CAN database (DBC, KCD, SYM, ARXML) that knows the frames.")
-@click.option("--seconds", type=click.FloatRange(0.1, 86400.0), default=3.0, show_default=True, help="How long.")
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@click.option("--fd", is_flag=True, help="Receive frames of CAN FD as well.")
+@click.option("--database", type=FILE, help="A CAN database (DBC, KCD, SYM, ARXML) that describes the frames.")
+@click.option("--seconds", type=click.FloatRange(0.1, 86400.0), default=3.0, help="How long.")
+@AS_JSON
 def can_(
     interface: str,
     channel: str | None,
@@ -159,57 +230,103 @@ def can_(
     seconds: float,
     as_json: bool,
 ) -> int:
-    """Listen on a CAN bus, and say which frames come, how regularly, and what in them moves.
+    """Listen on a CAN bus, and show frames, periods and changes.
 
-    With a database its signals are shown with their values; without, what moves as numbers do is found in the bytes: so
-    let the machine move meanwhile. Nothing is sent.
+    With a database, its signals are shown with their values. Without one, numbers are inferred from bytes that change,
+    so let the machine move meanwhile. Nothing is sent.
 
     \b
     Examples:
-      otolith probe can                                       the bus of 'otolith plant'
+      otolith probe can
       otolith probe can --channel can0 --seconds 60
       otolith probe can --channel can0 --database drive.dbc
       otolith probe can --interface pcan --channel PCAN_USBBUS1 --bitrate 500000
     """
-    import time
-
-    from otolith.cli.probe_view import can_document, console, listen, show_bus
+    from otolith.cli.probe_view import can_document, remarks, show_bus, stdout_console
     from otolith_drivers.canbus.bus import BusOptions
     from otolith_drivers.config_files import validated
 
     rate = {} if bitrate is None else {"bitrate": f"{bitrate} bit/s"}
     options = validated({"interface": interface, "channel": channel, "port": port, "fd": fd} | rate, BusOptions, ())
     stop = StopSignal()
-    terminal = console()
     begun = time.monotonic()
-    live = terminal if terminal.is_terminal and not as_json else None
-    picture = listen(options, database, seconds, lambda: stop.number is not None, live)
+    picture = _listen(options, database, seconds, stop, live=not as_json)
     elapsed = time.monotonic() - begun
     if as_json:
         click.echo(json.dumps(can_document(picture, options, database, elapsed), ensure_ascii=False))
     else:
-        show_bus(picture, options, database, elapsed, terminal)
+        show_bus(picture, options, database, elapsed, stdout_console())
+        if not picture.frames:
+            click.echo("\n".join((*remarks(picture), *_hints(options, picture))))
     return stop.code() or (0 if picture.frames else NOTHING_THERE)
 
 
-def _address(target: str) -> dict[str, Any]:
-    """Host and port, or serial port, as keys of the machine file."""
-    if target.startswith(("/", "COM")):
-        return {"serial": target}
-    match = re.fullmatch(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([^\s:/\[\]]+))(?::(\d{1,5}))?", target)
-    if match is None or not 1 <= int(match[3] or 502) <= 65535:
-        raise click.BadParameter(f"{target!r} is no HOST, HOST:PORT or /dev/tty...", param_hint="TARGET")
-    return {"host": match[1] or match[2], "port": int(match[3] or 502)}
+def _listen(options: "BusOptions", database: Path | None, seconds: float, stop: StopSignal, *, live: bool) -> "Picture":
+    """What came in ``seconds`` s; ``live`` shows it meanwhile if standard output is a terminal. Nothing is sent.
+
+    Raises:
+        DeviceError: the bus cannot be opened, or breaks.
+        ConfigurationError: the database cannot be read.
+    """
+    from rich.console import Group
+    from rich.live import Live
+
+    from otolith.cli.probe_view import bus_title, stdout_console, tables
+    from otolith_drivers.canbus.bus import open_bus
+    from otolith_drivers.canbus.database import load_dbc
+    from otolith_drivers.canbus.probe import Picture
+
+    picture = Picture(load_dbc(database) if database is not None else None)
+    console = stdout_console()
+
+    def draw() -> Group:
+        return Group(f"{bus_title(options, picture)}; Ctrl-C ends it", *tables(picture, console.width))
+
+    bus = open_bus(options, listen_only=True)
+    shown = Live(get_renderable=draw, console=console, refresh_per_second=REFRESH, transient=True)
+    try:
+        with shown if live and console.is_terminal else contextlib.nullcontext():
+            _receive(bus, options, picture, seconds, stop)
+    finally:
+        with contextlib.suppress(Exception):  # the frames that came matter more than a clean end
+            bus.shutdown()
+    return picture
 
 
-@contextmanager
-def _progress() -> Iterator[Callable[[str], None]]:
-    """A line on standard error, if somebody sees it."""
-    from rich.console import Console
+def _receive(bus: Any, options: "BusOptions", picture: "Picture", seconds: float, stop: StopSignal) -> None:
+    from otolith_drivers.canbus.bus import MAX_CONSECUTIVE_BAD, is_gone
+    from otolith_drivers.errors import DeviceError
 
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda text: None
+    end, bad = time.monotonic() + seconds, 0
+    while (left := end - time.monotonic()) > 0.0 and not stop.received():
+        try:
+            frame = bus.recv(min(left, RECEIVE_TIMEOUT))
+        except Exception as error:  # python-can passes on whatever the vendor's library raises
+            bad += 1
+            picture.unreadable += 1
+            if is_gone(error) or bad > MAX_CONSECUTIVE_BAD:
+                raise DeviceError(f"CAN bus {options.title()}: {error}; was the interface taken down?") from error
+            continue
+        bad = 0
+        if frame is not None:
+            picture.take(frame, frame.timestamp or time.monotonic())
+
+
+def _hints(options: "BusOptions", picture: "Picture") -> Iterator[str]:
+    """What to try where no frame came."""
+    interface, channel = options.resolved()
+    if interface == "udp_multicast":
+        yield "nothing was received: this virtual bus only has programs of this computer, such as 'otolith plant'"
+        yield "for a real bus: --channel can0, or what 'ip -brief link show type can' lists"
         return
-    with console.status("opening") as status:
-        yield status.update
+    if picture.error_frames:
+        yield "only error frames were received: the bit rate is most likely wrong, or the wires are swapped"
+    else:
+        yield "nothing was received; what to try:"
+    if interface == "socketcan":
+        yield f"- is it up, and at which bit rate? 'ip -details link show {channel}' prints both"
+        yield f"- another bit rate: 'ip link set {channel} down && ip link set {channel} up type can bitrate 500000'"
+    else:
+        yield "- another bit rate: --bitrate 250000, 500000 or 1000000"
+    yield "- termination: 60 ohm between CAN-H and CAN-L while everything is switched off"
+    yield "- does any node send? A CANopen drive only sends heartbeats until a master starts it"

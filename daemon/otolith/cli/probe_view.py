@@ -1,159 +1,101 @@
-"""What ``otolith probe`` shows: tables that fit a terminal, or one JSON document."""
+"""What ``otolith probe`` prints: tables that fit the terminal, lines for the machine file, or a JSON document."""
 
-import contextlib
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
-from rich.live import Live
+import numpy as np
+from cantools.database import Signal
+from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from otolith_drivers.canbus.bus import MOST_BAD_IN_A_ROW, BusOptions, is_gone, open_bus
-from otolith_drivers.canbus.database import load_dbc
-from otolith_drivers.canbus.probe import (
-    ObservedFrames,
-    Picture,
-    can_driver_lines,
-    can_signal_lines,
-    fields_of,
-    value_text,
-    within,
-)
-from otolith_drivers.errors import DeviceError
+from otolith_drivers.canbus import probe as canbus
+from otolith_drivers.canbus.bus import BusOptions
+from otolith_drivers.modbus import probe as modbus
+from otolith_drivers.modbus import probe_numbers
 from otolith_drivers.modbus.client import FUNCTION_CODES
-from otolith_drivers.modbus.options import HIGHEST_ADDRESS
-from otolith_drivers.modbus.probe import (
-    COLUMNS,
-    WIDE_COLUMNS,
-    Answer,
-    Block,
-    Client,
-    Number,
-    Place,
-    ProgressCallback,
-    Reading,
-    Speed,
-    Stopped,
-    Survey,
-    Words,
-    bytes_of,
-    modbus_driver_lines,
-    modbus_signal_lines,
-    numbers_of,
-    opened,
-    possible_rate,
-    readings_at,
-    scan,
-    spans,
-    speeds,
-    survey,
-    watch,
-)
 from otolith_drivers.modbus.protocol import LETTERS, TypeName
 from otolith_drivers.number_inference import LayoutVerdict, number_text
 
-PLAIN_WIDTH = 200  # columns where nobody looks at a terminal
-GAP = 2  # columns between columns
-LEFT = ("what", "remark")  # columns of words
-WORDS = 24  # columns into which words are broken where there is no more room
-STYLES = {"*": "bold green", "?": "yellow", "!": "bold red"}
+PLAIN_WIDTH = 200  # columns of output that goes into a file
+GAP = 2  # characters between columns
+TEXT_COLUMNS = ("what", "remark")  # aligned left and wrapped
+TEXT_WIDTH = 24  # characters to which a text column may shrink
+MIN_ZERO_RUN = 3  # registers in a row that are always zero and share a row of the table
+MAX_NAMES = 12  # messages or arbitration IDs named in a line
+STYLES = {"*": "bold green", "?": "yellow", "!": "bold red", "·": "dim"}  # by the first character of a cell
+MARKS = {LayoutVerdict.CERTAIN: "*", LayoutVerdict.COUNTER: "*", LayoutVerdict.LIKELY: "?"}
+MODBUS_LEGEND = "* inferred from its changes    ? likely, but it hardly changes    · not a plausible number"
+SINGLE_LEGEND = "a single register may be half of a longer number: probe its neighbours as well"
+CAN_LEGEND = "[..] bytes that have changed    ± half of the width that holds 19 of 20 periods"
+
+Row = dict[str, str]
+"""Cells by the name of their column; a header has one line for each word of the name."""
 
 
-@dataclass(slots=True)
-class Row:
-    """A row: what stands in every table, and what goes where there is room."""
-
-    fixed: tuple[str, ...]
-    cells: dict[str, str] = field(default_factory=dict)
-    """By the name of the column, of which each word is a line."""
-    marks: dict[str, str] = field(default_factory=dict)
-    """By the name of the column: ``*``, ``?`` or ``!`` before what deserves it."""
+def stdout_console() -> Console:
+    """Standard output, as wide as the terminal or ``PLAIN_WIDTH``."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
 
 
-def console() -> Console:
-    """Standard output: as wide as the terminal, or as a file may be."""
-    found = Console(highlight=False)
-    return found if found.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
-
-
-def grids(heads: Sequence[str], rows: Sequence[Row], width: int) -> Iterator[Table]:
-    """Tables of all rows, none wider than ``width`` as far as that is possible.
+def fitted_tables(fixed: tuple[str, ...], rows: Sequence[Row], width: int) -> Iterator[Table]:
+    """Tables of all rows, no wider than ``width`` where possible; the ``fixed`` columns stand in each.
 
     Columns whose names begin alike stay in one table if one can hold them.
     """
-    if not rows:
-        return
-    names = [name for name in dict.fromkeys(name for row in rows for name in row.cells) if _filled(rows, name)]
-    fixed = sum(GAP + max(len(head), *(len(row.fixed[at]) for row in rows)) for at, head in enumerate(heads))
-    families = groupby(names, key=lambda name: name.split()[0])
-    together: list[str] = []
-    room = width - fixed
-    for family in (list(members) for _, members in families):
-        whole = sum(_width(rows, name) for name in family)
-        for name in family:
-            needed = whole if name == family[0] and whole <= width - fixed else _width(rows, name)
-            if together and needed > room:
-                yield _grid(heads, rows, together)
-                together, room = [], width - fixed
-            together.append(name)
-            room -= _width(rows, name)
-    yield _grid(heads, rows, together)
-
-
-def _filled(rows: Sequence[Row], name: str) -> bool:
-    return any(row.cells.get(name) for row in rows)
+    names = [name for name in dict.fromkeys(name for row in rows for name in row) if name not in fixed]
+    widths = {name: _width(rows, name) for name in names if any(row.get(name) for row in rows)}
+    room = width - sum(_width(rows, name) for name in fixed)
+    chosen: list[str] = []
+    for _, members in groupby(widths, key=lambda name: name.split()[0]):
+        family = list(members)
+        whole = sum(widths[name] for name in family) <= room
+        for group in [family] if whole else [[name] for name in family]:
+            if chosen and sum(widths[name] for name in (*chosen, *group)) > room:
+                yield _table(fixed, chosen, rows)
+                chosen = []
+            chosen += group
+    if rows:
+        yield _table(fixed, chosen, rows)
 
 
 def _width(rows: Sequence[Row], name: str) -> int:
-    longest = max(len(row.cells.get(name, "")) + len(row.marks.get(name, "")) for row in rows)
-    longest = min(longest, WORDS) if name in LEFT else longest
-    return GAP + max([longest, *map(len, name.split())])
+    longest = max((len(row.get(name, "")) for row in rows), default=0)
+    longest = min(longest, TEXT_WIDTH) if name in TEXT_COLUMNS else longest
+    return GAP + max(longest, *map(len, name.split()))
 
 
-def _grid(heads: Sequence[str], rows: Sequence[Row], names: Sequence[str]) -> Table:
+def _table(fixed: tuple[str, ...], names: Sequence[str], rows: Sequence[Row]) -> Table:
     table = Table(box=None, padding=(0, GAP, 0, 0), header_style="bold")
-    for head in heads:
-        table.add_column(head, no_wrap=True, vertical="bottom")
-    for name in names:
-        justify: Literal["left", "right"] = "left" if name in LEFT else "right"
-        table.add_column(name.replace(" ", "\n"), justify=justify, no_wrap=name not in LEFT, vertical="bottom")
+    for name in (*fixed, *names):
+        left = name in fixed or name in TEXT_COLUMNS
+        table.add_column(name.replace(" ", "\n"), justify="left" if left else "right", vertical="bottom",
+                         no_wrap=name not in TEXT_COLUMNS)  # fmt: skip
     for row in rows:
-        table.add_row(*row.fixed, *(_cell(row, name) for name in names))
+        cells = [row.get(name, "") for name in names]
+        styled = [Text(cell, style=STYLES.get(cell[:1], "")) for cell in cells]
+        table.add_row(*(Text(row[name]) for name in fixed), *styled)
     return table
 
 
-def _cell(row: Row, name: str) -> Text:
-    mark = row.marks.get(name, "")
-    text = row.cells.get(name, "")
-    words = f"{mark} {text}" if mark and name in LEFT else f"{mark}{text}"
-    return Text(words, style=STYLES.get(mark, "dim" if text == "·" else ""))
-
-
-LONGEST_NUMBER = 4  # registers
-FEWEST_ZEROS = 3  # registers in a row that are one row of the table
-MARKS = {LayoutVerdict.TOLD: "*", LayoutVerdict.COUNTS: "*", LayoutVerdict.LIKELY: "?"}
-ALONE = "a register alone may be half of a longer number: ask for its neighbours as well"
-MODBUS_LEGEND = "* what it is, told by how it moves    ? likely, but it hardly moves    · a number that no machine has"
-
-
 @dataclass(frozen=True)
-class Probed:
-    """A device, as far as it was looked at."""
+class DeviceProbe:
+    """What was read from a Modbus device."""
 
-    place: Place
+    place: probe_numbers.Place
     registers: tuple[int, int]
-    """First and last that were asked for, on the wire."""
-    survey: Survey
-    readings: dict[Block, Words]
-    numbers: list[Number]
-    speeds: list[Speed]
+    """Addresses (on the wire) of the first and the last register asked for."""
+    survey: modbus.Survey
+    readings: dict[modbus.Block, modbus.Words]
+    speeds: list[modbus.Speed]
     seconds: float
+    """Time spent reading."""
+    numbers: list[probe_numbers.Number]
 
     @property
     def single(self) -> bool:
@@ -161,192 +103,136 @@ class Probed:
         return self.registers[0] == self.registers[1]
 
     @property
-    def wanted(self) -> list[Number]:
-        """The numbers that were asked for: with a single register only that which begins there."""
+    def requested(self) -> list[probe_numbers.Number]:
+        """The numbers asked for; with a single register only the one that begins there."""
         return [number for number in self.numbers if not self.single or number.address == self.registers[0]]
 
 
-def probe_device(
-    place: Place, registers: tuple[int, int], seconds: float, stopped: Stopped, told: ProgressCallback
-) -> Probed:
-    """Look at the registers (on the wire) of a device.
-
-    Raises:
-        DeviceError: the line cannot be opened, or the device does not answer.
-    """
-    with opened(place.options, told) as line:
-        asker = Client(line, place.options, place.device, place.table)
-        first, last = registers
-        if first == last:
-            last = min(first + LONGEST_NUMBER - 1, HIGHEST_ADDRESS)
-        found = survey(asker, first, last, stopped, told)
-        asker.round_trips.clear()  # the first ones take longer
-        begun = time.monotonic()
-        readings = watch(asker, found.blocks, seconds, stopped, told)
-        elapsed = time.monotonic() - begun
-        told("comparing")
-        return Probed(place, registers, found, readings, numbers_of(readings), speeds(asker, found.blocks), elapsed)
-
-
-def scan_line(
-    place: Place, devices: tuple[int, int], register: int, stopped: Stopped, told: ProgressCallback
-) -> list[Answer]:
-    """The devices on a line that answer when asked for ``register`` (on the wire).
-
-    Raises:
-        DeviceError: the line cannot be opened.
-    """
-    with opened(place.options, told) as line:
-        asker = Client(line, place.options, devices[0], place.table)
-        return scan(asker, range(devices[0], devices[1] + 1), register, stopped, told)
-
-
-def show_scan(place: Place, devices: tuple[int, int], answers: Sequence[Answer], console: Console) -> None:
-    """The answers, in words."""
-    asked = devices[1] - devices[0] + 1
-    console.print(f"{place.options.title()}: {len(answers)} of {asked} devices answer")
-    for said in dict.fromkeys(answer.reply for answer in answers):
-        alike = spans([answer.device for answer in answers if answer.reply == said], "device")
-        console.print(alike + (f" (that register is refused: {said})" if said else ""), markup=False)
-    if len(answers) == asked > 1:
-        console.print("everybody answers: it seems that this host does not look at the device number")
-    if not answers:
-        other = "is it the right host, or is it a gateway with framing = rtu?"
-        serial = "are baud rate, parity and stop bits right, and the two wires not swapped?"
-        console.print(serial if place.options.host is None else other)
-
-
-def show_device(probed: Probed, console: Console, *, wide: bool) -> None:
-    """All that was found, in words, tables and lines for the machine file."""
-    place = probed.place
+def show_device(probe: DeviceProbe, console: Console, *, wide: bool) -> None:
+    """Print which registers there are, their values, and lines for the machine file."""
+    place, survey = probe.place, probe.survey
     title = f"{place.options.title()}, device {place.device}, {place.table} registers"
     console.print(f"{title}, read only (function code {FUNCTION_CODES[place.table]})")
-    for text in probed.survey.describe(place.first_address):
-        console.print(text)
-    if not probed.survey.blocks and not probed.survey.refused:
-        console.print("ended before anything was read")
-        return
-    if not probed.survey.blocks:
+    for line in survey.describe(place.first_address):
+        console.print(line)
+    if not survey.blocks:
         other = "input" if place.table == "holding" else "holding"
-        console.print(f"the device is there, but not these registers: try others by --registers, or --table {other}")
+        missing = f"the device is there, but not these registers: try others by --registers, or --table {other}"
+        console.print(missing if survey.refused else "ended before anything was read")
         return
-    for text in speed_lines(probed):
-        console.print(text)
+    for line in _speed_lines(probe):
+        console.print(line)
     console.print()
-    kinds: tuple[TypeName, ...] = COLUMNS + WIDE_COLUMNS if wide else COLUMNS
-    heads, rows = _list(probed) if probed.single else (("register", "raw"), list(_rows(probed, kinds)))
-    for grid in grids(heads, rows, console.width):
-        console.print(grid)
-        console.print()
+    kinds = probe_numbers.COLUMNS + probe_numbers.WIDE_COLUMNS if wide else probe_numbers.COLUMNS
+    fixed, rows = ("register", "raw"), list(_register_rows(probe, kinds))
+    if probe.single:
+        fixed, rows = ("type", "order"), _type_rows(probe)
+    for table in fitted_tables(fixed, rows, console.width):
+        console.print(table, "")
     console.print(MODBUS_LEGEND, style="dim", soft_wrap=True)
-    if probed.single:
-        console.print(ALONE, style="dim", soft_wrap=True)
-    console.print()
-    for text in modbus_lines(probed):
-        console.print(text, markup=False, soft_wrap=True)
+    if probe.single:
+        console.print(SINGLE_LEGEND, style="dim", soft_wrap=True)
+    for line in ("", *_modbus_lines(probe)):
+        console.print(line, markup=False, soft_wrap=True)
 
 
-def modbus_lines(probed: Probed) -> list[str]:
-    """For the machine file."""
-    return [*modbus_driver_lines(probed.place, probed.survey), "", *modbus_signal_lines(probed.place, probed.wanted)]
+def _modbus_lines(probe: DeviceProbe) -> list[str]:
+    """The tables ``[driver]`` and ``[signals]``."""
+    driver = probe_numbers.modbus_driver_lines(probe.place, probe.survey)
+    return [*driver, "", *probe_numbers.modbus_signal_lines(probe.place, probe.requested)]
 
 
-def speed_lines(probed: Probed) -> list[str]:
-    """How often it was read, how fast it answered, and what rate that allows."""
-    most = max((len(words) for words in probed.readings.values()), default=0)
-    lines = [f"{most} readings in {probed.seconds:.1f} s"]
-    lines += [speed.describe() for speed in dict.fromkeys(probed.speeds)]
-    if rate := possible_rate(probed.speeds):
-        lines[-1] += f", so {rate:g} Hz is possible" + (" for all of it" if len(probed.speeds) > 1 else "")
+def _speed_lines(probe: DeviceProbe) -> list[str]:
+    """How often it was read, how fast it answered, and which polling rate that allows."""
+    count = max((len(words) for words in probe.readings.values()), default=0)
+    lines = [f"{count} readings in {probe.seconds:.1f} s"]
+    lines += [speed.describe() for speed in dict.fromkeys(probe.speeds)]
+    if rate := modbus.possible_rate(probe.speeds):
+        lines[-1] += f", so {rate:g} Hz is possible" + (" for all of it" if len(probe.speeds) > 1 else "")
     return lines
 
 
-def _rows(probed: Probed, kinds: Sequence[TypeName]) -> Iterator[Row]:
-    """A row for each register, and one for many that are always zero."""
-    numbers = {number.address: number for number in probed.numbers}
-    for block, words in probed.readings.items():
-        if not len(words):
-            continue
-        data = bytes_of(words)
-        zeros = [not words[:, at].any() for at in range(block.count)]
+def _register_rows(probe: DeviceProbe, kinds: Sequence[TypeName]) -> Iterator[Row]:
+    """A row for each register, and one for each run of registers that are always zero."""
+    numbers = {number.address: number for number in probe.numbers}
+    for block, words in probe.readings.items():
         at = 0
-        while at < block.count:
-            run = next((end for end in range(at, block.count) if not zeros[end]), block.count) - at
-            label = f"{probed.place.shown(block.address + at)}"
-            if run >= FEWEST_ZEROS:
-                yield Row((f"{label} to {probed.place.shown(block.address + at + run - 1)}", "0000"), {kinds[0]: "0"})
-                at += run
+        while len(words) and at < block.count:
+            address = block.address + at
+            label = str(probe.place.shown(address))
+            zeros = int(np.argmax(np.append(words[:, at:].any(axis=0), True)))
+            if zeros >= MIN_ZERO_RUN:
+                last = probe.place.shown(address + zeros - 1)
+                yield {"register": f"{label} to {last}", "raw": "0000", kinds[0]: "0"}
+                at += zeros
                 continue
-            row = Row((label, f"{words[-1, at]:04X}"))
-            for reading in readings_at(data, at, kinds):
-                row.cells[reading.layout.name] = _short(reading)
-            _mark(row, numbers.get(block.address + at))
+            row = {"register": label, "raw": f"{words[-1, at]:04X}"}
+            for reading in probe_numbers.readings_at(probe_numbers.bytes_of(words), at, kinds):
+                usable = not reading.fault and math.isfinite(reading.latest)
+                row[reading.layout.name] = number_text(reading.latest, reading.layout) if usable else "·"
+            part = numbers[address].part if address in numbers else None
+            if part is not None and part.layout is not None and part.verdict in MARKS:
+                text = row.get(part.layout.name, number_text(part.latest, part.layout))
+                row[part.layout.name] = MARKS[part.verdict] + text
             yield row
             at += 1
 
 
-def _mark(row: Row, number: Number | None) -> None:
-    """Show which of the numbers in a row it is."""
-    if number is not None and number.part.layout is not None and (mark := MARKS.get(number.part.verdict)):
-        name = number.part.layout.name
-        row.cells.setdefault(name, number_text(number.part.latest, number.part.layout))
-        row.marks[name] = mark
-
-
-def _short(reading: Reading) -> str:
-    """In a table there is no room for what cannot be."""
-    return "·" if reading.fault or not math.isfinite(reading.latest) else number_text(reading.latest, reading.layout)
-
-
-def _list(probed: Probed) -> tuple[tuple[str, ...], list[Row]]:
+def _type_rows(probe: DeviceProbe) -> list[Row]:
     """A single register in every type and order, a row each."""
-    block, words = next(
-        (pair for pair in probed.readings.items() if pair[0].address == probed.registers[0]), (None, None)
-    )
+    block = next((block for block in probe.readings if block.address == probe.registers[0]), None)
+    if block is None or not len(probe.readings[block]):
+        return []
+    part = next((number.part for number in probe.requested), None)
     rows = []
-    number = next(iter(probed.wanted), None)
-    for reading in [] if block is None or words is None or not len(words) else readings_at(bytes_of(words), 0, LETTERS):
-        row = Row((reading.layout.kind, reading.layout.order))
-        for name, value in (("now", reading.latest), ("least", reading.low), ("most", reading.high)):
-            row.cells[name] = number_text(value, reading.layout, reading.high - reading.low)
-        row.cells["remark"] = reading.fault
-        if number is not None and number.part.layout is not None and number.part.layout.name == reading.layout.name:
-            row.marks["now"] = MARKS.get(number.part.verdict, "")
-        rows.append(row)
-    return ("type", "order"), rows
+    for reading in probe_numbers.readings_at(probe_numbers.bytes_of(probe.readings[block]), 0, LETTERS):
+        layout, step = reading.layout, reading.high - reading.low
+        inferred = part is not None and part.layout is not None and part.layout.name == layout.name
+        mark = MARKS.get(part.verdict, "") if part is not None and inferred else ""
+        rows.append({
+            "type": layout.kind,
+            "order": layout.order,
+            "now": mark + number_text(reading.latest, layout, step),
+            "least": number_text(reading.low, layout, step),
+            "most": number_text(reading.high, layout, step),
+            "remark": reading.fault,
+        })  # fmt: skip
+    return rows
 
 
-def modbus_document(probed: Probed) -> dict[str, Any]:
-    """The same for machines; a number that is none is null."""
-    place = probed.place
+def modbus_document(probe: DeviceProbe) -> dict[str, Any]:
+    """All that was read, for JSON; a number that is not finite is None."""
+    place, survey = probe.place, probe.survey
     return {
         "line": place.options.title(),
         "device": place.device,
         "table": place.table,
         "first_address": place.first_address,
-        "readable": [[place.shown(block.address), place.shown(block.end - 1)] for block in probed.survey.blocks],
-        "refused": {str(place.shown(at)): reason for at, reason in probed.survey.refused.items()},
-        "most_registers": probed.survey.most,
+        "readable": [[place.shown(block.address), place.shown(block.end - 1)] for block in survey.blocks],
+        "refused": {str(place.shown(address)): reason for address, reason in survey.refused.items()},
+        "most_registers": survey.max_registers,
         "speed": [
-            {"registers": speed.registers, "median_s": speed.median, "slow_s": speed.slow} for speed in probed.speeds
+            {"registers": speed.registers, "median_s": speed.median, "slow_s": speed.slow} for speed in probe.speeds
         ],
-        "possible_hz": possible_rate(probed.speeds),
-        "registers": [entry for block, words in probed.readings.items() for entry in _entries(place, block, words)],
-        "numbers": [_number(place, number) for number in probed.wanted],
-        "lines": modbus_lines(probed),
+        "possible_hz": modbus.possible_rate(probe.speeds),
+        "registers": [
+            {
+                "register": place.shown(block.address + at),
+                "raw": f"{words[-1, at]:04X}",
+                "values": {
+                    reading.layout.name: _finite(reading.latest)
+                    for reading in probe_numbers.readings_at(probe_numbers.bytes_of(words), at, LETTERS)
+                },
+            }
+            for block, words in probe.readings.items()
+            for at in range(block.count if len(words) else 0)
+        ],
+        "numbers": [_number_document(place, number) for number in probe.requested],
+        "lines": _modbus_lines(probe),
     }
 
 
-def _entries(place: Place, block: Block, words: Words) -> Iterator[dict[str, Any]]:
-    if not len(words):
-        return
-    data = bytes_of(words)
-    for at in range(block.count):
-        values = {reading.layout.name: _finite(reading.latest) for reading in readings_at(data, at, LETTERS)}
-        yield {"register": place.shown(block.address + at), "raw": f"{words[-1, at]:04X}", "values": values}
-
-
-def _number(place: Place, number: Number) -> dict[str, Any]:
+def _number_document(place: probe_numbers.Place, number: probe_numbers.Number) -> dict[str, Any]:
     layout, part = number.part.layout, number.part
     return {
         "register": place.shown(number.address),
@@ -368,130 +254,74 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-RECEIVE_TIMEOUT = 0.1  # s; how late an end is noticed
-REFRESH = 4.0  # Hz of the live table
-MOST_NAMED = 12  # messages in a line
-CAN_LEGEND = "[..] bytes that have changed    ± half of the width in which 19 of 20 periods lie"
-
-
-def listen(
-    options: BusOptions, database: Path | None, seconds: float, stopped: Callable[[], bool], live: Console | None
-) -> Picture:
-    """Hear what is on the bus for so many seconds, with a table on ``live`` meanwhile; nothing is sent.
-
-    Raises:
-        DeviceError: the bus cannot be opened, or breaks.
-        ConfigurationError: the database cannot be read.
-    """
-    picture = Picture(load_dbc(database) if database is not None else None)
-    bus = open_bus(options, listen_only=True)
-    shown = Live(_Board(picture, options), console=live, refresh_per_second=REFRESH, transient=True) if live else None
-    try:
-        with shown or contextlib.nullcontext():
-            _receive(bus, options, picture, seconds, stopped)
-    finally:
-        with contextlib.suppress(Exception):  # it is being given up, and what was heard is what counts
-            bus.shutdown()
-    return picture
-
-
-def _receive(bus: Any, options: BusOptions, picture: Picture, seconds: float, stopped: Callable[[], bool]) -> None:
-    end = time.monotonic() + seconds
-    bad = 0
-    while (left := end - time.monotonic()) > 0.0 and not stopped():
-        try:
-            frame = bus.recv(min(left, RECEIVE_TIMEOUT))
-        except Exception as error:  # interfaces raise whatever their vendor's library does
-            bad += 1
-            picture.unreadable += 1
-            if is_gone(error) or bad > MOST_BAD_IN_A_ROW:
-                raise DeviceError(f"CAN bus {options.title()}: {error}; was the interface taken down?") from error
-            continue
-        bad = 0
-        if frame is not None:
-            picture.take(frame, frame.timestamp or time.monotonic())
-
-
-class _Board:
-    """The tables as they are now."""
-
-    def __init__(self, picture: Picture, options: BusOptions) -> None:
-        self._picture, self._options = picture, options
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Drawn anew each time."""
-        yield Text(f"{_title(self._options, self._picture)}; Ctrl-C ends it")
-        yield Group(*tables(self._picture, options.max_width))
-
-
-def _title(options: BusOptions, picture: Picture) -> str:
+def bus_title(options: BusOptions, picture: canbus.Picture) -> str:
+    """The bus, and how many frames came."""
     identifiers = f"{len(picture.observed)} arbitration ID{'s' * (len(picture.observed) != 1)}"
     return f"CAN bus {options.title()}, only listening: {picture.frames} frames of {identifiers}"
 
 
-def tables(picture: Picture, width: int) -> Iterator[RenderableType]:
-    """Frames, and the signals in them that a database knows."""
-    if picture.observed:
-        yield from grids(("ID", "data"), [_frame(picture, heard) for heard in picture.ordered()], width)
-    rows = [_signal(heard.message.name, signal, value) for heard, signal, value in picture.signals() if heard.message]
+def tables(picture: canbus.Picture, width: int) -> Iterator[RenderableType]:
+    """Frames, the signals in them that a database knows, and remarks."""
+    yield from fitted_tables(("ID", "data"), [_frame_row(picture, frames) for frames in picture.ordered()], width)
+    rows = [_signal_row(frames, signal, value) for frames, signal, value in picture.signals()]
     if rows:
         yield Text("")
-        yield from grids(("signal", "unit"), rows, width)
+        yield from fitted_tables(("signal", "unit"), rows, width)
     yield from (Text(line, style="yellow") for line in remarks(picture))
 
 
-def _frame(picture: Picture, heard: ObservedFrames) -> Row:
-    lengths = sorted({min(heard.lengths, default=0), max(heard.lengths, default=0)})
-    cells = {"bytes": " to ".join(map(str, lengths)), "frames": f"{heard.count}", "Hz": "", "period": ""}
-    if heard.period is not None:
-        cells["Hz"] = f"{1.0 / heard.period:.3g}"
-        cells["period"] = f"{1e3 * heard.period:.3g} ms ± {1e3 * heard.jitter:.2g}" if heard.regular else "irregular"
-    cells["what"] = _what(picture, heard)
-    row = Row((heard.name, marked(heard)), cells)
-    if heard.message is None and picture.has_database:
-        row.marks["what"] = "!"
-    return row
-
-
-def _what(picture: Picture, heard: ObservedFrames) -> str:
-    if heard.remote == heard.count:
-        return "remote frames"
-    if heard.message is not None:
-        short = f"; {heard.undecodable} not decodable" if heard.undecodable else ""
-        return f"{heard.message.name}{short}"
-    unknown = "not in the database" if picture.has_database else ""
-    return "; ".join(filter(None, [unknown, picture.guess(heard)]))
-
-
-def marked(heard: ObservedFrames) -> str:
-    """The latest data in hexadecimal digits, with the bytes that have changed in brackets."""
-    text = ""
-    for place, byte in enumerate(heard.latest):
-        now, before = bool(heard.changed[place]), place > 0 and bool(heard.changed[place - 1])
-        text += ("]" if before and not now else "") + (" " if place else "") + ("[" if now and not before else "")
-        text += f"{byte:02X}"
-    return text + ("]" if heard.latest and heard.changed[len(heard.latest) - 1] else "")
-
-
-def _signal(message: str, signal: Any, value: Any) -> Row:
-    low, high = signal.minimum, signal.maximum
-    cells = {
-        "now": value_text(signal, value.latest),
-        "least": value_text(signal, value.low),
-        "most": value_text(signal, value.high),
-        "range": f"{low:g} to {high:g}" if low is not None and high is not None and low < high else "",
-        "beyond": f"{value.beyond} times" if value.beyond else "",
+def _frame_row(picture: canbus.Picture, frames: canbus.ObservedFrames) -> Row:
+    lengths = sorted({min(frames.lengths, default=0), max(frames.lengths, default=0)})
+    rate = period = ""
+    if frames.period is not None:
+        rate = f"{1.0 / frames.period:.3g}"
+        period = f"{1e3 * frames.period:.3g} ms ± {1e3 * frames.jitter:.2g}" if frames.regular else "irregular"
+    return {
+        "ID": frames.name,
+        "data": marked(frames),
+        "bytes": " to ".join(map(str, lengths)),
+        "frames": str(frames.count),
+        "Hz": rate,
+        "period": period,
+        "what": _content(picture, frames),
     }
-    row = Row((f"{message}.{signal.name}", signal.unit or ""), cells)
-    if value.beyond:
-        row.marks["beyond"] = "!"
-    if not within(signal, value.latest):
-        row.marks["now"] = "!"
-    return row
 
 
-def remarks(picture: Picture) -> Iterator[str]:
-    """What else there is to say, a line each."""
+def _content(picture: canbus.Picture, frames: canbus.ObservedFrames) -> str:
+    """The message that the database names, or what the arbitration ID suggests."""
+    unknown = "! not in the database" if picture.has_database and frames.message is None else ""
+    if frames.remote == frames.count:
+        return f"{'! ' if unknown else ''}remote frames"
+    if frames.message is not None:
+        return frames.message.name + (f"; {frames.undecodable} not decodable" if frames.undecodable else "")
+    return "; ".join(filter(None, [unknown, picture.guess(frames)]))
+
+
+def marked(frames: canbus.ObservedFrames) -> str:
+    """The latest data in hexadecimal digits, with the bytes that have changed in brackets."""
+    runs = []
+    for changed, run in groupby(enumerate(frames.latest), key=lambda item: bool(frames.changed[item[0]])):
+        text = " ".join(f"{byte:02X}" for _, byte in run)
+        runs.append(f"[{text}]" if changed else text)
+    return " ".join(runs)
+
+
+def _signal_row(frames: canbus.ObservedFrames, signal: Signal, value: canbus.ObservedValue) -> Row:
+    low, high = signal.minimum, signal.maximum
+    name = f"{frames.message.name if frames.message else frames.name}.{signal.name}"
+    return {
+        "signal": name,
+        "unit": signal.unit or "",
+        "now": ("" if canbus.within(signal, value.latest) else "!") + canbus.value_text(signal, value.latest),
+        "least": canbus.value_text(signal, value.low),
+        "most": canbus.value_text(signal, value.high),
+        "range": f"{low:g} to {high:g}" if low is not None and high is not None and low < high else "",
+        "beyond": f"!{value.beyond} times" if value.beyond else "",
+    }
+
+
+def remarks(picture: canbus.Picture) -> Iterator[str]:
+    """Error frames, frames that are not shown, and messages of the database that did not come; a line each."""
     if picture.error_frames:
         kinds = ", ".join(f"{count} {name}" for name, count in picture.errors.most_common())
         yield f"{picture.error_frames} error frames: {kinds}"
@@ -500,100 +330,68 @@ def remarks(picture: Picture) -> Iterator[str]:
     if picture.left_out:
         yield f"{picture.left_out} frames of further arbitration IDs are not shown"
     if missing := [message.name for message in picture.missing()]:
-        shown = ", ".join(missing[:MOST_NAMED]) + (
-            f" and {len(missing) - MOST_NAMED} more" * (len(missing) > MOST_NAMED)
-        )
-        yield f"in the database, but not heard: {shown}"
+        yield f"in the database, but not received: {_names(missing)}"
 
 
-def show_bus(picture: Picture, options: BusOptions, database: Path | None, seconds: float, console: Console) -> None:
-    """All that was heard, and lines for the machine file."""
-    console.print(f"{_title(options, picture)} in {seconds:.1f} s")
+def _names(names: Sequence[str]) -> str:
+    more = len(names) - MAX_NAMES
+    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def show_bus(
+    picture: canbus.Picture, options: BusOptions, database: Path | None, seconds: float, console: Console
+) -> None:
+    """Print the frames that came, the signals in them, and lines for the machine file."""
+    console.print(f"{bus_title(options, picture)} in {seconds:.1f} s\n")
     if not picture.frames:
-        for line in (*remarks(picture), *silence(options, picture)):
-            console.print(line, markup=False)
         return
-    console.print()
-    for table in tables(picture, console.width):
-        console.print(table)
+    console.print(*tables(picture, console.width), sep="\n")
     console.print(CAN_LEGEND, style="dim", markup=False, soft_wrap=True)
-    console.print()
-    for line in can_lines(picture, options, database):
+    for line in ("", *_can_lines(picture, options, database)):
         console.print(line, markup=False, soft_wrap=True)
 
 
-def can_lines(picture: Picture, options: BusOptions, database: Path | None) -> list[str]:
-    """For the machine file."""
-    lines = [
-        *can_driver_lines(options, picture, str(database.absolute()) if database else None),
-        "",
-        *can_signal_lines(picture),
-    ]
-    quiet = [heard.name for heard in picture.ordered() if heard.message is None and not fields_of(heard)]
-    if quiet:
-        shown = ", ".join(quiet[:MOST_NAMED]) + (" ..." if len(quiet) > MOST_NAMED else "")
-        lines.append(f"# no number moves smoothly in {shown}: move the machine and probe again")
+def _can_lines(picture: canbus.Picture, options: BusOptions, database: Path | None) -> list[str]:
+    """The tables ``[driver]`` and ``[signals]``."""
+    driver = canbus.can_driver_lines(options, picture, str(database.absolute()) if database else None)
+    lines = [*driver, "", *canbus.can_signal_lines(picture)]
+    still = [frames.name for frames in picture.ordered() if frames.message is None and not canbus.fields_of(frames)]
+    if still:
+        lines.append(f"# no number changes smoothly in {_names(still)}: move the machine and probe again")
     return lines
 
 
-def silence(options: BusOptions, picture: Picture) -> Iterator[str]:
-    """What to try where nothing was heard."""
-    interface, channel = options.resolved()
-    if interface == "udp_multicast":
-        yield "nothing was heard: on this virtual bus only programs of this computer speak, such as 'otolith plant'"
-        yield "for a real bus: --channel can0, or what 'ip -brief link show type can' lists"
-        return
-    if picture.error_frames:
-        yield "only error frames were heard: the bit rate is most likely another one, or the wires are swapped"
-    else:
-        yield "nothing was heard; what to try:"
-    if interface == "socketcan":
-        yield f"- is it up, and at which bit rate? 'ip -details link show {channel}' says so"
-        yield f"- another bit rate: 'ip link set {channel} down && ip link set {channel} up type can bitrate 500000'"
-    else:
-        yield "- another bit rate: --bitrate 250000, 500000 or 1000000"
-    yield "- termination: 60 ohm between CAN-H and CAN-L while everything is switched off"
-    yield "- does anybody send? A CANopen drive says nothing but heartbeats until a master starts it"
-
-
-def can_document(picture: Picture, options: BusOptions, database: Path | None, seconds: float) -> dict[str, Any]:
-    """The same for machines."""
+def can_document(picture: canbus.Picture, options: BusOptions, database: Path | None, seconds: float) -> dict[str, Any]:
+    """All that came, for JSON."""
     return {
         "bus": options.title(),
         "seconds": seconds,
-        "frames": [_frame_document(picture, heard) for heard in picture.ordered()],
+        "frames": [_frame_document(picture, frames) for frames in picture.ordered()],
         "signals": [
-            {
-                "message": heard.message.name if heard.message else None,
-                "signal": signal.name,
-                "unit": signal.unit,
-                "latest": value.latest,
-                "low": value.low,
-                "high": value.high,
-                "beyond": value.beyond,
-            }
-            for heard, signal, value in picture.signals()
+            {"message": frames.message.name if frames.message else None, "signal": signal.name, "unit": signal.unit}
+            | asdict(value)
+            for frames, signal, value in picture.signals()
         ],
         "error_frames": picture.error_frames,
         "errors": dict(picture.errors),
         "unreadable": picture.unreadable,
-        "not_heard": [message.name for message in picture.missing()],
-        "lines": can_lines(picture, options, database) if picture.frames else [],
+        "not_received": [message.name for message in picture.missing()],
+        "lines": _can_lines(picture, options, database) if picture.frames else [],
     }
 
 
-def _frame_document(picture: Picture, heard: ObservedFrames) -> dict[str, Any]:
+def _frame_document(picture: canbus.Picture, frames: canbus.ObservedFrames) -> dict[str, Any]:
     return {
-        "id": heard.name,
-        "extended": heard.extended,
-        "count": heard.count,
-        "rate_hz": 1.0 / heard.period if heard.period else None,
-        "period_s": heard.period,
-        "jitter_s": heard.jitter,
-        "lengths": sorted(heard.lengths),
-        "data": heard.latest.hex(),
-        "changed": bytes(heard.changed).hex(),
-        "message": heard.message.name if heard.message else None,
-        "undecodable": heard.undecodable,
-        "guess": picture.guess(heard),
+        "id": frames.name,
+        "extended": frames.extended,
+        "count": frames.count,
+        "rate_hz": 1.0 / frames.period if frames.period else None,
+        "period_s": frames.period,
+        "jitter_s": frames.jitter,
+        "lengths": sorted(frames.lengths),
+        "data": frames.latest.hex(),
+        "changed": bytes(frames.changed).hex(),
+        "message": frames.message.name if frames.message else None,
+        "undecodable": frames.undecodable,
+        "guess": picture.guess(frames),
     }

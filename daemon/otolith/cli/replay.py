@@ -1,6 +1,5 @@
-"""What many reports come to, for people: a table of parameters, and how the windows were."""
+"""``otolith replay``: recorded data through the code of the daemon, and a summary of the reports."""
 
-import contextlib
 import re
 import sys
 from collections import Counter
@@ -10,39 +9,39 @@ from pathlib import Path
 
 import click
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from otolith.cli.live_table import STYLES, value_cells
-from otolith.discovery.sequential_test import WindowDecision
+from otolith.cli.common import echo_warnings, progress_line
+from otolith.cli.live_table import STYLES, parameter_table, title
+from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import ReportDocument, Status
+from otolith.health.text import component_text, finding_text, value_cells
 from otolith.machine import load_machine
 from otolith.runtime.replay import RealTimePacer, Replay, ReplayRecorder, open_recorded
 
-WIDTH = 110  # columns of a summary that goes into a file
-Stopped = Callable[[], bool]
-MOST_REASONS = 5  # that are told
-DATES = (1e8, 1e11)  # s since 1970: what is earlier counts from a beginning of its own, what is later is no second
+PLAIN_WIDTH = 110  # columns of a summary that goes into a file
+MAX_REASONS = 5  # kinds of bad windows that the summary lists
+UNIX_TIMES = (1e8, 1e11)  # s; between March 1973 and the year 5138 a time is a date, below it counts from zero
 FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")
 
 
 def time_text(seconds: float) -> str:
-    """A time of the data: seconds as they are, or the date where they can only be those since 1970."""
-    if not DATES[0] <= seconds < DATES[1]:
+    """A time of the data: seconds, or date and time (UTC) where only Unix seconds are that large."""
+    if not UNIX_TIMES[0] <= seconds < UNIX_TIMES[1]:
         return f"{round(seconds, 6) + 0.0:.12g} s"
     return f"{datetime.fromtimestamp(seconds, UTC):%F %T}Z"
 
 
 class ReplaySummary:
-    """Takes reports, keeps the last one and counts; draws itself."""
+    """Counts reports, keeps the last one, and draws itself."""
 
     def __init__(self) -> None:
         self._first: ReportDocument | None = None
         self._last: ReportDocument | None = None
-        self._windows = self._fitted = self._explained = 0
-        self._lessons: Counter[WindowDecision] = Counter()
-        self._statuses: dict[str, Counter[Status]] = {}
+        self._fitted = self._explained = 0
+        self._decisions: Counter[WindowDecision] = Counter()
+        self._statuses: Counter[tuple[str, Status]] = Counter()
         self._reasons: Counter[str] = Counter()
         self._examples: dict[str, str] = {}
 
@@ -50,99 +49,86 @@ class ReplaySummary:
         """Count one report."""
         self._first = self._first or document
         self._last = document
-        self._windows += 1
-        self._lessons[document.decision] += 1
+        self._decisions[document.decision] += 1
         if document.fit is not None:
             self._fitted += 1
             self._explained += document.fit.explained
-        for name, parameter in document.parameters.items():
-            self._statuses.setdefault(name, Counter())[parameter.status] += 1
+        self._statuses.update((name, parameter.status) for name, parameter in document.parameters.items())
         for reason in document.window.quality.reasons:
-            kind = FIGURE.sub("…", reason)  # one window lacks 7 %, another 8 %
+            kind = FIGURE.sub("…", reason)  # "7 % missing" and "8 % missing" are the same kind
             self._reasons[kind] += 1
             self._examples.setdefault(kind, f"{reason} (window {document.window.index})")
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The table and the counts."""
+        """Parameters, components and findings of the last report, and the counts."""
         del console, options
         if self._first is None or self._last is None:
             yield Text("no window")
             return
         last = self._last
-        span = f"from {time_text(self._first.window.start)} to {time_text(last.window.end)}"
-        yield Text.assemble((last.machine, "bold"), f" at {last.site}, twin {last.twin} ({last.model}), {span}")
+        yield title(last, f", from {time_text(self._first.window.start)} to {time_text(last.window.end)}")
         yield self._parameters(last)
         for name, parameter in last.parameters.items():
             if parameter.reason:
                 yield Text(f"{name} in the last window: {parameter.reason}", style="yellow")
-        for entry in last.components:
-            yield Text(
-                f"{entry.meaning}: {entry.equation}, since {time_text(entry.onset)} ({entry.approval})",
-                style="bold red",
-            )
+        for component in last.components:
+            yield Text(f"{component_text(component)}, since {time_text(component.onset)}", style="bold red")
+        shown = {component.id for component in last.components}
         for finding in last.findings:
-            if finding.id not in {entry.id for entry in last.components}:
-                yield Text(" ".join(filter(None, [finding.text, finding.advice])), style="red")
-        yield from self._words()
+            if finding.id not in shown:
+                yield Text(finding_text(finding), style="red")
+        yield from self._counts()
 
     def _parameters(self, last: ReportDocument) -> Table:
-        table = Table(expand=False)
-        for column in ("parameter", "value", "± 95 %", "unit", "change", "last window", *Status):
-            right = column in ("value", "± 95 %", "change", *Status)
-            table.add_column(column, justify="right" if right else "left", no_wrap=True)
+        table = parameter_table("last window", *Status)
         for name, parameter in last.parameters.items():
             status = Text(parameter.status, style=STYLES[parameter.status])
-            counts = (str(self._statuses[name][kind]) for kind in Status)
+            counts = (str(self._statuses[name, kind]) for kind in Status)
             table.add_row(name, *value_cells(parameter), status, *counts)
         return table
 
-    def _words(self) -> Iterator[Text]:
-        bad = self._lessons[WindowDecision.BAD]
+    def _counts(self) -> Iterator[Text]:
+        windows, bad = self._decisions.total(), self._decisions[WindowDecision.BAD]
         explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
-        yield Text(f"{self._windows} windows: {self._windows - bad} good, {bad} bad; {explained}")
-        for decision, count in self._lessons.items():
+        yield Text(f"{windows} windows: {windows - bad} good, {bad} bad; {explained}")
+        for decision, count in self._decisions.items():
             if decision not in (WindowDecision.LEARNED, WindowDecision.BAD):
                 yield Text(f"  {count} good, but: {decision}", style="yellow")
-        for kind, count in self._reasons.most_common(MOST_REASONS):
+        for kind, count in self._reasons.most_common(MAX_REASONS):
             yield Text(f"  {count} bad like: {self._examples[kind]}", style="red")
 
 
 def replay(
-    machine: Path, data: Path, recording: Path | None, *, as_json: bool, stopped: Stopped, real_time: bool = False
+    file: Path,
+    data: Path,
+    recording: Path | None,
+    *,
+    as_json: bool,
+    stopped: Callable[[], bool],
+    real_time: bool = False,
 ) -> None:
-    """Print what the daemon of ``machine`` would have said of ``data``: its reports as JSON Lines, or a summary.
+    """Print the daemon's reports on ``data`` for the machine in ``file``: as JSON Lines, or as a summary.
 
     Raises:
         OtolithError: a file that cannot be used.
     """
-    plan = load_machine(machine, with_driver=False)
-    tally = ReplaySummary()
-    with open_recorded(plan, data) as recorded:
+    machine = load_machine(file, with_driver=False)
+    summary = ReplaySummary()
+    with open_recorded(machine, data) as recorded:
         if recorded.ignored:
             click.echo(f"{data}: columns not used: {', '.join(recorded.ignored)}", err=True)
-        run = Replay(plan, recorded, stopped, RealTimePacer(stopped).wait if real_time else None)
-        with ReplayRecorder(recording, plan) as recorder, _bar(as_json=as_json) as bar:
-            task = bar.add_task("", total=1.0)
+        run = Replay(machine, recorded, stopped, RealTimePacer(stopped).wait if real_time else None)
+        with ReplayRecorder(recording, machine) as recorder, progress_line("reading", enabled=not as_json) as show:
             for report in run.reports():
-                tally.add(report.document)
+                summary.add(report.document)
                 recorder.add(report)
-                bar.update(task, completed=recorded.progress, description=f"window {report.document.window.index}")
+                show(f"window {report.document.window.index}, {recorded.progress:.0%} of the data")
                 if as_json:
                     click.echo(report.document.to_json())
     if as_json:
-        for line in run.warnings():
-            click.echo(f"{data}: {line}", err=True)
+        echo_warnings(data, run.warnings())
         return
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
-    console.print(tally)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else PLAIN_WIDTH)
+    console.print(summary)
     for line in (run.summary(), *run.warnings()):
         console.print(line, markup=False, soft_wrap=True)
-
-
-@contextlib.contextmanager
-def _bar(*, as_json: bool) -> Iterator[Progress]:
-    """On standard error, if somebody sees it."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=as_json or not console.is_terminal) as bar:
-        yield bar

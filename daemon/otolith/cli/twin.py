@@ -1,17 +1,22 @@
-"""``otolith twin``: the library, one twin as people read it, and a check of one's own."""
+"""``otolith twin``: the library of twins, one twin as a page of equations, and the check of a user's own twin."""
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
-FILE = click.Path(path_type=Path, dir_okay=False)
+from otolith.cli.common import AS_JSON, FILE
+
+if TYPE_CHECKING:
+    from otolith.twin.definition import Definition
+
+MIN_WIDTH = 100  # columns; narrower tables of parameters are hard to read, also in a file
 
 
-@click.group(name="twin")
+@click.group()
 def twin() -> None:
-    """Twins: pages of equations that describe machines.
+    """List, show and check twins, the equations of machines.
 
     \b
     Examples:
@@ -21,8 +26,8 @@ def twin() -> None:
     """
 
 
-@twin.command(name="list")
-@click.option("--json", "as_json", is_flag=True, help="As JSON.")
+@twin.command("list")
+@AS_JSON
 def list_(as_json: bool) -> None:
     """List the twins of the library.
 
@@ -30,23 +35,25 @@ def list_(as_json: bool) -> None:
     Example:
       otolith twin list
     """
-    from otolith.machine import find_twin, names
+    from otolith.machine import find_twin, library_twins
 
-    found = [find_twin(name) for name in names()]
+    twins = [find_twin(name) for name in library_twins()]
     if as_json:
-        click.echo(json.dumps([{"name": entry.name, "title": entry.title} for entry in found]))
+        click.echo(json.dumps([{"name": twin.name, "title": twin.title} for twin in twins]))
         return
-    width = max(len(entry.name) for entry in found)
-    for entry in found:
-        click.echo(f"{entry.name:{width}}  {entry.title}")
+    width = max(len(twin.name) for twin in twins)
+    for twin in twins:
+        click.echo(f"{twin.name:{width}}  {twin.title}")
 
 
 @twin.command()
 @click.argument("name")
-@click.option("--latex", is_flag=True, help="Only the equations, as LaTeX.")
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@click.option("--latex", is_flag=True, help="Print only the equations, as LaTeX.")
+@AS_JSON
 def show(name: str, latex: bool, as_json: bool) -> None:
-    """Show the twin NAME of the library, or of a file: equations, parameters, what could be estimated.
+    """Show equations, signals and parameters of the twin NAME.
+
+    NAME is a twin of the library or a file that ends in .toml.
 
     \b
     Examples:
@@ -54,15 +61,18 @@ def show(name: str, latex: bool, as_json: bool) -> None:
       otolith twin show dc_motor --latex
       otolith twin show my-twin.toml
     """
+    from dataclasses import asdict
+
     from otolith.machine import find_twin, load_twin
+    from otolith.twin.identifiability import structural_identifiability
+    from otolith.twin.symbolic import latex_page
 
     definition = load_twin(Path(name)) if name.endswith(".toml") else find_twin(name)
     if latex:
-        from otolith.twin.symbolic import latex_page
-
         click.echo(latex_page(definition))
     elif as_json:
-        click.echo(json.dumps(_document(definition), indent=2, ensure_ascii=False))
+        document = asdict(definition) | {"structure": [asdict(row) for row in structural_identifiability(definition)]}
+        click.echo(json.dumps(document, indent=2, ensure_ascii=False))
     else:
         _print(definition)
 
@@ -70,7 +80,7 @@ def show(name: str, latex: bool, as_json: bool) -> None:
 @twin.command()
 @click.argument("file", type=FILE)
 def check(file: Path) -> None:
-    """Check the twin in FILE: grammar, units on both sides, and what could be estimated from its outputs.
+    """Check grammar, units and identifiability of the twin in FILE.
 
     \b
     Example:
@@ -81,45 +91,35 @@ def check(file: Path) -> None:
     _print(load_twin(file))
 
 
-def _document(definition: Any) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    from otolith.twin.identifiability import structure_of
-
-    return asdict(definition) | {"structure": [asdict(entry) for entry in structure_of(definition)]}
-
-
-def _print(definition: Any) -> None:
+def _print(definition: "Definition") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from otolith.twin.identifiability import structure_of
+    from otolith.twin.identifiability import structural_identifiability
     from otolith.twin.symbolic import unicode_page
 
-    console = Console(width=max(Console().width, 100), highlight=False)
-    say = console.print
-    say(f"[bold]{definition.title}[/bold] ({definition.name})")
-    say(f"source: {definition.source}", markup=False)
+    console = Console(width=max(Console().width, MIN_WIDTH), highlight=False)
+    console.print(f"[bold]{definition.title}[/bold] ({definition.name})")
+    console.print(f"source: {definition.source}", markup=False)
     if definition.validity:
-        say(f"valid: {definition.validity}", markup=False)
-    say("")
-    say(unicode_page(definition), markup=False, soft_wrap=True)
-    say("")
-    structure = {entry.name: entry for entry in structure_of(definition)}
+        console.print(f"valid: {definition.validity}", markup=False)
+    console.print(f"\n{unicode_page(definition)}\n", markup=False, soft_wrap=True)
+    structure = {row.name: row for row in structural_identifiability(definition)}
     table = Table("parameter", "nominal", "bounds", "unit", "role", "could be estimated", "meaning")
-    for entry in definition.parameters:
-        found = structure[entry.name]
-        verdict = "yes" if found.identifiable else f"no: {found.reason}"
-        bounds = f"{entry.low:g} to {entry.high:g}"
-        table.add_row(entry.name, f"{entry.nominal:g}", bounds, entry.unit, entry.role, verdict, entry.meaning)
-    say(table)
+    for parameter in definition.parameters:
+        row = structure[parameter.name]
+        estimable = "yes" if row.identifiable else f"no: {row.reason}"
+        bounds = f"{parameter.low:g} to {parameter.high:g}"
+        table.add_row(parameter.name, f"{parameter.nominal:g}", bounds, parameter.unit, parameter.role, estimable,
+                      parameter.meaning)  # fmt: skip
+    console.print(table)
     signals = Table("signal", "", "unit", "meaning")
-    for entry in definition.inputs:
-        signals.add_row(entry.name, f"input, {entry.hold}", entry.unit, entry.meaning)
-    for entry in definition.outputs:
-        signals.add_row(entry.name, f"output, noise {entry.noise:g}", entry.unit, entry.meaning)
-    for entry in definition.constants:
-        signals.add_row(entry.name, f"constant {entry.value:g}", entry.unit, entry.meaning)
-    for entry in definition.sites:
-        signals.add_row(entry.name, f"site, {entry.mode} into {entry.into}", entry.unit, entry.meaning)
-    say(signals)
+    for driving in definition.inputs:
+        signals.add_row(driving.name, f"input, {driving.hold}", driving.unit, driving.meaning)
+    for output in definition.outputs:
+        signals.add_row(output.name, f"output, noise {output.noise:g}", output.unit, output.meaning)
+    for constant in definition.constants:
+        signals.add_row(constant.name, f"constant {constant.value:g}", constant.unit, constant.meaning)
+    for site in definition.sites:
+        signals.add_row(site.name, f"site, {site.mode} into {site.into}", site.unit, site.meaning)
+    console.print(signals)

@@ -1,110 +1,63 @@
-"""Levels of noise, learned from windows of a healthy machine: of each sensor, and of what strays in the machine.
+"""Noise identification: levels of sensor and process noise from windows of a healthy machine.
 
-Twice. First by likelihood (:mod:`otolith.commissioning.likelihood`), which knows what is quick: the levels under which
-the innovations are the most likely. Then by what windows say of each other (:mod:`otolith.commissioning.consistency`):
-where they scatter more than they claim, process noise is inflated until they do not.
-
-Where the search for levels of noise begins: what the signals themselves tell before any twin is fitted.
-
-What was learned of noise, and the sentences that go with it. Plain.
+The initial guess comes from the signals alone. Then the likelihood of the innovations is maximised
+(:mod:`otolith.commissioning.likelihood`), which identifies fast process noise. If the windows' estimates still scatter
+more than their uncertainties say (:mod:`otolith.commissioning.consistency`), process noise is inflated.
 """
 
-from collections.abc import Sequence
+import re
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Verdict, Window
-from otolith.commissioning.consistency import consistency_test, inflated, observable_states, root
-from otolith.commissioning.likelihood import HIDDEN, Fit, Ladder, Likeliest, Likelihood, Told, fewest, noisy
+from otolith.acquisition.window import Array, Mask, Verdict, Window
+from otolith.commissioning.consistency import consistency_test, inflate_process_noise, sqrt_information
+from otolith.commissioning.likelihood import (
+    FittedWindow,
+    Likelihood,
+    LikelihoodPoint,
+    Progress,
+    VarianceParametrisation,
+    backward_elimination,
+    with_levels,
+)
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import particle_swarm
+from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
 
-ORDER = 4  # of the differences: a signal that a cubic follows over five records is gone
-GAIN = np.sqrt(70.0)  # of fourth differences for white noise: the root of 1 + 16 + 36 + 16 + 1
-MEDIAN = 0.6745  # of the absolute value of a normal deviate
-DECADES = range(-14, 3)  # of process noise, in widths of the state's bounds
-FELT = np.log(2.0)  # of an innovation's variance: process noise adds as much as was there
-HALVINGS = 3
+# Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
+DIFFERENCE_ORDER = 4  # differences of this order remove what a cubic follows over five records
+DIFFERENCE_GAIN = np.sqrt(70.0)  # of white noise by these differences: √(1² + 4² + 6² + 4² + 1²)
+NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal deviate
+PROCESS_DECADES = range(-14, 3)  # searched for the initial process noise, in widths of the state's bounds
+OBSERVABLE = np.log(2.0)  # increase of the mean log variance of the innovations: process noise as large as all other
+PROCESS_RESOLUTION = 0.125  # decades, of the initial process noise
+MIN_RECORDS = DIFFERENCE_ORDER + 1  # of a window
+MIN_SENSOR_SHARE = 0.02  # of the noise that a signal shows: floor of the sensor's level
+MAX_COST = 1e6  # of a window's first fit, in units of the noise: beyond it, the twin cannot follow
+POOR_FIT = 5.0  # cost of the first window's fit beyond which the particle swarm looks for a better minimum
+SMALL_PROCESS_SHARE = 1e-3  # of the observable process noise: where inflation begins if the likelihood found none
+MAX_PLAUSIBLE_FACTOR = 10.0  # on process noise: beyond it, noise is hardly the cause
 
-
-def sensor_levels(problem: Problem, windows: Sequence[Window]) -> Array:
-    """(outputs,) standard deviation of what changes from record to record; 0 where nothing does, NaN without samples.
-
-    An upper estimate if the machine itself is as quick as that.
-    """
-    return np.array([_rough(entry.name, windows) for entry in problem.twin.outputs])
-
-
-def _rough(output: str, windows: Sequence[Window]) -> float:
-    found = []
-    for window in windows:
-        missing, values = window.missing_in(output), window.column(output)
-        holes = np.convolve(missing, np.ones(ORDER + 1))[ORDER : len(values)] > 0.5
-        differences = np.diff(values, ORDER)[~holes] / GAIN
-        if len(differences):
-            typical = float(np.median(np.abs(differences))) / MEDIAN
-            found.append(typical or float(np.std(differences)))
-    return float(np.median(found)) if found else float("nan")
-
-
-def felt_levels(problem: Problem, outputs: Array, window: Window) -> Array:
-    """(states,) process noise that doubles the variance of the innovations; NaN where none does.
-
-    With much less, the noise of the sensors (outputs,) hides it.
-    """
-    states = problem.twin.states
-    quiet = np.concatenate([outputs, np.zeros(len(states))])
-    least = _uncertainty(problem, quiet, window) + FELT
-
-    def is_felt(index: int, decade: float) -> bool:
-        levels = quiet.copy()
-        levels[len(outputs) + index] = (states[index].high - states[index].low) * 10.0**decade
-        return bool(_uncertainty(problem, levels, window) >= least)
-
-    found = np.full(len(states), np.nan)
-    for index, state in enumerate(states):
-        decade = next((float(decade) for decade in DECADES if is_felt(index, decade)), None)
-        if decade is None:
-            continue
-        low, high = decade - 1.0, decade
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if is_felt(index, middle) else (middle, high)
-        found[index] = (state.high - state.low) * 10.0**high
-    return found
-
-
-def _uncertainty(problem: Problem, levels: Array, window: Window) -> float:
-    """Mean logarithm of the innovations' variances."""
-    objective = Objective(noisy(problem, levels), window, problem.nominal)
-    return objective.correction.log_determinant / objective.count
-
-
-AS_IT_WAS = "; it stays as it was"
-NEVER_MEASURED = "no window has a sample of it" + AS_IT_WAS
-CONSTANT = "it never changes, so its noise is not to be seen" + AS_IT_WAS
-AT_MOST = "no more than that: beside the process noise a better sensor would not be noticed"
-UNSEEN = "no output shows it"
-AT_REST = "nothing moves in these windows, and what strays in the machine when it runs is not to be seen"
-NONE_NEEDED = "the windows are as likely without; about {:.1g} {} per square root of a second could hide"
-NO_WINDOW = "no window can be used: nothing was learned"
-LEFT_OUT = "windows left out because they are badly sampled, too short or beyond the twin: {} of {}"
-RESTING = "windows left out because nothing moves in them: {} of {}"
-ALONE = "one window cannot say whether windows agree"
-NOTHING_SHARED = "no two windows see the same, so whether they agree is not to be seen"
-BY_CHANCE = "windows agree as well as they claim"
-INFLATED = "windows scatter more than they claim: process noise was inflated until they agree"
-FROM_NOTHING = (
-    "windows scatter more than they claim, though none shows process noise by itself: what is measured or driven got as"
-    " much of it as makes them agree"
-)
-HELPLESS = (
-    "windows scatter more than they claim, and no process noise makes them agree: it stays as the likelihood says"
-)
-DOUBTFUL = "; so much is hardly noise: the machine changes from window to window, or the twin lacks something"
+NEVER_MEASURED = "no window has a sample of it: its level is unchanged"
+CONSTANT = "the signal is constant, so its noise cannot be identified: its level is unchanged"
+UPPER_BOUND = "upper bound: beside the process noise, a better sensor would not be distinguishable"
+NOT_OBSERVABLE = "no output depends on it"
+AT_REST = "nothing moves in these windows, so its process noise cannot be identified"
+NOT_SIGNIFICANT = "not significant: up to about {:.1g} {} per square root of a second cannot be detected"
+NO_WINDOW = "no window can be used: nothing was identified"
+EXCLUDED = "windows excluded because they are badly sampled, too short, or the twin cannot follow them: {} of {}"
+EXCLUDED_AT_REST = "windows excluded because nothing moves in them: {} of {}"
+ONE_WINDOW = "consistency of windows: not tested, as there is only one window"
+NOT_COMPARABLE = "consistency of windows: not tested, as no two windows determine the same parameters"
+CONSISTENT = "consistency of windows: they scatter as their uncertainties say"
+INFLATED = "consistency of windows: they scattered more than their uncertainties say, so process noise was inflated"
+ADDED = "consistency of windows: they scattered more than their uncertainties say, so process noise was added"
+NOT_INFLATED = "consistency of windows: they scatter more than their uncertainties say, but process noise is no cause"
+DOUBTFUL = "; by so much that the machine probably changes between windows, or the twin lacks something"
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,248 +67,242 @@ class NoiseLevel:
     name: str
     value: float
     """Standard deviation in the unit of the output; of a state, in its unit per square root of a second."""
-    sd: float | None
-    """Standard deviation of the value; none where it was not learned."""
-    remark: str
-    """In words, why it was not learned or what to know of it; empty if there is nothing to say."""
+    sd: float | None = None
+    """Standard deviation of the value; None if it was not identified."""
+    remark: str = NO_WINDOW
+    """Why it was not identified, or what limits it; empty if nothing does."""
 
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """What windows say of each other, with the likelihood's levels and with those that are handed out."""
+    """The consistency test with maximum-likelihood levels, and with those that are returned."""
 
-    degrees: int
-    """How many numbers were compared."""
-    before: float | None
-    """Reduced chi-square between windows; none where nothing can be compared."""
-    after: float | None
-    factor: float | None
-    """On process noise; none where there was none to inflate."""
-    remark: str
+    degrees: int = 0
+    """Degrees of freedom; 0 if nothing can be compared, and the numbers below are None."""
+    before: float | None = None
+    """Reduced chi-square of the windows."""
+    after: float | None = None
+    factor: float | None = None
+    """On process noise; None if there was none to inflate."""
+    remark: str = NO_WINDOW
 
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedNoise:
-    """Levels of noise and how well they are known."""
+    """Noise levels and their uncertainties."""
 
     outputs: tuple[NoiseLevel, ...]
     states: tuple[NoiseLevel, ...]
-    log_likelihood: float | None
-    """Before inflation, restricted, up to a constant; none where nothing was learned."""
-    consistency: Consistency
-    windows: int
-    """How many it was learned from."""
     remarks: tuple[str, ...]
-    """What else there is to say of the windows."""
-    evaluations: int
+    """About windows that were not used."""
+    consistency: Consistency = Consistency()
+    log_likelihood: float | None = None
+    """Restricted, before inflation, up to a constant; None if nothing was identified."""
+    windows: int = 0
+    """How many were used."""
+    evaluations: int = 0
+    """Linearisations of a window, for all its fits."""
 
     def applied(self, problem: Problem) -> Problem:
         """The problem with these levels."""
-        return noisy(problem, np.array([entry.value for entry in (*self.outputs, *self.states)]))
+        levels = np.array([level.value for level in (*self.outputs, *self.states)])
+        return replace(with_levels(problem, levels), open_loop=problem.open_loop)
 
 
-def nothing_learned(problem: Problem, remarks: tuple[str, ...]) -> IdentifiedNoise:
-    """The levels of the problem, as they were."""
-    twin = problem.twin
-    strays = problem.process_noise or (0.0,) * len(twin.states)
-    sensors = zip(twin.outputs, problem.noise, strict=True)
-    states = zip(twin.states, strays, strict=True)
-    return IdentifiedNoise(
-        outputs=tuple(NoiseLevel(entry.name, level, None, NO_WINDOW) for entry, level in sensors),
-        states=tuple(NoiseLevel(entry.name, level, None, NO_WINDOW) for entry, level in states),
-        log_likelihood=None,
-        consistency=Consistency(0, None, None, None, NO_WINDOW),
-        windows=0,
-        remarks=remarks,
-        evaluations=0,
-    )
+def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progress = lambda _: None) -> IdentifiedNoise:
+    """Noise levels of ``problem`` from ``windows``, given the noise of inputs; deterministic.
 
-
-FEWEST_RECORDS = 5
-LOST = 1e6  # cost of a window that the twin cannot follow at all
-SURPRISING = 5.0  # cost of the first fit beyond which the swarm looks for a better valley
-LITTLE = 1e-3  # of the process noise that is felt: where inflation begins if the likelihood found none
-SUSPICIOUS = 10.0  # a factor beyond which the noise is hardly what is wrong
-
-
-def identify_noise(
-    problem: Problem, windows: Sequence[Window], *, seed: int | None = None, told: Told = lambda _: None
-) -> IdentifiedNoise:
-    """The levels of ``problem`` are what is kept where nothing is learned; its noise of inputs is taken as known.
-
-    ``told`` hears of the progress. The same problem, windows and seed give the same levels, bit for bit.
+    A level that cannot be identified is unchanged. ``progress`` is called with a line of text from time to time.
     """
-    seeded = problem if seed is None else replace(problem, seed=seed)
-    return _Learning(seeded, told).run(windows)
-
-
-def _is_usable(window: Window) -> bool:
-    return (
-        window.quality.verdict is Verdict.GOOD
-        and window.records >= FEWEST_RECORDS
-        and bool(np.isfinite(window.values).all())
+    likelihood = Likelihood(problem)
+    guess = _initial_guess(likelihood, windows, progress)
+    twin = problem.twin
+    if not guess.fits:
+        sensors, process = problem.noise, problem.process_noise or (0.0,) * len(twin.states)
+        outputs = (NoiseLevel(output.name, level) for output, level in zip(twin.outputs, sensors, strict=True))
+        states = (NoiseLevel(state.name, level) for state, level in zip(twin.states, process, strict=True))
+        return IdentifiedNoise(tuple(outputs), tuple(states), guess.remarks)
+    best = backward_elimination(guess.variances, guess.fits, progress)
+    consistency, levels = _make_consistent(guess, best, progress)
+    return IdentifiedNoise(
+        outputs=tuple(_output_levels(twin, guess, best)),
+        states=tuple(_state_levels(twin, guess, best, levels, consistency.degrees)),
+        remarks=guess.remarks,
+        consistency=consistency,
+        log_likelihood=-0.5 * best.deviance,
+        windows=len(guess.fits),
+        evaluations=likelihood.evaluations,
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Ground:
-    """What the search stands on."""
+class _InitialGuess:
+    """Where the search begins."""
 
-    shown: Array
-    """(outputs,) what the signals show of their noise; 0 if one never changes, NaN if it is never measured."""
-    felt: Array
-    """(states,) process noise that the innovations feel; NaN if they feel none."""
-    fits: list[Fit]
-    moving: bool
-
-
-class _Learning:
-    """Step by step."""
-
-    def __init__(self, problem: Problem, told: Told) -> None:
-        self._problem, self._told = problem, told
-        self._likelihood = Likelihood(problem)
-        self._outputs = len(problem.twin.outputs)
-        self._remarks: list[str] = []
-
-    def run(self, windows: Sequence[Window]) -> IdentifiedNoise:
-        ground = self._ground(windows)
-        if ground is None:
-            return nothing_learned(self._problem, tuple(self._remarks))
-        sensors = self._sensors(ground.shown)
-        ladder = Ladder(
-            base=np.concatenate([sensors, np.nan_to_num(ground.felt)]),
-            least=np.concatenate([np.where(ground.shown > 0.0, HIDDEN, 1.0) * sensors, np.zeros(len(ground.felt))]),
-            sought=np.concatenate([ground.shown > 0.0, np.isfinite(ground.felt) & ground.moving]),
-        )
-        found = fewest(self._likelihood, ladder, ground.fits, self._told)
-        consistency, levels = self._consistent(ground, found)
-        return IdentifiedNoise(
-            outputs=self._sensor_levels(ground, ladder, found),
-            states=self._state_levels(ground, found, levels, consistency),
-            log_likelihood=-0.5 * found.unlikelihood,
-            consistency=consistency,
-            windows=len(ground.fits),
-            remarks=tuple(self._remarks),
-            evaluations=self._likelihood.evaluations,
-        )
-
-    def _sensors(self, shown: Array) -> Array:
-        """(outputs,) where the search begins, and what stays where nothing is shown."""
-        return np.where(shown > 0.0, shown, self._problem.noise)
-
-    def _ground(self, windows: Sequence[Window]) -> _Ground | None:
-        usable = [window for window in windows if _is_usable(window)]
-        fits: list[Fit] = []
-        shown, felt = np.zeros(0), np.zeros(0)
-        if usable:
-            shown = sensor_levels(self._problem, usable)
-            sensors = self._sensors(shown)
-            felt = felt_levels(self._problem, sensors, _liveliest(self._problem.twin, usable, sensors))
-            first = self._first_fits(np.concatenate([sensors, np.nan_to_num(felt)]), usable)
-            fits = [fit for fit in first if fit.cost < LOST]
-        if len(fits) < len(windows):
-            self._remarks.append(LEFT_OUT.format(len(windows) - len(fits), len(windows)))
-        if not fits:
-            return None
-        moving = [fit for fit in fits if len(root(fit, self._likelihood.width))]
-        if 0 < len(moving) < len(fits):
-            self._remarks.append(RESTING.format(len(fits) - len(moving), len(windows)))
-        return _Ground(shown, felt, moving or fits, bool(moving))
-
-    def _first_fits(self, levels: Array, windows: Sequence[Window]) -> list[Fit]:
-        """Each from the nominal values and from where the window before came to rest."""
-        fits: list[Fit] = []
-        starts = [self._problem.nominal]
-        for index, window in enumerate(windows):
-            self._told(f"window {index + 1} of {len(windows)}")
-            fit = self._likelihood.fit(levels, window, starts)
-            if not fits and fit.cost > SURPRISING:
-                objective = Objective(noisy(self._problem, levels), window, self._problem.nominal)
-                searched = particle_swarm(objective, self._problem.swarm, self._problem.nominal, self._problem.seed)
-                fit = self._likelihood.fit(levels, window, [*starts, searched.places[0]])
-            fits.append(fit)
-            starts = [self._problem.nominal, fit.guess[: len(self._problem.free)]]
-        return fits
-
-    def _consistent(self, ground: _Ground, found: Likeliest) -> tuple[Consistency, Array]:
-        """What windows say of each other, and the levels (outputs + states,) under which they agree."""
-        before = consistency_test(found.fits, self._likelihood.width)
-        if not before.degrees:
-            remark = ALONE if len(found.fits) == 1 else NOTHING_SHARED
-            return Consistency(0, None, None, None, remark), found.levels
-        if before.by_chance:
-            return Consistency(before.degrees, before.reduced, before.reduced, 1.0, BY_CHANCE), found.levels
-        strays = found.levels.copy()
-        strays[: self._outputs] = 0.0
-        from_nothing = not strays.any()
-        if from_nothing:
-            strays[self._outputs :] = np.where(
-                observable_states(self._problem.twin), LITTLE * np.nan_to_num(ground.felt), 0.0
-            )
-        sensors = np.where(np.arange(len(strays)) < self._outputs, found.levels, 0.0)
-        self._told(f"windows scatter {before.reduced:.3g} times more than they claim")
-        result = inflated(self._likelihood, lambda factor: sensors + factor * strays, found.fits)
-        after = result.reached
-        if not after.degrees or not after.by_chance:
-            return Consistency(before.degrees, before.reduced, before.reduced, None, HELPLESS), found.levels
-        remark = FROM_NOTHING if from_nothing else INFLATED
-        if not from_nothing and result.factor > SUSPICIOUS:
-            remark += DOUBTFUL
-        factor = None if from_nothing else result.factor
-        told = Consistency(before.degrees, before.reduced, after.reduced, factor, remark)
-        return told, sensors + result.factor * strays
-
-    def _sensor_levels(self, ground: _Ground, ladder: Ladder, found: Likeliest) -> tuple[NoiseLevel, ...]:
-        levels = []
-        for index, (entry, shown) in enumerate(zip(self._problem.twin.outputs, ground.shown, strict=True)):
-            value, sd = float(found.levels[index]), float(found.deviations[index])
-            if np.isnan(shown):
-                levels.append(NoiseLevel(entry.name, value, None, NEVER_MEASURED))
-            elif not shown:
-                levels.append(NoiseLevel(entry.name, value, None, CONSTANT))
-            else:
-                levels.append(NoiseLevel(entry.name, value, sd, AT_MOST if value <= sd + ladder.least[index] else ""))
-        return tuple(levels)
-
-    def _state_levels(
-        self, ground: _Ground, found: Likeliest, levels: Array, consistency: Consistency
-    ) -> tuple[NoiseLevel, ...]:
-        """The uncertainty of what was inflated is also that of the factor."""
-        states = []
-        for index, (entry, felt) in enumerate(zip(self._problem.twin.states, ground.felt, strict=True)):
-            place = self._outputs + index
-            value, likely, sd = float(levels[place]), float(found.levels[place]), float(found.deviations[place])
-            if np.isnan(felt):
-                states.append(NoiseLevel(entry.name, 0.0, None, UNSEEN))
-            elif not ground.moving:
-                states.append(NoiseLevel(entry.name, 0.0, None, AT_REST))
-            elif not value:
-                states.append(NoiseLevel(entry.name, 0.0, sd, NONE_NEEDED.format(sd, entry.unit)))
-            else:
-                own = sd / likely if likely else 0.0
-                of_factor = 0.0 if value == likely else 1.0 / np.sqrt(2.0 * consistency.degrees)
-                states.append(NoiseLevel(entry.name, value, value * float(np.hypot(own, of_factor)), ""))
-        return tuple(states)
+    signal_noise: Array
+    """(outputs,) what the signals show; 0 if one is constant, NaN if it is never measured."""
+    process: Array
+    """(states,) process noise that is just observable; NaN if none is."""
+    variances: VarianceParametrisation
+    """All levels that can be identified are free."""
+    fits: list[FittedWindow]
+    """The windows that are used; none if none can be."""
+    remarks: tuple[str, ...]
 
 
-def _liveliest(twin: Definition, windows: Sequence[Window], sensors: Array) -> Window:
-    """In which the outputs move the most, measured by their noise."""
-    names = [entry.name for entry in twin.outputs]
-
-    def moved(window: Window) -> float:
-        columns = (window.column(name) for name in names)
-        return float(sum(np.ptp(column) / noise for column, noise in zip(columns, sensors, strict=True)))
-
-    return max(windows, key=moved)
-
-
-def with_noise(problem: Problem, learned: IdentifiedNoise) -> Problem:
-    """The problem with the noise levels that were learned."""
-    outputs = {level.name: level.value for level in learned.outputs}
-    states = {level.name: level.value for level in learned.states}
-    return replace(
-        problem,
-        noise=tuple(outputs[entry.name] for entry in problem.twin.outputs),
-        process_noise=tuple(states[entry.name] for entry in problem.twin.states),
+def _initial_guess(likelihood: Likelihood, windows: Sequence[Window], progress: Progress) -> _InitialGuess:
+    """Windows at rest are used only if all are; then process noise is not free."""
+    problem, remarks = likelihood.problem, []
+    usable = [window for window in windows if _is_usable(window)]
+    signal_noise = np.array([_signal_noise(output.name, usable) for output in problem.twin.outputs])
+    shown = signal_noise > 0.0
+    sensors = np.where(shown, signal_noise, problem.noise)
+    process, fits = np.full(len(problem.twin.states), np.nan), list[FittedWindow]()
+    if usable:
+        process = _observable_process_noise(problem, sensors, _most_excited(problem, usable, sensors))
+        first = _first_fits(likelihood, np.concatenate([sensors, np.nan_to_num(process)]), usable, progress)
+        fits = [fit for fit in first if fit.cost < MAX_COST]
+    if len(fits) < len(windows):
+        remarks.append(EXCLUDED.format(len(windows) - len(fits), len(windows)))
+    moving = [fit for fit in fits if len(sqrt_information(fit, likelihood.width))]
+    if 0 < len(moving) < len(fits):
+        remarks.append(EXCLUDED_AT_REST.format(len(fits) - len(moving), len(windows)))
+    variances = VarianceParametrisation(
+        likelihood,
+        initial=np.concatenate([sensors, np.nan_to_num(process)]),
+        floor=np.concatenate([np.where(shown, MIN_SENSOR_SHARE, 1.0) * sensors, np.zeros(len(process))]),
+        free=np.concatenate([shown, np.isfinite(process) & bool(moving)]),
     )
+    return _InitialGuess(signal_noise, process, variances, moving or fits, tuple(remarks))
+
+
+def _first_fits(
+    likelihood: Likelihood, levels: Array, windows: Sequence[Window], progress: Progress
+) -> list[FittedWindow]:
+    """Each window starts from the nominal values and from the parameters of the window before."""
+    problem, fits = likelihood.problem, list[FittedWindow]()
+    starts = [problem.nominal]
+    for index, window in enumerate(windows):
+        progress(f"window {index + 1} of {len(windows)}")
+        fit = likelihood.fit(levels, window, starts)
+        if not fits and fit.cost > POOR_FIT:
+            objective = Objective(with_levels(problem, levels), window, problem.nominal)
+            swarm = search_parameters(objective, problem.swarm, problem.nominal, problem.seed)
+            fit = likelihood.fit(levels, window, [*starts, swarm.positions[0, 0]])
+        fits.append(fit)
+        starts = [problem.nominal, fit.guess[: len(problem.free)]]
+    return fits
+
+
+def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Progress) -> tuple[Consistency, Array]:
+    """The result of the consistency test, and the levels (outputs + states,), inflated if necessary."""
+    likelihood, outputs = guess.variances.likelihood, len(guess.signal_noise)
+    before = consistency_test(best.fits, likelihood.width)
+    if not before.degrees:
+        return Consistency(remark=ONE_WINDOW if len(best.fits) == 1 else NOT_COMPARABLE), best.levels
+    if before.passed:
+        return Consistency(before.degrees, before.reduced, before.reduced, 1.0, CONSISTENT), best.levels
+    sensors, process = best.levels.copy(), best.levels.copy()
+    sensors[outputs:], process[:outputs] = 0.0, 0.0
+    added = not process.any()
+    if added:
+        small = SMALL_PROCESS_SHARE * np.nan_to_num(guess.process)
+        process[outputs:] = np.where(observable_states(likelihood.problem.twin), small, 0.0)
+    progress(f"reduced chi-square of the windows: {before.reduced:.3g}")
+    factor, after = inflate_process_noise(likelihood, lambda factor: sensors + factor * process, best.fits)
+    if not after.degrees or not after.passed:
+        return Consistency(before.degrees, before.reduced, before.reduced, None, NOT_INFLATED), best.levels
+    remark = ADDED if added else INFLATED + (DOUBTFUL if factor > MAX_PLAUSIBLE_FACTOR else "")
+    consistency = Consistency(before.degrees, before.reduced, after.reduced, None if added else factor, remark)
+    return consistency, sensors + factor * process
+
+
+def _output_levels(twin: Definition, guess: _InitialGuess, best: LikelihoodPoint) -> Iterator[NoiseLevel]:
+    columns = (column.tolist() for column in (guess.signal_noise, best.levels, best.sd, guess.variances.floor))
+    for output, shown, value, sd, floor in zip(twin.outputs, *columns, strict=False):
+        if shown > 0.0:
+            yield NoiseLevel(output.name, value, sd, UPPER_BOUND if value <= sd + floor else "")
+        else:
+            yield NoiseLevel(output.name, value, None, NEVER_MEASURED if np.isnan(shown) else CONSTANT)
+
+
+def _state_levels(
+    twin: Definition, guess: _InitialGuess, best: LikelihoodPoint, levels: Array, degrees: int
+) -> Iterator[NoiseLevel]:
+    """The uncertainty of an inflated level includes that of the factor, from a chi-square of so many ``degrees``."""
+    columns = (column[len(twin.outputs) :].tolist() for column in (guess.variances.free, levels, best.levels, best.sd))
+    for state, observable, free, value, likeliest, sd in zip(twin.states, guess.process, *columns, strict=True):
+        if not free:
+            yield NoiseLevel(state.name, 0.0, None, NOT_OBSERVABLE if np.isnan(observable) else AT_REST)
+        elif not value:
+            yield NoiseLevel(state.name, 0.0, sd, NOT_SIGNIFICANT.format(sd, state.unit))
+        else:
+            own = sd / likeliest if likeliest else 0.0
+            of_factor = 0.0 if value == likeliest else 1.0 / np.sqrt(2.0 * degrees)
+            yield NoiseLevel(state.name, value, value * float(np.hypot(own, of_factor)), "")
+
+
+def _is_usable(window: Window) -> bool:
+    sampled = window.quality.verdict is Verdict.GOOD and window.records >= MIN_RECORDS
+    return sampled and bool(np.isfinite(window.values).all())
+
+
+def _signal_noise(output: str, windows: Sequence[Window]) -> float:
+    """Standard deviation of the changes from record to record; 0 for a constant signal, NaN without samples."""
+    deviations = []
+    for window in windows:
+        missing, values = window.missing_in(output), window.column(output)
+        incomplete: Mask = np.convolve(missing, np.ones(DIFFERENCE_ORDER + 1))[DIFFERENCE_ORDER : len(values)] > 0.5
+        differences = np.diff(values, DIFFERENCE_ORDER)[~incomplete] / DIFFERENCE_GAIN
+        if len(differences):
+            robust = float(np.median(np.abs(differences))) / NORMAL_MEDIAN
+            deviations.append(robust or float(np.std(differences)))
+    return float(np.median(deviations)) if deviations else float("nan")
+
+
+def _observable_process_noise(problem: Problem, sensors: Array, window: Window) -> Array:
+    """(states,) process noise that doubles the variance of innovations due to ``sensors``; NaN where none does."""
+    states = problem.twin.states
+    without = np.concatenate([sensors, np.zeros(len(states))])
+    threshold = _log_variance(problem, without, window) + OBSERVABLE
+
+    def smallest(index: int, width: float) -> float:
+        def is_observable(decade: float) -> bool:
+            levels = without.copy()
+            levels[len(sensors) + index] = width * 10.0**decade
+            return bool(_log_variance(problem, levels, window) >= threshold)
+
+        decade = next(filter(is_observable, PROCESS_DECADES), None)
+        if decade is None:
+            return float("nan")
+        finer = decade - np.arange(1.0, 0.0, -PROCESS_RESOLUTION) + PROCESS_RESOLUTION
+        return float(width * 10.0 ** finer[bisect_left(finer, True, hi=len(finer) - 1, key=is_observable)])
+
+    return np.array([smallest(index, state.high - state.low) for index, state in enumerate(states)])
+
+
+def _log_variance(problem: Problem, levels: Array, window: Window) -> float:
+    """Mean logarithm of the innovations' variances."""
+    objective = Objective(with_levels(problem, levels), window, problem.nominal)
+    return objective.innovation_model.log_determinant / objective.count
+
+
+def _most_excited(problem: Problem, windows: Sequence[Window], sensors: Array) -> Window:
+    """The window in which the outputs move the most, in units of their noise."""
+    names = [output.name for output in problem.twin.outputs]
+    return max(windows, key=lambda window: sum(np.ptp([window.column(name) for name in names], axis=1) / sensors))
+
+
+def observable_states(twin: Definition) -> Mask:
+    """(states,) the states in an output's equation, and those whose derivative depends on an input directly."""
+    definitions = {name: expression for name, expression, _ in twin.definitions}
+    equations = dict(twin.equations)
+
+    def names(expression: str) -> set[str]:
+        direct = set(re.findall(r"[A-Za-z_]\w*", expression))
+        return direct.union(*(names(definitions[name]) for name in direct & definitions.keys()))
+
+    shown = set().union(*(names(equations.get(output.name, output.name)) for output in twin.outputs))
+    inputs = {signal.name for signal in twin.inputs}
+    driven = [bool(names(equations[f"der({state.name})"]) & inputs) for state in twin.states]
+    return np.array([state.name in shown or by_input for state, by_input in zip(twin.states, driven, strict=True)])

@@ -1,15 +1,13 @@
-"""How likely windows are under given levels of noise, whatever their parameters and initial states are.
+"""Restricted likelihood of noise levels, and the levels that maximise it.
 
-Windows are fitted in innovation form; the likelihood of what is left is that of the innovations (F. C. Schweppe, IEEE
-Transactions on Information Theory 11, 1965), and what the fit itself takes out of the residuals is made up for by the
-determinant of the information: restricted likelihood (D. A. Harville, Journal of the American Statistical Association
-72, 1977). Without it noise would be found too small, the more so the shorter the windows.
+The likelihood is that of the innovations (F. C. Schweppe, IEEE Transactions on Information Theory 11, 1965). The
+determinant of the information corrects for what the fit takes out of them: restricted likelihood (D. A. Harville,
+Journal of the American Statistical Association 72, 1977). Without it, short windows underestimate noise.
 
-The levels of noise under which windows are likeliest, found along Fisher's information.
-
-In variances, so that a level may become zero, and one that was begun far off comes back at once (scoring: N. K. Gupta,
-R. K. Mehra, IEEE Transactions on Automatic Control 19, 1974; steps that stay above zero: C. L. Lawson, R. J. Hanson,
-Solving Least Squares Problems, chapter 23).
+The deviance, minus twice the log-likelihood, is minimised by Fisher scoring (N. K. Gupta, R. K. Mehra, IEEE
+Transactions on Automatic Control 19, 1974) over variances, so that a level may become zero. Each step is a non-negative
+least-squares problem (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, chapter 23).
+docs/explanation/noise-identification.md derives the equations, and compares SciPy's minimisers.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,259 +20,255 @@ from otolith.estimation.gauss_newton import FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 
-CENTRINGS = 3  # of the predictor around a first fit: its gain was made for parameters that may have been far off
+# Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
+FIRST_FITS = 3  # of a window; the predictor is remade between them, as its gain depends on the parameters
+DIFFERENCE_STEP = 0.02  # of a variance, for finite differences
+MIN_DIFFERENCE_SHARE = 1e-3  # of the initial variance: below it, the difference step no longer shrinks
+MAX_ITERATIONS = 25  # scoring steps
+MAX_TRIALS = 6  # points along one scoring step
+LENGTH_TOLERANCE = 0.75  # the line search ends if its minimum is beyond this share of the last trial's length
+MIN_LENGTH_RATIO = 0.1  # of two successive trials
+MIN_IMPROVEMENT = 0.05  # predicted decrease of the deviance below which the search ends
+SIGNIFICANT_LOSS = 2.706  # of deviance: 95 % point of ½χ²(0) + ½χ²(1), as a variance may not be negative
+MIN_EIGENVALUE = 1e-9  # of the largest one of the scaled Hessian: smaller directions do not move
+
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """One window, fitted at given levels of noise."""
+class FittedWindow:
+    """One window, its parameters and initial state fitted at given noise levels."""
 
     window: Window
     objective: Objective
     centre: Array
     """(guess,) around which the predictor was made."""
-    found: FitResult
+    result: FitResult
 
     @property
     def guess(self) -> Array:
         """(guess,) free parameters, then the initial state."""
-        return self.found.guess
+        return self.result.guess
 
     @property
     def cost(self) -> float:
-        """RMSE in units of the noise."""
-        return float(np.sqrt(self.found.chi_square / self.objective.count))
+        """Root mean square of the whitened innovations: 1 if the noise levels are right."""
+        return float(np.sqrt(self.result.chi_square / self.objective.count))
+
+
+Fits = Sequence[FittedWindow]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """What given levels make of windows that were fitted at others nearby."""
+class Linearisation:
+    """Near a fit's levels: half the Hessian of the deviance is approximately JᵀJ, J the Jacobian of ``whitened``."""
 
-    unlikelihood: float
-    spread: Array
-    """Whitened innovations that no parameter explains, then logarithms of what whitens them: half of the curvature of
-    the unlikelihood is the squared length of how it moves with a level, as Fisher's information is."""
+    deviance: float
+    whitened: Array
+    """Projected whitened innovations of all windows, then the logarithms of their whitening factors."""
 
 
-def noisy(problem: Problem, levels: Array) -> Problem:
-    """The problem with noise ``levels`` (outputs + states,)."""
+class Likelihood:
+    """Restricted likelihood of windows by noise levels (outputs + states,), standard deviations as in a problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        low, high = problem.bounds
+        states = [state.high - state.low for state in problem.twin.states]
+        self.width: Array = np.concatenate([high - low, states]) / np.sqrt(12.0)
+        """(guess,) standard deviation of a uniform distribution between the bounds."""
+        self.evaluations = 0
+        self.problem = problem
+        self._free = len(low)
+
+    def fit(self, levels: Array, window: Window, starts: Sequence[Array]) -> FittedWindow:
+        """The likeliest of the first fits from ``starts``, each (free,)."""
+        fits = [self._first_fit(levels, window, start) for start in starts]
+        return min(fits, key=lambda fit: self.deviance([fit]))
+
+    def refit(self, levels: Array, fits: Fits) -> list[FittedWindow]:
+        """The same windows at other levels; each fit starts where the last one ended."""
+        return [self._fit(self._objective(levels, fit.window, fit.guess), fit.window, fit.guess) for fit in fits]
+
+    def deviance(self, fits: Fits) -> float:
+        """Minus twice the restricted log-likelihood, up to a constant."""
+        return sum(self._deviance(fit.objective, fit.result.chi_square, fit.result.jacobian) for fit in fits)
+
+    def linearise(self, levels: Array, fits: Fits) -> Linearisation:
+        """At ``levels`` close to those of ``fits``, without a new fit: χ² is stationary at the fitted guess."""
+        deviance, innovations, factors = 0.0, [], []
+        for fit in fits:
+            objective = self._objective(levels, fit.window, fit.centre)
+            residuals, jacobian = objective.linearise(fit.guess)
+            deviance += self._deviance(objective, float(residuals @ residuals), jacobian)
+            innovations.append(self._project(residuals, fit.result.jacobian))
+            factors.append(np.log(np.diagonal(objective.whitening, axis1=1, axis2=2)).ravel())
+        return Linearisation(deviance, np.concatenate([*innovations, *factors]))
+
+    def _objective(self, levels: Array, window: Window, centre: Array) -> Objective:
+        return Objective(with_levels(self.problem, levels), window, centre[: self._free], centre[self._free :])
+
+    def _first_fit(self, levels: Array, window: Window, start: Array) -> FittedWindow:
+        objective = Objective(with_levels(self.problem, levels), window, start)
+        guess = objective.guess(start)
+        for _ in range(FIRST_FITS - 1):
+            guess = self._fit(objective, window, guess).guess
+            objective.set_predictor(guess[: self._free], guess[self._free :])
+        return self._fit(objective, window, guess)
+
+    def _fit(self, objective: Objective, window: Window, centre: Array) -> FittedWindow:
+        result = gauss_newton(objective, centre)
+        self.evaluations += result.evaluations
+        return FittedWindow(window, objective, centre, result)
+
+    def _deviance(self, objective: Objective, chi_square: float, jacobian: Array) -> float:
+        """χ² + ln|covariance of the innovations| + ln|information about the guess|."""
+        _, log_determinant = np.linalg.slogdet(self._information(jacobian))
+        return chi_square + objective.innovation_model.log_determinant + float(log_determinant)
+
+    def _project(self, residuals: Array, jacobian: Array) -> Array:
+        """(residuals,) the part that no change of the guess explains, as a new fit would leave it."""
+        scaled = jacobian * self.width
+        return np.asarray(residuals - scaled @ np.linalg.solve(self._information(jacobian), scaled.T @ residuals))
+
+    def _information(self, jacobian: Array) -> Array:
+        """(guess, guess) in units of ``width``; the bounds are the prior, so that it is never singular."""
+        scaled = jacobian * self.width
+        return np.asarray(np.eye(len(self.width)) + scaled.T @ scaled)
+
+
+def with_levels(problem: Problem, levels: Array) -> Problem:
+    """The problem with noise ``levels`` (outputs + states,), in innovation form."""
     count = len(problem.twin.outputs)
     return replace(problem, noise=tuple(levels[:count]), process_noise=tuple(levels[count:]), open_loop=False)
 
 
-class Likelihood:
-    """Of windows, by the levels of noise (outputs + states,), each a standard deviation as in a problem."""
-
-    def __init__(self, problem: Problem) -> None:
-        low, high = problem.bounds
-        states = [entry.high - entry.low for entry in problem.twin.states]
-        self.width: Array = np.concatenate([high - low, states]) / np.sqrt(12.0)
-        """(guess,) what is known of each entry before any window: the standard deviation between its bounds."""
-        self.evaluations = 0
-        self._problem = problem
-        self._free = len(low)
-
-    def fit(self, levels: Array, window: Window, starts: Sequence[Array]) -> Fit:
-        """The best of several first fits; a start is (free,), or a guess with an initial state."""
-        found = [self._first(levels, window, start) for start in starts]
-        return min(found, key=lambda fit: self._unlikelihood(fit.objective, fit.found))
-
-    def refitted(self, levels: Array, fits: Sequence[Fit]) -> list[Fit]:
-        """The same windows at other levels, each from its last fit."""
-        return [self._fit(self._objective(levels, fit.window, fit.guess), fit.window, fit.guess) for fit in fits]
-
-    def unlikelihood(self, fits: Sequence[Fit]) -> float:
-        """Minus twice the logarithm of the likelihood, up to a constant."""
-        return sum(self._unlikelihood(fit.objective, fit.found) for fit in fits)
-
-    def sight(self, levels: Array, fits: Sequence[Fit]) -> Sight:
-        """Nothing is fitted: at its minimum χ² does not change with the guess."""
-        total, innovations, scales = 0.0, [], []
-        for fit in fits:
-            objective = self._objective(levels, fit.window, fit.centre)
-            residuals, jacobian = objective.linearised(fit.guess)
-            found = replace(fit.found, residuals=residuals, jacobian=jacobian, chi_square=float(residuals @ residuals))
-            total += self._unlikelihood(objective, found)
-            scaled = fit.found.jacobian * self.width
-            innovations.append(residuals - scaled @ np.linalg.solve(self._information(fit.found), scaled.T @ residuals))
-            scales.append(np.log(np.diagonal(objective.whitening, axis1=1, axis2=2)).ravel())
-        return Sight(total, np.concatenate([*innovations, *scales]))
-
-    def _objective(self, levels: Array, window: Window, centre: Array) -> Objective:
-        return Objective(noisy(self._problem, levels), window, centre[: self._free], centre[self._free :])
-
-    def _first(self, levels: Array, window: Window, start: Array) -> Fit:
-        objective = Objective(noisy(self._problem, levels), window, start[: self._free])
-        guess = start if len(start) > self._free else objective.guess(start)
-        for _ in range(CENTRINGS - 1):
-            guess = self._fit(objective, window, guess).guess
-            objective.centre(guess[: self._free], guess[self._free :])
-        return self._fit(objective, window, guess)
-
-    def _fit(self, objective: Objective, window: Window, centre: Array) -> Fit:
-        found = gauss_newton(objective, centre)
-        self.evaluations += found.evaluations
-        return Fit(window, objective, centre, found)
-
-    def _unlikelihood(self, objective: Objective, found: FitResult) -> float:
-        _, log_determinant = np.linalg.slogdet(self._information(found))
-        return found.chi_square + objective.correction.log_determinant + float(log_determinant)
-
-    def _information(self, found: FitResult) -> Array:
-        """(guess, guess) in shares of ``width``, with the bounds as what is known before: no direction is without."""
-        scaled = found.jacobian * self.width
-        return np.asarray(np.eye(len(self.width)) + scaled.T @ scaled)
-
-
-HIDDEN = 0.02  # of the noise that a signal shows: a sensor that is better than that is not looked into further
-NUDGE = 0.02  # of a variance, for differences
-LEAST_NUDGE = 1e-3  # of the variance where the search begins
-ROUNDS, TRIALS = 25, 6
-NEAR, SHORTEST = 0.75, 0.1  # of a trial's length: how near is near enough, and the shortest after it
-DONE = 0.05  # of the unlikelihood: an improvement that is not worth another step
-ZERO = 2.706  # of the unlikelihood: the 95 % point for a variance at its bound, half of χ² of one degree
-Told = Callable[[str], None]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Ladder:
-    """Levels (outputs + states,) by the shares of variances that are sought."""
-
-    base: Array
-    """(outputs + states,) where the search begins: shares of one."""
-    least: Array
-    """(outputs + states,) what a share of zero leaves."""
-    sought: Mask
-    """(outputs + states,); what is not sought stays at ``least``."""
-
-    def levels(self, shares: Array) -> Array:
-        """(sought,) -> (outputs + states,)."""
-        found = self.least**2
-        found[self.sought] += shares * self.base[self.sought] ** 2
-        return np.asarray(np.sqrt(found))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Point:
-    """Windows, fitted at some levels."""
+class LikelihoodPoint:
+    """Noise levels, and all windows fitted at them."""
 
     shares: Array
-    """(sought,)."""
+    """(free,) as in :class:`VarianceParametrisation`."""
     levels: Array
     """(outputs + states,)."""
-    fits: list[Fit]
-    unlikelihood: float
+    fits: list[FittedWindow]
+    deviance: float
+    sd: Array
+    """(outputs + states,) standard deviation of each level, upwards if it is zero; zero until the search has ended."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Likeliest:
-    """The end of a search."""
+class VarianceParametrisation:
+    """The deviance by the free variances, each in shares of its initial value: level² = floor² + share·initial²."""
 
-    levels: Array
-    """(outputs + states,)."""
-    deviations: Array
-    """(outputs + states,) standard deviation of each level, of one at zero upwards; zero for what was not sought."""
-    fits: list[Fit]
-    unlikelihood: float
+    likelihood: Likelihood
+    initial: Array
+    """(outputs + states,) levels where the search begins, with shares of one."""
+    floor: Array
+    """(outputs + states,) levels at a share of zero."""
+    free: Mask
+    """(outputs + states,); a level that is not free stays at its floor."""
 
+    def levels(self, shares: Array) -> Array:
+        """(free,) -> (outputs + states,)."""
+        variances = self.floor**2
+        variances[self.free] += shares * self.initial[self.free] ** 2
+        return np.asarray(np.sqrt(variances))
 
-def fewest(likelihood: Likelihood, ladder: Ladder, fits: Sequence[Fit], told: Told) -> Likeliest:
-    """The likeliest levels, with process noise only of states without whose noise the windows are less likely."""
-    found = likeliest(likelihood, ladder, fits, told)
-    while (idle := _idle(likelihood, ladder, found)).any():
-        again = found.levels[idle].any()
-        ladder = replace(
-            ladder, base=np.where(found.levels > 0.0, found.levels, ladder.base), sought=ladder.sought & ~idle
-        )
-        if again:
-            left = likeliest(likelihood, ladder, found.fits, told)
-            hidden = np.where(idle, np.hypot(found.levels, found.deviations), found.deviations)
-            found = replace(left, deviations=np.where(ladder.sought, left.deviations, hidden))
-    return found
+    def evaluate(self, shares: Array, fits: Fits) -> LikelihoodPoint:
+        """The windows of ``fits``, fitted again at ``shares`` (free,)."""
+        levels = self.levels(shares)
+        refitted = self.likelihood.refit(levels, fits)
+        return LikelihoodPoint(shares, levels, refitted, self.likelihood.deviance(refitted), np.zeros(len(levels)))
 
+    def derivatives(self, point: LikelihoodPoint) -> tuple[Array, Array]:
+        """Gradient (free,) of the deviance by the shares, to second order, and its expected Hessian (free, free)."""
+        steps = DIFFERENCE_STEP * np.maximum(point.shares, MIN_DIFFERENCE_SHARE)
+        here = self.likelihood.linearise(point.levels, point.fits)
+        ahead = [self.likelihood.linearise(self.levels(row), point.fits) for row in point.shares + np.diag(steps)]
+        jacobian = np.array([(there.whitened - here.whitened) / step for there, step in zip(ahead, steps, strict=True)])
+        hessian = 2.0 * jacobian @ jacobian.T
+        differences = (np.array([there.deviance for there in ahead]) - here.deviance) / steps
+        return differences - 0.5 * steps * np.diag(hessian), hessian
 
-def _idle(likelihood: Likelihood, ladder: Ladder, found: Likeliest) -> Mask:
-    """(outputs + states,) the states at zero, or else the one whose noise is hardly missed."""
-    outputs = len(found.fits[0].objective.noise.outputs)
-    candidates: Mask = ladder.sought & (np.arange(len(found.levels)) >= outputs)
-    idle: Mask = candidates & (found.levels == 0.0)
-    if idle.any() or not candidates.any():
-        return idle
-    missed = np.full(len(idle), np.inf)
-    for index in np.flatnonzero(candidates):
-        levels = found.levels.copy()
-        levels[index] = 0.0
-        missed[index] = likelihood.unlikelihood(likelihood.refitted(levels, found.fits)) - found.unlikelihood
-    return np.asarray(candidates & (missed == missed.min()) & (missed < ZERO))
-
-
-def likeliest(likelihood: Likelihood, ladder: Ladder, fits: Sequence[Fit], told: Told) -> Likeliest:
-    """Of all levels that ``ladder`` seeks; ``fits`` were made at its base."""
-    point = _at(likelihood, ladder, np.ones(int(ladder.sought.sum())), fits)
-    for _ in range(ROUNDS):
-        slope, curvature = _turn(likelihood, ladder, point)
-        step = _aim(slope, curvature, point.shares) - point.shares
-        promised = -float(slope @ step + 0.5 * step @ curvature @ step)
-        told(f"log-likelihood {-0.5 * point.unlikelihood:.2f}")
-        if promised < DONE:
-            break
-        better = _along(likelihood, ladder, point, step, float(slope @ step))
-        if better is point:
-            break
-        point = better
-    else:
-        slope, curvature = _turn(likelihood, ladder, point)
-    return Likeliest(point.levels, _deviations(ladder, point, curvature), point.fits, point.unlikelihood)
+    def level_sd(self, levels: Array, hessian: Array) -> Array:
+        """(outputs + states,) standard deviations of ``levels``; Fisher's information is half of ``hessian``."""
+        variances = np.maximum(np.diag(np.linalg.pinv(0.5 * hessian, hermitian=True)), 0.0)
+        sd_of_squares = np.sqrt(variances) * self.initial[self.free] ** 2
+        sd = np.zeros(len(levels))
+        sd[self.free] = np.sqrt(levels[self.free] ** 2 + sd_of_squares) - levels[self.free]
+        return sd
 
 
-def _along(likelihood: Likelihood, ladder: Ladder, point: Point, step: Array, descent: float) -> Point:
-    """The best of a few points along ``step``: where innovations are not normal, Fisher's step is often too long."""
-    best, length = point, 1.0
-    for _ in range(TRIALS):
-        found = _at(likelihood, ladder, point.shares + length * step, point.fits)
-        best = min(best, found, key=lambda entry: entry.unlikelihood)
-        bend = found.unlikelihood - point.unlikelihood - length * descent
-        lowest = -descent * length**2 / (2.0 * bend) if bend > 0.0 else np.inf
-        if lowest > NEAR * length:
-            break
-        length = max(lowest, SHORTEST * length)
+def backward_elimination(variances: VarianceParametrisation, fits: Fits, progress: Progress) -> LikelihoodPoint:
+    """The likeliest levels, with process noise only where its removal makes the windows significantly less likely."""
+    best = maximise(variances, fits, progress)
+    while (removed := _removable(variances, best)).any():
+        initial = np.where(best.levels > 0.0, best.levels, variances.initial)
+        variances = replace(variances, initial=initial, free=variances.free & ~removed)
+        if best.levels[removed].any():
+            reduced = maximise(variances, best.fits, progress)
+            undetected = np.where(removed, np.hypot(best.levels, best.sd), best.sd)
+            best = replace(reduced, sd=np.where(variances.free, reduced.sd, undetected))
     return best
 
 
-def _at(likelihood: Likelihood, ladder: Ladder, shares: Array, fits: Sequence[Fit]) -> Point:
-    levels = ladder.levels(shares)
-    refitted = likelihood.refitted(levels, fits)
-    return Point(shares, levels, refitted, likelihood.unlikelihood(refitted))
+def _removable(variances: VarianceParametrisation, best: LikelihoodPoint) -> Mask:
+    """(outputs + states,) all free states at zero, or else the one whose process noise is the least significant."""
+    outputs = len(best.fits[0].objective.noise.outputs)
+    candidates: Mask = variances.free & (np.arange(len(best.levels)) >= outputs)
+    at_zero: Mask = candidates & (best.levels == 0.0)
+    if at_zero.any() or not candidates.any():
+        return at_zero
+    likelihood, loss = variances.likelihood, np.full(len(candidates), np.inf)
+    for index in np.flatnonzero(candidates):
+        levels = best.levels.copy()
+        levels[index] = 0.0
+        loss[index] = likelihood.deviance(likelihood.refit(levels, best.fits)) - best.deviance
+    return np.asarray(candidates & (loss == loss.min()) & (loss < SIGNIFICANT_LOSS))
 
 
-def _turn(likelihood: Likelihood, ladder: Ladder, point: Point) -> tuple[Array, Array]:
-    """Slope (sought,) of the unlikelihood by the shares, and curvature (sought, sought): twice Fisher's information."""
-    nudges = NUDGE * np.maximum(point.shares, LEAST_NUDGE)
-    still = likelihood.sight(point.levels, point.fits)
-    nudged = [likelihood.sight(ladder.levels(row), point.fits) for row in point.shares + np.diag(nudges)]
-    moved = np.array([(entry.spread - still.spread) / by for entry, by in zip(nudged, nudges, strict=True)])
-    curvature = 2.0 * moved @ moved.T
-    slope = (np.array([entry.unlikelihood for entry in nudged]) - still.unlikelihood) / nudges
-    return slope - 0.5 * nudges * np.diag(curvature), curvature
+def maximise(variances: VarianceParametrisation, fits: Fits, progress: Progress) -> LikelihoodPoint:
+    """The likeliest of all free levels by Fisher scoring; ``fits`` were made at the initial levels."""
+    point = variances.evaluate(np.ones(int(variances.free.sum())), fits)
+    gradient, hessian = variances.derivatives(point)
+    for _ in range(MAX_ITERATIONS):
+        step = _minimum_of_model(gradient, hessian, point.shares) - point.shares
+        slope = float(gradient @ step)
+        progress(f"log-likelihood {-0.5 * point.deviance:.2f}")
+        if -(slope + 0.5 * float(step @ hessian @ step)) < MIN_IMPROVEMENT:
+            break
+        better = _line_search(variances, point, step, slope)
+        if better is point:
+            break
+        point = better
+        gradient, hessian = variances.derivatives(point)
+    return replace(point, sd=variances.level_sd(point.levels, hessian))
 
 
-def _aim(slope: Array, curvature: Array, shares: Array) -> Array:
-    """(sought,) where the parabola is lowest among shares that are not negative."""
-    from scipy.optimize import nnls  # noqa: PLC0415 - SciPy is loaded by those who learn noise only
+def _minimum_of_model(gradient: Array, hessian: Array, shares: Array) -> Array:
+    """(free,) non-negative shares that minimise the quadratic model of the deviance around ``shares``."""
+    from scipy.optimize import nnls  # noqa: PLC0415 - only noise identification needs SciPy
 
-    size = np.sqrt(np.maximum(np.diag(curvature), np.finfo(float).tiny))
-    bends, directions = np.linalg.eigh(curvature / np.outer(size, size))
-    seen = bends > 1e-9 * bends.max(initial=0.0)
-    rows = np.sqrt(bends[seen])[:, None] * directions[:, seen].T
-    lowest = rows @ (size * shares) - (directions[:, seen].T @ (slope / size)) / np.sqrt(bends[seen])
-    return np.asarray(nnls(rows, lowest)[0] / size)
+    # With hessian = RᵀR, the model is ½‖R·x - b‖² up to a constant, where b = R·shares - R⁻ᵀ·gradient.
+    scale = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
+    eigenvalues, directions = np.linalg.eigh(hessian / np.outer(scale, scale))
+    kept = eigenvalues > MIN_EIGENVALUE * eigenvalues.max(initial=0.0)
+    roots, directions = np.sqrt(eigenvalues[kept]), directions[:, kept]
+    rows = roots[:, None] * directions.T
+    return np.asarray(nnls(rows, rows @ (scale * shares) - (directions.T @ (gradient / scale)) / roots)[0] / scale)
 
 
-def _deviations(ladder: Ladder, point: Point, curvature: Array) -> Array:
-    """From the variances' to the levels', of which one may be zero."""
-    found = np.zeros(len(point.levels))
-    variances = np.maximum(np.diag(np.linalg.pinv(0.5 * curvature, hermitian=True)), 0.0)
-    by = np.sqrt(variances) * ladder.base[ladder.sought] ** 2
-    levels = point.levels[ladder.sought]
-    found[ladder.sought] = np.sqrt(levels**2 + by) - levels
-    return found
+def _line_search(
+    variances: VarianceParametrisation, point: LikelihoodPoint, step: Array, slope: float
+) -> LikelihoodPoint:
+    """The best of a few points along ``step``, where the deviance has ``slope``; ``point`` if none is better."""
+    best, length = point, 1.0
+    for _ in range(MAX_TRIALS):
+        trial = variances.evaluate(point.shares + length * step, point.fits)
+        best = min(best, trial, key=lambda candidate: candidate.deviance)
+        bend = trial.deviance - point.deviance - length * slope
+        minimum = -slope * length**2 / (2.0 * bend) if bend > 0.0 else np.inf
+        if minimum > LENGTH_TOLERANCE * length:
+            break
+        length = max(minimum, MIN_LENGTH_RATIO * length)
+    return best

@@ -1,124 +1,103 @@
-"""The components of a machine that have been adopted into its twin, and what the specialist has said of them."""
+"""Components that have been adopted into the twin: since when, how surely, approved or not, and whether they fade."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
-from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
+from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, describe_hypothesis
 from otolith.discovery.sequential_test import SequentialTest
-from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import base_model, equation, indices, site_of
-from otolith.estimation.imm_filter import moment_match
-from otolith.estimation.problem import Component, Problem
+from otolith.estimation.augmented import indices, slot_of
+from otolith.estimation.posterior import Posterior
+from otolith.estimation.problem import Component
 
-FADED = 3.0  # standard deviations of an amplitude under which there is nothing to be seen
-SMALL = 0.05  # of the amplitude when it was found: the same
-FADES_AFTER = 3  # windows in a row
+INSIGNIFICANT = 3.0  # standard deviations of an amplitude below which the component is not seen
+INSIGNIFICANT_SHARE = 0.05  # of the discovered amplitude: the same, however certain
+FADED_AFTER = 3  # consecutive windows
 
 
 class Approval(StrEnum):
-    """What the specialist has said."""
+    """What the operator decided."""
 
     OPEN = "open"
     APPROVED = "approved"
-    """It belongs to the healthy machine."""
+    """The component belongs to the healthy machine."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """Another explanation that the data could not tell apart."""
+    """Another hypothesis that the data could not tell apart."""
 
-    reason: FaultType
+    type: FaultType
     text: str
     probability: float
 
 
 @dataclass(frozen=True, slots=True)
 class AdoptedComponent:
-    """An adopted component."""
+    """A component in the twin, with its history."""
 
     component: Component
     onset: float
     """Unix seconds."""
     probability: float = 1.0
+    """When it was adopted."""
     approval: Approval = Approval.OPEN
     alternatives: tuple[Alternative, ...] = ()
     fading: int = 0
-    """Windows in a row in which it could hardly be seen."""
+    """Consecutive windows in which it was not significant."""
+
+    @property
+    def has_faded(self) -> bool:
+        """Whether it may leave the twin."""
+        return self.fading >= FADED_AFTER
 
 
 def adopt(
-    case: SequentialTest, found: TrackedHypothesis, catalogue: tuple[AdoptedComponent, ...]
+    adopted: tuple[AdoptedComponent, ...], test: SequentialTest, accepted: TrackedHypothesis
 ) -> tuple[AdoptedComponent, ...]:
-    """The catalogue with the components of ``found`` that it does not have."""
-    there = {component.key for component in found.problem.components}
-    catalogue = tuple(entry for entry in catalogue if entry.component.key in there)
-    known = {entry.component.key for entry in catalogue}
-    share = case.probabilities[case.hypotheses.index(found)]
-    others = alternatives(case, found)
-    new = (component for component in found.problem.components if component.key not in known)
-    return (*catalogue, *(AdoptedComponent(component, case.onset, share, alternatives=others) for component in new))
+    """Return the components of ``accepted``: those known already, then the new ones."""
+    kept = keep_present(adopted, accepted.problem.components)
+    known = {item.component.key for item in kept}
+    share, others = test.probabilities[test.hypotheses.index(accepted)], alternatives_of(test, accepted)
+    new = (component for component in accepted.problem.components if component.key not in known)
+    return (*kept, *(AdoptedComponent(component, test.onset, share, alternatives=others) for component in new))
 
 
-def with_approvals(catalogue: tuple[AdoptedComponent, ...], approved: frozenset[str]) -> tuple[AdoptedComponent, ...]:
-    """The catalogue with what the specialist has approved, also of what was found again."""
+def keep_present(
+    adopted: tuple[AdoptedComponent, ...], components: Iterable[Component]
+) -> tuple[AdoptedComponent, ...]:
+    """Return those whose components are in the twin."""
+    present = {component.key for component in components}
+    return tuple(item for item in adopted if item.component.key in present)
+
+
+def with_approvals(adopted: tuple[AdoptedComponent, ...], approved: frozenset[str]) -> tuple[AdoptedComponent, ...]:
+    """Return the components, approved where the operator approved their keys."""
     return tuple(
-        replace(entry, approval=Approval.APPROVED) if entry.component.key in approved else entry for entry in catalogue
+        replace(item, approval=Approval.APPROVED) if item.component.key in approved else item for item in adopted
     )
 
 
-def alternatives(case: SequentialTest, to: TrackedHypothesis) -> tuple[Alternative, ...]:
-    """What could be instead, in words."""
-    return tuple(Alternative(entry.reason, describe_hypothesis(entry), share) for entry, share in case.alternatives(to))
+def alternatives_of(test: SequentialTest, to: TrackedHypothesis) -> tuple[Alternative, ...]:
+    """Return what the data do not tell from ``to``, in words."""
+    return tuple(Alternative(item.type, describe_hypothesis(item), share) for item, share in test.alternatives(to))
 
 
-def describe_hypothesis(found: TrackedHypothesis) -> str:
-    """What a hypothesis says, with its numbers."""
-    if found.reason in (FaultType.NOTHING, FaultType.PARAMETER):
-        return found.claim.name or str(found.reason)
-    twin, problem = base_model(found.problem), found.problem
-    if found.reason is FaultType.SENSOR and problem.components:
-        return _of_sensor(found)
-    values = moment_match(found.belief, problem).mean
-    return "; ".join(
-        f"{entry.site}: {equation(twin, entry, values[indices(problem, slot)].tolist())}"
-        for slot, entry in enumerate(problem.components)
-    )
-
-
-def _of_sensor(found: TrackedHypothesis) -> str:
-    """As an engineer would say it."""
-    problem = found.problem
-    slot = len(problem.components) - 1
-    component = problem.components[slot]
-    site = site_of(base_model(problem), component.site)
-    value = float(moment_match(found.belief, problem).mean[indices(problem, slot)[0]])
-    off = f"{value:+.1%}" if component.family == "linear" else f"{value:+.2g} {site.unit}"
-    return f"{site.into} reads {off} off: look at the sensor and its scale"
-
-
-def count_fading(
-    catalogue: tuple[AdoptedComponent, ...], problem: Problem, known: Prior
-) -> tuple[AdoptedComponent, ...]:
-    """The catalogue with how long each component has hardly been seen; ``known`` is of the problem."""
-    deviations = np.sqrt(np.diag(known.covariance))
-    found = []
-    for entry in catalogue:
-        slot = slot_of(problem, entry.component)
-        if slot is None:
-            found.append(entry)
-            continue
-        place = indices(problem, slot)[0]
-        amplitude, small = abs(float(known.mean[place])), SMALL * abs(entry.component.amplitude)
-        doubt = FADED * float(deviations[place])
-        visible = doubt < abs(entry.component.amplitude)  # else nobody could see whether it is there
-        gone = amplitude < small or (visible and amplitude < doubt)
-        found.append(replace(entry, fading=entry.fading + 1 if gone else 0))
-    return tuple(found)
-
-
-def slot_of(problem: Problem, component: Component) -> int | None:
-    """Where a component sits in the twin, if it does."""
-    keys = [entry.key for entry in problem.components]
-    return keys.index(component.key) if component.key in keys else None
+def count_fading(adopted: tuple[AdoptedComponent, ...], posterior: Posterior) -> tuple[AdoptedComponent, ...]:
+    """Return the components with the number of windows in which each was not significant."""
+    prior = posterior.prior()
+    deviations = np.sqrt(np.diag(prior.covariance))
+    counted = []
+    for item in adopted:
+        slot = slot_of(posterior.problem, item.component)
+        if slot is not None:
+            index = indices(posterior.problem, slot)[0]
+            amplitude, discovered = abs(float(prior.mean[index])), abs(item.component.amplitude)
+            doubt = INSIGNIFICANT * float(deviations[index])
+            visible = doubt < discovered  # otherwise no window could show it
+            gone = amplitude < INSIGNIFICANT_SHARE * discovered or (visible and amplitude < doubt)
+            item = replace(item, fading=item.fading + 1 if gone else 0)  # noqa: PLW2901 - the counted item
+        counted.append(item)
+    return tuple(counted)

@@ -1,241 +1,245 @@
-"""Candidates for components: all structures through the twin's linear response, their inner numbers by swarms.
+"""Candidates for components: all allowed forms, screened by the linear response, their inner parameters by swarms.
 
-Particle swarms for the inner numbers of many meta-models at once (Eq. 1-2 of the paper).
-
-Each structure has a swarm of its own, and all fly together: what a generation costs is one call of a compiled kernel,
-where an optimiser called for each would keep books for longer than the kernel computes. Amplitudes need no search, they
-enter linearly; so a swarm flies in one dimension.
+Each form with an inner parameter has a particle swarm of its own; all swarms move together, so that a generation costs
+one call of a compiled kernel. Amplitudes enter linearly and need no search, so a swarm has one dimension.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Array
 from otolith.discovery.linear_response import (
     CandidateForm,
+    Guess,
     LinearResponse,
-    ScoreStatistics,
     basis_functions,
     candidate_library,
-    grid,
+    inner_grid,
 )
 from otolith.estimation.augmented import base_model
-from otolith.estimation.problem import Component, Problem, SwarmOptions
-from otolith.twin.augmentation import SLOTS, sites, sources
+from otolith.estimation.particle_swarm import SwarmRule, particle_swarm
+from otolith.estimation.problem import Component, Problem
+from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
 
-PARTICLES, GENERATIONS = 10, 12
-CALMED = 0.3  # the inertia weight falls to it: held at the paper's 0.9 a swarm does not come to rest
-BLURRED = 0.5  # lines of the spectrum, or steps of a grid, by which particles are scattered around where they begin
-
-
-def evaluated(landscape: LinearResponse, guesses: list[tuple[CandidateForm, float]]) -> ScoreStatistics:
-    """What each guess, a structure and its inner number, would gain."""
-    if not guesses:
-        return ScoreStatistics(np.zeros(0), np.zeros((0, 2)))
-    counts = np.array([len(entry.model.phases) for entry, _ in guesses], dtype=np.int64)
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
-    pairs = np.column_stack([first, first + counts - 1])
-    return landscape.gains(landscape.responses(basis_functions(iter(guesses))), pairs)
-
-
-def pso_search(
-    landscape: LinearResponse, begun: list[tuple[CandidateForm, Array, float]], options: SwarmOptions, seed: int
-) -> list[float]:
-    """The best inner number of each structure, begun at (starts,) with steps of that size between them."""
-    random = np.random.default_rng(seed)
-    low, high = np.array([entry.bounds for entry, _, _ in begun]).T[:, :, None]
-    steps = np.array([step for _, _, step in begun])[:, None]
-    first = np.array([np.resize(starts, PARTICLES) for _, starts, _ in begun])
-    blur = BLURRED * steps * random.uniform(-1.0, 1.0, first.shape)
-    blur[:, 0] = 0.0
-    place = np.clip(first + blur, low, high)
-    speed = np.zeros_like(place)
-    best, reached = place.copy(), np.full(place.shape, -np.inf)
-    rows = np.arange(len(begun))
-    for generation in range(GENERATIONS):
-        guesses = [(entry, float(value)) for (entry, _, _), row in zip(begun, place, strict=True) for value in row]
-        gain = evaluated(landscape, guesses).gain.reshape(place.shape)
-        better = gain > reached
-        best, reached = np.where(better, place, best), np.where(better, gain, reached)
-        leader = best[rows, reached.argmax(axis=1)][:, None]
-        inertia = options.inertia + (CALMED - options.inertia) * generation / (GENERATIONS - 1)
-        own, common = random.random(place.shape), random.random(place.shape)
-        speed = inertia * speed + options.cognitive * own * (best - place) + options.social * common * (leader - place)
-        place = np.clip(place + speed, low, high)
-    found: list[float] = best[rows, reached.argmax(axis=1)].tolist()
-    return found
-
-
-COARSE, FINE = 1.5, 0.5  # lines of the spectrum between two frequencies, in a glance and in a search
-CLEARLY = 10.0  # in -2 log evidence: a Bayes factor of 150
-PEAKS = 3  # of a spectrum, where a swarm begins
-FLOWN, TRIED = 16, 10  # structures whose inner numbers are searched, and those that are polished
-KEPT, RELATIVE = 23.0, 0.3  # in -2 log evidence, and as a share: what the linear picture may be wrong by
-WORTH, FEWEST = 500, 4  # steps of the integrator in a window up to which all are tried, and what is tried at least
-LARGEST = 1e9  # amplitude, in the unit of a site: nobody could read an equation with a larger one
-
-
-Guess = tuple[CandidateForm, float]
-Settled = tuple[Guess, Array, float]
-"""A guess, its amplitudes, and its gain in -2 log evidence."""
-
-
-def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
-    """All that may be looked for where the sources are ``x`` (sources, records), while the twin has room for it.
-
-    What is in the twin and what the specialist or the machine file excludes is left out. Where components are not
-    looked for, the errors of sensors are.
-    """
-    twin = base_model(problem)
-    if len(problem.components) >= SLOTS:
-        return []
-    taken = problem.excluded | {entry.key for entry in problem.components}
-    own = len(twin.sites)
-    return [entry for entry in candidate_library(twin, x, taken) if problem.discover or entry.site >= own]
-
-
-def screened(
-    landscape: LinearResponse, problem: Problem, found: list[CandidateForm], fineness: float
-) -> tuple[list[Guess], Array, Array]:
-    """Guesses on the grid, their amplitudes (guesses, 2), and their gains in -2 log evidence (guesses,)."""
-    guesses = [(entry, float(inner)) for entry in found for inner in grid(entry, landscape.x, fineness)]
-    gains = evaluated(landscape, guesses)
-    return guesses, gains.amplitudes, scores_of(landscape, guesses, gains.gain, rivals_of(problem, found))
+DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
+COARSE, FINE = 1.5, 0.5  # spectral lines between two frequencies, in the screening test and in a search
+PARTICLES, GENERATIONS = 10, 12  # of the swarm of one form
+START_SPREAD = 0.5  # steps of the grid by which particles are scattered around their starts
+PEAKS = 3  # best grid points at which a swarm starts
+MAX_SWARMS = 16  # forms whose inner parameters are searched
+MAX_CANDIDATES, MIN_CANDIDATES = 10, 4  # candidates that are fitted
+AFFORDABLE_STEPS = 500  # integrator steps of a window up to which the largest number of candidates is fitted
+SCORE_MARGIN, SCORE_SHARE = 23.0, 0.3  # absolute (-2 log evidence) and relative error of the linear approximation
+MAX_AMPLITUDE = 1e9  # in the unit of the site
 
 
 @dataclass(frozen=True, slots=True)
-class Rivals:
-    """How many structures there are."""
+class ScoredGuess:
+    """A guess with the score of the linear response."""
 
-    own: int
-    """Number of the first site that is a sensor."""
+    form: CandidateForm
+    inner: float
+    amplitudes: Array
+    """(2,)."""
+    score: float
+    """Gain in -2 log evidence over parameters only."""
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether the amplitude is neither zero nor beyond any equation that a person could use."""
+        return bool(0.0 < np.abs(self.amplitudes).max() < MAX_AMPLITUDE)
+
+
+@dataclass(frozen=True, slots=True)
+class Alternatives:
+    """How many forms compete, by kind."""
+
+    first_sensor: int
+    """Index of the first site that is a sensor."""
     of_machine: float
     of_sensors: float
 
-    def of(self, structure: CandidateForm) -> float:
-        """Of its kind."""
-        return self.of_sensors if self.lies(structure) else self.of_machine
+    @classmethod
+    def among(cls, problem: Problem, forms: list[CandidateForm]) -> "Alternatives":
+        """Count ``forms``."""
+        first = len(base_model(problem).sites)
+        sensors = sum(form.site >= first for form in forms)
+        return cls(first, float(max(len(forms) - sensors, 1)), float(max(sensors, 1)))
 
-    def lies(self, structure: CandidateForm) -> bool:
-        """Whether it is the error of a sensor."""
-        return structure.site >= self.own
+    def of(self, form: CandidateForm) -> float:
+        """Return the number of forms of the same kind."""
+        return self.of_sensors if self.is_sensor(form) else self.of_machine
 
-
-def rivals_of(problem: Problem, found: list[CandidateForm]) -> Rivals:
-    """How many structures of each kind are among ``found``."""
-    own = len(base_model(problem).sites)
-    sensors = sum(entry.site >= own for entry in found)
-    return Rivals(own, float(max(len(found) - sensors, 1)), float(max(sensors, 1)))
-
-
-def scores_of(landscape: LinearResponse, guesses: list[Guess], gain: Array, rivals: Rivals) -> Array:
-    """(guesses,) gains in -2 log evidence over parameters only."""
-    records = landscape.objective.count
-    counts = np.array([_numbers_of(entry) for entry, _ in guesses], dtype=np.float64)
-    others = np.array([rivals.of(entry) for entry, _ in guesses])
-    left = max((landscape.chi_square - float(gain.max(initial=0.0))) / records, 1.0)
-    return np.asarray(gain / left - counts * np.log(records) - 2.0 * np.log(3.0 * others))
-
-
-def _numbers_of(structure: CandidateForm) -> int:
-    return len(structure.model.phases) + (structure.model.inner is not None)
+    def is_sensor(self, form: CandidateForm) -> bool:
+        """Whether the form is the error of a sensor."""
+        return form.site >= self.first_sensor
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A component worth a polish."""
+    """A component worth a fit."""
 
     component: Component
-    rivals: float
-    """How many structures there are of its kind."""
+    alternatives: float
+    """Number of forms of its kind."""
     of_sensor: bool
 
 
-def candidates(problem: Problem, landscape: LinearResponse, window: Window) -> list[Candidate]:
-    """The components worth a polish, the best first."""
-    found = allowed_forms(problem, landscape.x)
-    rivals = rivals_of(problem, found)
-    settled = _settled(problem, landscape, window, found, rivals)
-    if not settled:
+def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
+    """Return the forms that may be searched where the sources are ``x`` (sources, records).
+
+    Components in the twin and excluded ones are left out, and all if the twin has no free slot. If discovery is off,
+    only errors of sensors remain.
+    """
+    twin = base_model(problem)
+    if len(problem.components) >= MAX_COMPONENTS:
         return []
-    best_score = settled[0][2]
-    settled = _no_parameters(landscape, settled, rivals)
-    least = max(best_score - KEPT - RELATIVE * abs(best_score), -CLEARLY)
-    kept = [entry for entry in settled if entry[2] > least][: _affordable(landscape)]
-    kept += threshold_like(problem, settled[len(kept) :]) if kept else []
+    taken = problem.excluded | {component.key for component in problem.components}
+    return [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
+
+
+def screen(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> "Screening":
+    """Score all forms on a grid of inner parameters."""
+    guesses = [(form, float(inner)) for form in forms for inner in inner_grid(form, response.x, fineness)]
+    return Screening.of(response, guesses, Alternatives.among(response.problem, forms))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Screening:
+    """Many guesses and their scores."""
+
+    guesses: list[Guess]
+    amplitudes: Array
+    """(guesses, 2)."""
+    scores: Array
+    """(guesses,) gains in -2 log evidence over parameters only."""
+
+    @classmethod
+    def of(cls, response: LinearResponse, guesses: list[Guess], alternatives: Alternatives) -> "Screening":
+        """Score ``guesses`` by the linear response."""
+        statistics = response.score(guesses)
+        records = response.objective.count
+        parameters = np.array([_parameter_count(form) for form, _ in guesses], dtype=np.float64)
+        competing = np.array([alternatives.of(form) for form, _ in guesses])
+        variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / records, 1.0)
+        scores = statistics.gain / variance_factor - parameters * np.log(records) - 2.0 * np.log(3.0 * competing)
+        return cls(guesses, statistics.amplitudes, np.asarray(scores))
+
+    def __getitem__(self, index: int) -> ScoredGuess:
+        form, inner = self.guesses[index]
+        return ScoredGuess(form, inner, self.amplitudes[index], float(self.scores[index]))
+
+
+def _parameter_count(form: CandidateForm) -> int:
+    return len(form.model.phases) + (form.model.inner is not None)
+
+
+def find_candidates(response: LinearResponse) -> list[Candidate]:
+    """Return the components worth a fit, the best first."""
+    problem = response.problem
+    forms = allowed_forms(problem, response.x)
+    alternatives = Alternatives.among(problem, forms)
+    guesses = _best_guesses(response, forms, alternatives)
+    if not guesses:
+        return []
+    best = guesses[0].score
+    guesses = _without_parameters(response, guesses, alternatives)
+    least = max(best - SCORE_MARGIN - SCORE_SHARE * abs(best), -DECISIVE)
+    kept = [guess for guess in guesses if guess.score > least][: _affordable(response)]
+    kept += threshold_like(problem, guesses[len(kept) :]) if kept else []
     return [
-        Candidate(component_of(problem, window, *guess, pair), rivals.of(guess[0]), rivals.lies(guess[0]))
-        for guess, pair, _ in kept
-        if 0.0 < np.abs(pair).max() < LARGEST
+        Candidate(component_of(response, guess), alternatives.of(guess.form), alternatives.is_sensor(guess.form))
+        for guess in kept
+        if guess.is_readable
     ]
 
 
-def _settled(
-    problem: Problem, landscape: LinearResponse, window: Window, found: list[CandidateForm], rivals: Rivals
-) -> list[Settled]:
-    """The structures with the best inner numbers that swarms find, the best first; swarms fly for the leaders only."""
-    guesses, amplitudes, scores = screened(landscape, problem, found, FINE)
-    leaders: dict[CandidateForm, list[int]] = {}
-    for index in np.argsort(-scores, kind="stable").tolist():
-        leaders.setdefault(guesses[index][0], []).append(index)
-    still = [places[0] for entry, places in leaders.items() if entry.model.inner is None]
-    settled = [(guesses[place], amplitudes[place], float(scores[place])) for place in still]
-    flown = [(entry, places) for entry, places in leaders.items() if entry.model.inner is not None][:FLOWN]
-    if flown:
-        begun = [(entry, np.array([guesses[place][1] for place in places[:PEAKS]]), _step(entry, landscape.x))
-                 for entry, places in flown]  # fmt: skip
-        inner = pso_search(landscape, begun, problem.swarm, problem.seed + window.index)
-        arrived = [(entry, value) for (entry, _), value in zip(flown, inner, strict=True)]
-        gains = evaluated(landscape, arrived)
-        reached = scores_of(landscape, arrived, gains.gain, rivals)
-        settled += zip(arrived, gains.amplitudes, map(float, reached), strict=True)
-    return sorted(settled, key=lambda entry: -entry[2])
+def _best_guesses(
+    response: LinearResponse, forms: list[CandidateForm], alternatives: Alternatives
+) -> list[ScoredGuess]:
+    """Return each form with its best inner parameter, the best form first; swarms run for the leading forms only."""
+    screening = screen(response, forms, FINE)
+    by_form: dict[CandidateForm, list[int]] = {}
+    for index in np.argsort(-screening.scores, kind="stable").tolist():
+        by_form.setdefault(screening.guesses[index][0], []).append(index)
+    best = [screening[order[0]] for form, order in by_form.items() if form.model.inner is None]
+    searched = [(form, order) for form, order in by_form.items() if form.model.inner is not None][:MAX_SWARMS]
+    if searched:
+        starts = [(form, np.array([screening.guesses[at][1] for at in order[:PEAKS]])) for form, order in searched]
+        settled = Screening.of(response, search_inner_parameters(response, starts), alternatives)
+        best += [settled[index] for index in range(len(searched))]
+    return sorted(best, key=lambda guess: -guess.score)
 
 
-def _no_parameters(landscape: LinearResponse, settled: list[Settled], rivals: Rivals) -> list[Settled]:
-    """Without components that do what a parameter would do; a sensor that lies may."""
-    single = [len(guess[0].model.phases) == 1 for guess, _, _ in settled]
-    heights = np.concatenate([pair[:1] if one else pair for (_, pair, _), one in zip(settled, single, strict=True)])
-    same = landscape.is_parameter(basis_functions(iter(guess for guess, _, _ in settled)), heights)
-    first = np.cumsum([0, *(1 if one else 2 for one in single[:-1])]).tolist()
-    return [entry for entry, at in zip(settled, first, strict=True) if rivals.lies(entry[0][0]) or not same[at]]
+def search_inner_parameters(response: LinearResponse, starts: list[tuple[CandidateForm, Array]]) -> list[Guess]:
+    """Return each form with the inner parameter that its swarm finds from its ``starts`` (starts,)."""
+    forms = [form for form, _ in starts]
+    random = np.random.default_rng(response.problem.seed + response.window.index)
+    low, high = np.array([form.bounds for form in forms]).T[:, :, None, None]
+    steps = np.array([_grid_step(form, response.x) for form in forms])[:, None]
+    first = np.array([np.resize(values, PARTICLES) for _, values in starts])
+    scatter = START_SPREAD * steps * random.uniform(-1.0, 1.0, first.shape)
+    scatter[:, 0] = 0.0
+    positions = np.clip((first + scatter)[..., None], low, high)
+
+    def cost(inner: Array) -> Array:
+        guesses = [(form, float(value)) for form, row in zip(forms, inner[..., 0], strict=True) for value in row]
+        return -response.score(guesses).gain.reshape(inner.shape[:2])
+
+    rule = SwarmRule(response.problem.swarm, GENERATIONS, GENERATIONS)
+    best = particle_swarm(cost, positions, (low, high), rule, random).positions[:, 0, 0].tolist()
+    return list(zip(forms, best, strict=True))
 
 
-def _affordable(landscape: LinearResponse) -> int:
-    """How many candidates are polished: fewer in large windows, so that a search ends before the next one."""
-    return int(np.clip(TRIED * WORTH / max(landscape.objective.work, 1), FEWEST, TRIED))
+def _grid_step(form: CandidateForm, x: Array) -> float:
+    points = inner_grid(form, x, FINE)
+    return float(np.diff(points).min()) if len(points) > 1 else float(np.ptp(form.bounds))
 
 
-def threshold_like(problem: Problem, rest: list[Settled]) -> list[Settled]:
-    """Of each site the best family that the linear picture underrates, of a state of the twin."""
-    states = {entry.name for entry in base_model(problem).states}
-    found: dict[int, Settled] = {}
-    for entry in rest:
-        structure = entry[0][0]
-        if structure.model.holds and sources(base_model(problem))[structure.source].name in states:
-            found.setdefault(structure.site, entry)
-    return list(found.values())
+def _without_parameters(
+    response: LinearResponse, guesses: list[ScoredGuess], alternatives: Alternatives
+) -> list[ScoredGuess]:
+    """Return the guesses that no parameter would produce as well; errors of sensors stay."""
+    curves = [len(guess.form.model.phases) for guess in guesses]
+    amplitudes = np.concatenate([guess.amplitudes[:count] for guess, count in zip(guesses, curves, strict=True)])
+    same = response.is_parameter(basis_functions((guess.form, guess.inner) for guess in guesses), amplitudes)
+    first = np.cumsum([0, *curves[:-1]]).tolist()
+    return [
+        guess for guess, at in zip(guesses, first, strict=True) if alternatives.is_sensor(guess.form) or not same[at]
+    ]
 
 
-def _step(structure: CandidateForm, x: Array) -> float:
-    points = grid(structure, x, FINE)
-    return float(np.diff(points).min()) if len(points) > 1 else float(np.ptp(structure.bounds))
+def _affordable(response: LinearResponse) -> int:
+    """Return how many candidates are fitted: fewer in large windows, so that a search ends before the next window."""
+    share = MAX_CANDIDATES * AFFORDABLE_STEPS / max(response.objective.integrator_steps, 1)
+    return int(np.clip(share, MIN_CANDIDATES, MAX_CANDIDATES))
 
 
-def component_of(problem: Problem, window: Window, structure: CandidateForm, inner: float, pair: Array) -> Component:
-    """The component of a structure with its inner number and the amplitudes (2,) of the linear picture."""
+def threshold_like(problem: Problem, guesses: list[ScoredGuess]) -> list[ScoredGuess]:
+    """Return for each site the best threshold-like family of a state: the linear response underrates dry friction."""
     twin = base_model(problem)
-    first, second = map(float, pair)
-    two = len(structure.model.phases) > 1
+    states = {state.name for state in twin.states}
+    best: dict[int, ScoredGuess] = {}
+    for guess in guesses:
+        if guess.form.model.threshold_like and sources(twin)[guess.form.source].name in states:
+            best.setdefault(guess.form.site, guess)
+    return list(best.values())
+
+
+def component_of(response: LinearResponse, guess: ScoredGuess) -> Component:
+    """Return the component of a guess with the amplitude of the linear response."""
+    twin, form = base_model(response.problem), guess.form
+    first, second = map(float, guess.amplitudes)
+    periodic = len(form.model.phases) > 1
     return Component(
-        site=sites(twin)[structure.site].name,
-        family=structure.model.name,
-        source=sources(twin)[structure.source].name,
-        amplitude=float(np.hypot(first, second)) if two else first,
-        inner=inner,
-        phase=float(np.arctan2(second, first)) if two else 0.0,
-        low=structure.bounds[0],
-        high=structure.bounds[1],
-        origin=window.start,
+        site=sites(twin)[form.site].name,
+        family=form.model.name,
+        source=sources(twin)[form.source].name,
+        amplitude=float(np.hypot(first, second)) if periodic else first,
+        inner=guess.inner,
+        phase=float(np.arctan2(second, first)) if periodic else 0.0,
+        low=form.bounds[0],
+        high=form.bounds[1],
+        origin=response.window.start,
     )

@@ -1,274 +1,290 @@
-"""What could have happened in a window, and how well it explains it.
+"""Hypotheses about a window: nothing happened, parameters moved, a component appeared, or a sensor is wrong.
 
-What explains better is told by evidence (G. Schwarz, Annals of Statistics 6, 1978).
-
-An explanation that is followed from window to window, and what it has learned so far.
-
-What carries no weight: components that are hardly there (the paper's "deactivated"), explanations without content.
-
-A window that was itself wrong, frozen for a part of it, say, may be explained by something that is not seen again.
-Quiet windows after it tell for nobody, so evidence alone would never let go of such an explanation.
+A hypothesis is fitted to a window under its own prior and compared by evidence, in the form of the Bayesian information
+criterion (G. Schwarz, Annals of Statistics 6, 1978). A fitted hypothesis becomes a tracked one, which carries its own
+posterior from window to window.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
-from otolith.discovery.phase_tracking import PhaseAdvance, phase_advance, without_slot
-from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior, initial_prior
-from otolith.estimation.augmented import augment, indices
-from otolith.estimation.gauss_newton import FitResult, gauss_newton
-from otolith.estimation.imm_filter import ImmPosterior, moment_match, remap_parameters, set_all_modes, update
-from otolith.estimation.information import inflation
-from otolith.estimation.objective import PENALTY, Objective
+from otolith.estimation.arrival_cost import Evidence, Prior, extend_prior, initial_prior
+from otolith.estimation.augmented import amplitude_indices, augment, base_model, equation, indices, site_of
+from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import Fit
 
-STEPS = 25  # of a polish
-HALVINGS = 20  # of amplitudes with which the twin diverges
+MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
+SIGNIFICANT = 4.0  # standard deviations: nearer to zero, neither component nor change is told from nothing
+DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 
 
 class FaultType(StrEnum):
-    """What kind of explanation it is."""
+    """What kind of change a hypothesis states."""
 
     NOTHING = "nothing has happened"
     PARAMETER = "parameters have moved"
     COMPONENT = "a component has appeared"
-    SENSOR = "a sensor lies"
+    SENSOR = "a sensor is wrong"
 
 
 @dataclass(frozen=True, slots=True)
 class FaultHypothesis:
-    """What an explanation says has happened."""
+    """What a hypothesis states."""
 
-    reason: FaultType
+    type: FaultType
     name: str = ""
-    """Of parameters, or the keys of components."""
-    numbers: int = 0
-    """That had to be found."""
-    rivals: float = 1.0
-    """How many claims of the same reason there are."""
+    """Names of the parameters, or keys of the components."""
+    added: int = 0
+    """Number of values that it estimates in addition."""
+    alternatives: float = 1.0
+    """Number of hypotheses of the same type."""
 
     @property
-    def odds(self) -> float:
-        """-2 log of how likely it was beforehand: reasons are, and so are the claims of a reason."""
-        return 0.0 if self.reason is FaultType.NOTHING else float(2.0 * np.log(3.0 * self.rivals))
+    def log_prior(self) -> float:
+        """-2 log of the prior probability: types are equally probable, and so are the hypotheses of a type."""
+        return 0.0 if self.type is FaultType.NOTHING else float(2.0 * np.log(3.0 * self.alternatives))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposal:
+    """A hypothesis with what its fit starts from."""
+
+    hypothesis: FaultHypothesis
+    problem: Problem
+    prior: Prior
+    """Of all free parameters of ``problem``."""
+    start: Array
+    """(free, ...)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedHypothesis:
-    """One way to explain a window."""
+    """A hypothesis fitted to one window."""
 
-    claim: FaultHypothesis
-    problem: Problem
-    prior: Prior
-    """Of everything that is free in ``problem``, before the window."""
-    fit: FitResult
-    informed: MapObjective
+    hypothesis: FaultHypothesis
+    fit: Fit
 
     @property
-    def reason(self) -> FaultType:
-        """What kind of explanation it is."""
-        return self.claim.reason
+    def type(self) -> FaultType:
+        """What kind of change it states."""
+        return self.hypothesis.type
 
     @property
     def name(self) -> str:
-        """Of parameters, or the keys of components."""
-        return self.claim.name
+        """Names of the parameters, or keys of the components."""
+        return self.hypothesis.name
+
+    @property
+    def problem(self) -> Problem:
+        """The problem with what the hypothesis adds."""
+        return self.fit.problem
 
     @property
     def chi_square(self) -> float:
-        """Of the window and of the prior."""
+        """χ² of window and prior."""
         return self.fit.chi_square
 
-    def deviance(self, records: float, unexplained: float) -> float:
-        """-2 log evidence, where even the best leaves ``unexplained`` times the noise (variance)."""
-        claim = self.claim
-        return float(self.chi_square / unexplained + claim.numbers * np.log(records) + claim.odds)
+    def deviance(self, records: float, variance_factor: float) -> float:
+        """Return -2 log evidence, where the best hypothesis leaves ``variance_factor`` times the noise variance."""
+        stated = self.hypothesis
+        return float(self.chi_square / variance_factor + stated.added * np.log(records) + stated.log_prior)
 
 
-def residual_variance_factor(chi_squares: Iterable[float], records: float) -> float:
-    """How many times the noise (variance) even the best explanation leaves; at least one."""
-    return max(min(chi_squares) / records, 1.0)
+def nothing_happened(problem: Problem, prior: Prior) -> Proposal:
+    """Return the null hypothesis."""
+    return Proposal(FaultHypothesis(FaultType.NOTHING), problem, prior, prior.mean)
 
 
-def extend_prior(prior: Prior, problem: Problem, wider: Problem) -> Prior:
-    """What is known of ``problem``, and nothing of the numbers that ``wider`` has in addition."""
-    found, more = initial_prior(wider), len(wider.free)
-    order = [entry.name for entry in wider.free]
-    places = [order.index(entry.name) for entry in problem.free]
-    places += [more + place for place in places]
-    found.mean[places] = prior.mean
-    found.covariance[np.ix_(places, places)] = prior.covariance
-    return found
+def all_parameters_moved(problem: Problem, start: Array) -> Proposal:
+    """Return the hypothesis that nothing is known of any free parameter."""
+    names = ", ".join(parameter.name for parameter in problem.free if not parameter.name.startswith("_"))
+    moved = FaultHypothesis(FaultType.PARAMETER, names, len(problem.free))
+    return Proposal(moved, problem, initial_prior(problem), start)
 
 
 def with_candidate(
-    base: Problem, window: Window, prior: Prior, added: Candidate, before: FittedHypothesis | None = None
-) -> FittedHypothesis:
-    """``base`` with one component more; ``before`` is its own explanation, from where the polish begins."""
-    wider = augment(base, [added.component])
-    wide = extend_prior(prior, base, wider)
-    start = wide.mean.copy()
+    base: Problem, prior: Prior, candidate: Candidate, before: FittedHypothesis | None = None
+) -> Proposal:
+    """Return the hypothesis of ``base`` with one more component; ``before`` is a fit of ``base`` to start from."""
+    wider = augment(base, [candidate.component])
+    extended = extend_prior(prior, base, wider)
+    start = extended.mean.copy()
     if before is not None:
-        order = [entry.name for entry in wider.free]
-        for value, entry in zip(before.fit.guess, base.free, strict=False):
-            start[order.index(entry.name)] = value
-    claimed = [entry.key for entry in wider.components]
-    numbers = len(wider.free) - len(base.free) + (0 if before is None else before.claim.numbers)
-    rivals = added.rivals * (1.0 if before is None else before.claim.rivals)
-    reason = FaultType.SENSOR if added.of_sensor else FaultType.COMPONENT
-    return fit_hypothesis(FaultHypothesis(reason, " and ".join(claimed), numbers, rivals), wider, window, wide, start)
+        order = [parameter.name for parameter in wider.free]
+        for value, parameter in zip(before.fit.parameters, base.free, strict=True):
+            start[order.index(parameter.name)] = value
+    added = len(wider.free) - len(base.free) + (0 if before is None else before.hypothesis.added)
+    alternatives = candidate.alternatives * (1.0 if before is None else before.hypothesis.alternatives)
+    kind = FaultType.SENSOR if candidate.of_sensor else FaultType.COMPONENT
+    stated = FaultHypothesis(kind, _names(wider), added, alternatives)
+    return Proposal(stated, wider, extended, start)
 
 
-def fit_hypothesis(
-    claim: FaultHypothesis, problem: Problem, window: Window, prior: Prior, start: Array | None = None
-) -> FittedHypothesis:
-    """How ``problem`` explains ``window``; ``start`` (free parameters, ...) is where the polish begins."""
-    free = len(problem.free)
-    begin = np.clip((prior.mean if start is None else start)[:free], *problem.bounds)
-    objective = Objective(problem, window, begin)
-    informed = MapObjective(objective, problem, prior)
-    first = objective.guess(begin)[free:]
-    amplitudes = [indices(problem, slot)[0] for slot in range(len(problem.components))]
-    for _ in range(HALVINGS):  # an amplitude of the linear picture may be too much for the twin itself
-        if not amplitudes or objective.cost(np.concatenate([begin, first])[None])[0] < PENALTY:
-            break
-        begin[amplitudes] *= 0.5
-    fit = gauss_newton(informed, informed.guess(begin, first), STEPS)
-    return FittedHypothesis(claim, problem, prior, fit, informed)
+def _names(problem: Problem) -> str:
+    return " and ".join(component.key for component in problem.components)
+
+
+def residual_variance_factor(chi_squares: Iterable[float], records: float) -> float:
+    """Return how many times the noise variance even the best hypothesis leaves; at least one."""
+    return max(min(chi_squares) / records, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedHypothesis:
-    """One explanation, and what it knows. Plain: it pickles."""
+    """A hypothesis with what it knows after some windows. Plain: it pickles."""
 
-    claim: FaultHypothesis
-    problem: Problem
-    belief: ImmPosterior
-    turned: PhaseAdvance
+    hypothesis: FaultHypothesis
+    posterior: Posterior
     deviance: float
-    """-2 log evidence of all windows so far, over that of the best."""
+    """-2 log evidence of all windows so far, relative to the best hypothesis."""
     cost: float
-    """RMSE over noise that it left of the last window."""
-    silent: bool = True
-    """Whether what it left of the last window looked like noise."""
+    """RMSE of the last window in units of the noise."""
+    explains_all: bool = True
+    """Whether the screening test found nothing in what it left of the last window."""
 
     @property
-    def reason(self) -> FaultType:
-        """What kind of explanation it is."""
-        return self.claim.reason
+    def type(self) -> FaultType:
+        """What kind of change it states."""
+        return self.hypothesis.type
+
+    @property
+    def problem(self) -> Problem:
+        """The problem with what the hypothesis adds."""
+        return self.posterior.problem
 
 
-SHARPEST = 1e7  # times what was known: a window that claims to say more says it where the twin all but diverges
+@dataclass(frozen=True, slots=True, eq=False)
+class HypothesisStep:
+    """One tracked hypothesis on its way through one window."""
+
+    tracked: TrackedHypothesis
+    predicted: Posterior
+    fitted: FittedHypothesis
+    evidence: Evidence
+    deviance: float = 0.0
+    """-2 log evidence of this window."""
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether the prediction can be updated without losing all digits; always for the null hypothesis."""
+        return is_usable(self.tracked.hypothesis, self.predicted, self.evidence)
+
+    def updated(self, excess: float) -> TrackedHypothesis:
+        """Return the hypothesis after the window; ``excess`` is added to its deviance."""
+        posterior = self.predicted.update(self.evidence, self.fitted.fit.advance())
+        deviance = self.tracked.deviance + excess
+        return replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost, deviance=deviance)
 
 
-def is_usable(claim: FaultHypothesis, belief: ImmPosterior, evidence: Evidence, problem: Problem) -> bool:
-    """Whether a belief can be updated by that evidence without losing all digits; that nothing has happened always."""
-    if claim.reason is FaultType.NOTHING:
+def is_usable(hypothesis: FaultHypothesis, predicted: Posterior, evidence: Evidence) -> bool:
+    """Whether ``evidence`` can update the prediction without losing all digits; always for the null hypothesis."""
+    if hypothesis.type is FaultType.NOTHING:
         return True
-    deviations = np.sqrt(np.diag(moment_match(belief, problem).covariance))
-    return bool((np.abs(evidence.root) * deviations < SHARPEST).all())  # not a number is not smaller either
+    deviations = np.sqrt(np.diag(predicted.prior().covariance))
+    relative = np.abs(evidence.sqrt_information) * deviations
+    return bool((relative < MAX_GAIN_OF_INFORMATION).all())  # also false for not-a-number
 
 
-def begun(
-    found: FittedHypothesis, problem: Problem, expected: ImmPosterior, window: Window, deviance: float
-) -> TrackedHypothesis | None:
-    """After its first window; ``expected`` is what was known of ``problem``, carried to its end.
+def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float) -> TrackedHypothesis | None:
+    """Return the hypothesis after its first window, or None if its twin all but diverges.
 
-    Returns:
-        None if the window cannot be used with it: its twin all but diverges.
+    ``predicted`` is the prediction of what was known before the hypothesis.
     """
-    evidence, last = evidence_of(found)
-    belief = set_all_modes(remap_parameters(expected, problem, found.problem), found.prior, found.problem)
-    if not is_usable(found.claim, belief, evidence, found.problem):
+    evidence = fitted.fit.evidence()
+    own = predicted.remap_parameters(fitted.problem).set_prior(fitted.fit.prior)
+    if not is_usable(fitted.hypothesis, own, evidence):
         return None
-    belief = update(belief, evidence, found.problem)
-    after = phase_advance(found.problem, window, last)
-    return TrackedHypothesis(found.claim, found.problem, belief, after, deviance, cost_of(found))
+    posterior = own.update(evidence, fitted.fit.advance())
+    return TrackedHypothesis(fitted.hypothesis, posterior, deviance, fitted.fit.cost)
 
 
-def evidence_of(found: FittedHypothesis) -> tuple[Evidence, Array]:
-    """What the window says, and the state (states,) at its last record."""
-    informed, cost = found.informed, cost_of(found)
-    grown = inflation(informed.whitened(found.fit), cost)
-    return informed.evidence(found.fit, grown), informed.last_state(found.fit)
+def complexity_penalty(predicted: Posterior, evidence: Evidence) -> float:
+    """Return, as -2 log evidence, how little the prediction said of what the window then said."""
+    information = evidence.sqrt_information @ predicted.prior().covariance @ evidence.sqrt_information.T
+    return float(np.linalg.slogdet(np.eye(len(information)) + information)[1])
 
 
-def cost_of(found: FittedHypothesis) -> float:
-    """RMSE over noise that it leaves."""
-    return float(np.sqrt(found.informed.chi_square(found.fit) / found.informed.count))
+def prune(tracked: Sequence[TrackedHypothesis], deviances: Sequence[float]) -> list[TrackedHypothesis]:
+    """Drop hypotheses that have become equal to the null hypothesis and explained the window no better.
 
-
-def occam(belief: ImmPosterior, evidence: Evidence, problem: Problem) -> float:
-    """How little the hypothesis said beforehand of what the window then said, as -2 log evidence."""
-    known = moment_match(belief, problem).covariance
-    seen = evidence.root @ known @ evidence.root.T
-    return float(np.linalg.slogdet(np.eye(len(seen)) + seen)[1])
-
-
-NOTICED = 4.0  # standard deviations: nearer to nothing, neither component nor change can be told from it
-BETTER = 4.0  # in -2 log evidence, of one window: nearer to nothing, it told for nobody
-
-
-def prune(found: list[TrackedHypothesis], deviances: list[float]) -> list[TrackedHypothesis]:
-    """Without those that say by now that nothing has happened, and explained the window no better than that."""
-    at = next((at for at, entry in enumerate(found) if entry.reason is FaultType.NOTHING), None)
+    A window that was itself wrong may be explained by something that does not return. Quiet windows do not
+    discriminate, so evidence alone would keep such a hypothesis for ever.
+    """
+    at = next((at for at, item in enumerate(tracked) if item.type is FaultType.NOTHING), None)
     if at is None:
-        return found
-    calm = found[at]
+        return list(tracked)
+    null = tracked[at]
     return [
-        entry
-        for entry, deviance in zip(found, deviances, strict=True)
-        if entry is calm or deviance < deviances[at] - BETTER or not _says_nothing(entry, calm)
+        item
+        for item, deviance in zip(tracked, deviances, strict=True)
+        if item is null or deviance < deviances[at] - DISCRIMINATES or not _equals_null(item, null)
     ]
 
 
-def pruned(entry: TrackedHypothesis) -> TrackedHypothesis:
-    """Without components that do not carry their weight beside others (the paper's "deactivated")."""
-    problem = entry.problem
-    if len(problem.components) < 2:
-        return entry
-    carried_by = _weights(problem, entry.belief)
-    weakest = int(np.argmin(carried_by))
-    if carried_by[weakest] >= NOTICED:
-        return entry
-    problem, belief, turn = without_slot(problem, entry.belief, entry.turned, weakest)
-    claim = entry.claim
-    if claim.reason in (FaultType.COMPONENT, FaultType.SENSOR):  # the others are not about what is in the twin
-        claim = replace(claim, name=" and ".join(component.key for component in problem.components))
-    return replace(entry, claim=claim, problem=problem, belief=belief, turned=turn)
+def without_insignificant(tracked: TrackedHypothesis) -> TrackedHypothesis:
+    """Return the hypothesis without its weakest component, if that is not significant (the paper's "deactivated")."""
+    if len(tracked.problem.components) < 2:
+        return tracked
+    significance = _significance(tracked.posterior)
+    weakest = int(np.argmin(significance))
+    if significance[weakest] >= SIGNIFICANT:
+        return tracked
+    posterior, hypothesis = tracked.posterior.without_slot(weakest), tracked.hypothesis
+    if hypothesis.type in (FaultType.COMPONENT, FaultType.SENSOR):  # other types do not name components
+        hypothesis = replace(hypothesis, name=_names(posterior.problem))
+    return replace(tracked, hypothesis=hypothesis, posterior=posterior)
 
 
-def _weights(problem: Problem, belief: ImmPosterior) -> Array:
-    """(components,) amplitudes of the components in the twin of ``problem``, in their standard deviations."""
-    known = moment_match(belief, problem)
-    deviations = np.sqrt(np.diag(known.covariance))
-    amplitudes = [indices(problem, slot)[0] for slot in range(len(problem.components))]
-    return np.abs(known.mean[amplitudes]) / deviations[amplitudes]
+def _significance(posterior: Posterior) -> Array:
+    """Return the amplitudes (components,) in their standard deviations."""
+    prior = posterior.prior()
+    deviations = np.sqrt(np.diag(prior.covariance))
+    amplitudes = amplitude_indices(posterior.problem)
+    return np.abs(prior.mean[amplitudes]) / deviations[amplitudes]
 
 
-def _says_nothing(entry: TrackedHypothesis, calm: TrackedHypothesis) -> bool:
-    """Whether it is by now no different from ``calm``, in what it has added to the twin and in what it has freed."""
-    known, together = ([component.key for component in each.problem.components] for each in (calm, entry))
-    if together[: len(known)] != known:  # it says that one has gone
+def _equals_null(tracked: TrackedHypothesis, null: TrackedHypothesis) -> bool:
+    """Whether neither its additional components nor its shifts of parameters are significant."""
+    known, own = ([item.key for item in each.problem.components] for each in (null, tracked))
+    if own[: len(known)] != known:  # it states that a component is gone
         return False
-    more = _weights(entry.problem, entry.belief)[len(known) :]
-    return bool((more < NOTICED).all() and (_shifts(entry, calm) < NOTICED).all())
+    added = _significance(tracked.posterior)[len(known) :]
+    return bool((added < SIGNIFICANT).all() and (_shifts(tracked, null) < SIGNIFICANT).all())
 
 
-def _shifts(entry: TrackedHypothesis, calm: TrackedHypothesis) -> Array:
-    """(parameters,) how far its parameters, those of ``calm``, are from there, in standard deviations."""
-    own, other = moment_match(entry.belief, entry.problem), moment_match(calm.belief, calm.problem)
-    expected = {name: (value, 0.0) for name, value in calm.problem.known}
-    for at, parameter in enumerate(calm.problem.free):
+def _shifts(tracked: TrackedHypothesis, null: TrackedHypothesis) -> Array:
+    """Return how far its parameters (parameters,) are from those of ``null``, in standard deviations."""
+    own, other = tracked.posterior.prior(), null.posterior.prior()
+    expected = {name: (value, 0.0) for name, value in null.problem.known}
+    for at, parameter in enumerate(null.problem.free):
         expected[parameter.name] = float(other.mean[at]), float(other.covariance[at, at])
-    found = []
-    for at, parameter in enumerate(entry.problem.free):
-        if parameter.name in expected:  # else of a component that it has added
+    shifts = []
+    for at, parameter in enumerate(tracked.problem.free):
+        if parameter.name in expected:  # others belong to a component that it adds
             value, variance = expected[parameter.name]
-            found.append(abs(own.mean[at] - value) / np.sqrt(own.covariance[at, at] + variance))
-    return np.array(found)
+            shifts.append(abs(own.mean[at] - value) / np.sqrt(own.covariance[at, at] + variance))
+    return np.array(shifts)
+
+
+def describe_hypothesis(tracked: TrackedHypothesis) -> str:
+    """Return what the hypothesis states, with its values."""
+    if tracked.type in (FaultType.NOTHING, FaultType.PARAMETER):
+        return tracked.hypothesis.name or str(tracked.type)
+    problem, twin = tracked.problem, base_model(tracked.problem)
+    values = tracked.posterior.prior().mean
+    if tracked.type is FaultType.SENSOR and problem.components:
+        component = problem.components[-1]
+        site = site_of(twin, component.site)
+        error = float(values[indices(problem, len(problem.components) - 1)[0]])
+        off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g} {site.unit}"
+        return f"{site.into} reads {off} off: look at the sensor and its scale"
+    return "; ".join(
+        f"{component.site}: {equation(twin, component, values[indices(problem, slot)].tolist())}"
+        for slot, component in enumerate(problem.components)
+    )

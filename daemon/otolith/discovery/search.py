@@ -1,230 +1,289 @@
-"""A glance at every window: whether a search for components would be worth its time.
+"""Step 3 of the method: which component, moved parameter or faulty sensor explains what the twin leaves of a window.
 
-Step 3 of the method: which component, moved parameter or lying sensor explains what the twin leaves of a window.
-
-Candidates are screened by the twin's linearised response, inner numbers searched by swarms, and the best polished
-jointly with everything else in the completed twin; evidence tells what is better, over "nothing has happened" and over
-"parameters have moved".
+:func:`screening_test` asks of every window whether a search is worth its time. :func:`search` proposes hypotheses from
+the linear response, searches their inner parameters by swarms, and fits the best of them jointly with all parameters.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidates import (
-    CLEARLY,
     COARSE,
-    LARGEST,
-    TRIED,
+    DECISIVE,
+    MAX_CANDIDATES,
+    Alternatives,
     Candidate,
+    Screening,
     allowed_forms,
-    candidates,
     component_of,
-    evaluated,
-    rivals_of,
-    screened,
+    find_candidates,
+    screen,
     threshold_like,
 )
 from otolith.discovery.hypotheses import (
     FaultHypothesis,
     FaultType,
     FittedHypothesis,
-    extend_prior,
-    fit_hypothesis,
+    Proposal,
+    all_parameters_moved,
+    nothing_happened,
     residual_variance_factor,
     with_candidate,
 )
 from otolith.discovery.linear_response import LinearResponse
-from otolith.estimation.arrival_cost import Prior, initial_prior
+from otolith.estimation.arrival_cost import Prior, extend_prior, forget_parameter, initial_prior
 from otolith.estimation.augmented import base_model
 from otolith.estimation.objective import EXPLAINED, Objective
+from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
-from otolith.twin.augmentation import SLOTS, sources
-from otolith.twin.component_families import Kind
+from otolith.estimation.window_fit import Fit, WindowEstimate, fit
+from otolith.twin.augmentation import MAX_COMPONENTS, sources
+from otolith.twin.component_families import SourceKind
 
-LOOKED_AT = 4  # windows, in one of which families are tried that the linear picture underrates
+THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
+MAX_STEPS = 25  # of Gauss-Newton for a hypothesis
+MAX_RECORDS = 5000  # last records of a window that are searched
+PARTS = 8  # of a window, fitted one after another to find an onset
+FAR_OFF = 20.0  # squared innovation in units of its variance: one record in a hundred thousand
+EXPECTED_SPREAD = 5.0  # standard deviations of χ² up to which a part of a window is as predicted
+MIN_RECORDS_AFTER = 60  # records after an onset that say anything about it
+MAX_MOVED, MIN_MOVED_SHARE = 3, 0.5  # parameters tried alone, and their least share of the best gain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScreeningResult:
-    """What a window would gain at most, by a coarse look."""
+    """Whether a search of a window is worth its time."""
 
     gain: float
-    """In -2 log evidence, over parameters only; positive for something worth a search."""
-    landscape: LinearResponse
-    lacking: bool = False
-    """Whether it is worth it only if the twin has lacked it from the first window on."""
+    """Largest gain in -2 log evidence over parameters only, minus what is decisive; positive if worth a search."""
+    fitted: Fit
+    """Of the window, from what is known of it."""
+    response: LinearResponse
+    always_lacking: bool = False
+    """Whether the gain holds only if the twin has lacked something since the first window."""
+
+    @property
+    def is_positive(self) -> bool:
+        """Whether a search is worth its time."""
+        return self.gain > 0.0
 
 
-def screening_test(problem: Problem, window: Window, prior: Prior, start: Array) -> ScreeningResult:
-    """A coarse look at what a component would gain, around ``start`` (free parameters, ...)."""
-    landscape = LinearResponse(problem, window, prior, start[: len(problem.free)])
-    # Lines of the spectrum cost most: those over time are looked at in one window, those over angles in the next.
-    turn = (Kind.TIME, Kind.PLACE)[window.index % 2]
-    found = [
-        entry
-        for entry in allowed_forms(problem, landscape.x)
-        if problem.discover
-        and (len(entry.model.phases) == 1 or sources(base_model(problem))[entry.source].kind is turn)
+def fit_hypotheses(proposals: Iterable[Proposal], window: Window) -> list[FittedHypothesis]:
+    """Fit each proposal to ``window``."""
+    return [
+        FittedHypothesis(item.hypothesis, fit(item.problem, window, item.prior, item.start, MAX_STEPS))
+        for item in proposals
     ]
-    _, _, scores = screened(landscape, problem, found, COARSE)
-    gain = float(scores.max(initial=-np.inf)) - CLEARLY
-    if gain <= 0.0 and problem.discover and window.index % LOOKED_AT == 0:
-        held = _held(problem, window, landscape) - CLEARLY
-        return ScreeningResult(max(gain, held), landscape, lacking=held > 0.0)
-    return ScreeningResult(gain, landscape)
 
 
-def _held(problem: Problem, window: Window, landscape: LinearResponse) -> float:
-    """What a family would gain that the linear picture underrates, whatever was known of the parameters."""
-    found = allowed_forms(problem, landscape.x)
-    rivals = rivals_of(problem, found)
-    guesses = [(entry, entry.bounds[0]) for entry in found if entry.model.holds and not rivals.lies(entry)]
-    gains = evaluated(landscape, guesses)
-    settled = [
-        (guess, pair, 0.0)
-        for guess, pair in zip(guesses, gains.amplitudes, strict=True)
-        if 0.0 < np.abs(pair).max() < LARGEST
+def linearised(problem: Problem, window: Window, prior: Prior, start: Array) -> Fit:
+    """Return a fit of no steps: the window, linearised at ``start`` (free, ...)."""
+    return fit(problem, window, prior, start, max_steps=0)
+
+
+def screen_window(predicted: Posterior, estimated: WindowEstimate, *, determined: bool) -> ScreeningResult:
+    """Screen the window of an estimate, around the prediction, or around the estimate while that is unknown.
+
+    Of a very long window the last records are screened, so that a search ends before the next window.
+    """
+    problem, prior, window = predicted.problem, predicted.prior(), estimated.fit.window
+    is_known = determined and not predicted.unknown_phases()
+    is_long = window.records > MAX_RECORDS and not problem.components
+    if is_known and not is_long:
+        return screening_test(estimated.fit)
+    start = prior.mean if is_known else np.array([parameter.value for parameter in estimated.parameters])
+    recent = window.since(window.records - MAX_RECORDS) if is_long else window
+    return screening_test(linearised(problem, recent, prior, start))
+
+
+def screening_test(fitted: Fit) -> ScreeningResult:
+    """Return what a component would gain at most, around the start of ``fitted``, on a coarse grid.
+
+    Spectra cost most: those over time are tested in one window, those over angles in the next.
+    """
+    problem, index = fitted.problem, fitted.window.index
+    response = LinearResponse(fitted)
+    kind = (SourceKind.TIME, SourceKind.PLACE)[index % 2]
+    source_kinds = [source.kind for source in sources(base_model(problem))]
+    forms = [
+        form
+        for form in allowed_forms(problem, response.x)
+        if problem.discover and (len(form.model.phases) == 1 or source_kinds[form.source] is kind)
     ]
-    fresh, best = initial_prior(problem), -np.inf
-    for (structure, inner), pair, _ in threshold_like(problem, settled):
-        candidate = Candidate(
-            component_of(problem, window, structure, inner, pair), rivals.of(structure), of_sensor=False
-        )
-        tried = with_candidate(problem, window, fresh, candidate)
-        left = residual_variance_factor([tried.chi_square], tried.informed.count)
-        price = tried.deviance(tried.informed.count, 1.0) - tried.chi_square
-        price += len(problem.free) * np.log(tried.informed.count)
-        best = max(best, (landscape.chi_square - tried.chi_square) / left - price)
+    gain = float(screen(response, forms, COARSE).scores.max(initial=-np.inf)) - DECISIVE
+    if gain <= 0.0 and problem.discover and index % THRESHOLD_TEST_EVERY == 0:
+        threshold_gain = _threshold_gain(response) - DECISIVE
+        return ScreeningResult(max(gain, threshold_gain), fitted, response, always_lacking=threshold_gain > 0.0)
+    return ScreeningResult(gain, fitted, response)
+
+
+def _threshold_gain(response: LinearResponse) -> float:
+    """Return what the threshold-like families would gain if nothing were known of the parameters; they are fitted."""
+    problem, fresh = response.problem, initial_prior(response.problem)
+    forms = allowed_forms(problem, response.x)
+    alternatives = Alternatives.among(problem, forms)
+    guesses = [
+        (form, form.bounds[0]) for form in forms if form.model.threshold_like and not alternatives.is_sensor(form)
+    ]
+    screening = Screening.of(response, guesses, alternatives)
+    readable = [guess for guess in map(screening.__getitem__, range(len(guesses))) if guess.is_readable]
+    proposals = [
+        with_candidate(problem, fresh, Candidate(component_of(response, guess), alternatives.of(guess.form), False))
+        for guess in threshold_like(problem, readable)
+    ]
+    best = -np.inf
+    for fitted in fit_hypotheses(proposals, response.window):
+        count = fitted.fit.count
+        variance_factor = residual_variance_factor([fitted.chi_square], count)
+        penalty = fitted.deviance(count, 1.0) - fitted.chi_square + len(problem.free) * np.log(count)
+        best = max(best, (response.chi_square - fitted.chi_square) / variance_factor - penalty)
     return best
 
 
-FEW, WORTHY = 3, 0.5  # parameters one of which might have moved, and their share of the best gain
-PARTS = 8  # of a window, to see where in it something has begun
-FAR_OFF = 20.0  # square of an innovation, in units of its noise: one record in a hundred thousand
-CALM = 5.0  # standard deviations of χ², up to which a part of a window looks as it should
-
-
-def search(problem: Problem, window: Window, prior: Prior, seen: ScreeningResult) -> list[FittedHypothesis]:
-    """Explanations of ``window``, of all reasons; the first one is that nothing has happened."""
-    names = ", ".join(entry.name for entry in problem.free if not entry.name.startswith("_"))
-    found = [fit_hypothesis(FaultHypothesis(FaultType.NOTHING), problem, window, prior)]
+def search(screening: ScreeningResult) -> list[FittedHypothesis]:
+    """Return hypotheses of all types, fitted to the screened window; the first one is that nothing has happened."""
+    problem, prior, window = screening.fitted.problem, screening.fitted.prior, screening.fitted.window
+    proposals = [nothing_happened(problem, prior)]
     if len(problem.free) > 1:
-        moved = FaultHypothesis(FaultType.PARAMETER, names, len(problem.free))
-        found.append(fit_hypothesis(moved, problem, window, initial_prior(problem), prior.mean))
-    found += _one_moved(problem, window, prior, seen.landscape)
-    found += [with_candidate(problem, window, prior, entry) for entry in candidates(problem, seen.landscape, window)]
-    best = min((entry for entry in found if entry.reason is FaultType.COMPONENT), key=_left, default=None)
-    while best is not None and len(best.problem.components) < SLOTS:
-        more = _further(best, window)
-        if more is None:
-            break
-        found.append(more)
-        best = more
-    if seen.lacking or not _convinces(found):
-        found += _always_lacking(problem, window, prior)
-    return found
+        proposals.append(all_parameters_moved(problem, prior.mean))
+    proposals += _one_parameter_moved(problem, prior, screening.response)
+    proposals += [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
+    fitted = fit_hypotheses(proposals, window)
+    components = [item for item in fitted if item.type is FaultType.COMPONENT]
+    best = min(components, key=_chi_square, default=None)
+    while best is not None and len(best.problem.components) < MAX_COMPONENTS:
+        best = _with_another_component(best)
+        fitted += [] if best is None else [best]
+    if screening.always_lacking or not _is_convincing(fitted):
+        fitted += _always_lacking(fitted[0])
+    return fitted
 
 
-def _convinces(found: list[FittedHypothesis]) -> bool:
-    """Whether one of them explains the window, by one component at most, and clearly better than nothing does."""
-    records = found[0].informed.count
-    left = residual_variance_factor((entry.chi_square for entry in found), records)
-    best = min(found, key=lambda entry: entry.deviance(records, left))
-    gained = found[0].deviance(records, left) - best.deviance(records, left)
-    more = len(best.problem.components) - len(found[0].problem.components)
-    return gained > CLEARLY and more <= 1 and best.chi_square <= EXPLAINED**2 * records
+def _chi_square(fitted: FittedHypothesis) -> float:
+    return fitted.chi_square
 
 
-def _always_lacking(problem: Problem, window: Window, prior: Prior) -> list[FittedHypothesis]:
-    """The twin may have lacked something from the first window on, and what is known of parameters be wrong for it."""
-    names = ", ".join(entry.label for entry in problem.free)
-    fresh = initial_prior(problem)
-    moved = fit_hypothesis(
-        FaultHypothesis(FaultType.PARAMETER, names, len(problem.free)), problem, window, fresh, prior.mean
-    )
-    seen = screening_test(problem, window, fresh, moved.fit.guess)
-    if seen.gain <= 0.0:
-        return []
-    tried = [entry for entry in candidates(problem, seen.landscape, window) if not entry.of_sensor]
-    return [with_candidate(problem, window, fresh, entry, moved) for entry in tried]
+def _is_convincing(fitted: list[FittedHypothesis]) -> bool:
+    """Whether one hypothesis with at most one component explains the window, decisively better than nothing."""
+    null, records = fitted[0], fitted[0].fit.count
+    variance_factor = residual_variance_factor(map(_chi_square, fitted), records)
+    best = min(fitted, key=lambda item: item.deviance(records, variance_factor))
+    gain = null.deviance(records, variance_factor) - best.deviance(records, variance_factor)
+    added = len(best.problem.components) - len(null.problem.components)
+    return gain > DECISIVE and added <= 1 and best.chi_square <= EXPLAINED**2 * records
 
 
-def _one_moved(problem: Problem, window: Window, prior: Prior, landscape: LinearResponse) -> list[FittedHypothesis]:
-    """One parameter may have moved, be it estimated or taken as known: those that would explain most."""
+def _one_parameter_moved(problem: Problem, prior: Prior, response: LinearResponse) -> list[Proposal]:
+    """Propose that one parameter, estimated or known, has moved: those that would explain most."""
     known = dict(problem.known)
     given = [
-        replace(entry, nominal=known[entry.name])
-        for entry in base_model(problem).parameters
-        if entry.name in known and entry.low < known[entry.name] < entry.high
+        replace(parameter, nominal=known[parameter.name])
+        for parameter in base_model(problem).parameters
+        if parameter.name in known and parameter.low < known[parameter.name] < parameter.high
     ]
-    all_of_them = [*problem.free, *given]
-    gains = landscape.parameter_gains([entry.name for entry in all_of_them])
-    found = []
-    for index in np.argsort(-gains, kind="stable")[:FEW].tolist():
-        if gains[index] <= WORTHY * gains.max(initial=0.0):
+    parameters = [*problem.free, *given]
+    gains = response.score_parameters([parameter.name for parameter in parameters])
+    proposals = []
+    for index in np.argsort(-gains, kind="stable")[:MAX_MOVED].tolist():
+        if gains[index] <= MIN_MOVED_SHARE * gains.max(initial=0.0):
             continue
-        entry = all_of_them[index]
-        claim = FaultHypothesis(FaultType.PARAMETER, entry.label, 1, float(len(all_of_them)))
+        parameter = parameters[index]
+        moved = FaultHypothesis(FaultType.PARAMETER, parameter.label, 1, float(len(parameters)))
         if index < len(problem.free):
-            found.append(fit_hypothesis(claim, problem, window, _but_for(prior, problem, index), prior.mean))
+            proposals.append(Proposal(moved, problem, forget_parameter(prior, problem, index), prior.mean))
         else:
-            rest = tuple(pair for pair in problem.known if pair[0] != entry.name)
-            wider = replace(problem, free=(*problem.free, entry), known=rest)
-            found.append(fit_hypothesis(claim, wider, window, extend_prior(prior, problem, wider)))
-    return found
+            rest = tuple(pair for pair in problem.known if pair[0] != parameter.name)
+            wider = replace(problem, free=(*problem.free, parameter), known=rest)
+            extended = extend_prior(prior, problem, wider)
+            proposals.append(Proposal(moved, wider, extended, extended.mean))
+    return proposals
 
 
-def _but_for(prior: Prior, problem: Problem, index: int) -> Prior:
-    """What is known, but nothing of one parameter."""
-    mean, covariance, fresh = prior.mean.copy(), prior.covariance.copy(), initial_prior(problem)
-    for at in (index, index + len(problem.free)):
-        mean[at] = fresh.mean[at]
-        covariance[at, :] = covariance[:, at] = 0.0
-        covariance[at, at] = fresh.covariance[at, at]
-    return Prior(mean, covariance)
+def _with_another_component(best: FittedHypothesis) -> FittedHypothesis | None:
+    """Return the best hypothesis with one more component of the machine, or None if it gains nothing decisive."""
+    window = best.fit.window
+    screening = screening_test(best.fit.linearised_at_end())
+    if not screening.is_positive:
+        return None
+    candidates = [candidate for candidate in find_candidates(screening.response) if not candidate.of_sensor]
+    proposals = [
+        with_candidate(best.problem, best.fit.prior, candidate, best) for candidate in candidates[: MAX_CANDIDATES // 2]
+    ]
+    further = min(fit_hypotheses(proposals, window), key=_chi_square, default=None)
+    if further is None:
+        return None
+    records = best.fit.count
+    gain = best.deviance(records, 1.0) - further.deviance(records, 1.0)
+    return further if gain / residual_variance_factor([further.chi_square], records) > DECISIVE else None
 
 
-def onset(problem: Problem, window: Window, prior: Prior) -> int:
-    """The record at which a window begins that the twin as it was does not foretell; 0 if it is so from the start."""
-    calm: FittedHypothesis | None = None
+def _always_lacking(null: FittedHypothesis) -> list[FittedHypothesis]:
+    """Fit components under the initial prior: a twin that always lacked one has wrong parameters."""
+    problem, window = null.problem, null.fit.window
+    (moved,) = fit_hypotheses([all_parameters_moved(problem, null.fit.prior.mean)], window)
+    screening = screening_test(moved.fit.linearised_at_end())
+    if not screening.is_positive:
+        return []
+    candidates = [candidate for candidate in find_candidates(screening.response) if not candidate.of_sensor]
+    proposals = [with_candidate(problem, moved.fit.prior, candidate, moved) for candidate in candidates]
+    return fit_hypotheses(proposals, window)
+
+
+def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple[Posterior, list[FittedHypothesis]]:
+    """Search the screened window from the record at which something begins that the prediction does not explain.
+
+    Return the prediction there, and the hypotheses. What begins in the last records is left to the next window: then
+    the null hypothesis is the only one.
+    """
+    window = screening.fitted.window
+    onset = find_onset(predicted, window)
+    if not onset:
+        return predicted, search(screening)
+    first = max(min(onset, window.records - MIN_RECORDS_AFTER), 0)
+    later, rest = _advance_phases(predicted, window, first), window.since(first)
+    problem, prior = later.problem, later.prior()
+    if window.records - onset < MIN_RECORDS_AFTER:
+        return later, fit_hypotheses([nothing_happened(problem, prior)], rest)
+    return later, search(screening_test(linearised(problem, rest, prior, prior.mean)))
+
+
+def find_onset(predicted: Posterior, window: Window) -> int:
+    """Return the record of the onset, or 0 if there is none within the window."""
+    as_predicted: FittedHypothesis | None = None
     record = 0
+    null = nothing_happened(predicted.problem, predicted.prior())
     for part in range(1, PARTS + 1):
         end = window.records * part // PARTS
-        tried = fit_hypothesis(FaultHypothesis(FaultType.NOTHING), problem, window.until(end), prior)
-        count = tried.informed.count
-        if tried.chi_square > count + CALM * np.sqrt(2.0 * count):
+        (fitted,) = fit_hypotheses([null], window.until(end))
+        count = fitted.fit.count
+        if fitted.chi_square > count + EXPECTED_SPREAD * np.sqrt(2.0 * count):
             break
-        calm, record = tried, end
-    else:  # all of it is, in itself, as it could be
+        as_predicted, record = fitted, end
+    else:
         return 0
-    if calm is None:
+    if as_predicted is None:
         return 0
-    # On from where all was well, as if it had stayed so: the first record that is far off.
-    following = window.until(min(record + window.records // PARTS, window.records))
-    objective = Objective(problem, following, calm.fit.guess[: len(problem.free)])
-    free = len(problem.free)
-    still = np.concatenate([calm.fit.guess[:free], calm.fit.guess[2 * free :]])
-    off = (objective.residuals(objective.predict(still[None]))[0] ** 2).max(axis=1) > FAR_OFF
-    late = np.flatnonzero(off & (np.arange(following.records) >= record))
-    return int(late[0]) if len(late) else following.records
+    return _first_far_off(as_predicted, window.until(min(record + window.records // PARTS, window.records)), record)
 
 
-def _left(found: FittedHypothesis) -> float:
-    return found.chi_square
+def _first_far_off(fitted: FittedHypothesis, window: Window, record: int) -> int:
+    """Return the first record from ``record`` on that is far off the continued simulation of the fit."""
+    guess, free = fitted.fit.result.guess, len(fitted.problem.free)
+    objective = Objective(fitted.problem, window, guess[:free])
+    constant = np.concatenate([guess[:free], guess[2 * free :]])
+    squared = (objective.residuals(objective.predict(constant[None]))[0] ** 2).max(axis=1)
+    late = np.flatnonzero((squared > FAR_OFF) & (np.arange(window.records) >= record))
+    return int(late[0]) if len(late) else window.records
 
 
-def _further(best: FittedHypothesis, window: Window) -> FittedHypothesis | None:
-    """The best explanation with one more component of the machine, if that is worth it."""
-    seen = screening_test(best.problem, window, best.prior, best.fit.guess)
-    if seen.gain <= 0.0:
-        return None
-    tried = [entry for entry in candidates(best.problem, seen.landscape, window) if not entry.of_sensor][: TRIED // 2]
-    more = [with_candidate(best.problem, window, best.prior, entry, best) for entry in tried]
-    found = min(more, key=_left, default=None)
-    if found is None:
-        return None
-    records = best.informed.count
-    gained = best.deviance(records, 1.0) - found.deviance(records, 1.0)
-    return found if gained / residual_variance_factor([found.chi_square], records) > CLEARLY else None
+def _advance_phases(predicted: Posterior, window: Window, first: int) -> Posterior:
+    """Return the prediction with phases at record ``first``."""
+    problem = predicted.problem
+    if not first or not problem.components:
+        return predicted
+    before = window.until(first)
+    (fitted,) = fit_hypotheses([nothing_happened(problem, predicted.prior())], before)
+    return predicted.propagate_phases(fitted.fit.advance(), window.since(first))

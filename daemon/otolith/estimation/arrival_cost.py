@@ -1,14 +1,12 @@
-"""What is believed of the parameters before a window: the arrival cost of moving-horizon estimation.
+"""The arrival cost: what is known of the parameters before a window, and the window's objective together with it.
 
 (C. V. Rao, J. B. Rawlings, D. Q. Mayne, Constrained state estimation for nonlinear discrete-time systems: stability and
 moving horizon approximations, IEEE Transactions on Automatic Control 48, 2003.)
 
-How far the linear picture of a window holds: what bends within the interval is not known to the last digit.
-
-Parameters that are traded lie on a long ridge, and a ridge bends. Around its best point the window seems to know some
-combination of them far better than it does, because the combination changes along the ridge. The second-order change of
-the residuals, one standard deviation away in every direction, is therefore counted as noise (the modified Gaussian
-second-order filter: A. H. Jazwinski, Stochastic Processes and Filtering Theory, section 9.3).
+A window is nonlinear in its parameters. Correlated parameters lie on a long curved ridge, and the linear approximation
+at its best point claims too much. The second-order change of the residuals, one standard deviation away in every
+direction, therefore counts as noise (modified Gaussian second-order filter: A. H. Jazwinski, Stochastic Processes and
+Filtering Theory, section 9.3).
 """
 
 from dataclasses import dataclass
@@ -20,40 +18,10 @@ from otolith.estimation.gauss_newton import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 
-SLIGHT = 1e-12  # relative eigenvalue of a direction that is not uncertain at all
-
-
-def bends(objective: Objective, guess: Array, jacobian: Array) -> Array:
-    """(residuals, directions) second-order change of the residuals, one standard deviation from ``guess`` (guess,).
-
-    ``jacobian`` (rows, guess) is of everything that holds the guess in place, the prior included.
-    """
-    if not np.isfinite(jacobian).all():
-        return np.zeros((len(objective.measured.ravel()), 0))
-    size = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
-    _, singular, directions = np.linalg.svd(jacobian / size, full_matrices=False)
-    seen = singular > SLIGHT * singular[0]
-    steps = directions[seen] / singular[seen, None] / size
-    around = np.vstack([guess + steps, guess - steps, guess[None]])
-    inside = np.clip(around, objective.low, objective.high)
-    with np.errstate(over="ignore", invalid="ignore"):
-        found = objective.residuals(objective.predict(inside)).reshape(len(around), -1)
-        count = len(steps)
-        change = 0.5 * (found[:count] + found[count : 2 * count]) - found[-1]
-    return np.where(np.isfinite(change).all(axis=1)[:, None], change, 0.0).T
-
-
-def discounted(root: Array, rest: Array, bent: Array) -> tuple[Array, Array]:
-    """``root`` (rows, columns) and ``rest`` (rows,) with ``bent`` (rows, directions) as noise beside the unit one."""
-    # The inverse root of the whole covariance: whatever the size of what bends, rounding does not make it singular.
-    along, sizes, _ = np.linalg.svd(bent, full_matrices=False)
-    share = 1.0 - 1.0 / np.hypot(1.0, sizes)
-    return root - (along * share) @ (along.T @ root), rest - (along * share) @ (along.T @ rest)
-
-
-FASTEST = 1e-3  # 1/s: standard deviation of a trend that nothing is known of, in shares of the parameter's size
-TREND_REACH = 1.0  # 1/s: no parameter changes by more than its own size in a second
-UNSEEN = 1e-10  # relative singular value under which the initial state is not seen
+INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative to the parameter's size
+MAX_TREND = 1.0  # 1/s: bound of a trend, relative to the parameter's size
+MIN_STATE_SINGULAR = 1e-10  # relative singular value below which a window does not determine the initial state
+MIN_SINGULAR = 1e-12  # relative singular value below which a direction has no uncertainty to speak of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,101 +36,134 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What a window says of parameters and trends: residuals of unit variance, linear around ``point``.
+    """What a window says of parameters and trends, the initial state eliminated.
 
-    They are ``rest + root @ (z - point)``: the square-root information form (G. J. Bierman, Factorization Methods for
-    Discrete Sequential Estimation, chapter V), the initial state eliminated.
+    Square-root information form (G. J. Bierman, Factorization Methods for Discrete Sequential Estimation, chapter V):
+    ``residual + sqrt_information @ (z - point)`` has unit variance for the true ``z``.
     """
 
     point: Array
     """(2 free,)."""
-    root: Array
+    sqrt_information: Array
     """(2 free, 2 free)."""
-    rest: Array
+    residual: Array
     """(2 free,)."""
 
 
 def initial_prior(problem: Problem) -> Prior:
-    """All that is known before the first window: the machine file's values and bounds."""
+    """Return the prior before the first window, from the values and bounds of the machine file."""
     low, high = problem.bounds
-    deviations = np.concatenate([(high - low) / np.sqrt(12.0), FASTEST * problem.scale])
+    deviations = np.concatenate([(high - low) / np.sqrt(12.0), INITIAL_TREND_SD * problem.scale])
     return Prior(np.concatenate([problem.nominal, np.zeros(len(low))]), np.diag(deviations**2))
 
 
-def whitening(covariance: Array) -> Array:
-    """(n, n) what makes deviations of this ``covariance`` (n, n) independent and of unit variance."""
-    size = np.sqrt(np.diag(covariance))
-    factor = np.linalg.cholesky(covariance / np.outer(size, size))
-    return np.asarray(np.linalg.inv(factor) / size)
+def extend_prior(prior: Prior, problem: Problem, wider: Problem) -> Prior:
+    """Return ``prior`` of ``problem`` for ``wider``, whose additional parameters have the initial prior."""
+    extended, free = initial_prior(wider), len(wider.free)
+    order = [parameter.name for parameter in wider.free]
+    columns = [order.index(parameter.name) for parameter in problem.free]
+    columns += [free + column for column in columns]
+    extended.mean[columns] = prior.mean
+    extended.covariance[np.ix_(columns, columns)] = prior.covariance
+    return extended
 
 
-def eliminate_states(rows: Array, slopes: Array) -> Array:
-    """``rows`` (residuals, columns) less all that the initial state could make of them.
-
-    ``slopes`` (residuals, states) are of the residuals by the initial state, in shares of what it may be.
-    """
-    states, singular, _ = np.linalg.svd(slopes, full_matrices=False)
-    seen = states[:, singular > UNSEEN * max(singular.max(initial=0.0), 1.0)]
-    return np.asarray(rows - seen @ (seen.T @ rows))
+def forget_parameter(prior: Prior, problem: Problem, index: int) -> Prior:
+    """Return ``prior`` with the initial prior for one parameter and its trend."""
+    mean, covariance, fresh = prior.mean.copy(), prior.covariance.copy(), initial_prior(problem)
+    for at in (index, index + len(problem.free)):
+        mean[at] = fresh.mean[at]
+        covariance[at, :] = covariance[:, at] = 0.0
+        covariance[at, at] = fresh.covariance[at, at]
+    return Prior(mean, covariance)
 
 
 class MapObjective:
-    """The objective of a window together with the prior; a guess is parameters at the end, trends, initial state."""
+    """The objective of a window plus the prior. A guess holds parameters at the end, trends, and the initial state."""
 
     def __init__(self, objective: Objective, problem: Problem, prior: Prior) -> None:
         free = objective.free
-        reach = TREND_REACH * problem.scale
+        reach = MAX_TREND * problem.scale
         self.low = np.concatenate([objective.low[:free], -reach, objective.low[free:]])
         self.high = np.concatenate([objective.high[:free], reach, objective.high[free:]])
         self._objective = objective
         self._mean = prior.mean
-        self._root = whitening(prior.covariance)
+        self._whitening = _whitening(prior.covariance)
 
     def guess(self, parameters: Array, initial: Array) -> Array:
-        """(guess,) from (free,) and (states,), with the trends of the prior."""
+        """Return the guess of ``parameters`` (free,) and ``initial`` (states,) with the trends of the prior."""
         return np.concatenate([parameters, self._mean[len(parameters) :], initial])
 
-    def linearised(self, guess: Array) -> tuple[Array, Array]:
-        """(guess,) -> residuals of the window, then of the prior, and their derivatives."""
-        residuals, jacobian = self._objective.drifting(guess)
+    def linearise(self, guess: Array) -> tuple[Array, Array]:
+        """Return the residuals of the window, then of the prior, and their derivatives."""
+        residuals, jacobian = self._objective.linearise_with_trends(guess)
         count = len(self._mean)
-        believed = np.zeros((count, len(guess)))
-        believed[:, :count] = self._root
-        off = self._root @ (guess[:count] - self._mean)
-        return np.concatenate([residuals, off]), np.vstack([jacobian, believed])
+        prior_jacobian = np.zeros((count, len(guess)))
+        prior_jacobian[:, :count] = self._whitening
+        prior_residuals = self._whitening @ (guess[:count] - self._mean)
+        return np.concatenate([residuals, prior_residuals]), np.vstack([jacobian, prior_jacobian])
 
-    def chi_square(self, fit: FitResult) -> float:
-        """Of the window alone."""
-        own = fit.residuals[: -len(self._mean)]
-        return float(own @ own)
+    def window_residuals(self, fit: FitResult) -> Array:
+        """Return the residuals of the window without those of the prior."""
+        return fit.residuals[: -len(self._mean)]
 
-    @property
-    def count(self) -> float:
-        """Measured records of all outputs."""
-        return self._objective.count
-
-    def whitened(self, fit: FitResult) -> Array:
-        """(records, outputs) what is left of the window, in units of the noise."""
-        return fit.residuals[: -len(self._mean)].reshape(self._objective.measured.shape)
-
-    def last_state(self, fit: FitResult) -> Array:
-        """(states,) at the last record."""
-        return self._objective.followed(fit.guess)[1]
-
-    def evidence(self, fit: FitResult, grown: float) -> Evidence:
-        """What the window says around ``fit``, with standard deviations ``grown`` by what is left unexplained."""
+    def evidence(self, fit: FitResult, inflation: float) -> Evidence:
+        """Return what the window says around ``fit``; ``inflation`` multiplies its standard deviations."""
         count = len(self._mean)
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
-        both = np.column_stack([jacobian[:, :count], residuals, self._bends(fit)])
-        both = eliminate_states(both, jacobian[:, count:] * (self.high - self.low)[count:])
-        directions, triangle = np.linalg.qr(both[:, :count])
-        rest = directions.T @ both[:, count:]
-        root, rest = discounted(triangle / grown, rest[:, 0] / grown, rest[:, 1:])
-        return Evidence(fit.guess[:count], root, rest)
+        constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])
+        curvature = second_order_change(self._objective, fit.guess[constant], fit.jacobian[:, constant])
+        columns = np.column_stack([jacobian[:, :count], residuals, curvature])
+        columns = eliminate_states(columns, jacobian[:, count:] * (self.high - self.low)[count:])
+        basis, triangle = np.linalg.qr(columns[:, :count])
+        rest = basis.T @ columns[:, count:]
+        root, residual = _with_noise(triangle / inflation, rest[:, 0] / inflation, rest[:, 1:])
+        return Evidence(fit.guess[:count], root, residual)
 
-    def _bends(self, fit: FitResult) -> Array:
-        """(residuals, directions) how the window bends away from the linear picture around ``fit``."""
-        count = len(self._mean)
-        free = count // 2
-        still = np.concatenate([np.arange(free), np.arange(count, len(fit.guess))])
-        return bends(self._objective, fit.guess[still], fit.jacobian[:, still])
+
+def eliminate_states(rows: Array, slopes: Array) -> Array:
+    """Return ``rows`` (residuals, columns) minus their projection on what the initial state can explain.
+
+    ``slopes`` (residuals, states) are the derivatives by the initial state, relative to the width of its bounds.
+    """
+    states, singular, _ = np.linalg.svd(slopes, full_matrices=False)
+    basis = states[:, singular > MIN_STATE_SINGULAR * max(singular.max(initial=0.0), 1.0)]
+    return np.asarray(rows - basis @ (basis.T @ rows))
+
+
+def second_order_change(objective: Objective, guess: Array, jacobian: Array) -> Array:
+    """Return the second-order change (residuals, directions) of the residuals, one standard deviation from ``guess``.
+
+    ``jacobian`` (rows, guess) includes the rows of the prior.
+    """
+    if not np.isfinite(jacobian).all():
+        return np.zeros((len(objective.measured.ravel()), 0))
+    size = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
+    _, singular, directions = np.linalg.svd(jacobian / size, full_matrices=False)
+    kept = singular > MIN_SINGULAR * singular[0]
+    steps = directions[kept] / singular[kept, None] / size
+    around = np.vstack([guess + steps, guess - steps, guess[None]])
+    inside = np.clip(around, objective.low, objective.high)
+    with np.errstate(over="ignore", invalid="ignore"):
+        residuals = objective.residuals(objective.predict(inside)).reshape(len(around), -1)
+        count = len(steps)
+        change = 0.5 * (residuals[:count] + residuals[count : 2 * count]) - residuals[-1]
+    return np.where(np.isfinite(change).all(axis=1)[:, None], change, 0.0).T
+
+
+def _with_noise(root: Array, residual: Array, noise: Array) -> tuple[Array, Array]:
+    """Whiten ``root`` (rows, columns) and ``residual`` (rows,) again, with additional ``noise`` (rows, directions).
+
+    The inverse square root of the covariance I + N Nᵀ is formed from the singular values of N, so that rounding cannot
+    make it singular.
+    """
+    basis, sizes, _ = np.linalg.svd(noise, full_matrices=False)
+    share = 1.0 - 1.0 / np.hypot(1.0, sizes)
+    return root - (basis * share) @ (basis.T @ root), residual - (basis * share) @ (basis.T @ residual)
+
+
+def _whitening(covariance: Array) -> Array:
+    """Return the matrix (n, n) that makes deviations of ``covariance`` (n, n) independent with unit variance."""
+    size = np.sqrt(np.diag(covariance))
+    factor = np.linalg.cholesky(covariance / np.outer(size, size))
+    return np.asarray(np.linalg.inv(factor) / size)

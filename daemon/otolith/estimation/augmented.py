@@ -1,4 +1,4 @@
-"""How a twin is completed by components, and how they are written down (Eq. 3)."""
+"""The augmented twin: components in the slots of a twin (Eq. 3 of the paper), and their equations as text."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,125 +9,138 @@ from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Component, Problem
 from otolith.twin.augmentation import (
     ELAPSED,
-    SLOTS,
-    Source,
-    family,
-    numbers,
-    place,
-    shift,
+    MAX_COMPONENTS,
+    ComponentSource,
+    augmented_model,
+    component_parameters,
+    family_setting,
+    shift_setting,
+    site_setting,
     sites,
+    source_setting,
     sources,
-    weight,
-    with_slots,
 )
-from otolith.twin.component_families import code_of
+from otolith.twin.component_families import family_code
 from otolith.twin.definition import Definition, Parameter, Site
 
-REACH = 10.0  # times what was found: how large an amplitude may become
-STRETCH = 3.0  # times what was found: how far an inner number may move
-TURNS = 4.0 * np.pi  # rad: bounds of a phase, which is brought back between -pi and pi after every window
+AMPLITUDE_BOUND = 10.0  # times the discovered amplitude
+INNER_BOUND = 3.0  # times the discovered inner parameter, up and down
+PHASE_BOUND = 4.0 * np.pi  # rad; every window brings the phase back between -pi and pi
 
 
 def site_of(twin: Definition, name: str) -> Site:
-    """By its name; ``twin`` is the author's."""
-    return next(entry for entry in sites(twin) if entry.name == name)
+    """Return the site of that name; ``twin`` is the base model."""
+    return next(site for site in sites(twin) if site.name == name)
 
 
-def source_of(twin: Definition, name: str) -> Source:
-    """By its name; ``twin`` is the author's."""
-    return next(entry for entry in sources(twin) if entry.name == name)
+def source_of(twin: Definition, name: str) -> ComponentSource:
+    """Return the source of that name; ``twin`` is the base model."""
+    return next(source for source in sources(twin) if source.name == name)
 
 
 def base_model(problem: Problem) -> Definition:
-    """The author's twin."""
-    return problem.twin.plain or problem.twin
+    """Return the twin without slots for components."""
+    return problem.twin.base or problem.twin
 
 
 def augment(problem: Problem, components: Sequence[Component]) -> Problem:
-    """The problem with ``components`` in its twin, in addition to those it has; their numbers are free.
+    """Return the problem with ``components`` added to those in its twin; their values are free parameters.
 
     Raises:
-        ValueError: there are more than a twin has slots.
+        ValueError: more components than the twin has slots.
     """
     twin, together = base_model(problem), (*problem.components, *components)
-    if len(together) > SLOTS:
-        raise ValueError(f"{len(together)} components: a twin has {SLOTS} slots")
-    free = [entry for entry in problem.free if not entry.name.startswith("_")]
-    kept = {entry.name: entry for entry in problem.free if entry.name.startswith("_")}
-    known = [entry for entry in problem.known if not entry[0].startswith("_")]
+    if len(together) > MAX_COMPONENTS:
+        raise ValueError(f"{len(together)} components: a twin has {MAX_COMPONENTS} slots")
+    free = [parameter for parameter in problem.free if not parameter.name.startswith("_")]
+    kept = {parameter.name: parameter for parameter in problem.free if parameter.name.startswith("_")}
+    known = [pair for pair in problem.known if not pair[0].startswith("_")]
     for slot, component in enumerate(together):
         known += _settings(twin, slot, component).items()
-        free += [kept.get(entry.name, entry) for entry in _numbers(twin, slot, component)]
-    return replace(problem, twin=with_slots(twin), free=tuple(free), known=tuple(known), components=together)
+        free += [kept.get(parameter.name, parameter) for parameter in _free_values(twin, slot, component)]
+    return replace(problem, twin=augmented_model(twin), free=tuple(free), known=tuple(known), components=together)
 
 
-def without(problem: Problem, gone: Component) -> Problem:
-    """The problem without one of its components."""
-    rest = [entry for entry in problem.components if entry is not gone]
+def without(problem: Problem, removed: Component) -> Problem:
+    """Return the problem without one of its components."""
+    rest = [component for component in problem.components if component is not removed]
     bare = replace(
         problem,
         twin=base_model(problem),
         components=(),
-        free=tuple(entry for entry in problem.free if not entry.name.startswith("_")),
-        known=tuple(entry for entry in problem.known if not entry[0].startswith("_")),
+        free=tuple(parameter for parameter in problem.free if not parameter.name.startswith("_")),
+        known=tuple(pair for pair in problem.known if not pair[0].startswith("_")),
     )
     return augment(bare, rest) if rest else bare
 
 
 def _settings(twin: Definition, slot: int, component: Component) -> dict[str, float]:
-    at = [entry.name for entry in sites(twin)].index(component.site)
-    found = {family(slot): code_of(component.family), place(slot, at): 1.0}
-    source = [entry.name for entry in sources(twin)].index(component.source)
-    given = {numbers(slot)[1]: component.inner} if component.model.given is not None else {}
-    return found | given | ({weight(slot, source): 1.0} if source else {})
+    """Return the known parameters that select family, site and source of a slot."""
+    at = [site.name for site in sites(twin)].index(component.site)
+    settings = {family_setting(slot): family_code(component.family), site_setting(slot, at): 1.0}
+    source = [source.name for source in sources(twin)].index(component.source)
+    given = {component_parameters(slot)[1]: component.inner} if component.model.fixed_inner is not None else {}
+    return settings | given | ({source_setting(slot, source): 1.0} if source else {})
 
 
-def _numbers(twin: Definition, slot: int, component: Component) -> list[Parameter]:
-    """The free numbers of a component as parameters."""
-    amplitude, inner, phase = numbers(slot)
-    unit, row = site_of(twin, component.site).unit, component.model
-    reach = REACH * abs(component.amplitude)
-    low = 0.0 if component.repeats else -reach
-    found = [Parameter(amplitude, unit, component.amplitude, low, reach, f"amplitude of {component.key}")]
-    if row.inner is not None:
-        unit = row.inner.unit.format(x=source_of(twin, component.source).unit)
-        bounds = max(component.low, component.inner / STRETCH), min(component.high, component.inner * STRETCH)
-        found.append(Parameter(inner, unit, component.inner, *bounds, f"{row.inner.meaning} of {component.key}"))
-    if component.repeats:
-        found.append(Parameter(phase, "rad", component.phase, -TURNS, TURNS, f"phase of {component.key}"))
-    return found
+def _free_values(twin: Definition, slot: int, component: Component) -> list[Parameter]:
+    """Return amplitude, inner parameter and phase as free parameters, as far as the family has them."""
+    amplitude, inner, phase = component_parameters(slot)
+    unit, model = site_of(twin, component.site).unit, component.model
+    reach = AMPLITUDE_BOUND * abs(component.amplitude)
+    low = 0.0 if component.periodic else -reach
+    values = [Parameter(amplitude, unit, component.amplitude, low, reach, f"amplitude of {component.key}")]
+    if model.inner is not None:
+        unit = model.inner.unit.format(x=source_of(twin, component.source).unit)
+        bounds = max(component.low, component.inner / INNER_BOUND), min(component.high, component.inner * INNER_BOUND)
+        values.append(Parameter(inner, unit, component.inner, *bounds, f"{model.inner.meaning} of {component.key}"))
+    if component.periodic:
+        meaning = f"phase of {component.key}"
+        values.append(Parameter(phase, "rad", component.phase, -PHASE_BOUND, PHASE_BOUND, meaning))
+    return values
 
 
 def indices(problem: Problem, slot: int) -> list[int]:
-    """Where in a guess the numbers of a slot are: amplitude, then inner number and phase if it has them."""
-    names = [entry.name for entry in problem.free]
-    return [names.index(name) for name in numbers(slot) if name in names]
+    """Return where the values of a slot stand among the free parameters: amplitude, inner parameter, phase."""
+    names = [parameter.name for parameter in problem.free]
+    return [names.index(name) for name in component_parameters(slot) if name in names]
+
+
+def amplitude_indices(problem: Problem) -> list[int]:
+    """Return where the amplitudes of all components stand among the free parameters."""
+    return [indices(problem, slot)[0] for slot in range(len(problem.components))]
+
+
+def slot_of(problem: Problem, component: Component) -> int | None:
+    """Return the slot of a component, or None if the twin does not have it."""
+    keys = [other.key for other in problem.components]
+    return keys.index(component.key) if component.key in keys else None
 
 
 def time_offsets(problem: Problem, window: Window) -> dict[str, float]:
-    """The settings that count time from the origins of the components."""
-    found = {}
-    for slot, component in enumerate(problem.components):
-        if component.source == "t" and not component.repeats:
-            found[shift(slot)] = window.start - component.origin
-    return found
+    """Return the settings that count the time of a window from the origins of the components."""
+    return {
+        shift_setting(slot): window.start - component.origin
+        for slot, component in enumerate(problem.components)
+        if component.source == "t" and not component.periodic
+    }
 
 
 def input_matrix(twin: Definition, window: Window) -> Array:
-    """(records, inputs) of a twin, slotted or not."""
+    """Return the inputs (records, inputs) of a twin with or without slots."""
     columns = [np.zeros((window.records, 0))]
-    for entry in twin.inputs:
-        if entry.name == ELAPSED:
+    for source in twin.inputs:
+        if source.name == ELAPSED:
             columns.append(window.sample_period * np.arange(window.records, dtype=np.float64)[:, None])
-        elif entry.name.startswith("_"):
+        elif source.name.startswith("_"):
             columns.append(np.zeros((window.records, 1)))
         else:
-            columns.append(window.column(entry.name)[:, None])
+            columns.append(window.column(source.name)[:, None])
     return np.hstack(columns)
 
 
 def equation(twin: Definition, component: Component, values: Sequence[float]) -> str:
-    """As a person would write it, with ``values`` for amplitude, inner number and phase as far as it has them."""
+    """Return the component as text; ``values`` are amplitude, inner parameter and phase as far as it has them."""
     rest = [*values[1:], 0.0, 0.0]
     phase = f"{'−' if rest[1] < 0.0 else '+'} {abs(rest[1]):.2f}"
     text = component.model.equation.format(a=f"{values[0]:.4g}", b=f"{rest[0]:.4g}", c=phase, x=component.source)

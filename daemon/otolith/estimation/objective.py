@@ -1,10 +1,11 @@
-"""The objective of one window: how far a guess of parameters and initial state is from what was measured.
+"""The objective of one window: the whitened innovations of the twin, for any guess of parameters and initial state.
 
-What disturbs a real machine between records, and the predictor that knows it.
+The cost is the RMSE of section 3.2 of the paper, with each innovation divided by its standard deviation. A cost of one
+means that the twin explains the window up to the noise.
 
-Process noise comes from noisy inputs and from what strays in the states themselves. The Kalman gain weighs it against
-the sensors' noise; with it the twin predicts in innovation form (L. Ljung, System Identification, 2nd ed., sections 4.3
-and 7.4). Without process noise the gain is zero and the twin runs in open loop, the paper's cost.
+The predictor works in innovation form (L. Ljung, System Identification, 2nd ed., sections 4.3 and 7.4): after each
+record a Kalman gain corrects the state. The gain weighs process noise, which comes from noisy inputs and disturbed
+states, against sensor noise. Without process noise the gain is zero, and the twin runs in open loop: the paper's cost.
 """
 
 from dataclasses import replace
@@ -15,25 +16,33 @@ from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.augmented import input_matrix, time_offsets
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import MOST_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
+from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
+
+EXPLAINED = 1.5  # cost up to which the residual counts as noise
+INITIAL_STATE_REACH = 10.0  # standard deviations around the first record: least width of the bounds of a start
+TRUNCATION = 1e-3  # share of the noise: largest truncation error of the integrator
+PENALTY = 1e30  # cost of a guess whose prediction is not finite
+MAX_SUBSTEPS_WITH_COMPONENTS = 8  # no number of sub-steps makes the step of dry friction smooth
+ADC_TOLERANCE = 0.01  # share of a step: how far level differences may be from whole multiples of it
+MIN_ADC_LEVELS = 4  # levels in a window that show the step of a converter
 
 
 def predictor(
     kernel: Kernel, parameters: Array, initial: Array, excitation: Excitation, noise: NoiseModel
 ) -> InnovationModel:
-    """Along the window, around ``parameters`` (parameters,) and the initial state (states,).
+    """Return gain and whitening along the window, around ``parameters`` (parameters,) and ``initial`` (states,).
 
-    A twin that diverges there, or that nothing disturbs, runs in open loop.
+    A twin that diverges there, or that has no process noise, runs in open loop.
     """
     if noise.inputs.any() or noise.states.any():
-        found = kernel.correction(parameters, initial, excitation, noise)
-        if np.isfinite(found.gain).all() and np.isfinite(found.whitening).all():
-            return found
+        model = kernel.innovation_model(parameters, initial, excitation, noise)
+        if np.isfinite(model.gain).all() and np.isfinite(model.whitening).all():
+            return model
     return open_loop(kernel, excitation, noise)
 
 
 def open_loop(kernel: Kernel, excitation: Excitation, noise: NoiseModel) -> InnovationModel:
-    """Nothing is corrected, and each innovation is as uncertain as its sensor."""
+    """Return a zero gain and the whitening of the sensor noise alone."""
     if excitation.measured is None:
         raise ValueError("a predictor needs measurements")
     present = np.isfinite(excitation.measured)
@@ -43,214 +52,210 @@ def open_loop(kernel: Kernel, excitation: Excitation, noise: NoiseModel) -> Inno
     return InnovationModel(gain, whitening, float(-2.0 * np.log(scales).sum()))
 
 
-EXPLAINED = 1.5  # cost up to which the residual counts as noise: an explanation that leaves more explains too little
-INITIAL_STATE_REACH = 10.0  # standard deviations around the first record, in which the twin may start at least
-TRUNCATION = 1e-3  # of the noise: how large the integrator's error may be
-PENALTY = 1e30  # the cost of a guess whose prediction is not finite: worse than any other, and finite
-MOST_WITH_COMPONENTS = 8  # substeps: no number of them makes the step of dry friction smooth
-WHOLE = 0.01  # of a quantum: how far the steps between values may be from whole multiples of it
-FEWEST_LEVELS = 4  # that tell a converter's steps from a signal's own
-
-
 class Objective:
-    """The cost of guesses over one window: RMSE as in paper.txt section 3.2, of whitened innovations.
+    """Whitened innovations and cost of guesses over one window.
 
-    A guess is the free parameters, then the initial state: the first record is as noisy as any other, so the state it
-    shows is a nuisance parameter, estimated along with the rest. Innovations are divided by what they may be, so that
-    outputs of different units add up, and a cost of one means that the twin explains the window up to the noise.
+    A guess holds the free parameters, then the initial state. The first record is as noisy as any other, so the initial
+    state is a nuisance parameter, estimated along with the rest.
     """
 
     def __init__(self, problem: Problem, window: Window, start: Array, initial: Array | None = None) -> None:
-        """``start`` (free parameters,): around it the predictor is made, and around ``initial`` (states,) if given."""
+        """Build the predictor around ``start`` (free,) and ``initial`` (states,), by default the first record."""
         twin = problem.twin
         self.kernel = kernel_of(twin)
-        self.measured = np.column_stack([window.column(entry.name) for entry in twin.outputs])
-        self.present = ~np.column_stack([window.missing_in(entry.name) for entry in twin.outputs])
+        self.measured = np.column_stack([window.column(output.name) for output in twin.outputs])
+        self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
         self.count = max(float(self.present.sum()), 1.0)
-        self.noise = self._noise(problem)
+        """Measured values of all outputs."""
+        self.noise = self._noise_model(problem)
         lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
-        if problem.components:  # where a sensor that lies would have shown it, had it been right
+        if problem.components:  # a faulty sensor shows the first state far from where it is
             wider = np.where(highest > lowest, np.abs(self._first) + highest - lowest, 0.0)
             lowest, highest = lowest - wider, highest + wider
         given = dict(problem.known) | time_offsets(problem, window)
-        self._template = np.array([given.get(entry.name, entry.nominal) for entry in twin.parameters])
-        order = [entry.name for entry in twin.parameters[: len(twin.parameters) - twin.settings]]
-        self._places = [order.index(entry.name) for entry in problem.free]
-        self.free = len(self._places)
-        self._initial = [len(order) + index for index in range(len(twin.states))]
-        self._drifts = [len(order) + len(twin.states) + place for place in self._places]
+        self._template = np.array([given.get(parameter.name, parameter.nominal) for parameter in twin.parameters])
+        order = [parameter.name for parameter in twin.parameters[: len(twin.parameters) - twin.settings]]
+        self._free_columns = [order.index(parameter.name) for parameter in problem.free]
+        self.free = len(self._free_columns)
+        self._state_columns = [len(order) + index for index in range(len(twin.states))]
+        self._trend_columns = [len(order) + len(twin.states) + column for column in self._free_columns]
         low, high = problem.bounds
         self.low, self.high = np.concatenate([low, lowest]), np.concatenate([high, highest])
-        self.names = (*(entry.label for entry in problem.free), *(f"initial {state.name}" for state in twin.states))
+        states = (f"initial {state.name}" for state in twin.states)
+        self.names = (*(parameter.label for parameter in problem.free), *states)
         self._open_loop, self._states = problem.open_loop, len(twin.states)
-        self._most = MOST_SUBSTEPS if twin.plain is None else MOST_WITH_COMPONENTS
-        self._plain = twin.plain or twin
+        self._max_substeps = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
+        self._base = twin.base or twin
         self._excitation = Excitation(input_matrix(twin, window), window.sample_period)
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
-        self.centre(start, self._first if initial is None else initial)
+        self.set_predictor(start, self._first if initial is None else initial)
 
-    def centre(self, parameters: Array, initial: Array) -> None:
-        """Make the predictor around these (free parameters,), (states,): substeps, gain, whitening."""
+    def set_predictor(self, parameters: Array, initial: Array) -> None:
+        """Compute sub-steps, gain and whitening around ``parameters`` (free,) and ``initial`` (states,)."""
         full = self.parameters(parameters[None])[0]
         allowed = TRUNCATION * self.noise.outputs
-        plain = replace(self._excitation, gain=None, substeps=1)
+        uncorrected = replace(self._excitation, gain=None, substeps=1)
         while True:
-            made = self._correction(full, initial, plain)
-            corrected = replace(plain, gain=made.gain)
-            substeps = self.kernel.substeps(full, initial, corrected, allowed, self._most)
-            if substeps <= plain.substeps:  # else the gain was made by an integrator that is too coarse
+            model = self._innovation_model(full, initial, uncorrected)
+            corrected = replace(uncorrected, gain=model.gain)
+            substeps = self.kernel.substeps(full, initial, corrected, allowed, self._max_substeps)
+            if substeps <= uncorrected.substeps:  # otherwise the gain comes from too coarse an integrator
                 break
-            plain = replace(plain, substeps=substeps)
-        self.correction = made
+            uncorrected = replace(uncorrected, substeps=substeps)
+        self.innovation_model = model
         self._excitation = corrected
 
-    def _correction(self, parameters: Array, initial: Array, free: Excitation) -> InnovationModel:
-        """Of the plain twin: what components add hardly changes by how much a prediction may be off."""
-        twin = self._plain
-        made_for = replace(free, inputs=free.inputs[:, : len(twin.inputs)])
+    def _innovation_model(self, parameters: Array, initial: Array, excitation: Excitation) -> InnovationModel:
+        """Return gain and whitening of the base model: components hardly change the prediction error covariance."""
+        twin = self._base
+        reduced = replace(excitation, inputs=excitation.inputs[:, : len(twin.inputs)])
         parameters, initial = parameters[: len(twin.parameters)], initial[: len(twin.states)]
         kernel = kernel_of(twin)
-        made = (
-            open_loop(kernel, made_for, self.noise)
+        model = (
+            open_loop(kernel, reduced, self.noise)
             if self._open_loop
-            else predictor(kernel, parameters, initial, made_for, self.noise)
+            else predictor(kernel, parameters, initial, reduced, self.noise)
         )
-        more = self._states - len(twin.states)
-        return made._replace(gain=np.pad(made.gain, ((0, 0), (0, more), (0, 0)))) if more else made
+        extra = self._states - len(twin.states)
+        return model._replace(gain=np.pad(model.gain, ((0, 0), (0, extra), (0, 0)))) if extra else model
 
     @property
     def excitation(self) -> Excitation:
-        """What drives the twin, and what corrects it."""
+        """Inputs, measurements, gain and sub-steps of the predictor."""
         return self._excitation
 
     @property
     def whitening(self) -> Array:
-        """(records, outputs, outputs) makes each innovation's covariance the identity."""
-        return self.correction.whitening
+        """(records, outputs, outputs) matrices that make each innovation's covariance the identity."""
+        return self.innovation_model.whitening
 
     @property
-    def work(self) -> int:
+    def integrator_steps(self) -> int:
         """Steps of the integrator in one prediction."""
         return len(self.measured) * self._excitation.substeps
 
     def guess(self, parameters: Array) -> Array:
-        """(free parameters,) -> a guess that starts at the first record."""
+        """Return the guess (free + states,) of ``parameters`` (free,) that starts at the first record."""
         return np.concatenate([parameters, self._first])
 
-    def cost_of_parameters(self, parameters: Array) -> Array:
-        """(particles, free parameters) -> (particles,), every one started at the first record."""
-        starts = np.repeat(self._first[None, :], len(parameters), axis=0)
-        return self.cost(np.hstack([parameters, starts]))
-
     def parameters(self, guesses: Array) -> Array:
-        """(particles, guess) -> (particles, parameters of the twin)."""
-        found = np.repeat(self._template[None, :], len(guesses), axis=0)
-        found[:, self._places] = guesses[:, : self.free]
-        return found
+        """Return all parameters of the twin (particles, parameters) for guesses (particles, free, ...)."""
+        parameters = np.repeat(self._template[None, :], len(guesses), axis=0)
+        parameters[:, self._free_columns] = guesses[:, : self.free]
+        return parameters
 
-    def linearised(self, guess: Array) -> tuple[Array, Array]:
-        """(guess,) -> whitened residuals (residuals,) and their derivatives (residuals, guess).
+    def linearise(self, guess: Array) -> tuple[Array, Array]:
+        """Return whitened residuals (residuals,) and their derivatives (residuals, guess) at ``guess`` (guess,).
 
-        A prediction that is not finite gives residuals beyond hope, and no direction.
+        A prediction that is not finite gives very large residuals and zero derivatives.
         """
-        return self._linearised(guess, [*self._places, *self._initial])
+        return self._linearise(guess, [*self._free_columns, *self._state_columns])
 
-    def drifting(self, guess: Array) -> tuple[Array, Array]:
-        """The same with (free parameters at the end, their drifts per second, initial state) for a guess.
+    def linearise_with_trends(self, guess: Array) -> tuple[Array, Array]:
+        """Return the same for a guess of parameters at the end, their trends per second, and the initial state.
 
-        A drift enters to first order, as what it moves within a window is small.
+        A trend enters to first order: within a window it moves a parameter by little.
         """
         free = self.free
-        still = np.concatenate([guess[:free], guess[2 * free :]])
-        residuals, jacobian = self._linearised(still, [*self._places, *self._drifts, *self._initial])
+        constant = np.concatenate([guess[:free], guess[2 * free :]])
+        columns = [*self._free_columns, *self._trend_columns, *self._state_columns]
+        residuals, jacobian = self._linearise(constant, columns)
         return residuals + jacobian[:, free : 2 * free] @ guess[free : 2 * free], jacobian
 
-    def _linearised(self, guess: Array, columns: list[int]) -> tuple[Array, Array]:
+    def _linearise(self, guess: Array, columns: list[int]) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
         with np.errstate(over="ignore", invalid="ignore"):
             drifts = len(columns) > len(guess)
-            found = self.kernel.sensitivities(parameters, initial, self._excitation, drifts=drifts)
-            residuals = self.residuals(found.outputs[None])[0].ravel()
-            slopes = np.where(self.present[..., None], found.slopes[:, :, columns], 0.0)
+            prediction = self.kernel.sensitivities(parameters, initial, self._excitation, drifts=drifts)
+            residuals = self.residuals(prediction.outputs[None])[0].ravel()
+            slopes = np.where(self.present[..., None], prediction.slopes[:, :, columns], 0.0)
             jacobian = -np.matmul(self.whitening, slopes).reshape(len(residuals), -1)
         if np.isfinite(residuals).all() and np.isfinite(jacobian).all():
             return residuals, jacobian
         return np.full(len(residuals), PENALTY / len(residuals)), np.zeros(jacobian.shape)
 
     def predict(self, guesses: Array) -> Array:
-        """(particles, guess) -> (particles, records, outputs), one step ahead, in the units of the twin."""
+        """Return one-step predictions (particles, records, outputs), in the units of the twin."""
         initial = guesses[:, self.free :]
         return self.kernel.simulate(self.parameters(guesses), initial, self._excitation)
 
-    def followed(self, guess: Array) -> tuple[Array, Array]:
-        """(parameters at the end, drifts, initial state) -> prediction (records, outputs) and last state (states,)."""
+    def predict_with_trends(self, guess: Array) -> tuple[Array, Array]:
+        """Return prediction (records, outputs) and last state (states,) for a guess with trends."""
         free = self.free
         parameters = self.parameters(guess[None])[0]
-        found = self.kernel.sensitivities(parameters, guess[2 * free :], self._excitation, drifts=True)
-        return found.outputs + found.slopes[:, :, self._drifts] @ guess[free : 2 * free], found.last
+        prediction = self.kernel.sensitivities(parameters, guess[2 * free :], self._excitation, drifts=True)
+        trends = prediction.slopes[:, :, self._trend_columns] @ guess[free : 2 * free]
+        return prediction.outputs + trends, prediction.last
 
     def simulate(self, guess: Array) -> Array:
-        """(guess,) -> (records, outputs) in open loop, from its initial state on."""
-        free = replace(self._excitation, gain=None)
-        found: Array = self.kernel.simulate(self.parameters(guess[None]), guess[None, self.free :], free)[0]
-        return found
+        """Return the open-loop simulation (records, outputs) from the initial state of ``guess`` (guess,)."""
+        uncorrected = replace(self._excitation, gain=None)
+        simulated: Array = self.kernel.simulate(self.parameters(guess[None]), guess[None, self.free :], uncorrected)[0]
+        return simulated
 
     def residuals(self, predicted: Array) -> Array:
-        """(particles, records, outputs): whitened innovations, zero where not measured."""
+        """Return whitened innovations (particles, records, outputs), zero where nothing was measured."""
         innovations = np.where(self.present, self.measured - predicted, 0.0)
-        found: Array = np.einsum("rop,nrp->nro", self.whitening, innovations)
-        return found
+        whitened: Array = np.einsum("rop,nrp->nro", self.whitening, innovations)
+        return whitened
 
     def cost(self, guesses: Array) -> Array:
-        """(particles, guess) -> (particles,); a prediction that is not finite never wins."""
+        """Return the cost (particles,) of guesses (particles, guess); PENALTY where a prediction is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             errors = self.residuals(self.predict(guesses))
             cost = np.sqrt(np.einsum("pro,pro->p", errors, errors) / self.count)
         return np.where(np.isfinite(cost), np.minimum(cost, PENALTY), PENALTY)
 
+    def cost_of_parameters(self, parameters: Array) -> Array:
+        """Return the cost (particles,) of parameters (particles, free), each started at the first record."""
+        starts = np.repeat(self._first[None, :], len(parameters), axis=0)
+        return self.cost(np.hstack([parameters, starts]))
+
     def rmse(self, predicted: Array) -> Array:
-        """(records, outputs) -> (outputs,), each in its own unit, over the records that were measured."""
+        """Return the RMSE (outputs,) of a prediction (records, outputs), each in its unit, over measured records."""
         errors = np.where(self.present, self.measured - predicted, 0.0)
         counts = np.maximum(self.present.sum(axis=0), 1.0)
         return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
 
-    def _noise(self, problem: Problem) -> NoiseModel:
-        twin = problem.twin.plain or problem.twin
+    def _noise_model(self, problem: Problem) -> NoiseModel:
+        twin = problem.twin.base or problem.twin
         columns = zip(self.measured.T, self.present.T, strict=True)
-        quanta = np.array([adc_step(values[there]) for values, there in columns])
+        steps = np.array([adc_step(values[present]) for values, present in columns])
         return NoiseModel(
-            outputs=np.sqrt(np.array(problem.noise) ** 2 + quanta**2 / 12.0),
+            outputs=np.sqrt(np.array(problem.noise) ** 2 + steps**2 / 12.0),
             inputs=np.array(problem.input_noise or [0.0] * len(twin.inputs)),
             states=np.array(problem.process_noise or [0.0] * len(twin.states)),
         )
 
 
 def adc_step(values: Array) -> float:
-    """The step of a converter behind ``values`` (n,), as its rounding adds a twelfth of its square; 0 if none is seen.
+    """Return the step of the converter behind ``values`` (n,), or 0 if the values show none.
 
-    (B. Widrow, I. Kollar, Quantization Noise, section 4.4.)
+    Rounding to steps adds a twelfth of the squared step to the variance (B. Widrow, I. Kollar, Quantization Noise,
+    section 4.4).
     """
     levels = np.unique(values)
-    if len(levels) < FEWEST_LEVELS:
+    if len(levels) < MIN_ADC_LEVELS:
         return 0.0
     steps = np.diff(levels)
     multiples = steps / steps.min()
-    return float(steps.min()) if np.abs(multiples - np.rint(multiples)).max() <= WHOLE else 0.0
+    return float(steps.min()) if np.abs(multiples - np.rint(multiples)).max() <= ADC_TOLERANCE else 0.0
 
 
 def _initial_state(twin: Definition, measured: Array, present: Mask, noise: Array) -> tuple[Array, Array, Array]:
-    """(states,) lower bound, start and upper bound: around the first measurement where an output shows the state.
+    """Return lower bound, start and upper bound of the initial state, each (states,).
 
-    The bounds are as wide as the signal moves, as the first record may be missing or wrong.
+    A state that is an output starts at its first measurement. Its bounds are as wide as the signal moves, because the
+    first record may be missing or wrong.
     """
-    outputs = [entry.name for entry in twin.outputs]
+    outputs = [output.name for output in twin.outputs]
     rows = []
     for state in twin.states:
         index = outputs.index(state.name) if state.name in outputs else None
         if index is not None and present[:, index].any():
-            seen = measured[present[:, index], index]
-            first = float(seen[0])
-            reach = max(INITIAL_STATE_REACH * noise[index], float(np.ptp(seen)))
+            values = measured[present[:, index], index]
+            first = float(values[0])
+            reach = max(INITIAL_STATE_REACH * noise[index], float(np.ptp(values)))
             rows.append((first - reach, first, first + reach))
         else:
             rows.append((state.low, state.initial, state.high))

@@ -1,7 +1,4 @@
-"""What is to be estimated, the same for every window. Plain: it pickles.
-
-An unknown component, as it was found.
-"""
+"""The estimation problem of a machine: twin, known and free parameters, noise levels, components. Plain: it pickles."""
 
 from dataclasses import dataclass
 
@@ -11,53 +8,54 @@ from otolith.acquisition.window import Array
 from otolith.twin.component_families import ComponentFamily, family_of
 from otolith.twin.definition import Definition, Parameter
 
+MIN_SCALE = 0.01  # share of the width of the bounds: the size of a parameter whose nominal value is about zero
+
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """A component: where it enters, which family, of what, and its numbers when it was found."""
+    """A component that the twin lacks: site, family, source, and its values when it was discovered."""
 
     site: str
     family: str
     source: str
-    """Empty for nothing, ``t``, ``angle(omega)`` or the name of a signal or state."""
+    """Empty for none, ``t``, ``angle(omega)``, or the name of a signal or state."""
     amplitude: float
     """In the unit of the site."""
     inner: float = 0.0
+    """The family's nonlinear parameter: a frequency, an order, a rate or an exponent."""
     phase: float = 0.0
-    """rad, at the first record of the window it was found in."""
+    """rad, at the first record of the window of discovery."""
     low: float = 0.0
-    """Of the inner number."""
+    """Lower bound of the inner parameter."""
     high: float = 0.0
+    """Upper bound of the inner parameter."""
     origin: float = 0.0
-    """Unix seconds at which a time that does not repeat itself counts zero."""
+    """Unix seconds at which a source ``t`` that is not periodic counts zero."""
 
     @property
     def key(self) -> str:
-        """What tells it from others of the machine."""
+        """Identifies the component within the machine."""
         return key_of(self.site, self.family, self.source)
 
     @property
     def model(self) -> ComponentFamily:
-        """Its family."""
+        """The family."""
         return family_of(self.family)
 
     @property
-    def repeats(self) -> bool:
-        """Whether it has a phase."""
+    def periodic(self) -> bool:
+        """Whether the component has a phase."""
         return len(self.model.phases) > 1
 
 
 def key_of(site: str, family: str, source: str) -> str:
-    """``site/family/source``, without the source if there is none."""
+    """Return ``site/family/source``, without the source if there is none."""
     return f"{site}/{family}/{source}".rstrip("/")
-
-
-LEAST_SCALE = 0.01  # of the width of the bounds: what stands for the size of a parameter whose nominal value is about 0
 
 
 @dataclass(frozen=True, slots=True)
 class SwarmOptions:
-    """Particle swarm settings, Table 2 of the paper."""
+    """Particle swarm settings (Table 2 of the paper)."""
 
     size: int = 15
     generations: int = 1000
@@ -65,60 +63,60 @@ class SwarmOptions:
     cognitive: float = 2.0
     social: float = 2.0
     tolerance: float = 0.1
-    """The swarm is done when the best guesses of its particles lie within this share of χ²: all are in one valley then,
-    and the polish finds its floor."""
+    """The swarm has converged when the best positions of its particles differ by less than this share of χ²: then all
+    lie in one valley, and Gauss-Newton finds its minimum."""
 
 
 @dataclass(frozen=True, slots=True)
 class WindowOptions:
-    """How many records a window has."""
+    """Records per window."""
 
     records: int = 200
-    """Of the first, and of all if there is nothing to choose."""
+    """Of the first window, and of all windows if the length is fixed."""
     shortest: int = 200
     longest: int = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A machine's estimation problem."""
+    """What is estimated, from what, under which noise."""
 
     twin: Definition
     known: tuple[tuple[str, float], ...]
-    """Parameters that are given: name and value."""
+    """Name and value of each parameter that is given."""
     free: tuple[Parameter, ...]
-    """Parameters to be estimated, with the nominal values and bounds of this machine."""
+    """Parameters to estimate, with the nominal values and bounds of this machine."""
     noise: tuple[float, ...]
-    """Standard deviation of each output's sensor."""
+    """Standard deviation of the sensor of each output."""
     input_noise: tuple[float, ...] = ()
     """Standard deviation of each input; empty for none."""
     process_noise: tuple[float, ...] = ()
-    """Of each state, per square root of a second; empty for none."""
+    """Standard deviation of each state per square root of a second; empty for none."""
     open_loop: bool = False
-    """The paper's cost: nothing corrects the twin within a window, whatever disturbs the machine."""
+    """Use the paper's cost: no innovation corrects the twin within a window."""
     determined_within: float = 0.1
-    """A parameter is determined when the half of its 95 % interval is at most this share of its nominal value."""
+    """A parameter is determined when half of its 95 % interval is at most this share of its nominal value."""
     components: tuple[Component, ...] = ()
-    """That complete the twin; their numbers are free as well, with names that begin with "_"."""
+    """Components in the twin. Their values are free parameters with names that begin with an underscore."""
     excluded: frozenset[str] = frozenset()
-    """Keys of components that are not looked for."""
+    """Keys of components that discovery leaves out."""
     discover: bool = True
-    """Whether components are looked for at all."""
+    """Whether discovery looks for components of the machine."""
     window: WindowOptions = WindowOptions()
     swarm: SwarmOptions = SwarmOptions()
     seed: int = 1
 
     @property
     def scale(self) -> Array:
-        """(free,) what each parameter's accuracy is measured against."""
-        return np.array([max(abs(entry.nominal), LEAST_SCALE * (entry.high - entry.low)) for entry in self.free])
+        """(free,) the size of each parameter, to which accuracy is relative."""
+        return np.array([max(abs(free.nominal), MIN_SCALE * (free.high - free.low)) for free in self.free])
 
     @property
     def nominal(self) -> Array:
-        """(free,) the values of the machine file."""
-        return np.array([entry.nominal for entry in self.free])
+        """(free,) values of the machine file."""
+        return np.array([free.nominal for free in self.free])
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """(free,) lowest and highest values."""
-        return np.array([entry.low for entry in self.free]), np.array([entry.high for entry in self.free])
+        """(free,) lower and upper bounds."""
+        return np.array([free.low for free in self.free]), np.array([free.high for free in self.free])

@@ -1,13 +1,18 @@
-"""Step 2 of the method: from a window to parameters with their uncertainty."""
+"""Step 2 of the method: from one window to parameters with their uncertainty.
 
-from dataclasses import dataclass
+:func:`fit` is the one fit of a window under a prior; hypotheses use it as well. :func:`estimate` adds what the window
+says alone, and searches with a particle swarm where the prediction does not lead to an explanation.
+"""
+
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior, initial_prior
-from otolith.estimation.augmented import indices
-from otolith.estimation.gauss_newton import FitResult, gauss_newton
+from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior
+from otolith.estimation.augmented import amplitude_indices
+from otolith.estimation.gauss_newton import MAX_STEPS, FitResult, gauss_newton
 from otolith.estimation.information import (
     AccuracyTarget,
     Identifiability,
@@ -15,204 +20,267 @@ from otolith.estimation.information import (
     Outcome,
     ParameterEstimate,
     classify,
-    inflation,
+    inflation_of,
     information,
 )
-from otolith.estimation.objective import EXPLAINED, Objective
-from otolith.estimation.particle_swarm import SwarmResult, particle_swarm, scattered
+from otolith.estimation.objective import EXPLAINED, PENALTY, Objective
+from otolith.estimation.particle_swarm import SwarmResult, search_parameters, spread_starts
+from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
 from otolith.estimation.problem import Problem
 
-AT_BOUND = 1e-4  # of the width of the bounds
-PARTICLES = 4  # of the swarm, the best first, that the polish starts from
-SCATTERED = 12  # starts of the polish all over the bounds
-GLANCE = 15  # steps of the polish from each of these, to see which of them is worth more
-WORTH = 20_000  # steps of the integrator in a prediction, beyond which fewer starts are tried
-SILENT = 0.25  # of the width of the bounds: standard deviation from which on a window says nothing of a parameter
-ALONE_STEPS = 12  # of the polish of the window alone, which begins where the window with all before it ended
-APART = 5.0  # standard deviations between two results that are not the same
-ALIKE = 9.0  # in χ²: what two explanations of a window may differ by and be equally good
+AT_BOUND = 1e-4  # share of the width of the bounds
+POLISHED_PARTICLES = 4  # best particles of the swarm that Gauss-Newton starts from
+POLISHED_STARTS = 12  # further starts of Gauss-Newton over all of the bounds
+TRIAL_STEPS = 15  # of Gauss-Newton from each of these starts
+AFFORDABLE_STEPS = 20_000  # integrator steps of a prediction above which fewer starts are tried
+UNINFORMATIVE = 0.25  # share of the width of the bounds: standard deviation of a parameter that a window leaves open
+ALONE_STEPS = 12  # of Gauss-Newton for the window alone, which starts at the fit under the prior
+DISTINCT = 5.0  # standard deviations between two different results
+EQUALLY_GOOD = 9.0  # difference in χ² between two explanations that are equally good
+MAX_HALVINGS = 20  # of start amplitudes with which the twin diverges
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The maximum a-posteriori fit of a window under a prior."""
+
+    problem: Problem
+    prior: Prior
+    window: Window
+    objective: Objective
+    map_objective: MapObjective
+    result: FitResult
+
+    @property
+    def chi_square(self) -> float:
+        """χ² of window and prior."""
+        return self.result.chi_square
+
+    @property
+    def window_chi_square(self) -> float:
+        """χ² of the window alone."""
+        residuals = self.map_objective.window_residuals(self.result)
+        return float(residuals @ residuals)
+
+    @property
+    def count(self) -> float:
+        """Measured values of all outputs."""
+        return self.objective.count
+
+    @property
+    def cost(self) -> float:
+        """RMSE of the window in units of the noise."""
+        return float(np.sqrt(self.window_chi_square / self.count))
+
+    @property
+    def parameters(self) -> Array:
+        """(free,) at the end of the window."""
+        return self.result.guess[: len(self.problem.free)]
+
+    def evidence(self) -> Evidence:
+        """Return what the window says, with standard deviations grown by what the fit leaves unexplained."""
+        residuals = self.map_objective.window_residuals(self.result).reshape(self.objective.measured.shape)
+        return self.map_objective.evidence(self.result, inflation_of(residuals, self.cost))
+
+    def linearised_at_end(self) -> "Fit":
+        """Return the window linearised at the end of this fit, with a predictor made there."""
+        return fit(self.problem, self.window, self.prior, self.result.guess, max_steps=0)
+
+    def advance(self) -> PhaseAdvance:
+        """Return the advance of the components' phases to the next window."""
+        last_state = self.objective.predict_with_trends(self.result.guess)[1]
+        return phase_advance(self.problem, self.window, last_state)
+
+
+def fit(problem: Problem, window: Window, prior: Prior, start: Array, max_steps: int = MAX_STEPS) -> Fit:
+    """Fit the free parameters to ``window`` under ``prior``; Gauss-Newton starts at ``start`` (free,)."""
+    start = np.clip(start[: len(problem.free)], *problem.bounds)
+    objective = Objective(problem, window, start)
+    map_objective = MapObjective(objective, problem, prior)
+    amplitudes = amplitude_indices(problem)
+    initial = objective.guess(start)[len(start) :]
+    for _ in range(MAX_HALVINGS):  # the twin may diverge at an amplitude of the linear approximation
+        if not amplitudes or objective.cost(np.concatenate([start, initial])[None])[0] < PENALTY:
+            break
+        start[amplitudes] *= 0.5
+    result = gauss_newton(map_objective, map_objective.guess(start, initial), max_steps)
+    return Fit(problem, prior, window, objective, map_objective, result)
 
 
 @dataclass(frozen=True, slots=True)
 class WindowEstimate:
-    """What one window says. The traces are (records, outputs) in the units of the twin."""
+    """What one window says. Curves are (records, outputs) in the units of the twin."""
 
+    fit: Fit
     parameters: tuple[ParameterEstimate, ...]
-    """Of this window alone: about its middle, if they drift."""
+    """Of this window alone; about its middle, if they drift."""
     evidence: Evidence
-    """Of parameters at its end and their trends, to be weighed with what was known."""
+    """Of parameters at the end of the window and their trends, for the filter."""
     outcome: Outcome
     cost: float
     """RMSE in units of the noise."""
-    count: float
-    """Values that were measured."""
     rmse_configured: tuple[float, ...]
     rmse_estimated: tuple[float, ...]
     rmse_completed: tuple[float, ...]
-    """With the components; as estimated, where there are none."""
+    """With the components; the same as estimated if there are none."""
     predicted: Array
     last_state: Array
-    """(states,) of the twin at the last record."""
+    """(states,) at the last record."""
+    advance: PhaseAdvance
+    """Of the components, to the next window."""
     generations: int
     evaluations: int
 
-    @property
-    def chi_square(self) -> float:
-        """Of the window alone."""
-        return self.cost**2 * self.count
+
+class Search(Enum):
+    """When the particle swarm searches."""
+
+    NEVER = "the start lies in the right valley"
+    IF_UNEXPLAINED = "the start lies in the right valley unless the fit does not explain the window"
+    ALWAYS = "nothing is known of the right valley"
+
+
+def estimate_window(predicted: Posterior, window: Window, search: Search = Search.NEVER) -> WindowEstimate:
+    """Estimate from ``window`` under its prediction. If a phase is unknown, the best of four starting phases counts."""
+    problem, prior = predicted.problem, predicted.prior()
+    starts = predicted.starts() if search is Search.NEVER else [predicted.start()]
+    return min((estimate(problem, window, prior, start, search) for start in starts), key=lambda item: item.cost)
 
 
 def estimate(
-    problem: Problem, window: Window, start: Array, prior: Prior | None = None, *, warm: bool = False
+    problem: Problem, window: Window, prior: Prior, start: Array, search: Search = Search.NEVER
 ) -> WindowEstimate:
-    """Fit the free parameters to ``window``; ``start`` (free parameters,) is where the search begins.
+    """Estimate the free parameters from ``window``; ``start`` (free,) is where the fit starts.
 
-    A swarm finds the valley and Gauss-Newton its floor; a ``warm`` start is taken to lie in the valley, and the swarm
-    only looks for a better one if the floor does not explain the window. The same problem, window, start and prior give
-    the same estimate, bit for bit.
+    The same problem, window, prior and start give the same estimate, bit for bit.
     """
-    return _Fit(problem, window, start, prior or initial_prior(problem)).run(warm=warm)
+    fitted = fit(problem, window, prior, start)
+    both = _fit_alone(fitted, fitted.result.evaluations)
+    outcome, generations = Outcome.CONTINUED, 0
+    unexplained = both.cost > EXPLAINED and search is not Search.NEVER
+    if unexplained or (search is Search.ALWAYS and both.is_informative):
+        both, outcome, generations = _search(both)
+    elif search is Search.ALWAYS:
+        outcome = Outcome.NOTHING_TO_FIND
+    if not both.fit.result.converged and not both.alone.converged:
+        outcome = Outcome.UNFINISHED
+    return _summary(both, outcome, generations)
 
 
-def refine(problem: Problem, window: Window, start: Array, prior: Prior) -> WindowEstimate:
-    """As :func:`estimate`, but in the valley of ``start`` (free parameters,) whatever the window says."""
-    return _Fit(problem, window, start, prior).run(warm=True, near=True)
+@dataclass(frozen=True, slots=True, eq=False)
+class _BothFits:
+    """The fit under the prior, and the fit of the window alone that starts there."""
+
+    fit: Fit
+    alone: FitResult
+    inflation: float
+    information: Information
+    """Of the window alone."""
+    evaluations: int
+
+    @property
+    def cost(self) -> float:
+        """The lower cost of the two."""
+        best = min(self.alone.chi_square, self.fit.window_chi_square)
+        return float(np.sqrt(best / self.fit.count))
+
+    @property
+    def is_informative(self) -> bool:
+        """Whether the window determines any parameter better than its bounds do."""
+        objective = self.fit.objective
+        sd = self.information.sd[: objective.free]
+        return bool((sd < UNINFORMATIVE * (objective.high - objective.low)[: len(sd)]).any())
 
 
-class _Fit:
-    """One window's fit, step by step."""
+def _fit_alone(fitted: Fit, evaluations: int) -> _BothFits:
+    objective, guess, free = fitted.objective, fitted.result.guess, fitted.objective.free
+    constant = np.concatenate([guess[:free], guess[2 * free :]])
+    alone = gauss_newton(objective, constant, ALONE_STEPS)
+    residuals = alone.residuals.reshape(objective.measured.shape)
+    inflation = inflation_of(residuals, float(np.sqrt(alone.chi_square / objective.count)))
+    uncertainty = information(alone.jacobian, objective.high - objective.low, inflation)
+    return _BothFits(fitted, alone, inflation, uncertainty, evaluations + alone.evaluations)
 
-    def __init__(self, problem: Problem, window: Window, start: Array, prior: Prior) -> None:
-        self._problem, self._window = problem, window
-        self._objective = Objective(problem, window, start)
-        self._informed = MapObjective(self._objective, problem, prior)
-        self._generations = self._evaluations = 0
-        first = self._objective.guess(start)
-        self._fit = self._polish(self._informed.guess(start, first[len(start) :]))
-        self._alone = self._window_alone()
-        self._told = self._tell()
 
-    def run(self, *, warm: bool, near: bool = False) -> WindowEstimate:
-        outcome = Outcome.CONTINUED
-        unexplained = self._cost() > EXPLAINED and not near
-        if unexplained or not (warm or self._says_nothing()):
-            outcome = self._search()
-        elif not warm:
-            outcome = Outcome.NOTHING_TO_FIND
-        if not self._fit.converged and not self._alone.converged:
-            outcome = Outcome.UNFINISHED
-        return self._result(outcome)
+def _search(both: _BothFits) -> tuple[_BothFits, Outcome, int]:
+    """Search the bounds with a particle swarm; return the better fit, how the search ended, and its generations."""
+    fitted, objective, problem = both.fit, both.fit.objective, both.fit.problem
+    free, seed = objective.free, problem.seed + both.fit.window.index
+    swarm = search_parameters(objective, problem.swarm, fitted.parameters, seed)
+    best, evaluations = _polish(fitted, swarm, seed)
+    better = min(best, fitted.result, key=lambda result: result.chi_square)
+    objective.set_predictor(better.guess[:free], better.guess[2 * free :])  # made before around a start far off
+    best = gauss_newton(fitted.map_objective, best.guess)
+    previous = gauss_newton(fitted.map_objective, fitted.result.guess)
+    distinct = np.abs(best.guess - previous.guess)[:free] > DISTINCT * both.information.sd[:free]
+    chosen = min(previous, best, key=lambda result: result.chi_square)
+    evaluations += both.evaluations + swarm.evaluations + best.evaluations + previous.evaluations
+    after = _fit_alone(replace(fitted, result=chosen), evaluations)
+    if not distinct.any():
+        outcome = Outcome.AGREED
+    elif abs(best.chi_square - previous.chi_square) <= EQUALLY_GOOD * max(after.cost, 1.0) ** 2:
+        outcome = Outcome.AMBIGUOUS
+    else:
+        outcome = Outcome.SWARM_WAS_BETTER if chosen is best else Outcome.POLISH_WAS_BETTER
+    return after, outcome, swarm.generations
 
-    def _polish(self, guess: Array) -> FitResult:
-        found = gauss_newton(self._informed, guess)
-        self._evaluations += found.evaluations
-        return found
 
-    def _cost(self) -> float:
-        """Of the window alone, with what explains it best."""
-        best = min(self._alone.chi_square, self._informed.chi_square(self._fit))
-        return float(np.sqrt(best / self._objective.count))
+def _polish(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[FitResult, int]:
+    """Return the best fit from the best particles and from starts over all of the bounds, and its evaluations.
 
-    def _still(self, fit: FitResult) -> Array:
-        """A guess of the window alone: the parameters at its end, taken to hold throughout."""
-        free = self._objective.free
-        return np.concatenate([fit.guess[:free], fit.guess[2 * free :]])
+    The swarm searches parameters only, from the first record on. Where an initial state is not measured, or a valley is
+    narrow, the swarm stops on a slope that only Gauss-Newton descends.
+    """
+    objective, problem = fitted.objective, fitted.problem
+    count = min(POLISHED_STARTS, POLISHED_STARTS * AFFORDABLE_STEPS // max(objective.integrator_steps, 1))
+    starts = (*swarm.positions[0, : POLISHED_PARTICLES if count else 1], *spread_starts(*problem.bounds, count, seed))
+    results = [gauss_newton(objective, objective.guess(start), TRIAL_STEPS) for start in starts]
+    best, free = min(results, key=lambda result: result.chi_square), objective.free
+    final = gauss_newton(fitted.map_objective, fitted.map_objective.guess(best.guess[:free], best.guess[free:]))
+    return final, sum(result.evaluations for result in results) + final.evaluations
 
-    def _window_alone(self) -> FitResult:
-        found = gauss_newton(self._objective, self._still(self._fit), ALONE_STEPS)
-        self._evaluations += found.evaluations
-        return found
 
-    def _tell(self) -> Information:
-        """What the window alone can know."""
-        objective, alone = self._objective, self._alone
-        return information(alone.jacobian, objective.high - objective.low, self._inflation())
+def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstimate:
+    objective, problem, result = both.fit.objective, both.fit.problem, both.fit.result
+    configured = objective.predict(objective.guess(_without_amplitudes(problem, problem.nominal))[None])[0]
+    predicted, last_state = objective.predict_with_trends(result.guess)
+    bare = _without_amplitudes(problem, result.guess)
+    estimated = objective.predict_with_trends(bare)[0] if problem.components else predicted
+    return WindowEstimate(
+        fit=both.fit,
+        parameters=_parameter_estimates(both, outcome),
+        evidence=both.fit.map_objective.evidence(result, both.inflation),
+        outcome=outcome,
+        cost=both.cost,
+        rmse_configured=tuple(map(float, objective.rmse(configured))),
+        rmse_estimated=tuple(map(float, objective.rmse(estimated))),
+        rmse_completed=tuple(map(float, objective.rmse(predicted))),
+        predicted=predicted,
+        last_state=last_state,
+        advance=phase_advance(problem, both.fit.window, last_state),
+        generations=generations,
+        evaluations=both.evaluations,
+    )
 
-    def _inflation(self) -> float:
-        """By what standard deviations grow with what is left unexplained."""
-        objective, alone = self._objective, self._alone
-        residuals = alone.residuals.reshape(objective.measured.shape)
-        return inflation(residuals, float(np.sqrt(alone.chi_square / objective.count)))
 
-    def _says_nothing(self) -> bool:
-        reach = self._told.sd[: self._objective.free]
-        return not bool((reach < SILENT * (self._objective.high - self._objective.low)[: len(reach)]).any())
+def _without_amplitudes(problem: Problem, guess: Array) -> Array:
+    """Return a guess whose components have amplitude zero."""
+    bare = guess.copy()
+    bare[amplitude_indices(problem)] = 0.0
+    return bare
 
-    def _search(self) -> Outcome:
-        problem, objective, known = self._problem, self._objective, self._fit
-        free = objective.free
-        searched = particle_swarm(objective, problem.swarm, known.guess[:free], seed=problem.seed + self._window.index)
-        self._generations = searched.generations
-        self._evaluations += searched.evaluations
-        found = self._best_of(searched)
-        # Gain and substeps were made for parameters that may have been far off.
-        better = min(found, known, key=lambda fit: fit.chi_square)
-        objective.centre(better.guess[:free], better.guess[2 * free :])
-        found, known = self._polish(found.guess), self._polish(known.guess)
-        apart = np.abs(found.guess - known.guess)[:free] > APART * self._told.sd[:free]
-        self._fit = min(known, found, key=lambda fit: fit.chi_square)
-        self._alone = self._window_alone()
-        self._told = self._tell()
-        if not apart.any():
-            return Outcome.AGREED
-        if abs(found.chi_square - known.chi_square) <= ALIKE * max(self._cost(), 1.0) ** 2:
-            return Outcome.AMBIGUOUS
-        return Outcome.SWARM_WAS_BETTER if self._fit is found else Outcome.POLISH_WAS_BETTER
 
-    def _best_of(self, searched: SwarmResult) -> FitResult:
-        """The polished best of where the swarm came to rest and of starts all over the bounds.
-
-        A swarm looks at parameters alone, from the first record on; where an initial state is not measured, or the
-        valley is narrow, it rests on a slope that only the polish goes down.
-        """
-        objective, problem = self._objective, self._problem
-        count = min(SCATTERED, SCATTERED * WORTH // max(objective.work, 1))
-        spread = scattered(*problem.bounds, count, problem.seed + self._window.index)
-        starts = (*searched.places[: PARTICLES if count else 1], *spread)
-        polished = [gauss_newton(objective, objective.guess(start), GLANCE) for start in starts]
-        self._evaluations += sum(found.evaluations for found in polished)
-        best = min(polished, key=lambda found: found.chi_square)
-        free = objective.free
-        return self._polish(self._informed.guess(best.guess[:free], best.guess[free:]))
-
-    def _result(self, outcome: Outcome) -> WindowEstimate:
-        objective, problem = self._objective, self._problem
-        configured = objective.predict(objective.guess(self._bare(problem.nominal))[None])[0]
-        predicted, last_state = objective.followed(self._fit.guess)
-        estimated = objective.followed(self._bare(self._fit.guess))[0] if problem.components else predicted
-        return WindowEstimate(
-            parameters=self._parameters(outcome),
-            evidence=self._informed.evidence(self._fit, self._inflation()),
-            outcome=outcome,
-            cost=self._cost(),
-            count=objective.count,
-            rmse_configured=tuple(map(float, objective.rmse(configured))),
-            rmse_estimated=tuple(map(float, objective.rmse(estimated))),
-            rmse_completed=tuple(map(float, objective.rmse(predicted))),
-            predicted=predicted,
-            last_state=last_state,
-            generations=self._generations,
-            evaluations=self._evaluations,
-        )
-
-    def _bare(self, guess: Array) -> Array:
-        """A guess without components: their amplitudes are zero."""
-        problem, bare = self._problem, guess.copy()
-        bare[[indices(problem, slot)[0] for slot in range(len(problem.components))]] = 0.0
-        return bare
-
-    def _parameters(self, outcome: Outcome) -> tuple[ParameterEstimate, ...]:
-        objective, guess = self._objective, self._alone.guess
-        width = objective.high - objective.low
-        at_bound = (guess <= objective.low + AT_BOUND * width) | (guess >= objective.high - AT_BOUND * width)
-        found = []
-        allowed = self._problem.determined_within * self._problem.scale
-        for index, entry in enumerate(self._problem.free):
-            wanted = AccuracyTarget(float(allowed[index]), entry.unit, bool(at_bound[index]))
-            verdict, reason = classify(self._told, index, objective.names, wanted)
-            if outcome is Outcome.AMBIGUOUS and verdict is Identifiability.DETERMINED:
-                verdict, reason = Identifiability.WEAK, outcome.value
-            found.append(
-                ParameterEstimate(entry.name, float(guess[index]), float(self._told.sd[index]), verdict, reason)
-            )
-        return tuple(found)
+def _parameter_estimates(both: _BothFits, outcome: Outcome) -> tuple[ParameterEstimate, ...]:
+    objective, problem, guess = both.fit.objective, both.fit.problem, both.alone.guess
+    width = objective.high - objective.low
+    at_bound = (guess <= objective.low + AT_BOUND * width) | (guess >= objective.high - AT_BOUND * width)
+    required = problem.determined_within * problem.scale
+    estimates = []
+    for index, parameter in enumerate(problem.free):
+        target = AccuracyTarget(float(required[index]), parameter.unit, bool(at_bound[index]))
+        identifiability, reason = classify(both.information, index, objective.names, target)
+        if outcome is Outcome.AMBIGUOUS and identifiability is Identifiability.DETERMINED:
+            identifiability, reason = Identifiability.WEAK, outcome.value
+        sd = float(both.information.sd[index])
+        estimates.append(ParameterEstimate(parameter.name, float(guess[index]), sd, identifiability, reason))
+    return tuple(estimates)

@@ -1,8 +1,6 @@
-"""The report: one document per window, the same on Zenoh, in recordings and as JSON Lines.
+"""The report schema: one document per window, the same on Zenoh, in recordings and as JSON Lines.
 
-Every number is finite or absent; what has no content yet is absent, not invented.
-
-The part of the report that is about components and findings.
+Every number is finite or absent. What has no content yet is absent.
 """
 
 from dataclasses import dataclass
@@ -11,23 +9,23 @@ from typing import Literal
 
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.discovery.adopted import Approval
+from otolith.discovery.decision import WindowDecision
 from otolith.discovery.hypotheses import FaultType
-from otolith.discovery.sequential_test import WindowDecision
 from otolith.estimation.information import Identifiability, Outcome
 from otolith_drivers.config_files import StrictModel
 
 
 class ComponentStatus(StrEnum):
-    """Where a component is in its life."""
+    """Whether a component is still significant."""
 
     ADOPTED = "adopted"
-    """Several windows agreed on it; it is in the twin and followed."""
+    """Several windows agreed on it; it is in the twin and tracked."""
     FADING = "fading"
-    """It can hardly be seen any more."""
+    """It is hardly significant any more."""
 
 
 class NumberDocument(StrictModel):
-    """A number of a component."""
+    """One value of a component, with its 95 % interval."""
 
     value: float
     sd: float
@@ -38,7 +36,7 @@ class NumberDocument(StrictModel):
 
 
 class AlternativeDocument(StrictModel):
-    """Another explanation, and how probable it is."""
+    """A hypothesis, and how probable it is."""
 
     reason: FaultType
     text: str
@@ -46,42 +44,42 @@ class AlternativeDocument(StrictModel):
 
 
 class ComponentDocument(StrictModel):
-    """A component that the twin lacked."""
+    """A component that was added to the twin."""
 
     id: str
-    """Site, family and input: the same for as long as the component lives."""
+    """Site, family and input: the same from adoption to the end."""
     site: str
     meaning: str
-    """Of the site."""
+    """Meaning of the site."""
     mode: Literal["additive", "multiplicative"]
     family: str
     input: str
-    """What it depends on: empty for nothing, ``t``, an angle, or a signal."""
+    """The source: empty for none, ``t``, an angle, or a signal."""
     equation: str
     values: dict[str, NumberDocument]
     conditions: str
-    """Working conditions under which machines show such a thing (Table 1 of the paper)."""
+    """Working conditions under which machines show such a component (Table 1 of the paper)."""
     domain: str
-    """Inputs for which such an equation is valid, in words."""
+    """Inputs for which the equation is valid, in words."""
     status: ComponentStatus
     approval: Approval
     probability: float
-    """When it was adopted."""
+    """Probability of the component when it was adopted."""
     onset: float
     """Unix seconds."""
     alternatives: tuple[AlternativeDocument, ...] = ()
-    """What the data could not tell it from."""
+    """Hypotheses that the data could not tell from it."""
 
 
 class Severity(StrEnum):
-    """How urgent a finding is."""
+    """Severity of a finding."""
 
     WARNING = "warning"
     FAULT = "fault"
 
 
 class FindingDocument(StrictModel):
-    """What an operator should read."""
+    """A finding for the operator."""
 
     id: str
     severity: Severity
@@ -109,7 +107,7 @@ class Status(StrEnum):
 
 
 class QualityDocument(StrictModel):
-    """How well the window was sampled."""
+    """Sampling quality of a window."""
 
     verdict: Verdict
     missing: float
@@ -120,7 +118,7 @@ class QualityDocument(StrictModel):
 
 
 class WindowDocument(StrictModel):
-    """Which stretch of time the report is about; start and end in Unix seconds."""
+    """The window; start and end in Unix seconds."""
 
     index: int
     start: float
@@ -140,18 +138,18 @@ class ParameterDocument(StrictModel):
     high: float | None = None
     nominal: float
     raw: float | None = None
-    """What this window alone says."""
+    """Estimate of this window alone."""
     raw_sd: float | None = None
     trend_per_hour: float | None = None
-    """How it changes now, in its unit per hour."""
+    """Present trend, in the unit of the parameter per hour."""
     trend_sd_per_hour: float | None = None
     status: Status
     progress: float = 0.0
-    """How far its interval has come from the bounds to what is asked for, 0 to 1."""
+    """How far the interval has come from the bounds to what is required, 0 to 1."""
     identifiability: Identifiability | None = None
     reason: str = ""
     advice: str | None = None
-    """What move of the machine would pin it down, if it is not."""
+    """The experiment that would determine the parameter, if this window did not."""
 
 
 class FitDocument(StrictModel):
@@ -160,96 +158,95 @@ class FitDocument(StrictModel):
     rmse_configured: dict[str, float]
     rmse_estimated: dict[str, float]
     rmse_completed: dict[str, float] | None = None
-    """With the components."""
+    """With the components in the twin."""
     explained: bool
     """Whether the estimated twin leaves nothing but noise."""
     cost: float
     """RMSE of all outputs in units of their noise."""
     variance_ratio: float
-    """How much more windows differ from each other than each of them says, as a ratio of variances: one if all is well.
-    """
+    """How much more windows differ from each other than they claim (ratio of variances); one if they agree."""
     outcome: Outcome
     """How the search ended."""
 
 
 class CostDocument(StrictModel):
-    """What the report took."""
+    """Computing effort of a report."""
 
     seconds: float = 0.0
-    """Of computing."""
+    """Computing time in seconds."""
     latency_s: float = 0.0
     """From the end of the window to the publication of this report."""
     evaluations: int = 0
     generations: int = 0
     searched: bool = False
-    """Whether it was asked what else could have happened: components, moved parameters, lying sensors."""
+    """Whether hypotheses were compared: components, moved parameters, faulty sensors."""
 
 
 class DriverDocument(StrictModel):
-    """How the connection to the machine fares."""
+    """State of the connection to the machine."""
 
     up: bool
     reason: str = ""
-    """Why it is down."""
+    """Why the connection is down."""
     warnings: tuple[str, ...] = ()
-    """What is wrong although it is up, a line each."""
+    """What is wrong although the connection is up, a line each."""
     plan: str = ""
-    """What is asked of the machine and what is achieved, where it is asked."""
+    """Polling plan and achieved rate of a polling driver."""
 
 
 class CountersDocument(StrictModel):
-    """What was received and what was lost since the daemon started: nothing is lost silently."""
+    """What was received and lost since the daemon started."""
 
     received: int = 0
     """Samples."""
     bad: int = 0
-    """Frames, replies or values that came and could not be used."""
+    """Received frames, replies or values that could not be used."""
     lost: int = 0
-    """Samples that were sent or asked for and never came, or that found no room."""
+    """Samples that were sent or requested and did not arrive, or that overflowed a buffer."""
     reconnects: int = 0
     windows: int = 0
-    """Windows cut."""
+    """Windows formed."""
     windows_bad: int = 0
-    """Not estimated from, for their quality."""
+    """Windows not estimated from because of their quality."""
     windows_missed: int = 0
-    """Not adapted to, because the worker was dead or busy."""
+    """Windows not estimated from because the worker was down or busy."""
     worker_restarts: int = 0
     recordings_dropped: int = 0
-    """Windows that the recorder did not take in time."""
+    """Windows that the recorder did not accept in time."""
 
 
 class ReportDocument(StrictModel):
-    """The document itself."""
+    """The report of one window."""
 
     schema_: Literal["otolith.report/1"] = SCHEMA
     machine: str
     site: str
     twin: str
     model: str = "DT"
-    """``DT`` the twin as configured, ``DT'`` with estimated parameters (the paper's names)."""
+    """The paper's name: ``DT`` as configured, ``DT'`` with estimated parameters, ``DT''`` with components."""
     window: WindowDocument
     decision: WindowDecision
-    """What was made of the window."""
+    """What the window led to."""
     parameters: dict[str, ParameterDocument]
     components: tuple[ComponentDocument, ...] = ()
-    """That the twin lacked."""
+    """Components in the twin."""
     explanations: tuple[AlternativeDocument, ...] = ()
-    """Of what has happened, while that is not decided; the most probable first."""
+    """Competing hypotheses while they are undecided; the most probable first."""
     findings: tuple[FindingDocument, ...] = ()
     fit: FitDocument | None = None
-    """None where nothing was estimated from the window."""
+    """None for a window that was not estimated from."""
     cost: CostDocument = CostDocument()
     counters: CountersDocument | None = None
     driver: DriverDocument | None = None
     """None in a replay."""
 
     def to_json(self) -> str:
-        """As published: absent where there is no content, ``schema`` first."""
+        """Return the published JSON: ``schema`` first, absent keys where there is no content."""
         return self.model_dump_json(exclude_none=True).replace('"schema_"', '"schema"', 1)
 
     @classmethod
     def from_json(cls, text: str) -> "ReportDocument":
-        """The inverse of :meth:`to_json`.
+        """Return the report of a JSON text, the inverse of :meth:`to_json`.
 
         Raises:
             pydantic.ValidationError: not a report of this schema.
@@ -259,13 +256,13 @@ class ReportDocument(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class Traces:
-    """The curves behind a report, in the units of the twin; not a number where a record was missing."""
+    """The curves of a window in the units of the twin; not-a-number where nothing was measured."""
 
     outputs: tuple[str, ...]
     measured: Array
     """(records, outputs)."""
     predicted: Array | None
-    """(records, outputs); None where nothing was estimated."""
+    """(records, outputs); None for a window that was not estimated from."""
     noise: tuple[float, ...]
     inputs: tuple[str, ...]
     driving: Array
@@ -274,14 +271,14 @@ class Traces:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What the heart says of a window."""
+    """The report document of a window, with its curves."""
 
     document: ReportDocument
     traces: Traces
 
 
 def window_document(window: Window) -> WindowDocument:
-    """The part of the report that is known before any estimation."""
+    """Return the part of the report that is known before any estimation."""
     quality = window.quality
     return WindowDocument(
         index=window.index,

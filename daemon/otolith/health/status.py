@@ -1,37 +1,37 @@
-"""From what is known of a parameter to what is published of it: status with hysteresis, progress, reason."""
+"""The published status of a parameter: from what is known to value, interval, status with hysteresis, and reason."""
 
 import math
 from dataclasses import dataclass
 
-from otolith.discovery.sequential_test import ACCEPTED, WindowDecision
+from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE, Identifiability, ParameterEstimate
 from otolith.health.schema import ParameterDocument, Status
 from otolith.twin.definition import Parameter
 
-CONTRIBUTES = 0.98  # of its variance must be left at most, if a window that does not pin a parameter estimates it
-STILL_CONTRIBUTES = 0.995  # the same for a parameter that the window before estimated
-STILL_DETERMINED = 2.0  # times the interval that is asked for: what a window may leave to one estimated before
-INVALID_AFTER = 2  # windows in a row that contradict the twin
-FORGOTTEN = 0.5  # of the width of the bounds: an interval this wide is no knowledge
-HOUR = 3600.0
+MAX_VARIANCE_LEFT = 0.98  # share of the variance that a window may leave and still count as estimating the parameter
+MAX_VARIANCE_LEFT_AFTER = 0.995  # the same for a parameter that the window before estimated
+REQUIRED_FACTOR_AFTER = 2.0  # times the required interval: what a window may leave to one estimated before
+INVALID_AFTER = 2  # consecutive windows that contradict the twin
+FORGOTTEN = 0.5  # share of the width of the bounds: a half-width beyond which nothing is known any more
+HOUR = 3600.0  # s
 
 
 @dataclass(frozen=True, slots=True)
 class MarginalPosterior:
-    """What all windows together say of a parameter at the end of the last."""
+    """What all windows together say of a parameter at the end of the last one."""
 
     value: float
     sd: float
     trend: float
     """Per second."""
     trend_sd: float
-    kept: float = 1.0
-    """Share of its variance that this window left."""
+    variance_left: float = 1.0
+    """Share of the variance before the window that is left after it."""
 
 
 @dataclass(frozen=True, slots=True)
 class PreviousStatus:
-    """What was said of a parameter last."""
+    """What the report before said of a parameter."""
 
     known: bool = False
     """Whether it has been determined."""
@@ -40,18 +40,17 @@ class PreviousStatus:
 
 @dataclass(frozen=True, slots=True)
 class WindowEvidence:
-    """What a window brought."""
+    """What one window says of a parameter."""
 
     estimate: ParameterEstimate | None = None
-    """What it alone says; None for one that was not estimated from."""
+    """None for a window that was not estimated from."""
     decision: WindowDecision = WindowDecision.BAD
-    """What was made of it."""
     contradictions: int = 0
-    """Windows in a row that contradict twin or belief, this one included."""
+    """Consecutive windows, this one included, that contradict twin or posterior."""
     variance_ratio: float = 1.0
-    """How much more windows differ from each other than each of them says (variance)."""
+    """How much more windows differ from each other than they claim (ratio of variances)."""
     reason: str = ""
-    """What there is to say of the window as a whole."""
+    """About the window as a whole."""
 
     @property
     def at_bound(self) -> bool:
@@ -59,79 +58,76 @@ class WindowEvidence:
         return self.estimate is not None and self.estimate.identifiability is Identifiability.AT_BOUND
 
     @property
-    def taught(self) -> bool:
-        """Whether what is known has changed by it."""
+    def accepted(self) -> bool:
+        """Whether the window updated the posterior."""
         return self.estimate is not None and self.decision in ACCEPTED
 
 
 def publish(
-    parameter: Parameter, allowed: float, fused: MarginalPosterior, heard: WindowEvidence, before: PreviousStatus
+    parameter: Parameter, required: float, known_now: MarginalPosterior, window: WindowEvidence, before: PreviousStatus
 ) -> tuple[PreviousStatus, ParameterDocument]:
-    """What is said of a parameter, whose 95 % interval is to reach ``allowed`` to each side at most."""
-    reach = QUANTILE * fused.sd
+    """Return status and document of a parameter; ``required`` is the half-width of a determined 95 % interval."""
+    reach = QUANTILE * known_now.sd
     width = parameter.high - parameter.low
-    known = reach <= allowed or (before.known and reach <= FORGOTTEN * width)
-    status = _status(known, allowed, fused, heard, before)
-    estimate, reason = heard.estimate, heard.reason
-    identifiability = None if estimate is None else estimate.identifiability
-    if estimate is not None and (heard.taught or heard.at_bound):
+    known = reach <= required or (before.known and reach <= FORGOTTEN * width)
+    status = _status(known_now, window, before, known=known, required=required)
+    estimate, reason = window.estimate, window.reason
+    if estimate is not None and (window.accepted or window.at_bound):
         reason = "; ".join(filter(None, (estimate.reason, reason)))
-    alone = estimate if estimate is not None and _says_something(estimate, width) else None
-    value = min(max(fused.value, parameter.low), parameter.high)
-    shown = known and math.isfinite(value + reach + HOUR * (fused.trend + fused.trend_sd))
+    alone = estimate if estimate is not None and _is_informative(estimate, width) else None
+    value = min(max(known_now.value, parameter.low), parameter.high)
+    shown = known and math.isfinite(value + reach + HOUR * (known_now.trend + known_now.trend_sd))
     return PreviousStatus(known, status), ParameterDocument(
         value=value if shown else None,
         unit=parameter.unit,
-        sd=fused.sd if shown else None,
+        sd=known_now.sd if shown else None,
         low=value - reach if shown else None,
         high=value + reach if shown else None,
         nominal=parameter.nominal,
         raw=None if alone is None else alone.value,
-        raw_sd=None if alone is None else alone.sd * math.sqrt(heard.variance_ratio),
-        trend_per_hour=HOUR * fused.trend if shown else None,
-        trend_sd_per_hour=HOUR * fused.trend_sd if shown else None,
+        raw_sd=None if alone is None else alone.sd * math.sqrt(window.variance_ratio),
+        trend_per_hour=HOUR * known_now.trend if shown else None,
+        trend_sd_per_hour=HOUR * known_now.trend_sd if shown else None,
         status=status,
-        progress=_progress(reach, allowed, width),
-        identifiability=identifiability,
-        reason=reason or _why(status),
+        progress=_progress(reach, required, width),
+        identifiability=None if estimate is None else estimate.identifiability,
+        reason=reason or _default_reason(status),
     )
 
 
 def _status(
-    known: bool, allowed: float, fused: MarginalPosterior, heard: WindowEvidence, before: PreviousStatus
+    known_now: MarginalPosterior, window: WindowEvidence, before: PreviousStatus, *, known: bool, required: float
 ) -> Status:
-    if heard.contradictions >= INVALID_AFTER and heard.decision in (WindowDecision.SUSPECTED, WindowDecision.REFUSED):
-        return Status.INVALID
-    estimate = heard.estimate
-    if heard.at_bound:
+    undecided = window.decision in (WindowDecision.SUSPECTED, WindowDecision.REFUSED)
+    if (window.contradictions >= INVALID_AFTER and undecided) or window.at_bound:
         return Status.INVALID
     if not known:
         return Status.UNESTIMATED
-    if not heard.taught or estimate is None:
+    if not window.accepted or window.estimate is None:
         return Status.HELD
     if not before.known:
         return Status.ESTIMATED
     stays = before.status is Status.ESTIMATED
-    pinned = QUANTILE * estimate.sd <= allowed * (STILL_DETERMINED if stays else 1.0)
-    helped = fused.kept <= (STILL_CONTRIBUTES if stays else CONTRIBUTES)
-    return Status.ESTIMATED if pinned or helped else Status.HELD
+    determined = QUANTILE * window.estimate.sd <= required * (REQUIRED_FACTOR_AFTER if stays else 1.0)
+    contributes = known_now.variance_left <= (MAX_VARIANCE_LEFT_AFTER if stays else MAX_VARIANCE_LEFT)
+    return Status.ESTIMATED if determined or contributes else Status.HELD
 
 
-def _says_something(estimate: ParameterEstimate, width: float) -> bool:
+def _is_informative(estimate: ParameterEstimate, width: float) -> bool:
     return math.isfinite(estimate.value) and QUANTILE * estimate.sd < width
 
 
-def _progress(reach: float, allowed: float, width: float) -> float:
-    """How far the interval has come from the bounds to what is asked for: 0 to 1, in orders of magnitude."""
-    ignorance = QUANTILE * width / math.sqrt(12.0)
-    if reach <= allowed:
+def _progress(reach: float, required: float, width: float) -> float:
+    """Return how far the interval has come from the bounds to what is required: 0 to 1, in orders of magnitude."""
+    uninformed = QUANTILE * width / math.sqrt(12.0)
+    if reach <= required:
         return 1.0
-    if not math.isfinite(reach) or reach >= ignorance or allowed >= ignorance:
+    if not math.isfinite(reach) or reach >= uninformed or required >= uninformed:
         return 0.0
-    return math.log(ignorance / reach) / math.log(ignorance / allowed)
+    return math.log(uninformed / reach) / math.log(uninformed / required)
 
 
-def _why(status: Status) -> str:
+def _default_reason(status: Status) -> str:
     if status is Status.HELD:
         return "this window adds nothing to what is known"
     return "no window has determined it yet" if status is Status.UNESTIMATED else ""

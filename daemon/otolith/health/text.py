@@ -1,22 +1,63 @@
-"""A report in words, for logs and for those who only look."""
+"""A report in words. Every text that shows a value, a component or a finding to a person is made here."""
 
 from otolith.estimation.information import QUANTILE
-from otolith.health.schema import ReportDocument, Status
+from otolith.health.schema import ComponentDocument, FindingDocument, ParameterDocument, ReportDocument, Status
+
+UNKNOWN = "unknown"
+
+
+def half_width_text(sd: float) -> str:
+    """Half of the 95 % interval of a normal distribution with standard deviation ``sd``."""
+    return f"{QUANTILE * sd:.2g}"
+
+
+def interval_text(value: float, sd: float, unit: str) -> str:
+    """A value with its 95 % interval: ``5.9856 ohm ± 0.0075``."""
+    return f"{value:.5g} {unit} ± {half_width_text(sd)}"
+
+
+def value_text(parameter: ParameterDocument) -> str:
+    """The value of a parameter with its 95 % interval, or ``unknown``."""
+    if parameter.value is None or parameter.sd is None:
+        return UNKNOWN
+    return interval_text(parameter.value, parameter.sd, parameter.unit)
+
+
+def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
+    """The cells of a parameter in a table: value, half of the 95 % interval, unit, change against nominal."""
+    if parameter.value is None or parameter.sd is None:
+        return UNKNOWN, "", parameter.unit, ""
+    change = f"{parameter.value / parameter.nominal - 1:+.2%}" if parameter.nominal else ""
+    change = "0.00%" if change in ("-0.00%", "+0.00%") else change
+    return f"{parameter.value:.5g}", half_width_text(parameter.sd), parameter.unit, change
+
+
+def parameter_text(name: str, parameter: ParameterDocument) -> str:
+    """Name, value and interval of a parameter, with status and reason unless this window estimated it."""
+    text = f"{name} {value_text(parameter)}"
+    if parameter.status is Status.ESTIMATED:
+        return text
+    return f"{text} ({parameter.status}: {parameter.reason})"
+
+
+def component_text(component: ComponentDocument) -> str:
+    """Site, equation and approval of a component that the twin lacks."""
+    return f"{component.meaning}: {component.equation} ({component.approval})"
+
+
+def finding_text(finding: FindingDocument) -> str:
+    """Severity, text and advice of a finding."""
+    return " ".join(filter(None, [f"{finding.severity}: {finding.text}", finding.advice]))
 
 
 def summary(document: ReportDocument) -> str:
-    """A report in one line."""
+    """A report in one line: window, parameters, findings, and the first warning of the driver."""
     parts = [f"window {document.window.index} {document.window.quality.verdict}"]
-    for name, parameter in document.parameters.items():
-        if parameter.value is None or parameter.sd is None:
-            parts.append(f"{name} unknown ({parameter.reason})")
-        else:
-            held = "" if parameter.status is Status.ESTIMATED else f" ({parameter.status}: {parameter.reason})"
-            parts.append(f"{name} {parameter.value:.5g} {parameter.unit} ± {QUANTILE * parameter.sd:.2g}{held}")
-    parts += [f"{finding.severity}: {finding.text}" for finding in document.findings]
-    if document.driver is not None:
-        parts += [] if document.driver.up else [f"no connection: {document.driver.reason}"]
-        parts += document.driver.warnings[:1]
-        more = len(document.driver.warnings) - 1
-        parts += [f"and {more} more like that"] if more > 0 else []
+    parts += [parameter_text(name, parameter) for name, parameter in document.parameters.items()]
+    parts += [finding_text(finding) for finding in document.findings]
+    if (driver := document.driver) is not None:
+        parts += [] if driver.up else [f"no connection: {driver.reason}"]
+        parts += driver.warnings[:1]
+        more = len(driver.warnings) - 1
+        parts += [f"and {more} more warnings"] if more > 0 else []
     return ", ".join(parts)

@@ -1,1 +1,1 @@
-"""Where reports go: Zenoh and Rerun recordings."""
+"""Publishing of reports: Zenoh and Rerun recordings."""

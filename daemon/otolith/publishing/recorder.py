@@ -1,14 +1,15 @@
-"""The recorder process: writes reports and their curves into a Rerun recording.
+"""The recorder process: writes reports and their traces into a Rerun recording.
 
-It runs beside the daemon, so that no disk and no viewer can hold acquisition up. One ``send_columns`` per entity and
-window; an entity carries a vector, measured and twin side by side. All signals are in it, so that it can be replayed.
+It runs beside the daemon, so that neither disk nor viewer can delay acquisition. It makes one ``send_columns`` call per
+entity and window; an output's entity carries measured and predicted side by side. The recording contains all signals,
+so that it can be replayed.
 """
 
 import logging
 import math
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +19,19 @@ import rerun.blueprint as rrb
 
 from otolith.acquisition.window import Array, Verdict
 from otolith.estimation.information import QUANTILE
-from otolith.health.schema import Report, ReportDocument, Status, Traces
+from otolith.health.schema import Report, ReportDocument, Status
 from otolith.twin.definition import Definition, Parameter
 
 log = logging.getLogger(__name__)
 
 APPLICATION = "otolith"
 TIMELINE = "time"
-LEAST_FREE = 100 << 20  # bytes
-MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]
+MIN_FREE_BYTES = 100 << 20  # kept free on the disk, see docs/reference/thresholds-runtime.md
+MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
 
 
 def main(connection: Any, path: Path, title: str, twin: Definition, parameters: Sequence[Parameter]) -> None:
-    """Record what comes until None comes or the connection closes."""
+    """Record reports until None comes, the connection closes or the disk is full."""
     if not has_room(path):
         return
     recording = Recording(path, title, twin, parameters)
@@ -42,11 +43,12 @@ def main(connection: Any, path: Path, title: str, twin: Definition, parameters: 
 
 
 def has_room(path: Path) -> bool:
-    """Rerun's writer ends without a word on a full disk, so who records ends before."""
+    """Return whether the disk of ``path`` has room: Rerun's writer ends without an error on a full disk."""
     free = shutil.disk_usage(path.parent).free
-    if free < LEAST_FREE:
-        log.warning("recording stopped: %d MB free in %s, %d MB are kept", free >> 20, path.parent, LEAST_FREE >> 20)
-    return free >= LEAST_FREE
+    if free < MIN_FREE_BYTES:
+        bounds = f"{free >> 20} MB free in {path.parent}, at least {MIN_FREE_BYTES >> 20} MB are kept free"
+        log.warning("recording stopped: %s", bounds)
+    return free >= MIN_FREE_BYTES
 
 
 class Recording:
@@ -57,8 +59,8 @@ class Recording:
         self._stream.set_log_time_enabled(False)
         self._stream.save(path, default_blueprint=blueprint(twin, parameters))
         self._stream.send_recording_name(title)
-        for driving in twin.inputs:
-            self._style(f"signals/{driving.name}", [f"{driving.name} measured [{driving.unit}]"], [MEASURED])
+        for signal in twin.inputs:
+            self._style(f"signals/{signal.name}", [f"{signal.name} measured [{signal.unit}]"], [MEASURED])
         for output in twin.outputs:
             names = [f"{output.name} measured [{output.unit}]", f"{output.name} twin [{output.unit}]"]
             self._style(f"signals/{output.name}", names, [MEASURED, TWIN])
@@ -70,29 +72,21 @@ class Recording:
 
     def add(self, report: Report) -> None:
         """Append a window."""
-        document, traces = report.document, report.traces
+        self._add_traces(report)
+        document = report.document
         window = document.window
-        offsets = (window.end - window.start) * np.arange(window.records) / window.records
-        moments = round(window.start * 1e9) + np.rint(offsets * 1e9).astype(np.int64)
-        when = [rr.TimeColumn(TIMELINE, timestamp=moments.astype("datetime64[ns]"))]
-        for index, name in enumerate(traces.inputs):
-            self._columns(f"signals/{name}", when, traces.driving[:, index : index + 1])
-        for index, name in enumerate(traces.outputs):
-            self._columns(f"signals/{name}", when, _side_by_side(traces, index))
-        if traces.predicted is not None:
-            self._columns("residual", when, (traces.measured - traces.predicted) / np.asarray(traces.noise))
         self._stream.set_time(TIMELINE, timestamp=window.end)
         good = window.quality.verdict is Verdict.GOOD
-        self._stream.log("windows", rr.Scalars([float(good), window.start, window.end, float(window.records)]))
+        self._scalars("windows", float(good), window.start, window.end, float(window.records))
         for name, parameter in document.parameters.items():
             if parameter.value is not None and parameter.low is not None and parameter.high is not None:
-                self._stream.log(f"parameters/{name}", rr.Scalars([parameter.low, parameter.high, parameter.value]))
-        for entry in document.components:
-            amplitude = entry.values["amplitude"]
-            bare = re.sub(r"\W+", "_", entry.id)  # an entity's path has signs of its own
-            self._stream.log(f"components/{bare}", rr.Scalars([amplitude.low, amplitude.high, amplitude.value]))
-        for text, level in _sentences(document):
-            self._stream.log("log", rr.TextLog(text, level=level))
+                self._scalars(f"parameters/{name}", parameter.low, parameter.high, parameter.value)
+        for component in document.components:
+            amplitude = component.values["amplitude"]
+            path = re.sub(r"\W+", "_", component.id)  # '/' and brackets have a meaning in the path of an entity
+            self._scalars(f"components/{path}", amplitude.low, amplitude.high, amplitude.value)
+        for text, level in _log_lines(document):
+            self._stream.log("log", rr.TextLog(f"window {window.index}: {text}", level=level))
         self._stream.log("report", rr.TextDocument(_table(document), media_type=rr.MediaType.MARKDOWN))
 
     def close(self) -> None:
@@ -100,37 +94,45 @@ class Recording:
         self._stream.flush(timeout_sec=2.0)
         self._stream.disconnect()
 
-    def _columns(self, entity: str, when: list[rr.TimeColumn], values: Array) -> None:
-        self._stream.send_columns(entity, indexes=when, columns=rr.Scalars.columns(scalars=values))
+    def _add_traces(self, report: Report) -> None:
+        window, traces = report.document.window, report.traces
+        offsets = (window.end - window.start) * np.arange(window.records) / window.records
+        times = round(window.start * 1e9) + np.rint(offsets * 1e9).astype(np.int64)  # ns
+        index = [rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))]
+
+        def send(entity: str, values: Array) -> None:
+            self._stream.send_columns(entity, indexes=index, columns=rr.Scalars.columns(scalars=values))
+
+        predicted = np.full(traces.measured.shape, math.nan) if traces.predicted is None else traces.predicted
+        for column, name in enumerate(traces.inputs):
+            send(f"signals/{name}", traces.driving[:, column : column + 1])
+        for column, name in enumerate(traces.outputs):
+            send(f"signals/{name}", np.column_stack([traces.measured[:, column], predicted[:, column]]))
+        if traces.predicted is not None:
+            send("residual", (traces.measured - traces.predicted) / np.asarray(traces.noise))
+
+    def _scalars(self, entity: str, *values: float) -> None:
+        self._stream.log(entity, rr.Scalars(list(values)))
 
     def _style(self, entity: str, names: list[str], colors: list[list[int]] | None) -> None:
         self._stream.log(entity, rr.SeriesLines(names=names, colors=colors), static=True)
 
 
-def _side_by_side(traces: Traces, index: int) -> Array:
-    """(records, 2): measured and twin; the twin is not a number where nothing was estimated."""
-    measured = traces.measured[:, index]
-    twin = np.full(len(measured), math.nan) if traces.predicted is None else traces.predicted[:, index]
-    return np.column_stack([measured, twin])
-
-
-def _sentences(document: ReportDocument) -> list[tuple[str, str]]:
-    """What is worth a line in the log, with its level."""
-    window = document.window
-    lines = [(f"window {window.index}: {reason}", "WARN") for reason in window.quality.reasons]
+def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
+    """Yield the lines of the log, each with its level."""
+    reasons = document.window.quality.reasons
+    yield from ((reason, "WARN") for reason in reasons)
     for name, parameter in document.parameters.items():
-        if parameter.status is not Status.ESTIMATED and not window.quality.reasons:
-            lines.append((f"window {window.index}: {name} {parameter.status}: {parameter.reason}", "INFO"))
+        if parameter.status is not Status.ESTIMATED and not reasons:
+            yield f"{name} {parameter.status}: {parameter.reason}", "INFO"
     for finding in document.findings:
-        advice = f" ({finding.advice})" if finding.advice else ""
-        lines.append((f"window {window.index}: {finding.text}{advice}", "WARN"))
+        yield finding.text + (f" ({finding.advice})" if finding.advice else ""), "WARN"
     if document.fit is not None and not document.fit.explained:
-        lines.append((f"window {window.index}: the twin does not explain the window up to the noise", "INFO"))
-    return lines
+        yield "the twin does not explain the window up to the noise", "INFO"
 
 
 def _table(document: ReportDocument) -> str:
-    """The report as a Markdown table."""
+    """Return the report as a Markdown table."""
     rows = [f"# {document.machine} at {document.site}", "", "| parameter | value | status |", "|---|---|---|"]
     for name, parameter in document.parameters.items():
         value = "unknown"
@@ -139,38 +141,30 @@ def _table(document: ReportDocument) -> str:
         rows.append(f"| {name} | {value} | {parameter.status} {parameter.reason} |")
     if document.components:
         rows += ["", "| component | equation | status |", "|---|---|---|"]
-        rows += [
-            f"| {entry.meaning} | {entry.equation} | {entry.status} {entry.approval} |" for entry in document.components
-        ]
+        rows += [f"| {row.meaning} | {row.equation} | {row.status} {row.approval} |" for row in document.components]
     rows += [f"\n**{finding.severity}**: {finding.text} {finding.advice}" for finding in document.findings]
     return "\n".join(rows)
 
 
 def blueprint(twin: Definition, parameters: Sequence[Parameter]) -> rrb.Blueprint:
-    """What an operator sees: parameters first, then measured against twin, what is left, and the words."""
-    parameter_views = [
-        rrb.TimeSeriesView(origin=f"/parameters/{entry.name}", name=f"{entry.meaning} {entry.name} [{entry.unit}]")
-        for entry in parameters
+    """Return the layout of the viewer: parameters and residual, then signals, then report and log."""
+    series = rrb.TimeSeriesView
+    estimates = [
+        series(origin=f"/parameters/{row.name}", name=f"{row.meaning} {row.name} [{row.unit}]") for row in parameters
     ]
-    signal_views = [
-        rrb.TimeSeriesView(origin=f"/signals/{entry.name}", name=f"{entry.meaning} [{entry.unit}]: measured and twin")
-        for entry in twin.outputs
+    outputs = [
+        series(origin=f"/signals/{row.name}", name=f"{row.meaning} [{row.unit}]: measured and twin")
+        for row in twin.outputs
     ]
-    input_views = [
-        rrb.TimeSeriesView(origin=f"/signals/{entry.name}", name=f"{entry.meaning} [{entry.unit}]")
-        for entry in twin.inputs
-    ]
+    inputs = [series(origin=f"/signals/{row.name}", name=f"{row.meaning} [{row.unit}]") for row in twin.inputs]
+    components = series(origin="/components", name="components that the twin lacked: amplitudes")
+    residual = series(origin="/residual", name="residual in units of the noise")
+    texts = rrb.TextDocumentView(origin="/report", name="report"), rrb.TextLogView(origin="/log", name="log")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(
-                *parameter_views,
-                rrb.TimeSeriesView(origin="/components", name="components that the twin lacked: amplitudes"),
-                rrb.TimeSeriesView(origin="/residual", name="residual in units of the noise"),
-            ),
-            rrb.Vertical(*signal_views, *input_views),
-            rrb.Vertical(
-                rrb.TextDocumentView(origin="/report", name="report"), rrb.TextLogView(origin="/log", name="log")
-            ),
+            rrb.Vertical(*estimates, components, residual),
+            rrb.Vertical(*outputs, *inputs),
+            rrb.Vertical(*texts),
             column_shares=[3, 3, 2],
         ),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),

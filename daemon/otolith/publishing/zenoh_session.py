@@ -1,7 +1,4 @@
-"""Zenoh: the session's configuration, the daemon's publisher, and a subscriber for people and tests.
-
-The table of what is published: one row per kind of Zenoh key.
-"""
+"""Zenoh: the session's configuration, the daemon's publisher, and a listener for the command line and tests."""
 
 import json
 import re
@@ -16,41 +13,41 @@ import zenoh
 from otolith.health.schema import ReportDocument
 from otolith_drivers.errors import ServiceError
 
+LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
+
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One kind of key."""
+    """A kind of Zenoh key."""
 
     key: str
-    """Under ``otolith/<site>/<machine>/``; ``*`` stands for a name."""
-    content: str
-    rate: str
+    """Below :func:`prefix`; ``*`` stands for a name."""
 
     def under(self, site: str, machine: str, name: str = "") -> str:
-        """The whole key."""
+        """Return the whole key."""
         return f"{prefix(site, machine)}/{self.key.replace('*', name)}"
 
 
-REPORT = Topic("report", "JSON document otolith.report/1; the latest one answers a query", "once per window")
-PARAMETER = Topic("parameter/*", "JSON object: the entry of one parameter in the report", "once per window")
-ALIVE = Topic("alive", "liveliness token", "while the daemon runs")
+REPORT = Topic("report")
+"""JSON document ``otolith.report/1``, once per window; a query returns the latest one."""
+PARAMETER = Topic("parameter/*")
+"""JSON object, once per window: what the report says of one parameter."""
+ALIVE = Topic("alive")
+"""Liveliness token, while the daemon runs."""
 
 TOPICS = (REPORT, PARAMETER, ALIVE)
 
 
 def prefix(site: str, machine: str) -> str:
-    """What all keys of a machine begin with."""
+    """Return the beginning of all keys of a machine."""
     return f"otolith/{site}/{machine}"
 
 
-LEASE = 2000  # ms after which a silent peer counts as gone
-
-
 def session(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> zenoh.Session:
-    """An open session in peer mode that reaches only the endpoints it is told: no scouting, no shared memory.
+    """Open a session in peer mode that uses only the given endpoints: no scouting, no shared memory.
 
     Raises:
-        ServiceError: an endpoint to listen on is in use or malformed.
+        ServiceError: an endpoint to listen on is in use, or one is malformed.
     """
     settings = {
         "mode": "peer",
@@ -73,16 +70,16 @@ def session(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> zenoh.Se
         raise ServiceError(f"Zenoh cannot open {', '.join([*listen, *connect])}: {_cause(str(error))}") from error
 
 
-def _cause(said: str) -> str:
-    """What went wrong and the way out, from Zenoh's nested message."""
-    inner = re.sub(r"[\[\]]|\(os error \d+\)|at /\S+", "", said.rsplit(": [", maxsplit=1)[-1]).strip()
-    if "in use" in said:
-        return f"{inner}; another daemon publishes there: set zenoh.listen in the machine file, or --listen"
-    return f"{inner}; check the endpoint, which is written like tcp/127.0.0.1:7447"
+def _cause(message: str) -> str:
+    """Return the cause from Zenoh's nested message, and the remedy."""
+    cause = re.sub(r"[\[\]]|\(os error \d+\)|at /\S+", "", message.rsplit(": [", maxsplit=1)[-1]).strip()
+    if "in use" in message:
+        return f"{cause}; another daemon publishes there: set zenoh.listen in the machine file, or --listen"
+    return f"{cause}; check the endpoint, which is written like tcp/127.0.0.1:7447"
 
 
 class Publisher:
-    """Publishes reports of one machine and answers queries for the latest."""
+    """Publishes the reports of one machine and answers queries for the latest one."""
 
     def __init__(self, site: str, machine: str, listen: Iterable[str], connect: Iterable[str]) -> None:
         self._session = session(listen, connect)
@@ -97,22 +94,21 @@ class Publisher:
         self._token = self._session.liveliness().declare_token(ALIVE.under(site, machine))
 
     def publish(self, document: ReportDocument) -> None:
-        """Send the report and one key per parameter; never blocks for a slow subscriber."""
+        """Send the report, and one key per parameter; a slow subscriber never blocks."""
         text = document.to_json()
         with self._lock:
             self._latest = text
         self._reports.put(text)
         for name, parameter in document.parameters.items():
-            key = PARAMETER.under(self._site, self._machine, name)
             self._session.put(
-                key,
+                PARAMETER.under(self._site, self._machine, name),
                 parameter.model_dump_json(exclude_none=True),
                 encoding=zenoh.Encoding.APPLICATION_JSON,
                 congestion_control=zenoh.CongestionControl.DROP,
             )
 
     def close(self) -> None:
-        """End the session; subscribers see the liveliness token go."""
+        """Close the session; subscribers see the liveliness token disappear."""
         self._session.close()  # type: ignore[no-untyped-call]  # its stub says no return type
 
     def _answer(self, query: zenoh.Query) -> None:
@@ -122,31 +118,24 @@ class Publisher:
 
 
 class Listener:
-    """Hears the reports of any machine under ``key``, the latest one first if there is one already."""
+    """Passes the reports under ``key`` to ``on_report``, beginning with the latest one of each machine if it exists."""
 
-    def __init__(self, connect: Iterable[str], key: str, hear: Callable[[str], None]) -> None:
-        connect = tuple(connect)
-        self._session = session(connect=connect)
-        self._hear = hear
-        self._subscriber = self._session.declare_subscriber(key, self._take)
+    def __init__(self, connect: Iterable[str], key: str, on_report: Callable[[str], None]) -> None:
+        self._session = session(connect=tuple(connect))
+        self._subscriber = self._session.declare_subscriber(key, lambda sample: on_report(sample.payload.to_string()))
         for reply in self._session.get(key, timeout=1.0):
             if reply.ok is not None:
-                hear(reply.ok.payload.to_string())
+                on_report(reply.ok.payload.to_string())
 
     @property
     def connected(self) -> bool:
-        """Whether a daemon (or a router) is reached at all."""
+        """Whether a daemon or a router is connected."""
         return bool(self._session.info.peers_zid()) or bool(self._session.info.routers_zid())
 
     def __enter__(self) -> Self:
-        """The listener itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the session."""
         self._session.close()  # type: ignore[no-untyped-call]  # its stub says no return type
-
-    def _take(self, sample: zenoh.Sample) -> None:
-        self._hear(sample.payload.to_string())

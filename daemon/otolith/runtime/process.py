@@ -1,7 +1,8 @@
-"""A process of our own beside the daemon that may die at any moment without taking anything with it.
+"""A child process that may die at any moment without harm to the daemon.
 
-The only place where the daemon starts processes. A companion is spawned (forked children would inherit Zenoh's and
-Rerun's threads half), talks over one pipe, is never waited for, and ends by itself when the daemon is gone.
+This is the only module that starts processes. A child process is spawned, not forked, because a fork copies only part
+of the threads of Zenoh and Rerun. It communicates over one pipe, on which the daemon never waits, and ends by itself
+when the daemon has died.
 """
 
 import contextlib
@@ -12,37 +13,39 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from multiprocessing import resource_tracker
 from typing import Any
 
 log = logging.getLogger(__name__)
 
-FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0  # s before the second start after deaths in a row, and before any later one
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+FIRST_RESTART_PAUSE = 0.5  # s before the second restart in a row; the first restart is immediate
+MAX_RESTART_PAUSE = 30.0  # s; the pause doubles with each further restart up to this
+KILL_WAIT = 1.0  # s for the kernel to end a killed process
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 
-@contextlib.contextmanager
-def _signals_blocked() -> Iterator[None]:
-    """A child inherits the mask: on a signal to the whole group only the daemon acts, and ends the others."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _enter(connection: Any, main: str, arguments: Sequence[Any]) -> None:
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the daemon is gone
+def _run_main(connection: Any, main: str, arguments: Sequence[Any]) -> None:
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the daemon has died
         module, function = main.split(":")
         getattr(import_module(module), function)(connection, *arguments)
 
 
-class ChildProcess:
-    """Runs ``main``, written ``module:function``, as ``function(connection, *arguments)`` in a process.
+def _send_queued(outbox: queue.Queue[Any], connection: Any) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        while True:
+            message = outbox.get()
+            connection.send(message)
+            if message is None:
+                return
 
-    Only the companion imports the module. At most ``room`` messages wait for it.
+
+class ChildProcess:
+    """Runs ``main``, written ``module:function``, as ``function(connection, *arguments)`` in a child process.
+
+    Only the child imports the module. At most ``room`` messages wait for it.
     """
 
     def __init__(self, name: str, main: str, room: int) -> None:
@@ -51,20 +54,20 @@ class ChildProcess:
         self._main, self._room = main, room
         self._deaths = 0
         self._started_at = 0.0
-        self._start_again_at: float | None = None
+        self._restart_at: float | None = None
         self._process: Any = None
         self._connection: Any = None
         self._outbox: queue.Queue[Any] = queue.Queue(room)
 
     def start(self, *arguments: Any) -> None:
-        """Spawn the process; what waited for an earlier one is gone. A failure to spawn counts as a death."""
+        """Spawn the process; messages for an earlier one are dropped. A failure to spawn counts as a death."""
         self._release()
         self.starts += 1
-        self._start_again_at, self._started_at = None, time.monotonic()
+        self._restart_at, self._started_at = None, time.monotonic()
         try:
             self._spawn(arguments)
-        except OSError as error:  # no descriptors, no processes, no memory left: perhaps in a while
-            log.warning("%s cannot be started: %s", self.name, error)
+        except OSError as error:  # out of file descriptors, processes or memory: may be temporary
+            log.warning("process %s cannot be started: %s", self.name, error)
             self._release()
 
     def _spawn(self, arguments: Sequence[Any]) -> None:
@@ -72,22 +75,21 @@ class ChildProcess:
         self._connection, theirs = context.Pipe()
         try:
             self._outbox = queue.Queue(self._room)
-            process = context.Process(target=_enter, args=(theirs, self._main, arguments), name=self.name, daemon=True)
-            resource_tracker.ensure_running()  # it unblocks the signals when it starts, so not among those below
-            with _signals_blocked():
+            process = context.Process(
+                target=_run_main, args=(theirs, self._main, arguments), name=self.name, daemon=True
+            )
+            resource_tracker.ensure_running()  # its start unblocks signals, so it must be running before the block
+            # Child and thread inherit the mask: only the main thread handles a signal to the whole process group.
+            unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+            try:
                 process.start()
                 self._process = process
-                sender = threading.Thread(
-                    target=_send, args=(self._outbox, self._connection), name=f"to-{self.name}", daemon=True
-                )
-                sender.start()
+                sending = self._outbox, self._connection
+                threading.Thread(target=_send_queued, args=sending, name=f"to-{self.name}", daemon=True).start()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
         finally:
             theirs.close()
-
-    @property
-    def pid(self) -> int | None:
-        """Of the running process."""
-        return None if self._process is None else self._process.pid
 
     @property
     def alive(self) -> bool:
@@ -95,35 +97,35 @@ class ChildProcess:
         return self._process is not None and self._process.is_alive()
 
     @property
-    def waitables(self) -> list[Any]:
-        """For :func:`multiprocessing.connection.wait`: ready when there is a reply, or when the process has died."""
-        return [self._connection, self._process.sentinel] if self.alive else []
-
-    def may_start_again(self, now: float) -> bool:
-        """Whether it is dead and its pause is over: none at first, then doubled with every death in a row."""
-        if self.alive:
-            return False
-        if self._start_again_at is None:
-            pause = FIRST_PAUSE * 2 ** (self._deaths - 1) if self._deaths else 0.0
-            self._deaths = min(self._deaths + 1, 16)
-            self._start_again_at = now + min(pause, LONGEST_PAUSE)
-        return now >= self._start_again_at
-
-    def postpone(self) -> None:
-        """A start was given up before it began: the next pause is as after a death."""
-        self._start_again_at = None
-
-    @property
     def age(self) -> float:
         """Seconds since the process was started."""
         return time.monotonic() - self._started_at
 
-    def has_thrived(self) -> None:
-        """It did its work: the next death is the first in a row again."""
+    @property
+    def waitables(self) -> list[Any]:
+        """Arguments for :func:`multiprocessing.connection.wait`: ready on a reply, and when the process has died."""
+        return [self._connection, self._process.sentinel] if self.alive else []
+
+    def may_restart(self, now: float) -> bool:
+        """Return whether the process is dead and its restart pause is over; ``now`` is monotonic time, s."""
+        if self.alive:
+            return False
+        if self._restart_at is None:
+            pause = FIRST_RESTART_PAUSE * 2 ** (self._deaths - 1) if self._deaths else 0.0
+            self._deaths = min(self._deaths + 1, 16)
+            self._restart_at = now + min(pause, MAX_RESTART_PAUSE)
+        return now >= self._restart_at
+
+    def count_failed_start(self) -> None:
+        """Count a restart that the caller could not prepare as a death, so that the pause doubles."""
+        self._restart_at = None
+
+    def reset_backoff(self) -> None:
+        """Let the next restart be immediate again, because the process has done its work."""
         self._deaths = 0
 
     def offer(self, message: Any) -> bool:
-        """Hand a message over without waiting; False if there is no room and it was dropped."""
+        """Queue a message without waiting; return False if the queue is full and the message was dropped."""
         try:
             self._outbox.put_nowait(message)
         except queue.Full:
@@ -131,43 +133,32 @@ class ChildProcess:
         return True
 
     def replies(self) -> list[Any]:
-        """What it has said since; waits only for the rest of a message that has begun to come."""
-        said = []
+        """Return the messages received since the last call; wait only for the rest of a message that has begun."""
+        messages = []
         with contextlib.suppress(EOFError, OSError):
             while self._connection is not None and self._connection.poll():
-                said.append(self._connection.recv())
-        return said
+                messages.append(self._connection.recv())
+        return messages
 
     def kill(self) -> None:
-        """End the process now; :meth:`start` makes a new one."""
+        """Kill the process."""
         if self._process is not None:
             self._process.kill()
-            self._process.join(timeout=1.0)
+            self._process.join(timeout=KILL_WAIT)
         self._release()
 
     def stop(self, seconds: float) -> None:
-        """Let it finish what it has for up to ``seconds``, then end it."""
+        """Let the process handle its queued messages for up to ``seconds``, then kill it."""
         if self._process is not None:
-            with contextlib.suppress(queue.Full):
-                self._outbox.put_nowait(None)
+            self.offer(None)
             self._process.join(timeout=seconds)
         self.kill()
 
     def _release(self) -> None:
         if self._connection is not None:
-            with contextlib.suppress(queue.Full):
-                self._outbox.put_nowait(None)  # ends the sender's thread
+            self.offer(None)  # ends the sending thread
             self._connection.close()
         if self._process is not None:
             with contextlib.suppress(ValueError):
                 self._process.close()
         self._process = self._connection = None
-
-
-def _send(outbox: queue.Queue[Any], connection: Any) -> None:
-    with contextlib.suppress(OSError, ValueError):
-        while True:
-            message = outbox.get()
-            connection.send(message)
-            if message is None:
-                return

@@ -1,9 +1,9 @@
-"""The service: the only file that knows all parts. Builds, starts, watches and stops them.
+"""The service: builds, starts, supervises and stops the parts of the daemon.
 
-    driver thread -> rings -> [this thread] window -> worker process -> [this thread] report -> Zenoh, recorder process
+    driver thread -> rings -> [main thread] window -> worker process -> [main thread] report -> Zenoh, recorder process
 
-This thread never waits for a machine, a worker, a disk or a subscriber; only for a process that it has killed, and at
-the end half a second for the disk.
+The main thread never waits for a machine, a worker, a disk or a subscriber. It waits only for a process that it has
+killed and, at the end, for the writer thread and the recorder, each up to its flush time.
 """
 
 import contextlib
@@ -31,78 +31,82 @@ from otolith.adaptation.state import (
 )
 from otolith.health.schema import CountersDocument, DriverDocument, Report
 from otolith.health.text import summary
-from otolith.machine import LoadedMachine, recording_folder
+from otolith.machine import LoadedMachine
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS, ChildProcess
 from otolith.runtime.state_store import StateStore, WriterThread
 from otolith.runtime.systemd import Notifier
-from otolith.runtime.worker import COMPILING, Supervisor
+from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith_drivers.errors import OtolithError
 from otolith_drivers.user_dirs import writable
 
 log = logging.getLogger(__name__)
 
-RING_WINDOWS = 8  # windows that the rings hold: how long this thread may be held up without losing a sample
-RING_RATE = 4  # how much faster than the grid a source may send for that to be true
-TICK = 0.1  # s; the longest wait, so how late a stop, a death or an outage can be noticed
-SWITCH = 5e-4  # s that a thread of Python may keep the others waiting: what arrives is to be stamped at once
-RECORDER_ROOM = 32  # windows
-RECORDER_FLUSH, KEEPER_FLUSH = 1.5, 0.5  # s at the end
-STALL = 30.0  # s without a finished window (a bad one counts), after which the watchdog is no longer fed; the first
-# one may take as much longer as the supervisor gives it, or a slow computer would never compile its twin
-OTHER_GRID = 0.01  # difference of two sample periods that matters
-FORGET = "'otolith components forget' clears what is no longer so"
-KEEP_EVERY = 300.0  # s between two writes of components that are only known better
-THRIVES = 60.0  # s after which a recorder counts as healthy
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+RING_WINDOWS = 8  # windows that the rings hold: how long the main thread may be delayed without loss of samples
+RING_RATE = 4  # times the grid's rate at which a source may send for that to hold
+MAX_WAIT = 0.1  # s; bounds the reaction time to a stop signal, a dead process and an outage
+MIN_WAIT = 0.005  # s; bounds the CPU load while a window is overdue
+SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
+RECORDER_ROOM = 32  # windows that wait for the recorder
+RECORDER_FLUSH, WRITER_FLUSH = 1.5, 0.5  # s to finish writing at the end
+STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths; the watchdog is not fed afterwards
+MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
+SAVE_INTERVAL = 300.0  # s between two saves of components that have only become more precise
+RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
 
 
 class Service:
     """One machine, from :meth:`run` to the signal that stops it."""
 
     def __init__(
-        self, plan: LoadedMachine, listen: tuple[str, ...] | None = None, recording: Path | None = None
+        self, machine: LoadedMachine, listen: tuple[str, ...] | None = None, recording: Path | None = None
     ) -> None:
-        machine = plan.file.machine
-        self._plan = plan
-        self._listen = plan.file.zenoh.listen if listen is None else listen
-        self._rings = Rings(plan.twin.signals, RING_RATE * RING_WINDOWS * plan.problem.window.longest)
-        period, sampling = plan.file.window.sample_period, plan.driver.sampling
-        self._windower = Windower(plan.twin.signals, plan.records, period, plan.limits, sampling)
-        longest = plan.problem.window.longest * period
-        keeper = StateStore(machine.site, machine.name, plan.twin, signal_fingerprint=plan.signal_fingerprint)
-        self._housekeeper = WriterThread(keeper, keeper.stamp())
-        state = initial_state(machine.name, machine.site, plan.problem)
+        """``listen`` and ``recording`` replace the endpoints and the recording file that the machine file gives."""
+        file, longest, period = machine.file, machine.problem.window.longest, machine.file.window.sample_period
+        self._machine = machine
+        self._listen = file.zenoh.listen if listen is None else listen
+        self._rings = Rings(machine.twin.signals, RING_RATE * RING_WINDOWS * longest)
+        self._windower = Windower(
+            machine.twin.signals, machine.records, period, machine.limits, machine.driver.sampling
+        )
+        store = StateStore(
+            file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
+        )
+        self._writer = WriterThread(store, store.decisions_time())
+        state = initial_state(file.machine.name, file.machine.site, machine.problem)
         decisions = OperatorDecisions()
         try:
-            state, decisions = restore_components(state, keeper.components()), keeper.decisions()
-        except OtolithError as error:  # a file that cannot be read is no reason not to watch the machine
-            log.warning("begun without components: %s", error)
-        self._kept, self._kept_at = tuple(entry.component.key for entry in state.catalogue), 0.0
-        if self._kept:
-            log.info("begun with what was found earlier: %s; %s", ", ".join(map(str, self._kept)), FORGET)
-        self._supervisor = Supervisor(apply_decisions(state, decisions), longest)
+            state, decisions = restore_components(state, store.components()), store.decisions()
+        except OtolithError as error:  # an unreadable file must not keep the machine from being monitored
+            log.warning("started without saved components: %s", error)
+        self._saved, self._saved_at = tuple(known.component.key for known in state.adopted), 0.0
+        if self._saved:
+            remedy = "'otolith components forget' removes those that no longer exist"
+            log.info("started with saved components: %s; %s", ", ".join(self._saved), remedy)
+        self._supervisor = Supervisor(apply_decisions(state, decisions), longest * period)
         self._recorder = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
-        self._recording = recording if plan.file.recording.enabled else None
+        self._recording = recording
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
         self._stop_signal: int | None = None
-        self._windows = self._windows_bad = self._recordings_dropped = self._settled = 0
-        self._started = self._progress = self._fed = 0.0
+        self._windows = self._windows_bad = self._recordings_dropped = self._finished = 0
+        self._started_at = self._progress_at = self._fed_at = 0.0
 
     def run(self) -> int:
-        """Serve until SIGTERM, SIGHUP or SIGINT; the signal's number.
+        """Serve until SIGTERM, SIGHUP or SIGINT, and return the number of that signal.
 
         Raises:
             DeviceError: the machine's bus cannot be opened.
-            ServiceError: a port or folder of this computer cannot be had.
+            ServiceError: a port or folder of this computer is not available.
         """
         for number in SIGNALS:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves SIGHUP
+            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
                 signal.signal(number, self._on_signal)
         try:
             self._start()
             while self._stop_signal is None:
-                self._turn()
+                self._step()
         finally:
             self._stop()
         return self._stop_signal or 0
@@ -111,138 +115,131 @@ class Service:
         self._stop_signal = number
 
     def _start(self) -> None:
-        sys.setswitchinterval(SWITCH)
-        machine, driver = self._plan.file.machine, self._plan.driver
-        self._publisher = Publisher(machine.site, machine.name, self._listen, self._plan.file.zenoh.connect)
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        identity, driver = self._machine.file.machine, self._machine.driver
+        self._publisher = Publisher(identity.site, identity.name, self._listen, self._machine.file.zenoh.connect)
         driver.open(self._rings.deliver)
-        self._housekeeper.start()
+        self._writer.start()
         self._supervisor.start()
-        self._start_recorder()
-        self._started = self._progress = time.monotonic()
-        self._notifier.ready(f"listening: {driver.describe()[0]}")
-        log.info("machine %s, %s: reports on %s", machine.name, self._plan.twin.title, ", ".join(self._listen))
+        if self._machine.file.recording.enabled:
+            self._start_recorder()
+        self._started_at = self._progress_at = time.monotonic()
+        self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
+        log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, ", ".join(self._listen))
 
     def _stop(self) -> None:
-        """Everything that was begun, whatever becomes of the rest."""
+        """Stop every part, even if stopping another one fails; the last callback runs first."""
         with contextlib.ExitStack() as steps:
             steps.callback(self._notifier.close)
             if self._publisher is not None:
                 steps.callback(self._publisher.close)
-            steps.callback(self._housekeeper.stop, KEEPER_FLUSH)
+            steps.callback(self._writer.stop, WRITER_FLUSH)
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
-            steps.callback(self._supervisor.stop)
-            steps.callback(self._plan.driver.close)
-            self._keep(math.inf)
-            self._notifier.stopping()
+            steps.callback(self._supervisor.worker.kill)
+            steps.callback(self._machine.driver.close)
+            self._save_components(math.inf)
+            self._notifier.send("STOPPING=1")
 
-    def _start_recorder(self) -> None:
-        plan = self._plan
-        if not plan.file.recording.enabled:
-            return
-        if self._recording is None or self._recorder.starts:  # a second file never overwrites the first
-            folder = recording_folder(plan)
-            stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
-            self._recording = folder / f"{plan.file.machine.name}-{stamp}-{os.getpid()}.rrd"
-        writable(self._recording.parent)
-        title = f"{plan.file.machine.name} at {plan.file.machine.site}"
-        self._recorder.start(self._recording, title, plan.twin, plan.problem.free)
-        log.info("recording to %s", self._recording)
-
-    def _turn(self) -> None:
-        """One pass: cut what is due, hand it on, publish what came back, watch over everybody."""
+    def _step(self) -> None:
+        """Cut due windows, hand them to the worker, publish finished reports, supervise the processes."""
         now = time.monotonic()
-        begun = self._windower.begin(self._rings, now, now - self._started)
+        begun = self._windower.begin(self._rings, now, now - self._started_at)
         while begun and self._windower.due(self._rings, now):
             self._cut(now)
-        pause = min(TICK, max(0.005, self._windower.next_end - now))
-        wait(self._supervisor.waitables, timeout=pause)
+        wait(self._supervisor.worker.waitables, timeout=min(MAX_WAIT, max(MIN_WAIT, self._windower.next_end - now)))
         for report, seconds in self._supervisor.poll(time.monotonic()):
             self._publish(report, seconds)
             self._windower.records = self._supervisor.records
-            self._keep(time.monotonic())
-        self._watch(time.monotonic())
-
-    def _keep(self, now: float) -> None:
-        """Have components written down that are new, gone, or known better than a while ago."""
-        state = self._supervisor.state
-        found = tuple(entry.component.key for entry in state.catalogue)
-        if found != self._kept or (found and now - self._kept_at >= KEEP_EVERY):
-            self._housekeeper.keep(component_records(state))
-            self._kept, self._kept_at = found, now
-
-    def _listen_to_specialist(self) -> None:
-        """What has been said about components since it was last looked at."""
-        decisions = self._housekeeper.new_decisions()
-        if decisions is not None:
-            self._supervisor.revise(lambda state: apply_decisions(state, decisions))
-
-    def _regrid(self) -> None:
-        """Where the machine gives less than was asked, windows are made of what it gives."""
-        period, now = self._plan.driver.link().period, self._windower.sample_period
-        if period is None or abs(period / now - 1.0) < OTHER_GRID:
-            return
-        plan = self._plan
-        ratio = period / plan.file.window.sample_period
-        self._supervisor.revise(lambda state: with_sample_grid(state, plan.problem.window, ratio))
-        self._windower.regrid(self._supervisor.records, period)
-        found = f"the machine gives a sample every {period * 1e3:.4g} ms, not every {now * 1e3:.4g} ms"
-        size = f"{self._windower.records} records in {self._windower.length:.4g} s"
-        log.warning("%s: windows have %s from now on", found, size)
+            self._save_components(time.monotonic())
+        self._feed_watchdog(time.monotonic())
+        if self._machine.file.recording.enabled:
+            self._supervise_recorder(time.monotonic())
 
     def _cut(self, now: float) -> None:
         window = self._windower.cut(self._rings, time.time() - time.monotonic())
-        self._regrid()
-        self._listen_to_specialist()
+        self._adopt_achieved_period()
+        decisions = self._writer.new_decisions()
+        if decisions is not None:
+            self._supervisor.revise(lambda state: apply_decisions(state, decisions))
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
         self._supervisor.submit(window, now)
+
+    def _adopt_achieved_period(self) -> None:
+        """Use the sample period that a polled machine achieves for the following windows."""
+        period, current = self._machine.driver.link().period, self._windower.sample_period
+        if period is None or abs(period / current - 1.0) < MIN_PERIOD_CHANGE:
+            return
+        configured, ratio = self._machine.problem.window, period / self._machine.file.window.sample_period
+        self._supervisor.revise(lambda state: with_sample_grid(state, configured, ratio))
+        self._windower.regrid(self._supervisor.records, period)
+        change = f"the machine gives a sample every {period * 1e3:.4g} ms instead of every {current * 1e3:.4g} ms"
+        size = f"{self._windower.records} records in {self._windower.length:.4g} s"
+        log.warning("%s: windows now have %s", change, size)
 
     def _publish(self, report: Report, seconds: float) -> None:
         document = report.document
         latency = max(0.0, time.time() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
-        link = self._plan.driver.link()
+        link = self._machine.driver.link()
         driver = DriverDocument(up=link.up, reason=link.reason, warnings=link.warnings, plan=link.plan)
-        document = document.model_copy(update={"cost": cost, "counters": self._counters(), "driver": driver})
+        rings, driver_counters = self._rings.counters(), self._machine.driver.counters()
+        counters = CountersDocument(
+            received=rings.received,
+            bad=driver_counters.bad,
+            lost=driver_counters.lost + rings.overwritten,
+            reconnects=driver_counters.reconnects,
+            windows=self._windows,
+            windows_bad=self._windows_bad,
+            windows_missed=self._supervisor.missed,
+            worker_restarts=self._supervisor.restarts,
+            recordings_dropped=self._recordings_dropped,
+        )
+        document = document.model_copy(update={"cost": cost, "counters": counters, "driver": driver})
         if self._publisher is not None:
             self._publisher.publish(document)
-        if self._plan.file.recording.enabled:
+        if self._machine.file.recording.enabled:
             recorded = self._recorder.alive and self._recorder.offer(Report(document, report.traces))
             self._recordings_dropped += not recorded
         line = summary(document)
-        self._notifier.status(line)
+        self._notifier.send(f"STATUS={line}")
         log.info("%s", line)
 
-    def _counters(self) -> CountersDocument:
-        driver, rings, supervisor = self._plan.driver.counters(), self._rings.counters(), self._supervisor
-        return CountersDocument(
-            received=rings.received,
-            bad=driver.bad,
-            lost=driver.lost + rings.overwritten,
-            reconnects=driver.reconnects,
-            windows=self._windows,
-            windows_bad=self._windows_bad,
-            windows_missed=supervisor.missed,
-            worker_restarts=supervisor.restarts,
-            recordings_dropped=self._recordings_dropped,
-        )
+    def _save_components(self, now: float) -> None:
+        """Request a save if components were added or removed, or the last save is ``SAVE_INTERVAL`` ago."""
+        state = self._supervisor.state
+        keys = tuple(known.component.key for known in state.adopted)
+        if keys != self._saved or (keys and now - self._saved_at >= SAVE_INTERVAL):
+            self._writer.save(component_records(state))
+            self._saved, self._saved_at = keys, now
 
-    def _watch(self, now: float) -> None:
-        """Feed the watchdog by progress, not by mere life; bring a dead recorder back with a file of its own."""
-        if self._supervisor.finished != self._settled:
-            self._settled, self._progress = self._supervisor.finished, now
-        patience = STALL + 3 * self._windower.length + (0.0 if self._supervisor.finished else COMPILING)
-        stalled = now - self._progress > patience
-        if self._notifier.watchdog and not stalled and now - self._fed > self._notifier.watchdog / 4:
-            self._fed = now
-            self._notifier.progress()
-        if not self._plan.file.recording.enabled:
-            return
-        if self._recorder.alive and self._recorder.age > THRIVES:
-            self._recorder.has_thrived()
-        if self._recorder.may_start_again(now):
+    def _feed_watchdog(self, now: float) -> None:
+        """Feed systemd's watchdog as long as windows, good or bad, are being finished."""
+        if self._supervisor.finished != self._finished:
+            self._finished, self._progress_at = self._supervisor.finished, now
+        # Before the first window the worker may compile the kernels of the twin.
+        compiling = 0.0 if self._supervisor.finished else COMPILE_TIMEOUT
+        stalled = now - self._progress_at > STALL_TIMEOUT + 3 * self._windower.length + compiling
+        if self._notifier.watchdog and not stalled and now - self._fed_at > self._notifier.watchdog / 4:
+            self._fed_at = now
+            self._notifier.send("WATCHDOG=1")
+
+    def _supervise_recorder(self, now: float) -> None:
+        """Restart a dead recorder with a new file."""
+        if self._recorder.alive and self._recorder.age > RECORDER_HEALTHY_AGE:
+            self._recorder.reset_backoff()
+        if self._recorder.may_restart(now):
             try:
                 self._start_recorder()
-            except OtolithError as error:  # recordings are not what the machine is watched for
+            except OtolithError as error:  # monitoring continues without recording
                 log.warning("no recording: %s", error)
-                self._recorder.postpone()
+                self._recorder.count_failed_start()
+
+    def _start_recorder(self) -> None:
+        machine = self._machine
+        if self._recording is None or self._recorder.starts:  # a restarted recorder must not overwrite its first file
+            stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
+            self._recording = machine.recording_folder / f"{machine.file.machine.name}-{stamp}-{os.getpid()}.rrd"
+        writable(self._recording.parent)
+        self._recorder.start(self._recording, machine.title, machine.twin, machine.problem.free)
+        log.info("recording to %s", self._recording)

@@ -1,11 +1,11 @@
-"""The worker process: adapts to the windows it is handed, one by one, and owns nothing that could be lost.
+"""The worker process, which adapts to one window at a time, and its supervisor in the daemon.
 
-The daemon imports this module for its messages; only the worker loads the heart, with its compiler and its optimiser.
+The worker is stateless: it receives state and window, and returns the next state and the report. The state of record
+stays with the supervisor, so the death of a worker costs no more than the current window. That window is tried once
+more; if its worker dies again, or if it takes too long, it is counted as missed.
 
-Hands windows to the worker process one at a time, and keeps its promise that the worker may die at any moment.
-
-A window whose worker died is tried once more; a second death, or a window that waits too long, is counted as missed.
-The adaptation state stays on this side of the pipe, so that a death loses no more than the window at hand.
+The daemon imports this module too, so the adaptation core with its compiler and optimiser is imported only in the
+functions that run in the worker.
 """
 
 import logging
@@ -18,184 +18,165 @@ from typing import Any
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.state import AdaptationState
+from otolith.adaptation.state import AdaptationState, with_problem
 from otolith.health.schema import Report
 from otolith.runtime.process import ChildProcess
 
 log = logging.getLogger(__name__)
 
-REHEARSED = 80  # records
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+WARM_UP_RECORDS = 80  # of the random window that makes a new worker compile every kernel
+MAX_WAITING_WINDOWS = 2  # for a busy worker; older ones are missed
+WINDOW_TIMEOUT = 20.0  # s for a window, in addition to twice its length
+COMPILE_TIMEOUT = 120.0  # s for the first window, in addition: the kernels of a new twin are compiled before it
+NOT_READY = "the worker is starting; it compiles the kernels of a twin that is new on this computer for 1 to 2 minutes"
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """A window to adapt to, from a state."""
-
-    state: AdaptationState
-    window: Window
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """What came of a task; the state it began with and no report where the heart failed."""
+class WorkerResult:
+    """The next state and the report of a window; after a failure the unchanged state and no report."""
 
     window_index: int
     state: AdaptationState
     report: Report | None
     seconds: float
-    failure: str = ""
+    """Computing time, s."""
+    failure: str
+    """The exception, or an empty string."""
 
 
 def main(connection: Any, state: AdaptationState) -> None:
-    """Serve tasks until the connection closes or None comes."""
+    """Serve in the worker process: receive (state, window) and send a result, until None comes."""
     _warm_up(state)
     while (task := connection.recv()) is not None:
-        connection.send(perform(task))
+        connection.send(perform(*task))
 
 
-def perform(task: Task) -> Result:
-    """Adapt, timed; an exception in the heart costs this window and nothing else."""
+def perform(state: AdaptationState, window: Window) -> WorkerResult:
+    """Adapt to a window; an exception costs this window only."""
     from otolith.adaptation.adapt import adapt  # noqa: PLC0415 - see the module's docstring
 
     begun = time.perf_counter()
+    report, failure = None, ""
     try:
-        state, report = adapt(task.state, task.window)
+        state, report = adapt(state, window)
     except Exception as error:
-        log.exception("window %d", task.window.index)
+        log.exception("window %d", window.index)
         failure = f"{type(error).__name__}: {error}"
-        return Result(task.window.index, task.state, None, time.perf_counter() - begun, failure)
-    return Result(task.window.index, state, report, time.perf_counter() - begun)
+    return WorkerResult(window.index, state, report, time.perf_counter() - begun, failure)
 
 
 def _warm_up(state: AdaptationState) -> None:
-    """Load and compile what the first window would have to wait for."""
+    """Import and compile what the first window needs: no twin explains random values, so discovery runs as well."""
     signals = state.problem.twin.signals
-    values = np.random.default_rng(state.problem.seed).standard_normal((REHEARSED, len(signals)))  # nothing explains it
+    values = np.random.default_rng(state.problem.seed).standard_normal((WARM_UP_RECORDS, len(signals)))
     window = Window.whole(0, 0.0, 0.01, signals, values)
     short = replace(state.problem, swarm=replace(state.problem.swarm, generations=2))
-    perform(Task(replace(state, problem=short), window))
-
-
-ROOM = 2  # windows that wait for a busy worker; older ones are missed
-PATIENCE = 20.0  # s for a window beyond twice its length
-COMPILING = 120.0  # s more for the first one: a twin that this computer has never run is compiled before
-NOT_READY = (
-    "the worker is not ready: it starts, and compiles a twin that is new to this computer, which takes a minute or two"
-)
+    perform(with_problem(state, short), window)
 
 
 class Supervisor:
-    """Times are seconds on the monotonic clock, given by the caller."""
+    """Runs the worker process and keeps the adaptation state. Times are monotonic seconds, given by the caller."""
 
     def __init__(self, state: AdaptationState, window_length: float) -> None:
+        """``window_length`` is that of the longest window, s."""
+        self.state = state
+        """State after the last finished window."""
         self.missed = 0
         self.finished = 0
-        self._state = state
         self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
-        self._patience = PATIENCE + 2 * window_length
-        self._companion = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
+        self._timeout = WINDOW_TIMEOUT + 2 * window_length
+        self.worker = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
         self._waiting: deque[Window] = deque()
-        self._at_hand: Window | None = None
+        self._current: Window | None = None
         self._retried: int | None = None
         self._deadline = 0.0
-        self._missed_why = ""
+        self._last_reason = ""
 
     @property
     def records(self) -> int:
-        """How many the next window should have."""
-        state = self._state
-        for change in self._changes:
-            state = change(state)
-        return state.records
+        """Records of the next window."""
+        return self._next_state().records
 
     @property
     def restarts(self) -> int:
-        """How often the worker had to be started again."""
-        return max(0, self._companion.starts - 1)
+        """Number of restarts of the worker."""
+        return max(0, self.worker.starts - 1)
 
     @property
-    def waitables(self) -> list[Any]:
-        """See :attr:`otolith.runtime.process.Companion.waitables`."""
-        return self._companion.waitables
-
-    @property
-    def state(self) -> AdaptationState:
-        """After the last window that was finished."""
-        return self._state
-
-    @property
-    def _allowed(self) -> float:
-        """S that the window at hand may take."""
-        return self._patience + (0.0 if self.finished else COMPILING)
+    def _allowed_seconds(self) -> float:
+        return self._timeout + (0.0 if self.finished else COMPILE_TIMEOUT)
 
     def revise(self, change: Callable[[AdaptationState], AdaptationState]) -> None:
-        """Change the state before the next window, whatever becomes of the one at hand."""
+        """Apply ``change`` to the state before the next window is dispatched."""
         self._changes.append(change)
 
     def start(self) -> None:
         """Start the worker."""
-        self._companion.start(self._state)
-
-    def stop(self) -> None:
-        """End the worker at once; nobody will read what it has at hand."""
-        self._companion.kill()
+        self.worker.start(self.state)
 
     def submit(self, window: Window, now: float) -> None:
-        """Queue a window, and hand it on if the worker is free."""
+        """Queue a window, and dispatch it if the worker is free."""
         self._waiting.append(window)
-        while len(self._waiting) > ROOM:
+        while len(self._waiting) > MAX_WAITING_WINDOWS:
             self._miss(self._waiting.popleft(), "the worker is behind" if self.finished else NOT_READY)
-        self._hand_on(now)
+        self._dispatch(now)
 
     def poll(self, now: float) -> list[tuple[Report, float]]:
-        """Reports that are finished, each with the seconds of computing; restarts what has died."""
-        reports = [report for result in self._companion.replies() if (report := self._take(result)) is not None]
-        if not self._companion.alive:
-            self._take_back("died")
-            if self._companion.may_start_again(now):
+        """Return finished reports with their computing times in s; restart a worker that died or hangs."""
+        reports = [report for result in self.worker.replies() if (report := self._take(result)) is not None]
+        if not self.worker.alive:
+            self._requeue("died")
+            if self.worker.may_restart(now):
                 self.start()
-        elif self._at_hand is not None and now > self._deadline:
-            self._take_back(f"has not finished window {self._at_hand.index} in {self._allowed:.0f} s")
-            self._companion.kill()
-        self._hand_on(now)
+        elif self._current is not None and now > self._deadline:
+            self._requeue(f"has not finished window {self._current.index} in {self._allowed_seconds:.0f} s")
+            self.worker.kill()
+        self._dispatch(now)
         return reports
 
-    def _take(self, result: Result) -> tuple[Report, float] | None:
-        window = self._at_hand
-        if window is None or window.index != result.window_index:  # it was taken back, and is answered by another
+    def _take(self, result: WorkerResult) -> tuple[Report, float] | None:
+        window = self._current
+        if window is None or window.index != result.window_index:  # the window was requeued meanwhile
             return None
-        self._at_hand = None
-        self._companion.has_thrived()
+        self._current = None
+        self.worker.reset_backoff()
         if result.report is None:
             self._miss(window, result.failure)
             return None
-        self._state = result.state
+        self.state = result.state
         self.finished += 1
         return result.report, result.seconds
 
-    def _take_back(self, why: str) -> None:
-        """The window at hand waits for the next worker, unless it has already cost one."""
-        window, self._at_hand = self._at_hand, None
+    def _requeue(self, reason: str) -> None:
+        """Put the current window back for the next worker, or count it as missed if it was put back before."""
+        window, self._current = self._current, None
         if window is None:
             return
-        log.warning("the worker %s; it is started again", why)
+        log.warning("the worker %s; it is restarted", reason)
         if window.index == self._retried:
             self._miss(window, "its worker died twice")
         else:
             self._retried = window.index
             self._waiting.appendleft(window)
 
-    def _hand_on(self, now: float) -> None:
-        if self._at_hand is not None or not self._waiting or not self._companion.alive:
+    def _dispatch(self, now: float) -> None:
+        if self._current is not None or not self._waiting or not self.worker.alive:
             return
-        while self._changes:
-            self._state = self._changes.pop(0)(self._state)
-        self._at_hand = self._waiting.popleft()
-        self._companion.offer(Task(self._state, self._at_hand))
-        self._deadline = now + self._allowed
+        self.state, self._changes = self._next_state(), []
+        self._current = self._waiting.popleft()
+        self.worker.offer((self.state, self._current))
+        self._deadline = now + self._allowed_seconds
 
-    def _miss(self, window: Window, why: str) -> None:
+    def _next_state(self) -> AdaptationState:
+        """Return the state with all pending changes."""
+        state = self.state
+        for change in self._changes:
+            state = change(state)
+        return state
+
+    def _miss(self, window: Window, reason: str) -> None:
         self.missed += 1
-        level = logging.DEBUG if why == NOT_READY == self._missed_why else logging.WARNING  # once is enough
-        self._missed_why = why
-        log.log(level, "window %d missed: %s", window.index, why)
+        repeated = reason == NOT_READY == self._last_reason  # warn once about all windows missed during compilation
+        self._last_reason = reason
+        log.log(logging.DEBUG if repeated else logging.WARNING, "window %d missed: %s", window.index, reason)

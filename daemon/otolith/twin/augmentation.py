@@ -1,135 +1,141 @@
-"""A twin with slots for components: the page that every twin is searched and completed on.
+"""Augmented twins: the author's twin with component slots, augmentation inputs at its sites, and angles as states.
 
-Which component sits in a slot, where it enters and what it depends on are settings, chosen when the twin runs; so one
-compiled kernel serves every component, and nothing has to be compiled when one is found.
+Settings choose the component of a slot: its family, the site it enters and the source it depends on. They are ordinary
+arguments of the kernel, so one compiled kernel serves every component and nothing is compiled during a search.
 """
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from otolith.twin.component_families import Kind
-from otolith.twin.definition import Definition, Input, Parameter, Role, Site, StateVariable
+from otolith.twin.component_families import SourceKind
+from otolith.twin.definition import Definition, Input, Output, Parameter, Role, Site, StateVariable
 from otolith.twin.dimensions import dimension_of
 
-SLOTS = 3
-ELAPSED = "_elapsed"  # s since the first record; what begins with "_" no author of a twin can write
-WIDE = 1e30
-SPEEDS = {"rad/s": "rad", "m/s": "m"}
+MAX_COMPONENTS = 3
+"""Component slots of an augmented twin. Engineering choice: compile time grows with each slot."""
+UNBOUNDED = 1e30  # bounds of parameters whose real bounds come with the component; any finite number would do
+ELAPSED = "_elapsed"  # input: s since the first record; no author can write a name that begins with "_"
+INTEGRAL_UNITS = {"rad/s": "rad", "m/s": "m"}
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
-    """What a component may depend on."""
+class ComponentSource:
+    """A quantity that a component may depend on."""
 
     name: str
     unit: str
-    kind: Kind
+    kind: SourceKind
     symbol: str
-    """In the slotted twin; empty for nothing."""
-
-
-def reading(name: str) -> str:
-    """The site at which the sensor of a signal may lie."""
-    return f"sensor of {name}"
+    """Its name in the augmented twin; empty for no quantity."""
 
 
 @lru_cache(maxsize=64)
-def sites(definition: Definition) -> tuple[Site, ...]:
-    """The author's, then one for what each sensor adds to the truth."""
-    sensors = (
-        Site(reading(name), definition.unit_of(name), f"error of the sensor of {name}", name, "additive")
-        for name in (*(entry.name for entry in definition.outputs), *(entry.name for entry in definition.inputs))
-    )
-    return (*definition.sites, *sensors)
-
-
-@lru_cache(maxsize=64)
-def sources(definition: Definition) -> tuple[Source, ...]:
-    """Time, angles, inputs, states, and outputs that are no states; ``definition`` is the author's."""
-    states = [entry.name for entry in definition.states]
+def sites(base: Definition) -> tuple[Site, ...]:
+    """The author's sites, then one for the error of each sensor: outputs, then inputs."""
+    names = [*(output.name for output in base.outputs), *(driven.name for driven in base.inputs)]
+    sensors = [(name, f"sensor of {name}") for name in names]
     return (
-        Source("", "1", Kind.NOTHING, ""),
-        Source("t", "s", Kind.TIME, ELAPSED),
-        *(Source(f"angle({name})", unit, Kind.PLACE, _angle(name)) for name, unit in _speeds(definition)),
-        *(Source(entry.name, entry.unit, Kind.SIGNAL, entry.name) for entry in definition.inputs),
-        *(Source(entry.name, entry.unit, _kind(entry.unit), entry.name) for entry in definition.states),
-        *(Source(e.name, e.unit, _kind(e.unit), e.name) for e in definition.outputs if e.name not in states),
+        *base.sites,
+        *(Site(sensor, base.unit_of(name), f"error of the {sensor}", name, "additive") for name, sensor in sensors),
     )
 
 
-def _kind(unit: str) -> Kind:
-    return Kind.PLACE if unit in ("rad", "m") else Kind.SIGNAL
+@lru_cache(maxsize=64)
+def sources(base: Definition) -> tuple[ComponentSource, ...]:
+    """Nothing, time, angles, inputs, states, and the outputs that are no states."""
+    states = [state.name for state in base.states]
+    shown: list[StateVariable | Output] = [*base.states, *(o for o in base.outputs if o.name not in states)]
+    return (
+        ComponentSource("", "1", SourceKind.NOTHING, ""),
+        ComponentSource("t", "s", SourceKind.TIME, ELAPSED),
+        *(ComponentSource(f"angle({name})", unit, SourceKind.PLACE, _angle(name)) for name, unit in _speeds(base)),
+        *(ComponentSource(driven.name, driven.unit, SourceKind.SIGNAL, driven.name) for driven in base.inputs),
+        *(ComponentSource(quantity.name, quantity.unit, _kind(quantity.unit), quantity.name) for quantity in shown),
+    )
+
+
+def _kind(unit: str) -> SourceKind:
+    return SourceKind.PLACE if unit in ("rad", "m") else SourceKind.SIGNAL
 
 
 def _angle(speed: str) -> str:
     return f"_angle_{speed}"
 
 
-def _speeds(definition: Definition) -> list[tuple[str, str]]:
-    """States that are speeds, and the unit of their integrals; not those whose integral is a state already."""
-    integrated = {text.strip() for left, text in definition.equations if left.startswith("der(")}
-    found = []
-    for entry in definition.states:
-        for speed, unit in SPEEDS.items():
-            turns = speed == "m/s" or "rad" in entry.unit or "rpm" in entry.unit
-            if turns and dimension_of(entry.unit) == dimension_of(speed) and entry.name not in integrated:
-                found.append((entry.name, unit))
-                break
-    return found
+def _speeds(base: Definition) -> list[tuple[str, str]]:
+    """States that are speeds, with the unit of their integral; without those whose integral is a state already."""
+    integrated = {text.strip() for left, text in base.equations if left.startswith("der(")}
+    return [
+        (state.name, unit)
+        for state in base.states
+        for speed, unit in INTEGRAL_UNITS.items()
+        if dimension_of(state.unit) == dimension_of(speed)
+        # 1/s has the dimension of an angular speed too, but may be the rate of anything.
+        and (speed == "m/s" or "rad" in state.unit or "rpm" in state.unit)
+        and state.name not in integrated
+    ]
 
 
-def enters(index: int) -> str:
-    """The input through which something may be added at a site, by the site's number."""
-    return f"_enter_{index}"
+def augmentation_input(site: int) -> str:
+    """The input that is added at a site, by the site's number."""
+    return f"_enter_{site}"
 
 
-def entrances(definition: Definition) -> tuple[str, ...]:
-    """The inputs through which something may be added, in the order of the sites; ``definition`` is the author's."""
-    return tuple(enters(index) for index in range(len(sites(definition))))
+def augmentation_inputs(base: Definition) -> tuple[str, ...]:
+    """The augmentation inputs, in the order of the sites."""
+    return tuple(augmentation_input(site) for site in range(len(sites(base))))
 
 
-def numbers(slot: int) -> tuple[str, str, str]:
-    """Amplitude, inner number and phase of a slot."""
+def component_parameters(slot: int) -> tuple[str, str, str]:
+    """Amplitude, inner parameter and phase of a slot's component."""
     return f"_amplitude_{slot}", f"_inner_{slot}", f"_phase_{slot}"
 
 
-def family(slot: int) -> str:
-    """The setting that says which meta-model sits in a slot."""
+def family_setting(slot: int) -> str:
+    """The setting with the code of the family in a slot."""
     return f"_family_{slot}"
 
 
-def shift(slot: int) -> str:
-    """The setting that is added to a slot's input."""
+def shift_setting(slot: int) -> str:
+    """The setting that is added to the source of a slot."""
     return f"_shift_{slot}"
 
 
-def weight(slot: int, source: int) -> str:
-    """The setting that is one for the source that a slot depends on, by the source's number."""
+def source_setting(slot: int, source: int) -> str:
+    """The setting that is 1 for the source of a slot and 0 for every other, by the source's number."""
     return f"_weight_{slot}_{source}"
 
 
-def place(slot: int, site: int) -> str:
-    """The setting that is one for the site where a slot enters, by the site's number."""
+def site_setting(slot: int, site: int) -> str:
+    """The setting that is 1 for the site of a slot and 0 for every other, by the site's number."""
     return f"_place_{slot}_{site}"
 
 
 @lru_cache(maxsize=64)
-def with_slots(definition: Definition) -> Definition:
-    """The same machine with empty slots, the angles of its speeds as states, and an input for each site."""
-    speeds = _speeds(definition)
-    settings, found = [], []
-    for slot in range(SLOTS):
-        found += [Parameter(name, "1", 0.0, -WIDE, WIDE, "") for name in numbers(slot)]
-        names = [family(slot), shift(slot)]
-        names += [weight(slot, index) for index in range(1, len(sources(definition)))]
-        names += [place(slot, index) for index in range(len(sites(definition)))]
-        settings += [Parameter(name, "1", 0.0, -WIDE, WIDE, "", Role.SETTING) for name in names]
-    entering = (Input(enters(index), site.unit, "", "foh") for index, site in enumerate(sites(definition)))
+def augmented_model(base: Definition) -> Definition:
+    """``base`` with empty component slots, the angles of its speeds as states, and an input for each site."""
+    speeds = _speeds(base)
+    free: list[str] = []
+    settings: list[str] = []
+    for slot in range(MAX_COMPONENTS):
+        free += component_parameters(slot)
+        settings += [family_setting(slot), shift_setting(slot)]
+        settings += [source_setting(slot, index) for index in range(1, len(sources(base)))]
+        settings += [site_setting(slot, index) for index in range(len(sites(base)))]
+    site_inputs = zip(augmentation_inputs(base), sites(base), strict=True)
     return replace(
-        definition,
-        states=(*definition.states, *(StateVariable(_angle(name), unit, "", 0.0, 0.0, 0.0) for name, unit in speeds)),
-        inputs=(*definition.inputs, Input(ELAPSED, "s", "", "foh"), *entering),
-        parameters=(*definition.parameters, *found, *settings),
-        equations=(*definition.equations, *((f"der({_angle(name)})", name) for name, _ in speeds)),
-        plain=definition,
+        base,
+        states=(*base.states, *(StateVariable(_angle(name), unit, "", 0.0, 0.0, 0.0) for name, unit in speeds)),
+        inputs=(
+            *base.inputs,
+            Input(ELAPSED, "s", "", "foh"),
+            *(Input(name, site.unit, "", "foh") for name, site in site_inputs),
+        ),
+        parameters=(
+            *base.parameters,
+            *(Parameter(name, "1", 0.0, -UNBOUNDED, UNBOUNDED, "") for name in free),
+            *(Parameter(name, "1", 0.0, -UNBOUNDED, UNBOUNDED, "", Role.SETTING) for name in settings),
+        ),
+        equations=(*base.equations, *((f"der({_angle(name)})", name) for name, _ in speeds)),
+        base=base,
     )

@@ -1,21 +1,31 @@
-"""Algebra before code: a printer of scalars, what can be computed once per trajectory, and sparse Jacobians.
+"""Building blocks of generated kernels: printed algebra, sparse Jacobians, lines of source that kernels share.
 
-Fragments of generated kernels: lines of source that more than one kernel is made of.
+Names in generated code: ``x_``, ``u_`` and ``p_`` before the author's name of a state, an input and a parameter or
+setting; ``h_`` an expression of parameters alone; ``t_`` a shared subexpression; ``y_`` outputs, ``e_`` innovations,
+``k1_`` to ``k4_`` the rates at the Runge-Kutta stages. docs/explanation/kernels.md reads one kernel line by line.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from string import Template
 from typing import Any
 
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
 from otolith.twin.definition import Definition
-from otolith.twin.symbolic import System, system_of
+from otolith.twin.symbolic import system_of
+
+DECORATOR = '@njit(error_model="numpy", fastmath={"contract"})'
+
+
+# Step of a central difference by a state, in its unit. Its truncation error grows with the square of the step, its
+# rounding error with the inverse: 1e-6 of the value is near the cube root of the floating-point resolution.
+DIFFERENCE = "1e-6 * abs({name}) + 1e-9"
 
 
 class Printer(PythonCodePrinter):  # type: ignore[misc]  # sympy has no types
-    """Scalars for numba: small powers as products, the steps of sign and max without a call."""
+    """Prints scalar expressions for numba: small powers as products, sign as a conditional expression."""
 
     def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802 - sympy's name
         base, exponent = expr.as_base_exp()
@@ -39,15 +49,11 @@ class Printer(PythonCodePrinter):  # type: ignore[misc]  # sympy has no types
     def _print_component(self, expr: Any) -> str:
         return f"{expr.func.__name__}({', '.join(self._print(argument) for argument in expr.args)})"
 
-    # SymPy asks for a method of the very name of a function's class.
+    # SymPy looks a method up by the exact name of the function's class.
     _print_component_x = _print_component_a = _print_component_b = _print_component_c = _print_component
 
     def _print_Heaviside(self, expr: Any) -> str:  # noqa: N802
         return f"(1.0 if {self._print(expr.args[0])} > 0.0 else 0.0)"
-
-    def _print_DiracDelta(self, expr: Any) -> str:  # noqa: N802 - where a step is, the derivative is taken beside it
-        del expr
-        return "0.0"
 
     def _print_Float(self, expr: Any) -> str:  # noqa: N802
         return repr(float(expr))
@@ -63,261 +69,231 @@ PRINTER = Printer({"fully_qualified_modules": True})
 
 
 class Hoist:
-    """Takes what depends on parameters alone out of expressions."""
+    """Replaces subexpressions of parameters alone by symbols, which a kernel computes once per trajectory."""
 
     def __init__(self, parameters: Iterable[sympy.Symbol]) -> None:
         self._parameters = set(parameters)
         self._symbols: dict[sympy.Expr, sympy.Symbol] = {}
 
     @property
-    def lines(self) -> list[str]:
-        """Assignments, to be made once per trajectory."""
+    def assignments(self) -> list[str]:
+        """One line for each symbol."""
         return [f"{symbol.name} = {PRINTER.doprint(expression)}" for expression, symbol in self._symbols.items()]
 
     @property
     def names(self) -> list[str]:
-        """What the assignments assign to."""
+        """Names of the symbols."""
         return [symbol.name for symbol in self._symbols.values()]
 
     def __call__(self, expression: sympy.Expr) -> sympy.Expr:
-        """The expression with what depends on parameters alone replaced by names."""
+        """``expression`` with its constant parts replaced."""
         if expression.is_Atom:
             return expression
-        if self._alone(expression):
+        if self._is_constant(expression):
             return self._symbol(expression)
         if isinstance(expression, sympy.Piecewise):
             return sympy.Piecewise(*((self(value), self._condition(condition)) for value, condition in expression.args))
         if not (expression.is_Add or expression.is_Mul):
             return expression.func(*(self(part) for part in expression.args))
-        alone = [part for part in expression.args if self._alone(part)]
-        rest = [self(part) for part in expression.args if part not in alone]
-        if alone and not (len(alone) == 1 and alone[0].is_Symbol):
-            alone = [self._symbol(expression.func(*alone))]
-        return expression.func(*alone, *rest)
+        constant = [part for part in expression.args if self._is_constant(part)]
+        rest = [self(part) for part in expression.args if part not in constant]
+        if constant and not (len(constant) == 1 and constant[0].is_Symbol):
+            constant = [self._symbol(expression.func(*constant))]
+        return expression.func(*constant, *rest)
 
     def _condition(self, condition: Any) -> Any:
-        """A comparison is no number and stays; what it compares may be hoisted."""
+        """Hoist within both sides of a comparison; the comparison itself is no number and stays."""
         if condition.is_Atom:
             return condition
         inside = self._condition if not condition.is_Relational else self
         return condition.func(*(inside(part) for part in condition.args))
 
-    def _alone(self, expression: sympy.Expr) -> bool:
+    def _is_constant(self, expression: sympy.Expr) -> bool:
         return bool(expression.free_symbols) and expression.free_symbols <= self._parameters
 
     def _symbol(self, expression: sympy.Expr) -> sympy.Symbol:
-        if expression not in self._symbols:
-            self._symbols[expression] = sympy.Symbol(f"h_{len(self._symbols)}", real=True)
-        return self._symbols[expression]
+        return self._symbols.setdefault(expression, sympy.Symbol(f"h_{len(self._symbols)}", real=True))
+
+
+class SparseJacobian:
+    """The elements of a Jacobian that are not zero everywhere, by row and column."""
+
+    def __init__(self, rows: Sequence[sympy.Expr], by: Sequence[sympy.Symbol]) -> None:
+        derivatives = {(r, c): sympy.diff(row, symbol) for r, row in enumerate(rows) for c, symbol in enumerate(by)}
+        self.elements = {position: value for position, value in derivatives.items() if value != 0}
+
+    def names(self, prefix: str) -> list[str]:
+        """A variable for each element: ``prefix_row_column``."""
+        return [f"{prefix}_{row}_{column}" for row, column in self.elements]
+
+    def named(self, prefix: str) -> list[tuple[int, int, str]]:
+        """Row, column and variable of each element."""
+        return [(row, column, f"{prefix}_{row}_{column}") for row, column in self.elements]
 
 
 @dataclass(frozen=True)
-class Entries:
-    """The entries of a Jacobian that are not zero everywhere."""
+class Stage:
+    """One stage of the classical Runge-Kutta method (Hairer, Norsett, Wanner, Solving ODE I, Table II.1.2)."""
 
-    places: tuple[tuple[int, int], ...]
-    values: tuple[sympy.Expr, ...]
+    number: int
+    time: float
+    """Share of the step at which the stage evaluates the rates."""
+    length: str
+    """Variable of the kernel by which the stage advances the state along the rates of the stage before."""
+    input_prefix: str
+    """Before the name of a ``foh`` input: its value at the time of the stage."""
 
-    @classmethod
-    def of(cls, rows: Sequence[sympy.Expr], by: Sequence[sympy.Symbol]) -> "Entries":
-        """The derivatives of ``rows``, each by each of ``by``."""
-        found = [((r, c), sympy.diff(row, symbol)) for r, row in enumerate(rows) for c, symbol in enumerate(by)]
-        found = [(place, value) for place, value in found if value != 0]
-        return cls(tuple(place for place, _ in found), tuple(value for _, value in found))
-
-    def names(self, prefix: str) -> list[str]:
-        """A variable for each entry."""
-        return [f"{prefix}_{row}_{column}" for row, column in self.places]
-
-
-HELPER = '@njit(error_model="numpy", fastmath={"contract"})'
+    def advanced(self, names: Sequence[str], rates: str) -> list[str]:
+        """``names`` plus this stage's length times the ``rates`` (``k`` or ``q``) of the stage before."""
+        if self.number == 1:
+            return list(names)
+        return [f"{name} + {self.length} * {rates}{self.number - 1}_{row}" for row, name in enumerate(names)]
 
 
-class Fragments:
-    """What the kernels of one twin are put together of: names, reads, corrections, the integrator's step."""
+STAGES = (Stage(1, 0.0, "", ""), Stage(2, 0.5, "half", "mid_"), Stage(3, 0.5, "half", "mid_"),
+          Stage(4, 1.0, "step", "end_"))  # fmt: skip
+
+Blocks = dict[str, str | list[str]]
+"""What fills a template: text within a line, or lines of its own."""
+
+
+class KernelCode:
+    """Names, functions of scalars and source blocks that the kernels of one twin share."""
 
     def __init__(self, definition: Definition) -> None:
-        system = _renamed(system_of(definition))
+        system = system_of(definition)
         hoist = Hoist((*system.parameters, *system.settings))
         self.x = [symbol.name for symbol in system.states]
         self.u = [symbol.name for symbol in system.inputs]
         self.p = [symbol.name for symbol in system.parameters]
         self.settings = [symbol.name for symbol in system.settings]
-        self.linear = [entry.hold == "foh" for entry in definition.inputs]
-        self.outputs = len(system.outputs)
-        self.a, self.b = Entries.of(system.rates, system.states), Entries.of(system.rates, system.parameters)
-        self.c, self.d = Entries.of(system.outputs, system.states), Entries.of(system.outputs, system.parameters)
+        self.y = numbered("y", len(system.outputs))
+        self.ramps = [name for name, driven in zip(self.u, definition.inputs, strict=True) if driven.hold == "foh"]
+        # dx/dt = f(x, u, p) and y = g(x, u, p): a = df/dx, b = df/dp, c = dg/dx, d = dg/dp.
+        self.a, self.b = (SparseJacobian(system.rates, by) for by in (system.states, system.parameters))
+        self.c, self.d = (SparseJacobian(system.outputs, by) for by in (system.states, system.parameters))
         self.rates = [hoist(expression) for expression in system.rates]
-        self.expressions = [hoist(expression) for expression in system.outputs]
-        self.rate_entries = [hoist(expression) for expression in (*self.a.values, *self.b.values)]
-        self.output_entries = [hoist(expression) for expression in (*self.c.values, *self.d.values)]
-        self.hoisted = hoist.lines
-        self.fixed = [*self.p, *self.settings, *hoist.names]
+        self._outputs = [hoist(expression) for expression in system.outputs]
+        self._rate_slopes = [hoist(value) for jacobian in (self.a, self.b) for value in jacobian.elements.values()]
+        self._output_slopes = [hoist(value) for jacobian in (self.c, self.d) for value in jacobian.elements.values()]
+        self.hoisted = hoist.assignments
+        self.constants = [*self.p, *self.settings, *hoist.names]
+        self.blocks = self._shared_blocks()
 
-    def function(self, name: str, expressions: list[sympy.Expr]) -> list[str]:
-        """A function of scalars, subexpressions shared."""
+    def functions(self) -> list[str]:
+        """The right sides, alone and with their Jacobians, as functions of scalars that the compiler inlines."""
+        return [
+            *self._function("rates_", self.rates),
+            *self._function("outputs_", self._outputs),
+            *self._function("linearise_", [*self.rates, *self._rate_slopes]),
+            *self._function("linearise_outputs_", [*self._outputs, *self._output_slopes]),
+        ]
+
+    def _function(self, name: str, expressions: list[sympy.Expr]) -> list[str]:
+        """A function of states, inputs and constants; common subexpressions are computed once."""
         shared, results = sympy.cse(expressions, symbols=sympy.numbered_symbols("t_", real=True), order="none")
         lines = [f"{symbol.name} = {PRINTER.doprint(value)}" for symbol, value in shared]
         returned = ", ".join(PRINTER.doprint(result) for result in results)
-        head = f"def {name}({', '.join([*self.x, *self.u, *self.fixed])}):"
-        return [HELPER, head, *indent([*lines, f"return ({returned},)"]), "", ""]
+        head = f"def {name}({self.arguments(self.x, self.u)}):"
+        return [DECORATOR, head, *indent([*lines, f"return ({returned},)"]), "", ""]
 
     def arguments(self, states: Sequence[str], inputs: Sequence[str]) -> str:
-        """What such a function is called with."""
-        return ", ".join([*states, *inputs, *self.fixed])
+        """Arguments of such a function."""
+        return ", ".join([*states, *inputs, *self.constants])
 
-    def y(self) -> list[str]:
-        """The outputs of a record."""
-        return [f"y_{index}" for index in range(self.outputs)]
+    def _shared_blocks(self) -> Blocks:
+        return {
+            "arguments": self.arguments(self.x, self.u),
+            "n_states": str(len(self.x)),
+            "n_outputs": str(len(self.y)),
+            "y": unpacked(self.y),
+            "linearised_y": unpacked([*self.y, *self.c.names("c"), *self.d.names("d")]),
+            "read_parameters": self.read_parameters(""),
+            "read_inputs": [f"{name} = inputs[record, {index}]" for index, name in enumerate(self.u)],
+            "innovations": self._innovations(),
+            "correct_state": [
+                f"{x} += {total([f'gain[record, {row}, {index}] * e_{index}' for index in range(len(self.y))])}"
+                for row, x in enumerate(self.x)
+            ],
+            "input_increments": self.input_increments("inputs[record + 1, {index}]"),
+            "inputs_at_stages": [
+                f"mid_{u}, end_{u} = {u} + 0.5 * increment_{u}, {u} + increment_{u}" for u in self.ramps
+            ],
+            "stage_rates": self.stages("rates_", []),
+            "advance_state": [
+                f"{x} += sixth * (k1_{row} + 2.0 * k2_{row} + 2.0 * k3_{row} + k4_{row})"
+                for row, x in enumerate(self.x)
+            ],
+            "advance_inputs": [f"{u} = end_{u}" for u in self.ramps],
+            "read_next_inputs": [f"w_{index} = inputs[record + 1, {index}]" for index in range(len(self.u))],
+            "next_state": [self.advanced(numbered("n", len(self.x)), {})],
+            "move_to_next": [f"{x} = n_{row}" for row, x in enumerate(self.x)],
+        }  # fmt: skip
 
-    def k(self, stage: int) -> list[str]:
-        """The rates at a stage."""
-        return [f"k{stage}_{row}" for row in range(len(self.x))]
-
-    def jacobians(self, stage: int) -> list[str]:
-        """The entries of both Jacobians of the rates at a stage."""
-        return [*self.a.names(f"a{stage}"), *self.b.names(f"b{stage}")]
-
-    def preamble(self) -> list[str]:
-        """Once per call."""
-        return [
-            "step = sample_period / substeps",
-            "half, sixth = step / 2.0, step / 6.0",
-            "correct = np.any(gain != 0.0)",
-        ]
-
-    def read(self, parameter: str, state: str) -> list[str]:
-        """Once per trajectory."""
-        return [
-            *(f"{name} = {parameter.format(index)}" for index, name in enumerate([*self.p, *self.settings])),
-            *self.hoisted,
-            *(f"{name} = {state.format(index)}" for index, name in enumerate(self.x)),
-        ]
-
-    def read_inputs(self) -> list[str]:
-        """Once per record."""
-        return [f"{name} = inputs[record, {index}]" for index, name in enumerate(self.u)]
-
-    def innovations(self) -> list[str]:
-        """What was measured minus predicted; a record without a measurement corrects nothing."""
+    def _innovations(self) -> list[str]:
+        """``e`` is measured minus predicted and ``m`` is 1; both are 0 for a missing measurement, which is NaN."""
         lines = []
-        for index in range(self.outputs):
+        for index, y in enumerate(self.y):
+            e, m = f"e_{index}", f"m_{index}"
+            lines += [f"{e} = measured[record, {index}] - {y}", f"{m} = 1.0", f"if {e} != {e}:", f"    {e} = {m} = 0.0"]
+        return lines
+
+    def read_parameters(self, row: str) -> list[str]:
+        """Parameters, hoisted expressions and the initial state; ``row`` selects the particle of a swarm."""
+        return [
+            *(f"{name} = parameters[{row}{index}]" for index, name in enumerate([*self.p, *self.settings])),
+            *self.hoisted,
+            *(f"{name} = initial[{row}{index}]" for index, name in enumerate(self.x)),
+        ]
+
+    def input_increments(self, following: str) -> list[str]:
+        """Change of each ``foh`` input per substep; ``following`` is its value at the next record."""
+        return [
+            f"increment_{name} = ({following.format(index=index)} - {name}) / substeps"
+            for index, name in enumerate(self.u)
+            if name in self.ramps
+        ]
+
+    def stages(self, function: str, jacobians: Sequence[tuple[str, SparseJacobian]]) -> list[str]:
+        """The four stages of a substep: a call of ``function`` each, for ``k`` and the elements of ``jacobians``."""
+        lines = []
+        for stage in STAGES:
+            results = numbered(f"k{stage.number}", len(self.x))
+            results += [name for prefix, jacobian in jacobians for name in jacobian.names(f"{prefix}{stage.number}")]
+            inputs = [stage.input_prefix + name if name in self.ramps else name for name in self.u]
+            lines.append(f"{unpacked(results)} = {function}({self.arguments(stage.advanced(self.x, 'k'), inputs)})")
+        return lines
+
+    def advanced(self, names: list[str], changed: Mapping[str, str]) -> str:
+        """An assignment of the states at the next record to ``names``, with some arguments of ``advance_`` replaced."""
+        given = [changed.get(name, name) for name in (*self.x, *self.u, *numbered("w", len(self.u)))]
+        return f"{unpacked(names)} = advance_({', '.join(['step', 'substeps', *given, *self.constants])})"
+
+    def transition(self, element: str) -> list[str]:
+        """The next state by this one, by central differences, into ``element`` of row and column."""
+        states = range(len(self.x))
+        lines = []
+        for column, x in enumerate(self.x):
             lines += [
-                f"e_{index} = measured[record, {index}] - y_{index}",
-                f"m_{index} = 1.0",
-                f"if e_{index} != e_{index}:",
-                f"    e_{index} = m_{index} = 0.0",
+                f"delta = {DIFFERENCE.format(name=x)}",
+                self.advanced(numbered("up", len(self.x)), {x: f"{x} + delta"}),
+                self.advanced(numbered("down", len(self.x)), {x: f"{x} - delta"}),
+                *(f"{element.format(row, column)} = (up_{row} - down_{row}) / (2.0 * delta)" for row in states),
             ]
         return lines
 
-    def correction(self, row: int) -> str:
-        """Of a state, by the gain."""
-        return added([f"gain[record, {row}, {index}] * e_{index}" for index in range(self.outputs)])
 
-    def slope_correction(self, row: int) -> str:
-        """Of a state's sensitivity, by the gain."""
-        terms = [f"gain[record, {row}, {i}] * m_{i} * slopes[record, {i}, column]" for i in range(self.outputs)]
-        return f"({added(terms)})"
-
-    def slopes(self, following: str = "inputs[record + 1, {index}]") -> list[str]:
-        """How a ``foh`` input runs from substep to substep."""
-        return [
-            f"g_{name} = ({following.format(index=index)} - {name}) / substeps"
-            for index, (name, linear) in enumerate(zip(self.u, self.linear, strict=True))
-            if linear
-        ]
-
-    def step(self, stages: list[str], then: list[str]) -> list[str]:
-        """From a record to the next, if there is one; see :meth:`substeps`."""
-        return ["if record + 1 == records:", "    break", *self.slopes(), *self.substeps(stages, then)]
-
-    def substeps(self, stages: list[str], then: list[str]) -> list[str]:
-        """The substeps of a record by the classical Runge-Kutta method; ``stages`` wait for their arguments."""
-        running = [name for name, linear in zip(self.u, self.linear, strict=True) if linear]
-        at = {"": "", "half": "m", "step": "z"}
-
-        def inputs(where: str) -> list[str]:
-            return [f"{at[where]}{name}" if name in running and at[where] else name for name in self.u]
-
-        def states(stage: int, length: str) -> list[str]:
-            return [f"{x} + {length} * k{stage}_{row}" for row, x in enumerate(self.x)]
-
-        arguments = [
-            self.arguments(self.x, inputs("")),
-            self.arguments(states(1, "half"), inputs("half")),
-            self.arguments(states(2, "half"), inputs("half")),
-            self.arguments(states(3, "step"), inputs("step")),
-        ]
-        substep = [
-            *(f"m{name}, z{name} = {name} + 0.5 * g_{name}, {name} + g_{name}" for name in running),
-            *(stage.format(given) for stage, given in zip(stages, arguments, strict=True)),
-            *(f"{x} += sixth * (k1_{r} + 2.0 * k2_{r} + 2.0 * k3_{r} + k4_{r})" for r, x in enumerate(self.x)),
-            *then,
-            *(f"{name} = z{name}" for name in running),
-        ]
-        return ["for substep in range(substeps):", *indent(substep)]
-
-    def advance(self) -> list[str]:
-        """A function of scalars: the states at the next record, where the inputs are ``w``."""
-        following = [f"w_{index}" for index in range(len(self.u))]
-        head = ", ".join(["step", "substeps", *self.x, *self.u, *following, *self.fixed])
-        body = [
-            "half, sixth = step / 2.0, step / 6.0",
-            *self.slopes("w_{index}"),
-            *self.substeps([f"{unpacked(self.k(stage))} = rates_({{}})" for stage in range(1, 5)], []),
-            f"return {unpacked(self.x)}",
-        ]
-        return [HELPER, f"def advance_({head}):", *indent(body), "", ""]
-
-    def propagate(self, columns: int) -> list[str]:
-        """The derivative of the step: each column of the state's sensitivities through the four stages."""
-        lines = [
-            f"drive[{stage - 1}, {row}, {column}] = {name}"
-            for stage in range(1, 5)
-            for (row, column), name in zip(self.b.places, self.b.names(f"b{stage}"), strict=True)
-        ]
-        base = len(self.p) + len(self.x)
-        if columns > base:
-            lines.append("begins = when + substep * step")
-            lines += [
-                f"drive[{stage - 1}, {row}, {base + column}] = (begins + {share} * step) * {name}"
-                for stage, share in ((1, 0.0), (2, 0.5), (3, 0.5), (4, 1.0))
-                for (row, column), name in zip(self.b.places, self.b.names(f"b{stage}"), strict=True)
-            ]
-        rows, driven = range(len(self.x)), {row for row, _ in self.b.places}
-        inner = [f"s_{row} = state[{row}, column]" for row in rows]
-        for stage, length in ((1, ""), (2, "half"), (3, "half"), (4, "step")):
-            for row in rows:
-                terms = [
-                    f"{name} * {f'(s_{c} + {length} * q{stage - 1}_{c})' if length else f's_{c}'}"
-                    for (r, c), name in zip(self.a.places, self.a.names(f"a{stage}"), strict=True)
-                    if r == row
-                ]
-                terms += [f"drive[{stage - 1}, {row}, column]"] if row in driven else []
-                inner.append(f"q{stage}_{row} = {added(terms)}")
-        inner += [f"state[{r}, column] = s_{r} + sixth * (q1_{r} + 2.0 * q2_{r} + 2.0 * q3_{r} + q4_{r})" for r in rows]
-        return [*lines, f"for column in range({columns}):", *indent(inner)]
-
-
-def _renamed(system: System) -> System:
-    """Prefixed symbols, so that no name of a page meets one of the kernel's own."""
-    new = {
-        symbol: sympy.Symbol(f"{prefix}_{symbol.name}", real=True)
-        for prefix, symbols in (
-            ("x", system.states),
-            ("u", system.inputs),
-            ("p", (*system.parameters, *system.settings)),
-        )
-        for symbol in symbols
-    }
-    return System(
-        states=tuple(new[symbol] for symbol in system.states),
-        inputs=tuple(new[symbol] for symbol in system.inputs),
-        parameters=tuple(new[symbol] for symbol in system.parameters),
-        settings=tuple(new[symbol] for symbol in system.settings),
-        rates=tuple(expression.xreplace(new) for expression in system.rates),
-        outputs=tuple(expression.xreplace(new) for expression in system.outputs),
-    )
+def fill(template: str, blocks: Blocks) -> list[str]:
+    """The lines of ``template``: a line ``$name`` becomes the lines of that block, ``$name`` within a line its text."""
+    lines: list[str] = []
+    for line in template.strip().splitlines():
+        code = line.lstrip()
+        block = blocks.get(code.removeprefix("$")) if code.startswith("$") else None
+        if isinstance(block, list):
+            lines += [line[: -len(code)] + inner for inner in block]
+        else:
+            lines.append(Template(line).substitute(blocks))
+    return lines
 
 
 def indent(lines: Iterable[str]) -> list[str]:
@@ -325,16 +301,16 @@ def indent(lines: Iterable[str]) -> list[str]:
     return [f"    {line}" for line in lines]
 
 
-def record_loop(lines: list[str]) -> list[str]:
-    """Over all records."""
-    return ["for record in range(records):", *indent(lines)]
+def numbered(prefix: str, count: int) -> list[str]:
+    """``prefix_0``, ``prefix_1``, ..."""
+    return [f"{prefix}_{index}" for index in range(count)]
 
 
 def unpacked(names: Sequence[str]) -> str:
-    """A tuple to assign to, of one entry as well."""
+    """A tuple to assign to, with its comma if it has one element."""
     return f"({', '.join(names)},)"
 
 
-def added(terms: Sequence[str]) -> str:
-    """A sum, of nothing as well."""
+def total(terms: Sequence[str]) -> str:
+    """The sum of ``terms``; ``0.0`` if there are none."""
     return " + ".join(terms) if terms else "0.0"

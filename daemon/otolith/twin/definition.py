@@ -1,19 +1,19 @@
-"""A twin as its author wrote it, and nothing derived: plain, frozen, hashable, so that it pickles."""
+"""A twin as its author wrote it: frozen, hashable and picklable dataclasses, nothing derived."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
 
 class Role(StrEnum):
-    """How a parameter's value is come by, in the paper's words."""
+    """Where the value of a parameter comes from, in the paper's words."""
 
     INSTRUMENTED = "instrumented"
     """Instrumented known: given or measured."""
     ESTIMATED = "estimated"
     """Non-instrumented known: estimated from windows."""
     SETTING = "setting"
-    """A choice, of which no derivative is taken: what sits in a slot for components."""
+    """Selects a component of an augmented twin; no derivative is taken by it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Parameter:
 
     @property
     def label(self) -> str:
-        """For people: a number of a component is called by what it means."""
+        """The name for people: the meaning if the parameter belongs to a component."""
         return self.meaning if self.name.startswith("_") else self.name
 
 
@@ -46,7 +46,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class StateVariable:
-    """What the machine remembers from one instant to the next."""
+    """A state of the differential equations."""
 
     name: str
     unit: str
@@ -65,9 +65,9 @@ class Input:
     unit: str
     meaning: str
     hold: Literal["zoh", "foh"]
-    """Between two records: ``zoh`` keeps the value (a command), ``foh`` runs straight to the next (a measurement)."""
+    """Between two records ``zoh`` holds the value (a command), ``foh`` interpolates linearly (a measurement)."""
     low: float = -1.0
-    """Between ``low`` and ``high`` the signal lies in ordinary operation."""
+    """Lower end of the range in ordinary operation."""
     high: float = 1.0
 
 
@@ -79,28 +79,28 @@ class Output:
     unit: str
     meaning: str
     noise: float
-    """Standard deviation of an ordinary sensor, in ``unit``: what a machine file that says nothing gets."""
+    """Standard deviation of the sensor in ``unit``, used where a machine file gives none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A place where an unknown component may enter."""
+    """A place in the equations where an unknown component may enter."""
 
     name: str
     unit: str
-    """Of the component there; ``1`` for a multiplicative one."""
+    """Unit of the component; ``1`` for a multiplicative one."""
     meaning: str
     into: str
     """``der(state)``, a definition or an output."""
     mode: Literal["additive", "multiplicative"]
     """Additive: the right side becomes ``right + through * U``; multiplicative: ``right * (1 + U)`` (Eq. 18)."""
     through: str = "1"
-    """What turns the component's unit into that of the right side: ``1/J`` for a torque in ``der(omega)``."""
+    """Turns the unit of the component into that of the right side: ``1/J`` for a torque in ``der(omega)``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """The page of equations."""
+    """A twin: its quantities and equations."""
 
     name: str
     title: str
@@ -115,29 +115,29 @@ class Definition:
     constants: tuple[Constant, ...] = ()
     definitions: tuple[tuple[str, str, str], ...] = ()
     """Name, expression and meaning of helper quantities, in the author's order."""
-    sites: tuple[Site, ...] = field(default=())
-    plain: "Definition | None" = None
-    """Of a twin with slots for components (see :mod:`otolith.twin.augmentation`): the twin without them."""
+    sites: tuple[Site, ...] = ()
+    base: "Definition | None" = None
+    """The author's twin, if this one is augmented (see :mod:`otolith.twin.augmentation`)."""
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of all inputs and outputs: what a machine file must say where to read."""
-        return (*(entry.name for entry in self.inputs), *(entry.name for entry in self.outputs))
+        """Names of all inputs and outputs; a machine file says where each is read."""
+        return (*(driven.name for driven in self.inputs), *(output.name for output in self.outputs))
 
     def unit_of(self, name: str) -> str:
-        """Of a state, input, output, parameter or constant."""
+        """Unit of a state, input, output, parameter or constant."""
         return self.units()[name]
 
     def units(self) -> dict[str, str]:
         """Every named quantity and its unit."""
         groups = (self.states, self.inputs, self.outputs, self.parameters, self.constants)
-        return {entry.name: entry.unit for group in groups for entry in group}
+        return {quantity.name: quantity.unit for group in groups for quantity in group}
 
     @property
     def settings(self) -> int:
-        """How many of the parameters, the last ones, have no derivatives."""
-        return sum(entry.role is Role.SETTING for entry in self.parameters)
+        """Number of settings; they are the last parameters, and no derivative is taken by them."""
+        return sum(parameter.role is Role.SETTING for parameter in self.parameters)
 
     def parameter(self, name: str) -> Parameter:
-        """By its name."""
-        return next(entry for entry in self.parameters if entry.name == name)
+        """The parameter of that name."""
+        return next(parameter for parameter in self.parameters if parameter.name == name)

@@ -1,4 +1,4 @@
-"""Dimensional analysis of expressions, by pint: what an expression measures, or which two of its parts disagree."""
+"""Dimensional analysis of expressions with pint: the dimension of an expression, or two of its parts that disagree."""
 
 import ast
 from collections.abc import Mapping
@@ -9,9 +9,8 @@ from otolith.twin.expressions import ExpressionError, constant
 from otolith_drivers.units import unit
 
 Dimension = Any
-"""pint's container of dimensions and exponents; None stands for the number zero, which has any dimension."""
+"""pint's container of dimensions and exponents; None for the number zero, which fits any dimension."""
 
-SAME_AS_ARGUMENT = {"abs", "min", "max"}
 NAMED_UNITS = ("V", "A", "ohm", "H", "Wb", "W", "N*m", "J", "N", "Pa", "m", "s", "kg", "m/s", "m/s^2", "rad/s^2", "1/s",
                "kg*m^2", "N*m*s", "m^3/s", "V/s", "A/s", "N/m", "N*s/m", "Pa/s", "K", "K/s", "W/K", "J/K", "W/s", "m^2",
                "m^3")  # fmt: skip
@@ -20,7 +19,7 @@ BASE_UNITS = {"[mass]": "kg", "[length]": "m", "[time]": "s", "[current]": "A", 
 
 
 def dimension_of(unit_text: str) -> Dimension:
-    """What a unit measures.
+    """The dimension of a unit.
 
     Raises:
         ValueError: not a unit.
@@ -31,11 +30,11 @@ def dimension_of(unit_text: str) -> Dimension:
 NONE = dimension_of("1")
 
 
-def measure(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension:
-    """What the expression measures; ``known`` has the dimension of every name in it.
+def infer_dimension(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension:
+    """The dimension of an expression; ``known`` has that of every name in it.
 
     Raises:
-        ExpressionError: two parts that must measure the same do not, or a function got what it cannot take.
+        ExpressionError: two parts differ in dimension that must not, or a function does not take its argument.
     """
     match tree:
         case ast.Constant(value=value):
@@ -43,17 +42,17 @@ def measure(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension:
         case ast.Name(id=name):
             return NONE if name == "pi" else known[name]
         case ast.UnaryOp(operand=operand):
-            return measure(operand, known)
+            return infer_dimension(operand, known)
         case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
             return _same([left, right], known, "a sum")
         case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            first, second = measure(left, known), measure(right, known)
+            first, second = infer_dimension(left, known), infer_dimension(right, known)
             return None if first is None or second is None else _tidy(first * second)
         case ast.BinOp(left=left, op=ast.Div(), right=right):
-            first, second = measure(left, known), measure(right, known)
+            first, second = infer_dimension(left, known), infer_dimension(right, known)
             return None if first is None else _tidy(first / (NONE if second is None else second))
         case ast.BinOp(left=left, op=ast.Pow(), right=right):
-            base = measure(left, known)
+            base = infer_dimension(left, known)
             return None if base is None else _tidy(base ** constant(right))
         case ast.Call(func=ast.Name(id=name), args=arguments):
             return _call(name, arguments, known)
@@ -62,7 +61,7 @@ def measure(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension:
 
 
 def _tidy(dimension: Dimension) -> Dimension:
-    """Without what rounding leaves of exponents: s^0.1 * s^0.2 / s^0.3 is a plain number."""
+    """``dimension`` without rounding errors of exponents: s^0.1 * s^0.2 / s^0.3 is a plain number."""
     exact = {name: Fraction(float(value)).limit_denominator(1000) for name, value in dimension.items()}
     return type(dimension)({name: float(value) for name, value in exact.items() if value})
 
@@ -70,41 +69,39 @@ def _tidy(dimension: Dimension) -> Dimension:
 def _call(name: str, arguments: list[ast.expr], known: Mapping[str, Dimension]) -> Dimension:
     if name == "where":
         condition = arguments[0]
-        assert isinstance(condition, ast.Compare)  # noqa: S101 - the parser has seen to it
+        assert isinstance(condition, ast.Compare)  # noqa: S101 - the parser refuses anything else
         _same([condition.left, *condition.comparators], known, "a comparison")
         return _same(arguments[1:], known, "the two branches of where")
-    if name in SAME_AS_ARGUMENT:
+    if name in ("abs", "min", "max"):
         return _same(arguments, known, name)
-    if name == "sqrt":
-        inner = measure(arguments[0], known)
-        return None if inner is None else _tidy(inner**0.5)
-    if name == "sign":
-        measure(arguments[0], known)
-        return NONE
     if name == "atan2":
         _same(arguments, known, name)
         return NONE
-    inner = measure(arguments[0], known)
-    if inner is not None and inner != NONE:
-        text = f"{name} takes a number without a dimension, not {describe(inner)}: {ast.unparse(arguments[0])}"
+    dimension = infer_dimension(arguments[0], known)
+    if name == "sqrt":
+        return None if dimension is None else _tidy(dimension**0.5)
+    if name != "sign" and dimension is not None and dimension != NONE:
+        text = f"{name} takes a plain number, not {describe(dimension)}: {ast.unparse(arguments[0])}"
         raise ExpressionError(text, arguments[0].col_offset + 1)
     return NONE
 
 
 def _same(parts: list[ast.expr], known: Mapping[str, Dimension], what: str) -> Dimension:
+    """The common dimension of ``parts``; ``what`` they are, for the error."""
     first = None
     for part in parts:
-        found = measure(part, known)
+        dimension = infer_dimension(part, known)
         if first is None:
-            first, owner = found, part
-        elif found is not None and found != first:
-            text = f"{what} of {describe(first)} and {describe(found)}: {ast.unparse(owner)} and {ast.unparse(part)}"
+            first, owner = dimension, part
+        elif dimension is not None and dimension != first:
+            dimensions = f"{describe(first)} and {describe(dimension)}"
+            text = f"{what} of {dimensions}: {ast.unparse(owner)} and {ast.unparse(part)}"
             raise ExpressionError(text, part.col_offset + 1)
     return first
 
 
 def describe(dimension: Dimension) -> str:
-    """A dimension in the units people know: "V", "N*m", else in base units."""
+    """The dimension as a common unit such as "V" or "N*m", else in base units."""
     if dimension is None or dimension == NONE:
         return "a plain number"
     for name in NAMED_UNITS:

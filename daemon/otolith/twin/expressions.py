@@ -1,7 +1,7 @@
-"""The expressions of the twin language: parsed by Python's own grammar, against a list of what is allowed.
+"""The expressions of the twin language: parsed by Python's grammar and checked against a list of allowed nodes.
 
-Nothing is ever evaluated. An expression is a tree of numbers, names, the four operations, powers with a constant
-exponent, calls of the functions below and comparisons inside ``where``; anything else is refused with its position.
+No text is evaluated. Allowed are numbers, names, the four operations, powers with a constant exponent, calls of the
+functions below and comparisons inside ``where``; anything else is an error with its column.
 """
 
 import ast
@@ -14,17 +14,19 @@ from typing import Any
 
 from otolith_drivers.errors import nearest
 
-LONGEST = 2000  # characters
-DEEPEST = 40  # levels of nesting
-LARGEST_TREE = 600  # nodes
-LARGEST_EXPONENT = 16.0
+# Limits keep parser, SymPy and compiler from hostile or generated files; docs/reference/thresholds-twin.md.
+MAX_LENGTH = 2000  # characters of an expression
+MAX_DEPTH = 40  # levels of nesting
+MAX_TERMS = 600  # nodes of the tree
+MAX_EXPONENT = 16.0
+MAX_NUMBER = 1e30
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 
 FUNCTIONS: dict[str, int] = {
     "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1, "atan2": 2, "sinh": 1, "cosh": 1, "tanh": 1,
     "exp": 1, "log": 1, "sqrt": 1, "abs": 1, "sign": 1, "min": 2, "max": 2, "where": 3,
 }  # fmt: skip
-"""Every function, and how many arguments it takes."""
+"""Every function and its number of arguments."""
 
 RESERVED = frozenset({*FUNCTIONS, "t", "der", "pi", "Piecewise"})
 ARITHMETIC: dict[type[ast.operator], Callable[..., Any]] = {
@@ -35,7 +37,7 @@ COMPARISONS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 
 
 class ExpressionError(ValueError):
-    """An expression that is not one of the language; ``column`` counts from 1."""
+    """The text is not an expression of the language; ``column`` counts from 1."""
 
     def __init__(self, message: str, column: int) -> None:
         super().__init__(f"column {column}: {message}")
@@ -43,25 +45,21 @@ class ExpressionError(ValueError):
 
 
 def check_name(name: str) -> None:
-    """Refuse what cannot be the name of a quantity.
+    """Check the name of a quantity.
 
     Raises:
-        ValueError: with the rule it breaks.
+        ValueError: not a valid name, or a reserved one.
     """
     if not NAME.fullmatch(name) or keyword.iskeyword(name):
-        raise ValueError(f"{name!r} is no name: a letter, then letters, digits and '_', at most 40")
+        raise ValueError(f"{name!r} is not a name: write a letter, then letters, digits and '_', at most 40 characters")
     if name in RESERVED:
-        raise ValueError(f"{name!r} is a word of the language and cannot name a quantity")
+        raise ValueError(f"{name!r} is reserved by the twin language: choose another name")
 
 
 def parse(text: str) -> ast.expr:
-    """The tree of ``text``; ``^`` may be written for ``**``.
-
-    Raises:
-        ExpressionError: not an expression of the language.
-    """
-    if len(text) > LONGEST:
-        raise ExpressionError(f"longer than {LONGEST} characters: use definitions", LONGEST)
+    """The syntax tree of ``text``; ``^`` is accepted for ``**``. Raises ExpressionError."""
+    if len(text) > MAX_LENGTH:
+        raise ExpressionError(f"longer than {MAX_LENGTH} characters: use definitions", MAX_LENGTH)
     columns = _columns(text)
     try:
         tree = ast.parse(text.strip().replace("^", "**"), mode="eval").body
@@ -77,102 +75,91 @@ def parse(text: str) -> ast.expr:
 
 
 def _columns(text: str) -> Callable[[int], int]:
-    """From an offset in what is parsed (stripped, '**' for '^') to a column of ``text``; refuses all but ASCII."""
+    """A function from an offset in the parsed text (stripped, '**' for '^') to a column of ``text``, which is ASCII."""
     places, depth = [], 0
     for column, letter in enumerate(text, start=1):
         if not letter.isascii() or letter in "\n\r\f\v\0":
             raise ExpressionError(f"{letter!r} is not allowed: an expression is one line of plain ASCII", column)
         depth += {"(": 1, "[": 1, "{": 1, ")": -1, "]": -1, "}": -1}.get(letter, 0)
-        if depth > DEEPEST:
-            raise ExpressionError(f"nested deeper than {DEEPEST} levels: use definitions", column)
+        if depth > MAX_DEPTH:
+            raise ExpressionError(f"nested deeper than {MAX_DEPTH} levels: use definitions", column)
         places += [column, column] if letter == "^" else [column]
     places = places[len(text) - len(text.lstrip()) :] or [1]
     return lambda offset: places[min(offset, len(places) - 1)]
 
 
-def names(tree: ast.expr) -> set[str]:
-    """The quantities that the expression depends on."""
-    called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
-    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and node not in called} - {"pi"}
+def names_in(tree: ast.expr) -> set[str]:
+    """Names of the quantities that the expression depends on."""
+    return {node.id for node in _quantities(tree)}
 
 
 def check_known(tree: ast.expr, known: Collection[str]) -> None:
-    """Refuse names that stand for nothing.
-
-    Raises:
-        ExpressionError: with the nearest known name.
-    """
-    called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Name) and node not in called and node.id not in known and node.id != "pi":
+    """Raise ExpressionError with the nearest known name if the expression has a name that is not ``known``."""
+    for node in _quantities(tree):
+        if node.id not in known:
             raise ExpressionError(f"unknown symbol {node.id!r}: {nearest(node.id, sorted(known))}", node.col_offset + 1)
 
 
+def _quantities(tree: ast.expr) -> list[ast.Name]:
+    called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    return [node for node in ast.walk(tree) if isinstance(node, ast.Name) and node not in called and node.id != "pi"]
+
+
 def _check(tree: ast.expr) -> None:
+    """Raise ExpressionError if the tree is too large or has a node that is not allowed."""
     pending: list[tuple[ast.AST, int]] = [(tree, 0)]
-    seen = 0
+    terms = 0
     while pending:
         node, depth = pending.pop()
-        seen += 1
+        terms += 1
         column = getattr(node, "col_offset", 0) + 1
-        if depth > DEEPEST:
-            raise ExpressionError(f"nested deeper than {DEEPEST} levels: use definitions", column)
-        if seen > LARGEST_TREE:
-            raise ExpressionError(f"more than {LARGEST_TREE} terms: use definitions", column)
+        if depth > MAX_DEPTH:
+            raise ExpressionError(f"nested deeper than {MAX_DEPTH} levels: use definitions", column)
+        if terms > MAX_TERMS:
+            raise ExpressionError(f"more than {MAX_TERMS} terms: use definitions", column)
         pending += [(child, depth + 1) for child in _children(node, column)]
 
 
 def _check_constants(tree: ast.expr) -> float | None:
-    """The value of an expression without names, None of one with; refuses what has no real value, like 1/0."""
+    """The value of an expression without names, else None; raises ExpressionError if it is not real, as 1/0."""
+    operands = [_check_constants(operand) for operand in _operands(tree)]
     try:
-        found = _folded(tree, [_check_constants(part) for part in _parts(tree)])
-    except ExpressionError:
-        raise
+        return _folded(tree, operands)
     except (ArithmeticError, ValueError) as error:
         raise ExpressionError(f"{ast.unparse(tree)} has no real value", tree.col_offset + 1) from error
-    if isinstance(found, complex) or (found is not None and not math.isfinite(found)):
-        raise ExpressionError(f"{ast.unparse(tree)} has no real value", tree.col_offset + 1)
-    return found
 
 
-def _parts(tree: ast.expr) -> list[ast.expr]:
-    match tree:
-        case ast.BinOp(left=left, right=right):
-            return [left, right]
-        case ast.UnaryOp(operand=operand):
-            return [operand]
-        case ast.Call(args=arguments):
-            return arguments
-        case ast.Compare(left=left, comparators=others):
-            return [left, *others]
-        case _:
-            return []
+def _operands(tree: ast.expr) -> list[ast.expr]:
+    children = tree.args if isinstance(tree, ast.Call) else ast.iter_child_nodes(tree)
+    return [child for child in children if isinstance(child, ast.expr)]
 
 
-def _folded(tree: ast.expr, parts: list[float | None]) -> float | complex | None:
+def _folded(tree: ast.expr, operands: list[float | None]) -> float | None:
     if isinstance(tree, ast.Constant):
         return float(tree.value)  # type: ignore[arg-type]  # the check before has left numbers only
     if isinstance(tree, ast.Name):
         return math.pi if tree.id == "pi" else None
-    if isinstance(tree, ast.BinOp) and isinstance(tree.op, ast.Div) and parts[1] == 0.0:
+    if isinstance(tree, ast.BinOp) and isinstance(tree.op, ast.Div) and operands[1] == 0.0:
         raise ZeroDivisionError
-    known = [part for part in parts if part is not None]
-    if not parts or len(known) < len(parts):
+    values = [operand for operand in operands if operand is not None]
+    if len(values) < len(operands):
         return None
     if isinstance(tree, ast.UnaryOp):
-        return -known[0] if isinstance(tree.op, ast.USub) else known[0]
+        return -values[0] if isinstance(tree.op, ast.USub) else values[0]
     if isinstance(tree, ast.BinOp):
-        found: float | complex = ARITHMETIC[type(tree.op)](*known)
-        return found
+        result = ARITHMETIC[type(tree.op)](*values)
+        if isinstance(result, complex) or not math.isfinite(result):
+            raise ArithmeticError
+        return float(result)
     name = tree.func.id if isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name) else ""
-    return float(getattr(math, name)(*known)) if name in FUNCTIONS and hasattr(math, name) else None
+    return float(getattr(math, name)(*values)) if name in FUNCTIONS and hasattr(math, name) else None
 
 
 def _children(node: ast.AST, column: int) -> list[ast.expr]:
-    """What ``node`` is made of, if it is allowed at all."""
+    """The operands of an allowed node; raises ExpressionError for any other."""
     match node:
         case ast.Constant(value=bool()) | ast.Constant(value=complex()):
-            raise ExpressionError(f"{node.value!r} is no real number", column)
+            raise ExpressionError(f"{node.value!r} is not a real number", column)
         case ast.Constant(value=int() | float() as value):
             _check_number(value, column)
             return []
@@ -190,7 +177,7 @@ def _children(node: ast.AST, column: int) -> list[ast.expr]:
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
             return _arguments(name, arguments, column)
         case _:
-            raise ExpressionError(f"{_what(node)} is not allowed", column)
+            raise ExpressionError(f"{_kind_of(node)} is not allowed", column)
 
 
 def _arguments(name: str, arguments: list[ast.expr], column: int) -> list[ast.expr]:
@@ -213,22 +200,22 @@ def _check_number(value: float, column: int) -> None:
         number = float(value)
     except OverflowError:
         number = math.inf
-    if not math.isfinite(number) or abs(number) > 1e30:
-        raise ExpressionError("a number beyond 1e30", column)
+    if not math.isfinite(number) or abs(number) > MAX_NUMBER:
+        raise ExpressionError(f"a number is beyond {MAX_NUMBER:g}", column)
 
 
 def _check_exponent(node: ast.expr, column: int) -> None:
     if constant(node) is None:
         raise ExpressionError("the exponent must be a number: write exp(b*log(a)) for a variable one", column)
-    if abs(constant(node) or 0.0) > LARGEST_EXPONENT:
-        raise ExpressionError(f"the exponent is beyond {LARGEST_EXPONENT:g}", column)
+    if abs(constant(node) or 0.0) > MAX_EXPONENT:
+        raise ExpressionError(f"the exponent is beyond {MAX_EXPONENT:g}", column)
 
 
 def constant(node: ast.expr) -> float | None:
     """The value of a number, a signed number or a quotient of two; None for anything else."""
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
-            return float(value) if abs(value) < 1e30 else math.inf
+            return float(value) if abs(value) < MAX_NUMBER else math.inf
         case ast.UnaryOp(op=ast.USub(), operand=operand):
             inner = constant(operand)
             return None if inner is None else -inner
@@ -239,12 +226,12 @@ def constant(node: ast.expr) -> float | None:
             return None
 
 
-def _what(node: ast.AST) -> str:
-    names = {
+def _kind_of(node: ast.AST) -> str:
+    kinds = {
         ast.Attribute: "attribute access", ast.Subscript: "indexing", ast.Lambda: "a lambda", ast.IfExp: "if",
         ast.ListComp: "a comprehension", ast.GeneratorExp: "a comprehension", ast.Compare: "a comparison outside where",
         ast.BoolOp: "and/or", ast.JoinedStr: "a string", ast.Constant: "this constant", ast.Starred: "unpacking",
         ast.NamedExpr: "an assignment", ast.Tuple: "a tuple", ast.List: "a list", ast.Dict: "a dictionary",
         ast.Call: "this kind of call",
     }  # fmt: skip
-    return names.get(type(node), f"this ({type(node).__name__})")
+    return kinds.get(type(node), f"this ({type(node).__name__})")

@@ -1,8 +1,9 @@
-"""A twin that computes: simulation of whole swarms, exact sensitivities, innovation form.
+"""Compiled twins: simulation of whole swarms, exact sensitivities, the innovation form and its Kalman gains.
 
-The classical Runge-Kutta method with substeps; between records an input is held (``zoh``) or runs straight to its next
-value (``foh``). With a gain the state is corrected after each record by ``gain @ (measured - predicted)``, which makes
-the outputs one-step-ahead predictions (innovation form; L. Ljung, System Identification, 2nd ed., section 4.3).
+The integrator is the classical Runge-Kutta method with substeps; between records an input is held (``zoh``) or
+interpolated linearly (``foh``). With a gain the state is corrected after each record by ``gain @ (measured -
+predicted)``, so the outputs are one-step-ahead predictions (innovation form; L. Ljung, System Identification, 2nd ed.,
+section 4.3). docs/explanation has the equations.
 """
 
 import hashlib
@@ -19,14 +20,15 @@ from otolith.acquisition.window import Array, Mask
 from otolith.twin.definition import Definition
 from otolith_drivers.errors import ConfigurationError
 
-MOST_SUBSTEPS = 1024
+MAX_SUBSTEPS = 1024
+"""Engineering choice: ends the search for substeps where the equations are too stiff for any number of them."""
 
-Numbers = NDArray[np.int64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excitation:
-    """What drives a twin through a window, and what corrects it on the way."""
+    """What drives a twin through a window, and what corrects it."""
 
     inputs: Array
     """(records, inputs)."""
@@ -35,9 +37,9 @@ class Excitation:
     substeps: int = 1
     """Steps of the integrator per record."""
     measured: Array | None = None
-    """(records, outputs); a measurement that is not a number corrects nothing."""
+    """(records, outputs); a measurement that is NaN corrects nothing."""
     gain: Array | None = None
-    """(records, states, outputs); without it, or all zero, the twin runs in open loop."""
+    """(records, states, outputs); None or all zero for open loop."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,26 +49,26 @@ class NoiseModel:
     outputs: Array
     """(outputs,) of the sensors."""
     inputs: Array
-    """(inputs,) of what the twin is told to be driven by; independent from record to record."""
+    """(inputs,) of the measured or commanded inputs; independent from record to record."""
     states: Array
-    """(states,) per square root of a second, of what strays in the machine itself."""
+    """(states,) process noise per square root of a second."""
 
 
 class InnovationModel(NamedTuple):
-    """How a disturbed twin is corrected on its way, and how far off each prediction may then be."""
+    """The gains of the innovation form and the covariances of its innovations."""
 
     gain: Array
     """(records, states, outputs)."""
     whitening: Array
-    """(records, outputs, outputs): makes each innovation's covariance the identity."""
+    """(records, outputs, outputs), lower triangular: whitened innovations have the identity as covariance."""
     log_determinant: float
-    """Sum over the records, of the innovations' covariances."""
+    """Sum over the records of the log determinants of the innovations' covariances."""
 
 
 class Sensitivities(NamedTuple):
-    """A prediction and its exact derivatives, by each parameter, each initial state, and each parameter's drift.
+    """A prediction and its exact derivatives by each parameter, each initial state and each parameter's drift.
 
-    A drift is one unit per second, about the value at the last record.
+    A drift is a change by one unit per second that leaves the parameter's value at the last record.
     """
 
     outputs: Array
@@ -74,25 +76,28 @@ class Sensitivities(NamedTuple):
     slopes: Array
     """(records, outputs, parameters + states [+ parameters])."""
     last: Array
-    """(states,) at the last record, corrected by it."""
+    """(states,) at the last record, corrected by its measurement."""
     last_slopes: Array
     """(states, parameters + states [+ parameters])."""
 
 
-class Linear(NamedTuple):
-    """A twin with slots, linearised along a window (see :mod:`otolith.twin.kernel_sources`)."""
+class LinearisedModel(NamedTuple):
+    """The linear time-varying system of an augmented twin along a trajectory; its inputs are those of the sites.
+
+    ``x[k + 1] = transition x[k] + input_now u[k] + input_next u[k + 1]``, ``y[k] = output x[k] + feedthrough u[k]``.
+    """
 
     trajectory: Array
     """(records, states) as predicted."""
-    moves: Array
+    transition: Array
     """(records, states, states)."""
-    early: Array
+    input_now: Array
     """(records, states, sites)."""
-    late: Array
+    input_next: Array
     """(records, states, sites)."""
     output: Array
     """(records, outputs, states)."""
-    through: Array
+    feedthrough: Array
     """(records, outputs, sites)."""
 
 
@@ -106,89 +111,83 @@ class Kernel:
         self._compiled: set[str] = set()
 
     def simulate(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
-        """Predict: ``outputs[:, 0]`` belongs to the initial state.
+        """(particles, records, outputs) predicted for (particles, parameters) and (particles, states).
 
-        Shapes (particles, parameters), (particles, states) -> (particles, records, outputs). A particle that diverges
-        gets values that are not finite.
+        The first record belongs to the initial state. A particle that diverges gets values that are not finite.
         """
-        found: Array = self._call("simulate", parameters, initial, *self._drive(excitation))
-        return found
+        predicted: Array = self._call("simulate", parameters, initial, *self._arguments(excitation))
+        return predicted
 
     def sensitivities(
         self, parameters: Array, initial: Array, excitation: Excitation, *, drifts: bool = False
-    ) -> "Sensitivities":
-        """One prediction and its exact derivatives, also by the parameters' ``drifts`` if asked for.
-
-        Shapes (parameters,), (states,).
-        """
+    ) -> Sensitivities:
+        """One prediction and its exact derivatives, with ``drifts`` also by those; (parameters,), (states,)."""
         name = "drifting_sensitivities" if drifts else "sensitivities"
-        return Sensitivities(*self._call(name, parameters, initial, *self._drive(excitation)))
+        return Sensitivities(*self._call(name, parameters, initial, *self._arguments(excitation)))
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
 
-        States are updated in the order of the page, each with the new values of those before it (Eq. 11-12).
+        States are updated in the author's order, each with the new values of those before it (Eq. 11-12).
         """
-        period = excitation.sample_period
-        inputs = np.ascontiguousarray(excitation.inputs, dtype=np.float64)
-        found: Array = self._call("euler", parameters, initial, inputs, period, max(1, round(period / step)))
-        return found
+        inputs, period, *_ = self._arguments(excitation)
+        predicted: Array = self._call("euler", parameters, initial, inputs, period, max(1, round(period / step)))
+        return predicted
 
-    def correction(
+    def innovation_model(
         self, parameters: Array, initial: Array, excitation: Excitation, noise: NoiseModel
     ) -> InnovationModel:
-        """The extended Kalman filter along ``excitation.measured``; shapes (parameters,), (states,).
+        """The extended Kalman filter along ``excitation.measured``; (parameters,), (states,).
 
-        Entries are not finite where the filter diverges.
+        Elements are not finite where the filter diverges.
         """
-        inputs, period, substeps, measured, _ = self._drive(replace(excitation, gain=self._open_loop))
-        noises = (noise.outputs**2, noise.states**2, noise.inputs)
-        found = self._call("kalman", parameters, initial, inputs, period, substeps, measured, *noises)
-        return InnovationModel(*found)
+        inputs, period, substeps, measured, _ = self._arguments(replace(excitation, gain=self._open_loop))
+        variances = (noise.outputs**2, noise.states**2)
+        return InnovationModel(
+            *self._call("kalman", parameters, initial, inputs, period, substeps, measured, *variances, noise.inputs)
+        )
 
-    def along(self, parameters: Array, initial: Array, excitation: Excitation, nudge: Array) -> Linear:
+    def linearise(self, parameters: Array, initial: Array, excitation: Excitation, nudge: Array) -> LinearisedModel:
         """The linear system along a window, by differences of ``nudge`` (sites,) in the units of the sites."""
-        return Linear(*self._call("along", parameters, initial, *self._drive(excitation), nudge))
+        return LinearisedModel(*self._call("linearise", parameters, initial, *self._arguments(excitation), nudge))
 
-    def curves(self, families: Array, x: Array, sources: Numbers, inner: Array, phases: Array) -> Array:
-        """Shapes of components of unit amplitude: (curves,), (sources, records), (curves,), (curves,), (curves,).
-
-        ``sources`` are the rows of ``x`` that they depend on. Returns (records, curves).
-        """
-        found: Array = self._call("curves", families, x, sources, inner, phases)
-        return found
+    def curves(self, families: Array, x: Array, sources: Indices, inner: Array, phases: Array) -> Array:
+        """(records, curves) of components of unit amplitude; ``x`` is (sources, records), all else (curves,)."""
+        shapes: Array = self._call("curves", families, x, sources, inner, phases)
+        return shapes
 
     def respond(
-        self, linear: Linear, correction: InnovationModel, present: Mask, curves: Array, sites: Numbers
+        self, linear: LinearisedModel, innovation: InnovationModel, present: Mask, curves: Array, sites: Indices
     ) -> Array:
-        """(records * outputs, curves) whitened innovations, as each of ``curves`` (records, curves) changes them.
+        """(records * outputs, curves): change of the whitened innovations by each of ``curves`` (records, curves).
 
-        ``sites`` (curves,) are the numbers of the sites at which they enter.
+        ``sites`` (curves,) are the numbers of the sites that the curves enter; group curves by site for speed.
         """
-        rest = (linear.through, correction.gain, correction.whitening, present, curves, sites)
-        found: Array = self._call("respond", linear.moves, linear.early, linear.late, linear.output, *rest)
-        return found
+        rest = (linear.feedthrough, innovation.gain, innovation.whitening, present, curves, sites)
+        matrices = (linear.transition, linear.input_now, linear.input_next, linear.output)
+        response: Array = self._call("respond", *matrices, *rest)
+        return response
 
     def substeps(
-        self, parameters: Array, initial: Array, excitation: Excitation, tolerance: Array, most: int = MOST_SUBSTEPS
+        self, parameters: Array, initial: Array, excitation: Excitation, tolerance: Array, limit: int = MAX_SUBSTEPS
     ) -> int:
-        """The fewest substeps (a power of two up to ``most``) with a truncation error under ``tolerance`` (outputs,).
+        """The fewest substeps, a power of two up to ``limit``, with truncation errors below ``tolerance`` (outputs,).
 
-        Shapes (parameters,), (states,). The error is told by halving the step (Richardson; Hairer, Norsett, Wanner,
-        Solving Ordinary Differential Equations I, section II.4).
+        Shapes (parameters,), (states,). The error is estimated by halving the step (Richardson; Hairer, Norsett,
+        Wanner, Solving Ordinary Differential Equations I, section II.4).
         """
         count = 1
         coarse = self.simulate(parameters[None], initial[None], replace(excitation, substeps=count))
-        while count < most:
+        while count < limit:
             fine = self.simulate(parameters[None], initial[None], replace(excitation, substeps=2 * count))
             with np.errstate(invalid="ignore"):
-                error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0
+                error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0  # of an order-4 method
             if np.all(error <= tolerance):
                 break
             count, coarse = 2 * count, fine
         return count
 
-    def _drive(self, excitation: Excitation) -> tuple[Array, float, int, Array, Array]:
+    def _arguments(self, excitation: Excitation) -> tuple[Array, float, int, Array, Array]:
         inputs = np.ascontiguousarray(excitation.inputs, dtype=np.float64)
         measured, gain = self._unmeasured, self._open_loop
         if excitation.measured is not None and excitation.gain is not None:
@@ -200,19 +199,19 @@ class Kernel:
     def _module(self) -> Any:
         return kernel_cache.load(identity_of(self.definition), lambda: _source(self.definition))
 
-    def _call(self, name: str, parameters: Array, initial: Array, *rest: Any) -> Any:
+    def _call(self, name: str, first: Array, second: Array, *rest: Any) -> Any:
         function: Callable[..., Any] = getattr(self._module, name)
-        arguments = (np.ascontiguousarray(parameters), np.ascontiguousarray(initial), *rest)
+        arguments = (np.ascontiguousarray(first), np.ascontiguousarray(second), *rest)
         if name in self._compiled:
             return function(*arguments)
         with kernel_cache.compiling(self._module):
             try:
-                found = function(*arguments)
-            except Exception:  # noqa: BLE001 - whatever unpickling half a file raises; a real fault comes again
+                result = function(*arguments)
+            except Exception:  # noqa: BLE001 - a truncated cache file raises anything; a real fault comes again
                 kernel_cache.discard(self._module)
-                found = function(*arguments)
+                result = function(*arguments)
         self._compiled.add(name)
-        return found
+        return result
 
 
 @lru_cache(maxsize=64)
@@ -222,23 +221,23 @@ def kernel_of(definition: Definition) -> Kernel:
 
 
 def identity_of(definition: Definition) -> str:
-    """What tells one twin's kernels from another's: everything on the page that enters them."""
+    """A hash of everything in a definition that its kernels depend on."""
     mathematical = (
         definition.name,
-        [(entry.name, entry.unit) for entry in definition.states],
-        [(entry.name, entry.unit, entry.hold) for entry in definition.inputs],
-        [(entry.name, entry.unit) for entry in definition.outputs],
-        [(entry.name, entry.unit) for entry in definition.parameters],
-        [astuple(entry)[:3] for entry in definition.constants],
+        [(state.name, state.unit) for state in definition.states],
+        [(driven.name, driven.unit, driven.hold) for driven in definition.inputs],
+        [(output.name, output.unit) for output in definition.outputs],
+        [(parameter.name, parameter.unit) for parameter in definition.parameters],
+        [(fixed.name, fixed.unit, fixed.value) for fixed in definition.constants],
         [(name, expression) for name, expression, _ in definition.definitions],
         definition.equations,
-        None if definition.plain is None else [astuple(entry) for entry in definition.sites],
+        None if definition.base is None else [astuple(site) for site in definition.sites],
     )
     return hashlib.sha256(repr(mathematical).encode()).hexdigest()
 
 
 def _source(definition: Definition) -> str:
-    from otolith.twin.kernel_sources import kernel_source  # noqa: PLC0415 - loads SymPy, which a cached kernel does not need
+    from otolith.twin.kernel_sources import kernel_source  # noqa: PLC0415 - loads SymPy; a cached kernel needs none
 
     try:
         return kernel_source(definition)

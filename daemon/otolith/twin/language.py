@@ -1,384 +1,177 @@
-"""Reading a page of the twin language: TOML in, a checked :class:`Definition` out, or every fault with its line.
+"""The twin language: a TOML file in, a checked :class:`Definition` out, or every fault with its line.
 
-Whether the equations of a page can be meant: known symbols, no loops, the same dimension on both sides.
+First the schema of the file, then its quantities and names, then its equations: known symbols, no algebraic loops, the
+same dimension on both sides.
 """
 
 import ast
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sized
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, StateVariable
-from otolith.twin.dimensions import NONE, describe, dimension_of, measure
-from otolith.twin.expressions import ExpressionError, check_known, check_name, names, parse
+from otolith.twin.dimensions import NONE, Dimension, describe, dimension_of, infer_dimension
+from otolith.twin.expressions import ExpressionError, check_known, check_name, names_in, parse
 from otolith_drivers.config_files import Location, SourceFile, StrictModel, expect, validate
 from otolith_drivers.config_files import parse as parse_toml
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import Quantity, to_base
 
-MOST_TERMS, MOST_LEVELS = 3000, 100  # of an expression with its definitions written out
+# Limits keep the compile time of a kernel in minutes; docs/reference/thresholds-twin.md.
+MAX_ROWS = {"states": 12, "parameters": 40, "inputs": 40, "outputs": 40, "definitions": 60}
+MAX_EXPANDED_TERMS, MAX_EXPANDED_LEVELS = 3000, 100  # of an equation with its definitions substituted
 
 Fault = Callable[[Location, str], None]
-
-
-def check_equations(definition: Definition, fault: Fault) -> None:
-    """Tell ``fault`` everything that is wrong with the equations of ``definition``, and where."""
-    _Checker(definition, fault).check()
-
-
-class _Checker:
-    def __init__(self, definition: Definition, fault: Fault) -> None:
-        self._definition = definition
-        self._tell = fault
-        self._faulty = False
-        self._states = [entry.name for entry in definition.states]
-
-    def _fault(self, location: Location, message: str) -> None:
-        self._faulty = True
-        self._tell(location, message)
-
-    def check(self) -> None:
-        """In stages, as a fault in one makes nonsense of what the next would say."""
-        known = {name: dimension_of(unit) for name, unit in self._definition.units().items()}
-        for output in self._definition.outputs:
-            if output.name not in self._states:
-                del known[output.name]
-        trees = self._definitions(known)
-        self._check_left_sides()
-        used: set[str] = set()
-        for left, text in self._definition.equations:
-            tree = self._tree(("equations", left), text, known)
-            if tree is not None and not self._faulty:
-                used |= names(tree)
-                self._check_sides(("equations", left), tree, known, _left_dimension(left, self._definition))
-                self._check_size(("equations", left), tree, trees)
-        for site in self._definition.sites:
-            used |= _names_in(site.through)
-        if not self._faulty:
-            self._check_used(_reachable(used, trees))
-            for site in self._definition.sites:
-                self._check_site(site, known)
-
-    def _tree(self, location: Location, text: str, known: Mapping[str, Any]) -> ast.expr | None:
-        outputs = {entry.name for entry in self._definition.outputs} - set(self._states)
-        try:
-            tree = parse(text)
-            for name in sorted(names(tree) & outputs - set(known)):
-                self._fault(location, f"{name!r} is an output and follows from the states: use a definition for both")
-                return None
-            check_known(tree, known)
-        except ExpressionError as error:
-            self._fault(location, str(error))
-            return None
-        return tree
-
-    def _check_sides(self, location: Location, tree: ast.expr, known: Mapping[str, Any], left: Any) -> None:
-        try:
-            found = measure(tree, known)
-        except ExpressionError as error:
-            self._fault(location, str(error))
-            return
-        if left is not None and found is not None and found != left:
-            self._fault(location, f"the left side is in {describe(left)}, the right side in {describe(found)}")
-
-    def _definitions(self, known: dict[str, Any]) -> dict[str, ast.expr]:
-        """Parse helper quantities in the order of their use; adds what each measures to ``known``."""
-        helpers = [name for name, _, _ in self._definition.definitions]
-        everything = {**known, **dict.fromkeys(helpers)}
-        pending = {}
-        for name, text, _ in self._definition.definitions:
-            tree = self._tree(("definitions", name), text, everything)
-            if tree is not None:
-                pending[name] = tree
-        trees = dict(pending)
-        while pending:
-            ready = [name for name, tree in pending.items() if not names(tree) & set(pending)]
-            if not ready:
-                loop = " -> ".join([*pending, next(iter(pending))])
-                self._fault(("definitions", next(iter(pending))), f"an algebraic loop: {loop}; solve it by hand first")
-                known.update(dict.fromkeys(pending))
-                break
-            for name in ready:
-                try:
-                    known[name] = measure(pending[name], known)
-                except ExpressionError as error:
-                    self._fault(("definitions", name), str(error))
-                    known[name] = None
-                del pending[name]
-        return trees
-
-    def _check_left_sides(self) -> None:
-        wanted = [f"der({name})" for name in self._states]
-        wanted += [entry.name for entry in self._definition.outputs if entry.name not in self._states]
-        written = [left for left, _ in self._definition.equations]
-        for left in written:
-            if left in self._states:
-                self._fault(("equations", left), f"{left!r} is a state: write its derivative, der({left})")
-            elif left not in wanted:
-                self._fault(("equations", left), f"no state or output has this equation: {nearest(left, wanted)}")
-        for left in wanted:
-            if left not in written:
-                self._fault(("equations",), f"the equation of {left} is missing")
-
-    def _check_used(self, used: set[str]) -> None:
-        tables: dict[str, list[str]] = {
-            "parameters": [entry.name for entry in self._definition.parameters],
-            "inputs": [entry.name for entry in self._definition.inputs],
-            "constants": [entry.name for entry in self._definition.constants],
-            "definitions": [name for name, _, _ in self._definition.definitions],
-        }
-        for table, entries in tables.items():
-            for name in entries:
-                if name not in used:
-                    self._fault((table, name), "appears in no equation: use it or leave it out")
-
-    def _check_size(self, location: Location, tree: ast.expr, trees: Mapping[str, ast.expr]) -> None:
-        """Definitions are written out in what uses them, so their sizes multiply."""
-        terms, depth = _written_out(tree, trees, {})
-        if terms > MOST_TERMS or depth > MOST_LEVELS:
-            self._fault(
-                location,
-                f"with its definitions written out it has {terms} terms, {depth} levels deep: "
-                f"at most {MOST_TERMS} and {MOST_LEVELS} are supported, so make one of them a state or simplify",
-            )
-
-    def _check_site(self, site: Site, known: Mapping[str, Any]) -> None:
-        at: Location = ("sites", site.name)
-        places = [left for left, _ in self._definition.equations] + [
-            name for name, _, _ in self._definition.definitions
-        ]
-        if site.into not in places:
-            self._fault(at, f"into {site.into!r}, which is no left side or definition: {nearest(site.into, places)}")
-            return
-        if site.mode == "multiplicative":
-            if site.through != "1" or dimension_of(site.unit) != NONE:
-                self._fault(at, 'a multiplicative component is a plain number: unit = "1", and no through')
-            return
-        tree = self._tree(at, site.through, known)
-        if tree is None:
-            return
-        left = known.get(site.into) if site.into in known else _left_dimension(site.into, self._definition)
-        try:
-            entering = (measure(tree, known) or NONE) * dimension_of(site.unit)
-        except ExpressionError as error:
-            self._fault(at, str(error))
-            return
-        if left is not None and entering != left:
-            text = f"through * component is in {describe(entering)}, but {site.into} is in {describe(left)}"
-            self._fault(at, text)
-
-
-def _written_out(tree: ast.expr, trees: Mapping[str, ast.expr], known: dict[str, tuple[int, int]]) -> tuple[int, int]:
-    """Terms and levels of an expression with its definitions written out; ``known`` remembers those of definitions."""
-    terms, levels = 0, 0
-    pending: list[tuple[ast.AST, int]] = [(tree, 1)]
-    while pending:
-        node, level = pending.pop()
-        inner = (1, 0)
-        if isinstance(node, ast.Name) and node.id in trees:
-            if node.id not in known:
-                known[node.id] = _written_out(trees[node.id], trees, known)
-            inner = known[node.id]
-        terms += inner[0]
-        levels = max(levels, level + inner[1])
-        pending += [(child, level + 1) for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
-    return terms, levels
-
-
-def _reachable(used: set[str], trees: Mapping[str, ast.expr]) -> set[str]:
-    """``used``, and what the definitions in it use."""
-    found, pending = set(used), list(used)
-    while pending:
-        inner = names(trees[name]) if (name := pending.pop()) in trees else set()
-        pending += inner - found
-        found |= inner
-    return found
-
-
-def _left_dimension(left: str, definition: Definition) -> Any:
-    units = definition.units()
-    if left.startswith("der(") and left[4:-1] in units:
-        return dimension_of(units[left[4:-1]]) / dimension_of("s")
-    return dimension_of(units[left]) if left in units else None
-
-
-def _names_in(text: str) -> set[str]:
-    try:
-        return names(parse(text))
-    except ExpressionError:
-        return set()
-
-
-MOST_STATES, MOST_PARAMETERS, MOST_SIGNALS, MOST_DEFINITIONS = 12, 40, 40, 60
+"""Records what is wrong at a place of the file."""
 
 
 def _unit(written: str) -> str:
     if to_base(written)[1] != 0.0:
-        raise ValueError(f"{written!r} has a zero of its own, which equations cannot add up: write kelvin")
+        raise ValueError(f"{written!r} has an offset, so equations cannot use it: write 'K'")
     return written
 
 
 def _twin_name(written: str) -> str:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_\-]{0,63}", written):
-        raise ValueError(f"{written!r} is no name: a letter, then letters, digits, '_' and '-', at most 64")
+        raise ValueError(f"{written!r} is not a name: write a letter, then letters, digits, '_' and '-', at most 64")
     return written
 
 
-def _no_flag(written: object) -> object:
+def _no_boolean(written: object) -> object:
     if isinstance(written, bool):
         raise ValueError(f"{written!r} is not a number")  # noqa: TRY004 - a fault of a file, not a bug
     return written
 
 
 Unit = Annotated[str, AfterValidator(_unit)]
-Number = Annotated[float | str, BeforeValidator(_no_flag)]
+Number = Annotated[float | str, BeforeValidator(_no_boolean)]
 Bounds = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
 
 
-class _Head(StrictModel):
+class _HeadTable(StrictModel):
     name: Annotated[str, AfterValidator(_twin_name)]
     title: str
     source: str
     validity: str = ""
 
 
-class _StateTable(StrictModel):
+class _QuantityTable(StrictModel):
     unit: Unit
     meaning: str
+
+
+class _StateTable(_QuantityTable):
     initial: Number = 0.0
     bounds: Bounds = (-1000.0, 1000.0)
 
 
-class _Input(StrictModel):
-    unit: Unit
-    meaning: str
+class _InputTable(_QuantityTable):
     hold: Literal["zoh", "foh"]
     range: Bounds = (-1.0, 1.0)
 
 
-class _Output(StrictModel):
-    unit: Unit
-    meaning: str
+class _OutputTable(_QuantityTable):
     noise: Number
 
 
-class _Parameter(StrictModel):
-    unit: Unit
+class _ParameterTable(_QuantityTable):
     nominal: Number
     bounds: Bounds
-    meaning: str
     role: Role = Role.INSTRUMENTED
 
 
-class _Constant(StrictModel):
-    unit: Unit
+class _ConstantTable(_QuantityTable):
     value: Number
-    meaning: str
 
 
-class _Definition(StrictModel):
+class _DefinitionTable(StrictModel):
     expression: str
     meaning: str = ""
 
 
-class _Site(StrictModel):
-    unit: Unit
-    meaning: str
+class _SiteTable(_QuantityTable):
     into: str
     mode: Literal["additive", "multiplicative"]
     through: str = "1"
 
 
 class _TwinFile(StrictModel):
-    twin: _Head
+    twin: _HeadTable
     states: dict[str, _StateTable]
-    inputs: Annotated[dict[str, _Input], Field(default_factory=dict)]
-    outputs: dict[str, _Output]
-    parameters: dict[str, _Parameter]
-    constants: Annotated[dict[str, _Constant], Field(default_factory=dict)]
-    definitions: Annotated[dict[str, str | _Definition], Field(default_factory=dict)]
+    inputs: Annotated[dict[str, _InputTable], Field(default_factory=dict)]
+    outputs: dict[str, _OutputTable]
+    parameters: dict[str, _ParameterTable]
+    constants: Annotated[dict[str, _ConstantTable], Field(default_factory=dict)]
+    definitions: Annotated[dict[str, str | _DefinitionTable], Field(default_factory=dict)]
     equations: dict[str, str]
-    sites: Annotated[dict[str, _Site], Field(default_factory=dict)]
+    sites: Annotated[dict[str, _SiteTable], Field(default_factory=dict)]
 
 
 def read_twin(page: SourceFile) -> Definition:
-    """The twin on ``page``.
+    """The twin in the file ``page``.
 
     Raises:
-        ConfigurationError: one line per fault, each with file, line, key and the way out.
+        ConfigurationError: one line per fault, each with file, line, key and what to do.
     """
     data = parse_toml(page)
     expect(page, data, "equations")
-    file = validate(data, _TwinFile, page)
-    reader = _Reader(page, file)
-    definition = reader.definition()
-    if reader.faults:
-        raise ConfigurationError("\n".join(dict.fromkeys(reader.faults)))
+    faults: list[str] = []
+
+    def fault(location: Location, message: str) -> None:
+        faults.append(f"{page.place(location)}: {message}")
+
+    definition = _Reader(validate(data, _TwinFile, page), fault).definition()
+    if not faults:
+        _EquationChecker(definition, fault).check()
+    if faults:
+        raise ConfigurationError("\n".join(dict.fromkeys(faults)))
     return definition
 
 
 class _Reader:
-    """Collects faults, so that an author sees all of them at once."""
+    """Converts quantities to their declared units; collects faults, so that an author sees all of them at once."""
 
-    def __init__(self, page: SourceFile, file: _TwinFile) -> None:
-        self.faults: list[str] = []
-        self._page = page
+    def __init__(self, file: _TwinFile, fault: Fault) -> None:
         self._file = file
+        self._fault = fault
 
     def definition(self) -> Definition:
         file = self._file
         self._check_sizes()
         self._check_names()
-        definition = Definition(
+        return Definition(
             name=file.twin.name,
             title=file.twin.title,
             source=file.twin.source,
             validity=file.twin.validity,
-            states=tuple(self._state(name, entry) for name, entry in file.states.items()),
-            inputs=tuple(self._input(name, entry) for name, entry in file.inputs.items()),
-            outputs=tuple(self._output(name, entry) for name, entry in file.outputs.items()),
-            parameters=tuple(self._parameter(name, entry) for name, entry in file.parameters.items()),
-            constants=tuple(self._constant(name, entry) for name, entry in file.constants.items()),
+            states=tuple(self._state(name, table) for name, table in file.states.items()),
+            inputs=tuple(self._input(name, table) for name, table in file.inputs.items()),
+            outputs=tuple(self._output(name, table) for name, table in file.outputs.items()),
+            parameters=tuple(self._parameter(name, table) for name, table in file.parameters.items()),
+            constants=tuple(self._constant(name, table) for name, table in file.constants.items()),
             definitions=tuple(
-                (name, entry, "") if isinstance(entry, str) else (name, entry.expression, entry.meaning)
-                for name, entry in file.definitions.items()
+                (name, table, "") if isinstance(table, str) else (name, table.expression, table.meaning)
+                for name, table in file.definitions.items()
             ),
             equations=tuple(file.equations.items()),
-            sites=tuple(Site(name, e.unit, e.meaning, e.into, e.mode, e.through) for name, e in file.sites.items()),
+            sites=tuple(Site(name, t.unit, t.meaning, t.into, t.mode, t.through) for name, t in file.sites.items()),
         )
-        if not self.faults:
-            check_equations(definition, self._fault)
-        return definition
-
-    def _fault(self, location: Location, message: str) -> None:
-        self.faults.append(f"{self._page.place(location)}: {message}")
 
     def _check_sizes(self) -> None:
-        file = self._file
-        for table, entries, most in (
-            ("states", file.states, MOST_STATES),
-            ("parameters", file.parameters, MOST_PARAMETERS),
-            ("inputs", file.inputs, MOST_SIGNALS),
-            ("outputs", file.outputs, MOST_SIGNALS),
-            ("definitions", file.definitions, MOST_DEFINITIONS),
-        ):
-            if len(entries) > most:
-                self._fault((table,), f"{len(entries)} entries, at most {most} are supported")
-        for table, entries in (("states", file.states), ("outputs", file.outputs)):
-            if not entries:
-                self._fault((table,), f"a twin has at least one entry in [{table}]")
+        for table, limit in MAX_ROWS.items():
+            rows: Sized = getattr(self._file, table)
+            if len(rows) > limit:
+                self._fault((table,), f"has {len(rows)} rows: at most {limit} are supported")
+            if not rows and table in ("states", "outputs"):
+                self._fault((table,), f"a twin needs at least one row in [{table}]")
 
     def _check_names(self) -> None:
-        file, owner = self._file, dict[str, str]()
-        tables: dict[str, Iterable[str]] = {
-            "states": file.states, "inputs": file.inputs, "outputs": file.outputs, "parameters": file.parameters,
-            "constants": file.constants, "definitions": file.definitions, "sites": file.sites,
-        }  # fmt: skip
-        for table, entries in tables.items():
-            for name in entries:
+        owner: dict[str, str] = {}
+        for table in ("states", "inputs", "outputs", "parameters", "constants", "definitions", "sites"):
+            for name in getattr(self._file, table):
                 try:
                     check_name(name)
                 except ValueError as error:
@@ -389,7 +182,7 @@ class _Reader:
                 owner.setdefault(name, table)
 
     def _number(self, location: Location, unit: str, written: Number, *, difference: bool = False) -> float:
-        """A number in the declared unit, or a quantity in any unit that fits."""
+        """A number in the declared unit, or a quantity in any unit of the same dimension; NaN after a fault."""
         try:
             if isinstance(written, int | float):
                 return written
@@ -401,37 +194,213 @@ class _Reader:
     def _bounds(self, location: Location, unit: str, bounds: Bounds) -> tuple[float, float]:
         low, high = (self._number(location, unit, bound) for bound in bounds)
         if not low < high and not math.isnan(low + high):
-            self._fault(location, f"the lower bound {low:g} is not under the upper {high:g} {unit}")
+            self._fault(location, f"the lower bound {low:g} {unit} must be below the upper bound {high:g} {unit}")
         return low, high
 
-    def _state(self, name: str, entry: _StateTable) -> StateVariable:
-        low, high = self._bounds(("states", name, "bounds"), entry.unit, entry.bounds)
-        initial = self._number(("states", name, "initial"), entry.unit, entry.initial)
-        if initial < low < high or initial > high > low:
-            self._fault(("states", name), f"initial {initial:g} is outside the bounds {low:g} to {high:g} {entry.unit}")
-        return StateVariable(name, entry.unit, entry.meaning, initial, low, high)
+    def _inside(self, location: Location, unit: str, key: str, written: Number, bounds: tuple[float, float]) -> float:
+        """A number that must be within valid ``bounds``."""
+        value, (low, high) = self._number((*location, key), unit, written), bounds
+        if value < low < high or value > high > low:
+            self._fault(location, f"{key} {value:g} {unit} is outside its bounds {low:g} to {high:g} {unit}")
+        return value
 
-    def _input(self, name: str, entry: _Input) -> Input:
-        low, high = self._bounds(("inputs", name, "range"), entry.unit, entry.range)
-        return Input(name, entry.unit, entry.meaning, entry.hold, low, high)
+    def _state(self, name: str, table: _StateTable) -> StateVariable:
+        bounds = self._bounds(("states", name, "bounds"), table.unit, table.bounds)
+        initial = self._inside(("states", name), table.unit, "initial", table.initial, bounds)
+        return StateVariable(name, table.unit, table.meaning, initial, *bounds)
 
-    def _output(self, name: str, entry: _Output) -> Output:
-        noise = self._number(("outputs", name, "noise"), entry.unit, entry.noise, difference=True)
+    def _input(self, name: str, table: _InputTable) -> Input:
+        bounds = self._bounds(("inputs", name, "range"), table.unit, table.range)
+        return Input(name, table.unit, table.meaning, table.hold, *bounds)
+
+    def _output(self, name: str, table: _OutputTable) -> Output:
+        noise = self._number(("outputs", name, "noise"), table.unit, table.noise, difference=True)
         if noise <= 0.0:
-            self._fault(("outputs", name), f"noise {noise:g} {entry.unit} must be above zero")
+            self._fault(("outputs", name), f"noise {noise:g} {table.unit} must be above zero")
         state = self._file.states.get(name)
-        if state is not None and state.unit != entry.unit:
-            self._fault(("outputs", name), f"shows the state {name!r}, so its unit must be {state.unit!r} too")
-        return Output(name, entry.unit, entry.meaning, noise)
+        if state is not None and state.unit != table.unit:
+            self._fault(("outputs", name), f"shows the state {name!r}: its unit must be {state.unit!r} too")
+        return Output(name, table.unit, table.meaning, noise)
 
-    def _parameter(self, name: str, entry: _Parameter) -> Parameter:
-        nominal = self._number(("parameters", name, "nominal"), entry.unit, entry.nominal)
-        low, high = self._bounds(("parameters", name, "bounds"), entry.unit, entry.bounds)
-        if nominal < low < high or nominal > high > low:
-            text = f"nominal {nominal:g} {entry.unit} is outside its bounds {low:g} to {high:g} {entry.unit}"
-            self._fault(("parameters", name), text)
-        return Parameter(name, entry.unit, nominal, low, high, entry.meaning, entry.role)
+    def _parameter(self, name: str, table: _ParameterTable) -> Parameter:
+        bounds = self._bounds(("parameters", name, "bounds"), table.unit, table.bounds)
+        nominal = self._inside(("parameters", name), table.unit, "nominal", table.nominal, bounds)
+        return Parameter(name, table.unit, nominal, *bounds, table.meaning, table.role)
 
-    def _constant(self, name: str, entry: _Constant) -> Constant:
-        value = self._number(("constants", name, "value"), entry.unit, entry.value)
-        return Constant(name, entry.unit, value, entry.meaning)
+    def _constant(self, name: str, table: _ConstantTable) -> Constant:
+        value = self._number(("constants", name, "value"), table.unit, table.value)
+        return Constant(name, table.unit, value, table.meaning)
+
+
+class _EquationChecker:
+    """Checks the equations of a definition whose quantities are right."""
+
+    def __init__(self, definition: Definition, fault: Fault) -> None:
+        self._definition = definition
+        self._report = fault
+        self._faulty = False
+        self._states = [state.name for state in definition.states]
+        self._outputs = [output.name for output in definition.outputs if output.name not in self._states]
+        self._units = {name: dimension_of(unit) for name, unit in definition.units().items()}
+        self._known: dict[str, Dimension] = {n: d for n, d in self._units.items() if n not in self._outputs}
+        """Dimension of every name that an expression may use: outputs follow from the states and are not among them."""
+        self._trees: dict[str, ast.expr] = {}
+        """Of the definitions."""
+
+    def check(self) -> None:
+        """Report the faults of a stage only if the stages before have none, because they would follow from those."""
+        self._check_definitions()
+        self._check_left_sides()
+        used: set[str] = set()
+        for left, text in self._definition.equations:
+            tree = self._tree(("equations", left), text)
+            if tree is not None and not self._faulty:
+                used |= names_in(tree)
+                self._check_dimensions(left, tree)
+                self._check_expanded_size(left, tree)
+        if not self._faulty:
+            self._check_used(used)
+            for site in self._definition.sites:
+                self._check_site(site)
+
+    def _fault(self, location: Location, message: str) -> None:
+        self._faulty = True
+        self._report(location, message)
+
+    def _tree(self, location: Location, text: str, pending: Mapping[str, Any] | None = None) -> ast.expr | None:
+        """The tree of an expression that uses known names and ``pending`` ones only; None after a fault."""
+        known = self._known.keys() | (pending or {}).keys()
+        try:
+            tree = parse(text)
+            for name in sorted(names_in(tree) & (set(self._outputs) - known)):
+                self._fault(location, f"{name!r} is an output, which no expression may use: move it to a definition")
+                return None
+            check_known(tree, known)
+        except ExpressionError as error:
+            self._fault(location, str(error))
+            return None
+        return tree
+
+    def _dimension(self, location: Location, tree: ast.expr) -> Dimension:
+        """The dimension of an expression; None after a fault, as for the number zero."""
+        try:
+            return infer_dimension(tree, self._known)
+        except ExpressionError as error:
+            self._fault(location, str(error))
+            return None
+
+    def _left_dimension(self, left: str) -> Dimension:
+        """The dimension that the left side of an equation or definition has; None if it is unknown."""
+        if left.startswith("der(") and left[4:-1] in self._units:
+            return self._units[left[4:-1]] / dimension_of("s")
+        return self._units.get(left, self._known.get(left))
+
+    def _check_definitions(self) -> None:
+        """Parse definitions and infer their dimensions, those first that the others use."""
+        helpers = {name: text for name, text, _ in self._definition.definitions}
+        trees = {name: self._tree(("definitions", name), text, helpers) for name, text in helpers.items()}
+        self._trees = {name: tree for name, tree in trees.items() if tree is not None}
+        pending = dict(self._trees)
+        while pending:
+            ready = [name for name, tree in pending.items() if not names_in(tree) & pending.keys()]
+            if not ready:
+                first = next(iter(pending))
+                loop = " -> ".join([*pending, first])
+                text = f"an algebraic loop: {loop}: solve it by hand, or make one of them a state"
+                self._fault(("definitions", first), text)
+                self._known.update(dict.fromkeys(pending))
+                break
+            for name in ready:
+                self._known[name] = self._dimension(("definitions", name), pending.pop(name))
+
+    def _check_left_sides(self) -> None:
+        wanted = [*(f"der({name})" for name in self._states), *self._outputs]
+        written = [left for left, _ in self._definition.equations]
+        for left in written:
+            if left in self._states:
+                self._fault(("equations", left), f"{left!r} is a state: write its derivative, der({left})")
+            elif left not in wanted:
+                self._fault(("equations", left), f"no state or output has this equation: {nearest(left, wanted)}")
+        for left in wanted:
+            if left not in written:
+                self._fault(("equations",), f"the equation of {left} is missing")
+
+    def _check_dimensions(self, left: str, tree: ast.expr) -> None:
+        expected, inferred = self._left_dimension(left), self._dimension(("equations", left), tree)
+        if expected is not None and inferred is not None and inferred != expected:
+            text = f"the left side is in {describe(expected)}, the right side in {describe(inferred)}"
+            self._fault(("equations", left), text)
+
+    def _check_expanded_size(self, left: str, tree: ast.expr) -> None:
+        """Definitions are substituted where they are used, so their sizes multiply."""
+        terms, levels = self._expanded_size(tree, {})
+        if terms > MAX_EXPANDED_TERMS or levels > MAX_EXPANDED_LEVELS:
+            self._fault(
+                ("equations", left),
+                f"with its definitions written out it has {terms} terms, {levels} levels deep, but at most "
+                f"{MAX_EXPANDED_TERMS} and {MAX_EXPANDED_LEVELS} are supported: simplify, or make one of them a state",
+            )
+
+    def _expanded_size(self, tree: ast.expr, sizes: dict[str, tuple[int, int]]) -> tuple[int, int]:
+        """Terms and levels with definitions substituted; ``sizes`` holds those of definitions that are known."""
+        terms, levels = 0, 0
+        pending: list[tuple[ast.AST, int]] = [(tree, 1)]
+        while pending:
+            node, level = pending.pop()
+            inner = (1, 0)
+            if isinstance(node, ast.Name) and node.id in self._trees:
+                if node.id not in sizes:
+                    sizes[node.id] = self._expanded_size(self._trees[node.id], sizes)
+                inner = sizes[node.id]
+            terms += inner[0]
+            levels = max(levels, level + inner[1])
+            pending += [(child, level + 1) for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
+        return terms, levels
+
+    def _check_used(self, used: set[str]) -> None:
+        """Every quantity must act on an equation, directly or through definitions, or be used by a site."""
+        for site in self._definition.sites:
+            try:
+                used |= names_in(parse(site.through))
+            except ExpressionError:
+                continue  # the check of the site reports it
+        pending = list(used)
+        while pending:
+            inner = names_in(self._trees[name]) if (name := pending.pop()) in self._trees else set()
+            pending += inner - used
+            used |= inner
+        tables = {
+            "parameters": [parameter.name for parameter in self._definition.parameters],
+            "inputs": [driven.name for driven in self._definition.inputs],
+            "constants": [fixed.name for fixed in self._definition.constants],
+            "definitions": [name for name, _, _ in self._definition.definitions],
+        }
+        for table, rows in tables.items():
+            for name in rows:
+                if name not in used:
+                    self._fault((table, name), "appears in no equation: use it or leave it out")
+
+    def _check_site(self, site: Site) -> None:
+        at: Location = ("sites", site.name)
+        targets = [left for left, _ in self._definition.equations]
+        targets += [name for name, _, _ in self._definition.definitions]
+        if site.into not in targets:
+            text = f"into {site.into!r}, which is neither an equation nor a definition: {nearest(site.into, targets)}"
+            self._fault(at, text)
+            return
+        if site.mode == "multiplicative":
+            if site.through != "1" or dimension_of(site.unit) != NONE:
+                self._fault(at, 'a multiplicative component has no unit: write unit = "1", and no through')
+            return
+        tree = self._tree(at, site.through)
+        if tree is None:
+            return
+        try:
+            entering = (infer_dimension(tree, self._known) or NONE) * dimension_of(site.unit)
+        except ExpressionError as error:
+            self._fault(at, str(error))
+            return
+        expected = self._left_dimension(site.into)
+        if expected is not None and entering != expected:
+            text = f"through * component is in {describe(entering)}, but {site.into} is in {describe(expected)}"
+            self._fault(at, text)

@@ -1,12 +1,7 @@
-"""From the page to algebra: the right sides as SymPy expressions of scalars, helpers substituted, units made coherent.
+"""From a definition to algebra: its right sides as SymPy expressions, and its equations as printed for people.
 
-Importing it loads SymPy, which only those need who print equations or generate a kernel.
-
-Functions that SymPy lacks, or has with properties that a machine does not care for.
-
-The algebra of slots: what enters at each site of a twin with slots (see :mod:`otolith.twin.augmentation`).
-
-A twin as people read it: its equations as on paper, in Unicode or LaTeX.
+Definitions are substituted, units are converted to coherent ones, and in an augmented twin components enter at their
+sites. Importing this module loads SymPy, which only printing equations and generating a kernel need.
 """
 
 import ast
@@ -16,17 +11,30 @@ from functools import lru_cache
 
 import sympy
 
-from otolith.twin.augmentation import SLOTS, enters, family, numbers, place, shift, sites, sources, weight
+from otolith.twin.augmentation import (
+    MAX_COMPONENTS,
+    augmentation_inputs,
+    component_parameters,
+    family_setting,
+    shift_setting,
+    site_setting,
+    sites,
+    source_setting,
+    sources,
+)
 from otolith.twin.definition import Definition, Site
-from otolith.twin.expressions import constant, parse
+from otolith.twin.expressions import ARITHMETIC, constant, parse
 from otolith_drivers.units import to_base
 
+Values = Mapping[str, sympy.Expr]
+"""The expression of each name."""
 
-class sign(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no types; printed as it is called
-    """The sign, with the slope that it has beside its step: SymPy's own asks whether its argument is real."""
+
+class sign(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no types; the class name is printed
+    """The sign function with derivative 0; SymPy's own asks whether its argument is real."""
 
     def fdiff(self, argindex: int = 1) -> sympy.Expr:
-        """Zero."""
+        """0: the slope beside the step."""
         del argindex
         return sympy.Integer(0)
 
@@ -35,92 +43,64 @@ class absolute(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as above
     """The absolute value of a real quantity."""
 
     def fdiff(self, argindex: int = 1) -> sympy.Expr:
-        """The sign."""
+        """The sign of the argument."""
         del argindex
         return sign(self.args[0])
 
     def _pretty(self, printer: object) -> object:
-        return printer._print(sympy.Abs(self.args[0]))  # type: ignore[attr-defined]  # what sympy hands every printer
+        return printer._print(sympy.Abs(self.args[0]))  # type: ignore[attr-defined]  # SymPy calls it with a printer
 
     def _latex(self, printer: object) -> str:
-        found: str = printer._print(sympy.Abs(self.args[0]))  # type: ignore[attr-defined]  # as above
-        return found
+        return str(printer._print(sympy.Abs(self.args[0])))  # type: ignore[attr-defined]  # as above
 
 
 class component(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as above
-    """``component(family, x, a, b, c)``: a meta-model, which the kernel looks up by the family's number."""
+    """``component(family, x, a, b, c)``: the kernel looks the formula up by the code of the family."""
 
     def fdiff(self, argindex: int = 1) -> sympy.Expr:
-        """By anything but the family."""
-        slope: sympy.Expr = SLOPES[argindex - 2](*self.args)
+        """The derivative by ``x``, ``a``, ``b`` or ``c``; by the family there is none."""
+        slope: sympy.Expr = COMPONENT_SLOPES[argindex - 2](*self.args)
         return slope
 
 
 class component_x(component):  # noqa: N801 - as above
-    """Its derivative by the input."""
+    """Derivative of a component by its source."""
 
 
 class component_a(component):  # noqa: N801 - as above
-    """Its derivative by the amplitude."""
+    """Derivative of a component by its amplitude."""
 
 
 class component_b(component):  # noqa: N801 - as above
-    """Its derivative by the inner number."""
+    """Derivative of a component by its inner parameter."""
 
 
 class component_c(component):  # noqa: N801 - as above
-    """Its derivative by the phase."""
+    """Derivative of a component by its phase."""
 
 
-SLOPES = (component_x, component_a, component_b, component_c)
-
-
-def entering_of(
-    plain: Definition, symbols: Mapping[str, sympy.Symbol], outputs: Mapping[str, sympy.Expr]
-) -> list[sympy.Expr]:
-    """For each site of ``plain``, in its order, the sum of what enters there, in coherent units.
-
-    ``outputs`` are those of the plain twin in the units of the page: a component that depends on one would otherwise
-    depend on itself.
-    """
-    components = [_component(plain, slot, symbols, outputs) for slot in range(SLOTS)]
-    found = []
-    for index, site in enumerate(sites(plain)):
-        terms = [symbols[place(slot, index)] * entry for slot, entry in enumerate(components)]
-        scale = to_base(site.unit)[0]
-        total = sympy.Add(symbols[enters(index)], *terms)
-        found.append(total if scale == 1.0 else sympy.Float(scale) * total)
-    return found
-
-
-def _component(
-    plain: Definition, slot: int, symbols: Mapping[str, sympy.Symbol], outputs: Mapping[str, sympy.Expr]
-) -> sympy.Expr:
-    states = {entry.name for entry in plain.states}
-    terms = [symbols[shift(slot)]]
-    for index, source in enumerate(sources(plain)):
-        if source.symbol:
-            is_output = source.name in outputs and source.name not in states
-            value = outputs[source.name] if is_output else symbols[source.symbol]
-            terms.append(symbols[weight(slot, index)] * value)
-    amplitude, inner, phase = (symbols[name] for name in numbers(slot))
-    return component(symbols[family(slot)], sympy.Add(*terms), amplitude, inner, phase)
-
-
-UNARY = {name: getattr(sympy, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh",
-                                                   "exp", "log", "sqrt")}  # fmt: skip
-COMPARE = {ast.Lt: sympy.Lt, ast.LtE: sympy.Le, ast.Gt: sympy.Gt, ast.GtE: sympy.Ge}
+TIME = sympy.Symbol("t")
+COMPONENT_SLOPES = (component_x, component_a, component_b, component_c)
+COMPARISONS = {ast.Lt: sympy.Lt, ast.LtE: sympy.Le, ast.Gt: sympy.Gt, ast.GtE: sympy.Ge}
+SYMPY_FUNCTIONS = {
+    **{name: getattr(sympy, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh",
+                                               "tanh", "exp", "log", "sqrt")},
+    "sign": sign, "abs": absolute, "min": sympy.Min, "max": sympy.Max,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class System:
-    """``dx/dt = rates(x, u, p)``, ``y = outputs(x, u, p)``, every quantity a real symbol in the unit of the page."""
+    """``dx/dt = rates(x, u, p)``, ``y = outputs(x, u, p)``; every symbol is real and in the unit of the definition.
+
+    Names are prefixed with ``x_``, ``u_`` or ``p_``, so that no name of a twin file meets one of a kernel's own.
+    """
 
     states: tuple[sympy.Symbol, ...]
     inputs: tuple[sympy.Symbol, ...]
     parameters: tuple[sympy.Symbol, ...]
     settings: tuple[sympy.Symbol, ...]
-    """Of which no derivative is taken."""
+    """Parameters by which no derivative is taken."""
     rates: tuple[sympy.Expr, ...]
     outputs: tuple[sympy.Expr, ...]
 
@@ -128,69 +108,106 @@ class System:
 @lru_cache(maxsize=64)
 def system_of(definition: Definition) -> System:
     """The algebra of a checked definition."""
-    symbols = {name: sympy.Symbol(name, real=True) for name in definition.units()}
+    symbols = _symbols(definition)
     scales = {name: to_base(unit)[0] for name, unit in definition.units().items()}
-    # Equations hold in coherent units; a page may use others, so each symbol enters with its factor.
-    values: dict[str, sympy.Expr] = {name: _scaled(symbols[name], scales[name]) for name in symbols}
-    for entry in definition.constants:
-        values[entry.name] = sympy.Float(entry.value * scales[entry.name])
+    # Equations hold in coherent units, so each symbol enters with the factor of its own unit.
+    values: dict[str, sympy.Expr] = {name: _scaled(symbol, scales[name]) for name, symbol in symbols.items()}
+    for fixed in definition.constants:
+        values[fixed.name] = sympy.Float(fixed.value * scales[fixed.name])
     entering = _Entering(definition, symbols)
     for driven in definition.inputs:
-        values[driven.name] -= entering.sensor(driven.name)  # the twin is driven by what is true
+        values[driven.name] -= entering.sensor_error(driven.name)  # the true input drives the twin
     pending = {name: parse(text) for name, text, _ in definition.definitions}
     while pending:
-        ready = [name for name in pending if not _depends(pending[name], pending)]
-        for name in ready:
+        for name in [name for name in pending if not _depends(pending[name], pending)]:
             values[name] = entering.at(name, to_sympy(pending.pop(name), values), values)
-    states = [entry.name for entry in definition.states]
+    states = [state.name for state in definition.states]
     right = {left: entering.at(left, to_sympy(parse(text), values), values) for left, text in definition.equations}
     shown = {left: _scaled(side, 1.0 / scales[left]) for left, side in right.items() if left in scales}
     shown |= {name: symbols[name] for name in states}
-    settings = len(definition.parameters) - definition.settings
+    parameters = tuple(symbols[parameter.name] for parameter in definition.parameters)
+    free = len(parameters) - definition.settings
     return System(
         states=tuple(symbols[name] for name in states),
-        inputs=tuple(symbols[entry.name] for entry in definition.inputs),
-        parameters=tuple(symbols[entry.name] for entry in definition.parameters[:settings]),
-        settings=tuple(symbols[entry.name] for entry in definition.parameters[settings:]),
+        inputs=tuple(symbols[driven.name] for driven in definition.inputs),
+        parameters=parameters[:free],
+        settings=parameters[free:],
         rates=tuple(_scaled(right[f"der({name})"], 1.0 / scales[name]) for name in states),
         outputs=tuple(
-            shown[entry.name] + _scaled(entering.sensor(entry.name), 1.0 / scales[entry.name])
-            for entry in definition.outputs
+            shown[output.name] + _scaled(entering.sensor_error(output.name), 1.0 / scales[output.name])
+            for output in definition.outputs
         ),
     )
 
 
+def _symbols(definition: Definition) -> dict[str, sympy.Symbol]:
+    names = {
+        "p": [parameter.name for parameter in definition.parameters],
+        "u": [driven.name for driven in definition.inputs],
+        "x": [state.name for state in definition.states],
+    }
+    return {name: sympy.Symbol(f"{prefix}_{name}", real=True) for prefix, group in names.items() for name in group}
+
+
+def _scaled(expression: sympy.Expr, scale: float) -> sympy.Expr:
+    return expression if scale == 1.0 else sympy.Float(scale) * expression
+
+
+def _depends(tree: ast.expr, on: Mapping[str, ast.expr]) -> bool:
+    return any(isinstance(node, ast.Name) and node.id in on for node in ast.walk(tree))
+
+
 class _Entering:
-    """What components add at the sites of a twin with slots; nothing at those of a plain one."""
+    """What components and augmentation inputs add at the sites of an augmented twin; nothing for any other twin."""
 
-    def __init__(self, definition: Definition, symbols: dict[str, sympy.Symbol]) -> None:
-        self._sites: list[tuple[Site, sympy.Expr]] = []
+    def __init__(self, definition: Definition, symbols: Mapping[str, sympy.Symbol]) -> None:
+        self._author: list[tuple[Site, sympy.Expr]] = []
         self._sensors: dict[str, sympy.Expr] = {}
-        plain = definition.plain
-        if plain is not None:
-            outputs = [entry.name for entry in plain.outputs]
-            entering = entering_of(plain, symbols, dict(zip(outputs, system_of(plain).outputs, strict=True)))
-            own = len(plain.sites)
-            self._sites = list(zip(plain.sites, entering[:own], strict=True))
-            self._sensors = {
-                site.into: expression for site, expression in zip(sites(plain)[own:], entering[own:], strict=True)
-            }
+        if definition.base is not None:
+            entering = list(zip(sites(definition.base), _sums_at_sites(definition.base, symbols), strict=True))
+            own = len(definition.base.sites)
+            self._author = entering[:own]
+            self._sensors = {site.into: expression for site, expression in entering[own:]}
 
-    def at(self, left: str, side: sympy.Expr, values: dict[str, sympy.Expr]) -> sympy.Expr:
-        """The right side that belongs to ``left``, with what enters there (Eq. 3 and 18)."""
-        for site, expression in self._sites:
+    def at(self, left: str, side: sympy.Expr, values: Values) -> sympy.Expr:
+        """The right ``side`` of ``left`` with what enters there (Eq. 3 and 18)."""
+        for site, expression in self._author:
             if site.into == left and site.mode == "multiplicative":
                 side *= 1 + expression
             elif site.into == left:
                 side += to_sympy(parse(site.through), values) * expression
         return side
 
-    def sensor(self, name: str) -> sympy.Expr:
-        """What the sensor of a signal adds to the truth."""
+    def sensor_error(self, name: str) -> sympy.Expr:
+        """What the sensor of a signal adds to its true value."""
         return self._sensors.get(name, sympy.Integer(0))
 
 
-def to_sympy(tree: ast.expr, values: dict[str, sympy.Expr]) -> sympy.Expr:
+def _sums_at_sites(base: Definition, symbols: Mapping[str, sympy.Symbol]) -> list[sympy.Expr]:
+    """For each site of ``base`` its augmentation input and the components there, in coherent units."""
+    components = [_component(base, slot, symbols) for slot in range(MAX_COMPONENTS)]
+    sums = []
+    for index, (site, name) in enumerate(zip(sites(base), augmentation_inputs(base), strict=True)):
+        terms = [symbols[site_setting(slot, index)] * term for slot, term in enumerate(components)]
+        sums.append(_scaled(sympy.Add(symbols[name], *terms), to_base(site.unit)[0]))
+    return sums
+
+
+def _component(base: Definition, slot: int, symbols: Mapping[str, sympy.Symbol]) -> sympy.Expr:
+    """The component of a slot, as a function of the source that its settings select."""
+    # The outputs of the base model: those of the augmented twin would depend on the component itself.
+    outputs = {shown.name: value for shown, value in zip(base.outputs, system_of(base).outputs, strict=True)}
+    values = outputs | {state.name: symbols[state.name] for state in base.states}
+    terms = [symbols[shift_setting(slot)]]
+    for index, source in enumerate(sources(base)):
+        if source.symbol:
+            value = values[source.name] if source.name in values else symbols[source.symbol]
+            terms.append(symbols[source_setting(slot, index)] * value)
+    amplitude, inner, phase = (symbols[name] for name in component_parameters(slot))
+    return component(symbols[family_setting(slot)], sympy.Add(*terms), amplitude, inner, phase)
+
+
+def to_sympy(tree: ast.expr, values: Values) -> sympy.Expr:
     """The expression with every name replaced by its value."""
     match tree:
         case ast.Constant(value=value):
@@ -203,70 +220,37 @@ def to_sympy(tree: ast.expr, values: dict[str, sympy.Expr]) -> sympy.Expr:
         case ast.BinOp(left=left, op=ast.Pow(), right=right):
             return to_sympy(left, values) ** sympy.nsimplify(constant(right), rational=True)
         case ast.BinOp(left=left, op=operator, right=right):
-            first, second = to_sympy(left, values), to_sympy(right, values)
-            match operator:
-                case ast.Add():
-                    return first + second
-                case ast.Sub():
-                    return first - second
-                case ast.Mult():
-                    return first * second
-                case _:
-                    return first / second
+            return ARITHMETIC[type(operator)](to_sympy(left, values), to_sympy(right, values))
+        case ast.Call(func=ast.Name(id="where"), args=[ast.Compare() as condition, then, otherwise]):
+            left, right = to_sympy(condition.left, values), to_sympy(condition.comparators[0], values)
+            test = COMPARISONS[type(condition.ops[0])](left, right)
+            return sympy.Piecewise((to_sympy(then, values), test), (to_sympy(otherwise, values), True))
         case ast.Call(func=ast.Name(id=name), args=arguments):
-            return _call(name, arguments, values)
+            return SYMPY_FUNCTIONS[name](*(to_sympy(argument, values) for argument in arguments))
         case _:
             raise AssertionError(ast.dump(tree))
 
 
-def _call(name: str, arguments: list[ast.expr], values: dict[str, sympy.Expr]) -> sympy.Expr:
-    if name == "where":
-        condition = arguments[0]
-        assert isinstance(condition, ast.Compare)  # noqa: S101 - the parser has seen to it
-        left, right = to_sympy(condition.left, values), to_sympy(condition.comparators[0], values)
-        test = COMPARE[type(condition.ops[0])](left, right)
-        return sympy.Piecewise((to_sympy(arguments[1], values), test), (to_sympy(arguments[2], values), True))
-    found = [to_sympy(argument, values) for argument in arguments]
-    several = {"sign": sign, "abs": absolute, "min": sympy.Min, "max": sympy.Max, "atan2": sympy.atan2}
-    return (UNARY | several)[name](*found)
-
-
-def _scaled(expression: sympy.Expr, scale: float) -> sympy.Expr:
-    return expression if scale == 1.0 else sympy.Float(scale) * expression
-
-
-def _depends(tree: ast.expr, on: dict[str, ast.expr]) -> bool:
-    return any(isinstance(node, ast.Name) and node.id in on for node in ast.walk(tree))
-
-
-TIME = sympy.Symbol("t")
-
-
 def equations(definition: Definition) -> list[sympy.Eq]:
-    """Helper quantities in the author's order, then the equations; names stay as the author gave them."""
+    """Definitions in the author's order, then the equations, with the author's names."""
     symbols = {name: sympy.Symbol(name, real=True) for name in definition.units()}
     symbols |= {name: sympy.Symbol(name, real=True) for name, _, _ in definition.definitions}
-    found = [
-        sympy.Eq(symbols[name], to_sympy(parse(text), symbols), evaluate=False)
-        for name, text, _ in definition.definitions
-    ]
+    sides = [(symbols[name], text) for name, text, _ in definition.definitions]
     for left, text in definition.equations:
-        if left.startswith("der("):
-            side = sympy.Derivative(sympy.Symbol(left[4:-1]), TIME, evaluate=False)
-        else:
-            side = symbols[left]
-        found.append(sympy.Eq(side, to_sympy(parse(text), symbols), evaluate=False))
-    return found
+        is_rate = left.startswith("der(")
+        side = sympy.Derivative(sympy.Symbol(left[4:-1]), TIME, evaluate=False) if is_rate else symbols[left]
+        sides.append((side, text))
+    return [sympy.Eq(left, to_sympy(parse(text), symbols), evaluate=False) for left, text in sides]
 
 
 def unicode_page(definition: Definition, columns: int = 110) -> str:
-    """The equations for a terminal."""
+    """The equations for a terminal of that many columns."""
     return "\n\n".join(
         sympy.pretty(equation, use_unicode=True, num_columns=columns) for equation in equations(definition)
     )
 
 
 def latex_page(definition: Definition) -> str:
-    """The equations as the body of a LaTeX ``align*``."""
+    """The equations as a LaTeX ``align*`` environment."""
     lines = [sympy.latex(equation).replace(" = ", " &= ", 1) for equation in equations(definition)]
     return "\\begin{align*}\n" + " \\\\\n".join(lines) + "\n\\end{align*}"

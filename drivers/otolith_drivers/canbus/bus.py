@@ -1,18 +1,17 @@
-"""Opening a CAN bus: the kernel's where there is one, else a virtual one between processes of this computer.
+"""Opening a CAN bus: that of the kernel, of an adapter, or a virtual one between processes of this computer.
 
-Shared by the receiver and by the simulated plant, so that both mean the same bus by the same words.
-
-What python-can does not ask of the kernel: room for frames, how many were thrown away, and whether the bus is up.
+The driver and the simulated plant share it, so that the same options mean the same bus. It also asks the kernel for
+what python-can does not: a larger receive buffer, the number of dropped frames, and whether the bus is up.
 """
 
-import contextlib
 import os
 import re
 import socket
 import stat
 import struct
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeVar
 
 import can
 from pydantic import BeforeValidator, Field, model_validator
@@ -21,98 +20,35 @@ from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import DeviceError
 from otolith_drivers.units import Quantity
 
-SO_RCVBUFFORCE, SO_MEMINFO = 33, 55  # of <asm-generic/socket.h>; the socket module has no names for them
-MEMORY_INFO = struct.Struct("9I")  # of <linux/sock_diag.h>
-DROPS = 8  # its last
-BUFFER = 8 << 20  # bytes; a second or two of a bus at its limit
-RECENT = 60.0  # s for which dropped frames are told
-
-
-def enlarge_buffer(bus: can.BusABC) -> None:
-    """Let the kernel keep frames for as long as this computer may be busy; above its limit where that is permitted."""
-    descriptor = _descriptor(bus)
-    if descriptor is None:
-        return
-    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as handle:
-        try:
-            handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER)
-        except PermissionError:
-            handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
-
-
-def frames_dropped(bus: can.BusABC) -> int | None:
-    """Frames that the kernel had no room for since the bus was opened; None where it does not say."""
-    descriptor = _descriptor(bus)
-    if descriptor is None:
-        return None
-    try:
-        with socket.socket(fileno=os.dup(descriptor)) as handle:
-            if handle.type == socket.SOCK_STREAM:  # what is dropped there is sent again
-                return None
-            told = handle.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMORY_INFO.size)
-    except OSError:
-        return None
-    if len(told) < MEMORY_INFO.size:
-        return None
-    drops: int = MEMORY_INFO.unpack_from(told)[DROPS]
-    return drops
-
-
-def refusal(bus: can.BusABC) -> str | None:
-    """What the kernel has against a bus that was just opened: it opens one that is down, too, and then refuses to read.
-
-    The error is taken off the bus by asking, so that it is to be shut.
-    """
-    descriptor = _descriptor(bus)
-    if descriptor is None:
-        return None
-    try:
-        with socket.socket(fileno=os.dup(descriptor)) as handle:
-            code = handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-    except OSError:
-        return None
-    return os.strerror(code) if code else None
-
-
-def _descriptor(bus: can.BusABC) -> int | None:
-    """Of the socket under ``bus``; other interfaces have none, or that of a serial line."""
-    try:
-        found = bus.fileno()
-        is_socket = isinstance(found, int) and found >= 0 and stat.S_ISSOCK(os.fstat(found).st_mode)
-    except (NotImplementedError, OSError):
-        return None
-    return found if is_socket else None
-
-
-class Drops:
-    """Frames that this computer did not read in time, over all the buses that were opened."""
-
-    def __init__(self) -> None:
-        self.total = 0
-        self._of_this_bus = 0
-        self._at = 0.0
-
-    def begin(self) -> None:
-        """Another socket counts from zero."""
-        self._of_this_bus = 0
-
-    def note(self, count: int | None, now: float) -> None:
-        """What the kernel says of this bus."""
-        if count is not None and count > self._of_this_bus:
-            self.total += count - self._of_this_bus
-            self._of_this_bus, self._at = count, now
-
-    def warnings(self, now: float) -> list[str]:
-        """A line for a while after it happened."""
-        if not self.total or now - self._at > RECENT:
-            return []
-        return [f"this computer was too busy to read {self.total} frames, the last {now - self._at:.1f} s ago"]
-
-
-IP_MULTICAST_ALL = 49  # of <linux/in.h>; the socket module has no name for it
+RECEIVE_BUFFER = 8 << 20  # bytes; a second or two of a bus at its limit
+DROPS_SHOWN = 60.0  # s after the last dropped frame
+MAX_CONSECUTIVE_BAD = 50  # frames that cannot be unpacked; after more the bus is opened anew
 DEFAULT_CHANNEL, DEFAULT_GROUP = "vcan0", "239.74.163.2"
-MOST_BAD_IN_A_ROW = 50  # frames that cannot be unpacked; more are no accident
 GROUP = re.compile(r"239\.\d{1,3}\.\d{1,3}\.\d{1,3}")
+
+# Constants of Linux for which the socket module has no names: asm-generic/socket.h, linux/sock_diag.h, linux/in.h.
+SO_RCVBUFFORCE, SO_MEMINFO, IP_MULTICAST_ALL = 33, 55, 49
+MEMORY_INFO, DROPS_FIELD = struct.Struct("9I"), 8
+
+Result = TypeVar("Result")
+
+LISTEN_ONLY: dict[str, dict[str, Any]] = {
+    "cantact": {"monitor": True},
+    "kvaser": {"driver_mode": False},
+    "nixnet": {"listen_only": True},
+    "pcan": {"state": can.BusState.PASSIVE},
+    "seeedstudio": {"operation_mode": "silent"},
+    "slcan": {"listen_only": True},
+    "systec": {"state": can.BusState.PASSIVE},
+    "vector": {"listen_only": True},
+}
+"""Arguments of python-can for an interface that shall not acknowledge. For socketcan 'ip link' decides."""
+FILTERING = {"socketcan"}
+"""Interfaces that get filters. Elsewhere they cost as much as they save, or hide error frames."""
+WAYS_OUT = {
+    "socketcan": "'ip -brief link show type can' lists what there is; set driver.channel or bring the interface up",
+    "udp_multicast": "it needs a multicast route: 'ip route add 239.0.0.0/8 dev lo' as root makes one",
+}
 
 
 class BusOptions(StrictModel):
@@ -121,17 +57,17 @@ class BusOptions(StrictModel):
     interface: str = "auto"
     """``auto``, or one of python-can: ``socketcan``, ``udp_multicast``, ``pcan``, ``kvaser``, ``slcan`` ..."""
     channel: str | None = None
-    """The kernel's network interface, or the channel as the interface of python-can names it; ``vcan0`` without it."""
+    """Network interface of the kernel, or channel as python-can names it; by default ``vcan0``."""
     bitrate: Annotated[float, BeforeValidator(Quantity("bit/s", 1e3, 1e6))] | None = None
-    """Only for interfaces that set it themselves; the kernel's is set with ``ip link``."""
+    """Only for interfaces that set it themselves; that of the kernel is set with ``ip link``."""
     fd: bool = False
     """Whether frames of CAN FD are received as well."""
     data_bitrate: Annotated[float, BeforeValidator(Quantity("bit/s", 1e3, 2e7))] | None = None
-    """Of the data of FD frames; like ``bitrate``."""
+    """Bit rate of the data of FD frames; see ``bitrate``."""
     listen_only: bool = True
-    """Not even to acknowledge, where the interface can; ``false`` where nobody else on the bus acknowledges."""
+    """Whether the adapter does not even acknowledge, if it can; ``false`` if no other node would."""
     port: Annotated[int, Field(ge=1024, le=65535)] = 43113
-    """Of ``udp_multicast``: two buses on one computer differ in it, or in their group."""
+    """UDP port of ``udp_multicast``: two buses on one computer differ in it, or in their group."""
 
     @model_validator(mode="after")
     def _channel_fits(self) -> Self:
@@ -144,7 +80,7 @@ class BusOptions(StrictModel):
     def resolved(self) -> tuple[str, str]:
         """Interface and channel, with ``auto`` decided for this computer.
 
-        Only a virtual channel has a stand-in: a real one that is missing must not turn into a bus where nobody speaks.
+        Only a virtual channel that does not exist is replaced by another bus.
         """
         if self.interface == "udp_multicast":
             return self.interface, self.channel or DEFAULT_GROUP
@@ -158,15 +94,12 @@ class BusOptions(StrictModel):
     def title(self) -> str:
         """The bus in a few words."""
         interface, channel = self.resolved()
-        return (
-            f"{interface} {channel}:{self.port} (this computer only)"
-            if interface == "udp_multicast"
-            else f"{interface} {channel}"
-        )
+        port = f":{self.port} (this computer only)" if interface == "udp_multicast" else ""
+        return f"{interface} {channel}{port}"
 
 
 def kernel_has(channel: str) -> bool:
-    """Whether the kernel speaks CAN and has a network interface of this name."""
+    """Whether the kernel supports CAN and has a network interface of this name."""
     if not hasattr(socket, "AF_CAN") or not (Path("/sys/class/net") / Path(channel).name).exists():
         return False
     try:
@@ -176,28 +109,13 @@ def kernel_has(channel: str) -> bool:
     return True
 
 
-# How an interface of python-can is told not to acknowledge. The kernel's is set up with 'ip link ... listen-only on'.
-LISTEN_ONLY: dict[str, dict[str, Any]] = {
-    "cantact": {"monitor": True},
-    "kvaser": {"driver_mode": False},
-    "nixnet": {"listen_only": True},
-    "pcan": {"state": can.BusState.PASSIVE},
-    "seeedstudio": {"operation_mode": "silent"},
-    "slcan": {"listen_only": True},
-    "systec": {"state": can.BusState.PASSIVE},
-    "vector": {"listen_only": True},
-}
-FILTERING = {"socketcan"}
-"""Where the kernel looks at filters. Elsewhere they cost as much as they save, or hide error frames."""
-
-
 def open_bus(
     options: BusOptions, filters: list[can.typechecking.CanFilter] | None = None, *, listen_only: bool = False
 ) -> can.BusABC:
-    """The bus, open; with ``listen_only`` it does not even acknowledge, where the interface can do that.
+    """The bus, open. With ``listen_only`` the adapter does not even acknowledge, if it can and the options agree.
 
     Raises:
-        DeviceError: it is not there, or refuses.
+        DeviceError: the bus is missing, or cannot be opened.
     """
     interface, channel = options.resolved()
     arguments: dict[str, Any] = {"interface": interface, "channel": channel}
@@ -212,35 +130,94 @@ def open_bus(
     try:
         bus = can.Bus(**arguments, can_filters=filters if interface in FILTERING else None)
         if interface == "udp_multicast":
-            _hear_only_this_group(bus)
+            _receive_only_this_group(bus)
     except (can.CanError, OSError, ImportError, ValueError, TypeError, AttributeError, NotImplementedError) as error:
-        raise DeviceError(
-            f"CAN bus {options.title()} cannot be opened: {_cause(error)}; {_way_out(interface)}"
-        ) from error
+        inner = error.__cause__ or error
+        cause = (getattr(inner, "strerror", None) or str(inner) or type(inner).__name__).strip()
+        way_out = WAYS_OUT.get(interface, f"interfaces known here: {', '.join(sorted(can.VALID_INTERFACES))}")
+        raise DeviceError(f"CAN bus {options.title()} cannot be opened: {cause}; {way_out}") from error
     return bus
 
 
-def is_gone(error: Exception) -> bool:
-    """Whether ``error``, raised on receiving, says that the bus has failed, and not only a frame in the unpacking."""
-    return isinstance(error, OSError) or isinstance(error.__cause__, OSError)
-
-
-def _hear_only_this_group(bus: can.BusABC) -> None:
-    """Linux hands a socket the frames of every group that anybody on this computer has joined on its port."""
+def _receive_only_this_group(bus: can.BusABC) -> None:
+    """Without this, Linux delivers the frames of every group that any program here has joined on the same port."""
     with socket.socket(fileno=os.dup(bus.fileno())) as handle:
         handle.setsockopt(socket.IPPROTO_IP, IP_MULTICAST_ALL, 0)
 
 
-def _cause(error: BaseException) -> str:
-    inner = error.__cause__ or error
-    return (getattr(inner, "strerror", None) or str(inner) or type(inner).__name__).strip()
+def is_gone(error: Exception) -> bool:
+    """Whether ``error``, raised on receiving, means that the bus has failed, and not only that a frame is bad."""
+    return isinstance(error, OSError) or isinstance(error.__cause__, OSError)
 
 
-WAYS_OUT = {
-    "socketcan": "'ip -brief link show type can' lists what there is; set driver.channel or bring the interface up",
-    "udp_multicast": "it needs a multicast route: 'ip route add 239.0.0.0/8 dev lo' as root makes one",
-}
+def _ask_kernel(bus: can.BusABC, ask: Callable[[socket.socket], Result | None]) -> Result | None:
+    """What ``ask`` returns for the socket below ``bus``; None if there is no socket, or if the kernel refuses.
+
+    Interfaces other than the kernel's use a serial line or a library of the vendor.
+    """
+    try:
+        descriptor = bus.fileno()
+        if not isinstance(descriptor, int) or descriptor < 0 or not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+            return None
+        with socket.socket(fileno=os.dup(descriptor)) as handle:
+            return ask(handle)
+    except (NotImplementedError, OSError):
+        return None
 
 
-def _way_out(interface: str) -> str:
-    return WAYS_OUT.get(interface, f"interfaces known here: {', '.join(sorted(can.VALID_INTERFACES))}")
+def enlarge_buffer(bus: can.BusABC) -> None:
+    """Let the kernel keep the frames that come while this computer is busy; above its limit if that is permitted."""
+
+    def enlarge(handle: socket.socket) -> None:
+        try:
+            handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
+        except PermissionError:
+            handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+
+    _ask_kernel(bus, enlarge)
+
+
+def frames_dropped(bus: can.BusABC) -> int | None:
+    """Frames that the kernel had no room for since the bus was opened; None if that is not known."""
+
+    def drops(handle: socket.socket) -> int | None:
+        if handle.type == socket.SOCK_STREAM:  # what is dropped there is sent again
+            return None
+        memory = handle.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMORY_INFO.size)
+        return MEMORY_INFO.unpack_from(memory)[DROPS_FIELD] if len(memory) >= MEMORY_INFO.size else None
+
+    return _ask_kernel(bus, drops)
+
+
+def bus_error(bus: can.BusABC) -> str | None:
+    """Why a bus that was just opened cannot be read; None if it can.
+
+    The kernel opens an interface that is down, and refuses to read from it. Asking clears the error.
+    """
+    code = _ask_kernel(bus, lambda handle: handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR))
+    return os.strerror(code) if code else None
+
+
+class DropCounter:
+    """Counts the frames that this computer did not read in time, over every bus that was opened."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._of_this_bus = 0
+        self._time = 0.0
+
+    def restart(self) -> None:
+        """The bus was opened anew: its socket counts from zero."""
+        self._of_this_bus = 0
+
+    def note(self, count: int | None, now: float) -> None:
+        """Take the number of :func:`frames_dropped` at ``now`` (s)."""
+        if count is not None and count > self._of_this_bus:
+            self.total += count - self._of_this_bus
+            self._of_this_bus, self._time = count, now
+
+    def warnings(self, now: float) -> list[str]:
+        """One line as long as a drop is recent at ``now`` (s)."""
+        if not self.total or now - self._time > DROPS_SHOWN:
+            return []
+        return [f"this computer was too busy to read {self.total} frames, the last {now - self._time:.1f} s ago"]

@@ -1,220 +1,218 @@
-"""From frames to samples, without any clock: serves a bus and a recording of one alike.
+"""From frames to samples: serves a live bus and a log of one alike.
 
-Taking the frames of one message: is it whole, is it new, what is in it. No clock in here.
+:class:`FrameDecoder` gives each frame to the :class:`MessageReader` of its arbitration ID, which checks that the frame
+is intact and new, and reads its signals. No clock in here: the time of a frame is an argument.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import can
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
 
 from otolith_drivers.base import Counters, Sample, Setup, Signal
-from otolith_drivers.canbus.canopen import NodeWatch, Note
-from otolith_drivers.canbus.database import Loaded, load_database
+from otolith_drivers.canbus.canopen import CanopenDrive, FrameHandler, NodeMonitor
+from otolith_drivers.canbus.database import CanDatabase, load_database
 from otolith_drivers.canbus.monitoring import (
-    STANDS_STILL,
+    MIN_STUCK_FRAMES,
     BusFaults,
-    Checksum,
+    ChecksumTest,
     FrameCounter,
     PeriodEstimator,
-    checksum_of,
+    checksum_test,
     counter_by_name,
     period_text,
 )
 from otolith_drivers.canbus.options import FrameOptions, MessageTable
 from otolith_drivers.canbus.signals import (
-    BitField,
     BitRange,
+    RawReader,
     SignalRequest,
     bytes_needed,
-    field,
-    find_in_databases,
-    raw_signal,
+    raw_reader,
+    request_bits,
+    request_from_databases,
 )
 from otolith_drivers.errors import ConfigurationError, nearest
 
 NO_READING = float("nan")
-NOTHING: list[Sample] = []
-RECENT = 10.0  # s for which a frame or value that could not be used is told
-NEVER_SEEN_AFTER = 3.0  # s, or ten declared periods
+NO_SAMPLES: list[Sample] = []
+EXTENDED = 1 << 29  # added to an extended arbitration ID, so that it differs from the same standard one
+REJECTION_SHOWN = 10.0  # s after the last frame or value of a kind that could not be used
+MIN_WAIT, WAIT_PERIODS = 3.0, 10.0  # s; periods: when a message is reported that has not come once
+GROUP_WAIT_PERIODS = 100.0  # periods of the message: the same for the signals of one multiplexer value
+MAX_WARNINGS = 20  # lines about the files; more of them do not help
 
-Condition = tuple[tuple[BitField, frozenset[int]], ...]
-Row = tuple[str, BitField, float, float, float, float, str]
-"""Name, how to read it, lowest and highest raw number, scale, offset, unit."""
+Condition = tuple[tuple[RawReader, frozenset[int]], ...]
+Row = tuple[str, RawReader, float, float, float, float, str]
+"""Name, reader, lowest and highest raw number, scale, offset, unit."""
 
 
 @dataclass(frozen=True, slots=True)
-class Rules:
-    """What a message is held to."""
+class MessageRules:
+    """What the frames of a message are checked against."""
 
     counter: FrameCounter | None = None
-    checksum: Checksum | None = None
+    checksum: ChecksumTest | None = None
     period: float | None = None
     """s, declared."""
-    needed: int = 0
+    length: int = 0
     """Bytes that counter and checksum need."""
 
 
 @dataclass(slots=True)
-class _Trouble:
-    count: int
-    at: float
+class _Rejection:
+    """Frames or values of one kind that could not be used."""
+
     text: str
+    time: float = 0.0
+    count: int = 0
 
 
-class _Group:
-    """The wanted signals that a frame has for some values of its multiplexers alone."""
+@dataclass(slots=True)
+class _MultiplexedGroup:
+    """The requested signals that a frame has only for some values of its multiplexers."""
 
-    def __init__(self, title: str, condition: Condition) -> None:
-        self.title = title
-        self.condition = condition
-        self.rows: list[Row] = []
-        self.pace = PeriodEstimator()
-        self.lost = 0
+    title: str
+    condition: Condition
+    rows: list[Row] = field(default_factory=list)
+    periods: PeriodEstimator = field(default_factory=PeriodEstimator)
+    lost: int = 0
 
     def is_in(self, data: bytes | bytearray) -> bool:
         return all(read(data) in values for read, values in self.condition)
 
 
 class MessageReader:
-    """Takes the frames of one arbitration ID, in the order of their arrival."""
+    """Reads the frames of one arbitration ID, in the order of their arrival."""
 
-    def __init__(self, messages: Sequence[Message], wanted: Sequence[SignalRequest], rules: Rules) -> None:
-        """``messages`` are all descriptions of the frame in which something is ``wanted``."""
-        self.wanted = tuple(wanted)
-        self.title = f"{messages[0].name} (0x{messages[0].frame_id:X})"
-        if messages[0].name == f"0x{messages[0].frame_id:X}":
-            self.title = messages[0].name
-        self.pace = PeriodEstimator(rules.period)
+    def __init__(self, messages: Sequence[Message], requests: Sequence[SignalRequest], rules: MessageRules) -> None:
+        """``messages`` are the descriptions of the frame that contain the signals of ``requests``."""
+        name, identifier = messages[0].name, f"0x{messages[0].frame_id:X}"
+        self.title = name if name == identifier else f"{name} ({identifier})"
+        self.requests = tuple(requests)
+        self.periods = PeriodEstimator(rules.period)
         self.received = self.bad = 0
         self._lost = 0
-        self._rules, self._counter, self._checksum = rules, rules.counter, rules.checksum
-        self._length = max(rules.needed, *(message.length for message in messages))
-        self._cycle = max((message.cycle_time or 0) * 1e-3 for message in messages)
+        self._counter, self._checksum, self._declared_period = rules.counter, rules.checksum, rules.period
+        self._length = max(rules.length, *(message.length for message in messages))
+        self._database_period = max((message.cycle_time or 0) * 1e-3 for message in messages)
         self._rows: list[Row] = []
-        self._groups: dict[tuple[object, ...], _Group] = {}
-        self._troubles: dict[str, _Trouble] = {}
-        for entry in wanted:
-            self._add(entry)
+        self._groups: dict[tuple[object, ...], _MultiplexedGroup] = {}
+        self._rejections: dict[str, _Rejection] = {}
+        for request in requests:
+            self._length = max(self._length, bytes_needed(request.signal))
+            read, limits = raw_reader(request.signal), (request.raw_low, request.raw_high)
+            row = (request.name, read, *limits, request.scale, request.offset, request.target_unit)
+            self._rows_of(request).append(row)
 
     @property
     def lost(self) -> int:
-        """Samples that are known to be missing."""
+        """Samples that are known to be lost."""
         return self._lost + sum(group.lost for group in self._groups.values())
 
     def take(self, data: bytes | bytearray, time: float) -> list[Sample]:
-        """The samples in one frame, which came at ``time`` (s); none where it is broken or is the last one again."""
-        if len(data) < self._length or (self._checksum is not None and not self._checksum.holds(data)):
-            return self._refuse(data, time)
-        if self._counter is None:
-            missing = self.pace.note(time)
+        """The samples of a frame of ``time`` (s); none if it is corrupted or repeats the last one."""
+        if len(data) < self._length or (self._checksum is not None and not self._checksum(data)):
+            return self._reject(data, time)
+        if self._counter is not None:
+            lost = self._counter.lost_before(data, time, self.periods)
         else:
-            missing = self._counter.missing(data, time, self.pace)
-            if missing < 0:
-                self.bad += 1
-                return NOTHING
-        if missing:
-            self._lost += missing * len(self._rows)
+            lost = self.periods.lost_before(time)
+        if lost is None:
+            self.bad += 1
+            return NO_SAMPLES
+        if lost:
+            self._lost += lost * len(self._rows)
+        rows = self._rows if not self._groups else self._rows + self._multiplexed_rows(data, time)
         samples = [
             Sample(name, time, scale * raw + offset)
             if low <= (raw := read(data)) <= high
             else self._no_reading(name, time, scale * raw + offset, unit)
-            for name, read, low, high, scale, offset, unit in self._rows
+            for name, read, low, high, scale, offset, unit in rows
         ]
-        if self._groups:
-            self._take_groups(data, time, samples)
         self.received += len(samples)
         return samples
 
     def warnings(self, now: float, begun: float, *, unused: bool = True) -> list[str]:
-        """What is wrong at ``now``, a line each; listening began at ``begun`` (s).
+        """What is wrong at ``now`` (s), a line each; listening began at ``begun`` (s).
 
         With ``unused`` also what came lately and could not be used.
         """
-        if self.pace.last is None and not self._troubles:
-            declared = self._rules.period or self._cycle
+        if self.periods.last is None and not self._rejections:
             waited = now - begun
-            return [f"{self.title} has not come once in {waited:.1f} s"] if waited > _patience(declared) else []
+            limit = max(MIN_WAIT, WAIT_PERIODS * (self._declared_period or self._database_period))
+            return [f"{self.title} has not come once in {waited:.1f} s"] if waited > limit else []
         lines = [
-            f"{self.title}: {trouble.text}; {trouble.count} in all, the last {max(now - trouble.at, 0.0):.1f} s ago"
-            for trouble in list(self._troubles.values())  # the receiving thread may add one
-            if unused and now - trouble.at < RECENT
+            f"{self.title}: {rejection.text}; {rejection.count} in all, "
+            f"the last {max(now - rejection.time, 0.0):.1f} s ago"
+            for rejection in list(self._rejections.values())  # the receive thread may add one
+            if unused and now - rejection.time < REJECTION_SHOWN
         ]
-        if self._counter is not None and self._counter.standing >= STANDS_STILL:
-            lines.append(self._standing(self._counter))
-        elif (silence := self.pace.silent_for(now)) is not None:
-            lines.append(f"{self.title} silent for {silence:.1f} s; it came {self.pace.pace()}")
-        elif self._groups:
+        if self._counter is not None and self._counter.repeated >= MIN_STUCK_FRAMES:
+            lines.append(self._stuck_counter(self._counter))
+        elif (silence := self.periods.silence(now)) is not None:
+            lines.append(f"{self.title} silent for {silence:.1f} s; {self.periods.describe()}")
+        else:
             lines += self._silent_groups(now, begun)
         return lines
 
     def describe(self) -> list[str]:
-        """What is read, and what the frames are held to, a line each."""
+        """What is read, and what the frames are checked against, a line each."""
         rules = []
         if self._counter is not None:
             rules.append(f"counted by {self._counter.name}")
         if self._checksum is not None:
             rules.append("with a checksum")
-        if self._rules.period is not None:
-            rules.append(f"every {period_text(self._rules.period)}")
-        held = [f"frames {self.title} are {', '.join(rules)}"] if rules else []
-        return [*(entry.describe() for entry in self.wanted), *held]
+        if self._declared_period is not None:
+            rules.append(f"every {period_text(self._declared_period)}")
+        checks = [f"frames {self.title} are {', '.join(rules)}"] if rules else []
+        return [*(request.describe() for request in self.requests), *checks]
 
-    def _add(self, entry: SignalRequest) -> None:
-        message, signal = entry.message, entry.signal
-        self._length = max(self._length, bytes_needed(signal))
-        unit = entry.target_unit
-        row = (entry.name, field(signal), entry.raw_low, entry.raw_high, entry.scale, entry.offset, unit)
-        links = _multiplexers(message, signal)
-        if not links:
-            self._rows.append(row)
-            return
-        key = tuple((switch.name, values) for switch, values in links)
+    def _rows_of(self, request: SignalRequest) -> list[Row]:
+        """The rows that are read under the same condition as ``request``."""
+        switches = _multiplexers(request.message, request.signal)
+        if not switches:
+            return self._rows
+        key = tuple((switch.name, values) for switch, values in switches)
         if key not in self._groups:
-            when = " and ".join(f"{switch.name} = {_few(values)}" for switch, values in links)
-            condition = tuple((field(switch), values) for switch, values in links)
-            self._groups[key] = _Group(f"{self.title} with {when}", condition)
-        self._groups[key].rows.append(row)
+            when = " and ".join(f"{switch.name} = {_few(values)}" for switch, values in switches)
+            condition = tuple((raw_reader(switch), values) for switch, values in switches)
+            self._groups[key] = _MultiplexedGroup(f"{self.title} with {when}", condition)
+        return self._groups[key].rows
 
-    def _take_groups(self, data: bytes | bytearray, time: float, samples: list[Sample]) -> None:
+    def _multiplexed_rows(self, data: bytes | bytearray, time: float) -> list[Row]:
+        """The rows that a frame of ``time`` (s) has because of its multiplexers; counts what they have lost."""
+        rows: list[Row] = []
         for group in self._groups.values():
-            if not group.is_in(data):
-                continue
-            group.lost += group.pace.note(time) * len(group.rows)
-            for name, read, low, high, scale, offset, unit in group.rows:
-                raw = read(data)
-                value = scale * raw + offset
-                fits = low <= raw <= high
-                samples.append(Sample(name, time, value) if fits else self._no_reading(name, time, value, unit))
+            if group.is_in(data):
+                group.lost += group.periods.lost_before(time) * len(group.rows)
+                rows += group.rows
+        return rows
 
     def _no_reading(self, name: str, time: float, value: float, unit: str) -> Sample:
-        self.bad += 1
-        self._trouble(name, time, f"{name} of {value:.6g} {unit} is out of its range")
+        self._count_rejection(name, time, f"{name} of {value:.6g} {unit} is out of its range")
         return Sample(name, time, NO_READING)
 
-    def _refuse(self, data: bytes | bytearray, time: float) -> list[Sample]:
-        self.bad += 1
+    def _reject(self, data: bytes | bytearray, time: float) -> list[Sample]:
         if len(data) < self._length:
-            self._trouble("short", time, f"a frame of {len(data)} bytes, of which there should be {self._length}")
+            self._count_rejection("short", time, f"a frame of {len(data)} bytes instead of {self._length}")
         else:
-            self._trouble("checksum", time, "a frame with a wrong checksum")
+            self._count_rejection("checksum", time, "a frame with a wrong checksum")
         if self._counter is None:
-            self._lost += self.pace.note(time) * len(self._rows)
+            self._lost += self.periods.lost_before(time) * len(self._rows)
         else:
-            self._counter.spoiled()
-        return NOTHING
+            self._counter.note_corrupted()
+        return NO_SAMPLES
 
-    def _trouble(self, kind: str, time: float, text: str) -> None:
-        known = self._troubles.get(kind)
-        if known is None:
-            self._troubles[kind] = _Trouble(1, time, text)
-        else:
-            known.count, known.at, known.text = known.count + 1, time, text
+    def _count_rejection(self, kind: str, time: float, text: str) -> None:
+        self.bad += 1
+        rejection = self._rejections.setdefault(kind, _Rejection(text))
+        rejection.count, rejection.time, rejection.text = rejection.count + 1, time, text
 
-    def _standing(self, counter: FrameCounter) -> str:
-        line = f"the counter {counter.name} of {self.title} stands still since {counter.standing} frames"
+    def _stuck_counter(self, counter: FrameCounter) -> str:
+        line = f"the counter {counter.name} of {self.title} has not changed for {counter.repeated} frames"
         if counter.declared:
             return line
         return f"{line}; if it is no counter, set driver.messages.{self.title.split()[0]}.counter = false"
@@ -222,15 +220,14 @@ class MessageReader:
     def _silent_groups(self, now: float, begun: float) -> list[str]:
         lines = []
         for group in self._groups.values():
-            if (silence := group.pace.silent_for(now)) is not None:
-                lines.append(f"{group.title} silent for {silence:.1f} s; it came {group.pace.pace()}")
-            elif group.pace.last is None and now - begun > _patience(10.0 * (self.pace.period or 0.0)):
-                lines.append(f"{group.title} has not come once in {now - begun:.1f} s")
+            waited = now - begun
+            if (silence := group.periods.silence(now)) is not None:
+                lines.append(f"{group.title} silent for {silence:.1f} s; {group.periods.describe()}")
+            elif group.periods.last is None and waited > max(
+                MIN_WAIT, GROUP_WAIT_PERIODS * (self.periods.period or 0.0)
+            ):
+                lines.append(f"{group.title} has not come once in {waited:.1f} s")
         return lines
-
-
-def _patience(period: float) -> float:
-    return max(NEVER_SEEN_AFTER, 10.0 * period)
 
 
 def _few(values: frozenset[int]) -> str:
@@ -239,86 +236,71 @@ def _few(values: frozenset[int]) -> str:
 
 
 def _multiplexers(message: Message, signal: CanSignal) -> list[tuple[CanSignal, frozenset[int]]]:
-    """The multiplexers on which ``signal`` depends, outermost last, each with its values."""
-    links: list[tuple[CanSignal, frozenset[int]]] = []
-    while signal.multiplexer_signal is not None and signal.multiplexer_ids is not None:
-        if len(links) == len(message.signals):
-            raise ConfigurationError(f"message {message.name}: its multiplexers depend on each other in a circle")
-        switch = message.get_signal_by_name(signal.multiplexer_signal)
-        links.append((switch, frozenset(signal.multiplexer_ids)))
-        signal = switch
-    return links
-
-
-EXTENDED = 1 << 29  # added to an extended arbitration ID, to tell it from a standard one of the same number
-MOST_WARNINGS = 20  # lines; a file of which everything is wrong says no more by more of them
-
-
-def decoder_of(options: FrameOptions, setup: Setup) -> "FrameDecoder":
-    """What decodes the frames that hold ``setup.signals``.
+    """The multiplexers on which ``signal`` depends, outermost last, each with its values.
 
     Raises:
-        ConfigurationError: a signal cannot be found where its source says.
+        ConfigurationError: they depend on each other in a circle.
     """
-    databases = [load_database(setup.folder / path) for path in options.databases()]
-    warnings = [line for loaded in databases for line in loaded.warnings()]
-    drives = _Drives(options, setup)
-    wanted = [_find(signal, databases, drives) for signal in setup.signals]
-    warnings += drives.warnings()
-    readers = _readers(wanted, options.messages, databases, warnings)
-    if len(warnings) > MOST_WARNINGS:
-        warnings = [*warnings[:MOST_WARNINGS], f"... and {len(warnings) - MOST_WARNINGS} more"]
-    return FrameDecoder(readers, drives.watches(), warnings)
+    switches: list[tuple[CanSignal, frozenset[int]]] = []
+    while signal.multiplexer_signal is not None and signal.multiplexer_ids is not None:
+        if len(switches) == len(message.signals):
+            raise ConfigurationError(f"message {message.name}: its multiplexers depend on each other in a circle")
+        switch = message.get_signal_by_name(signal.multiplexer_signal)
+        switches.append((switch, frozenset(signal.multiplexer_ids)))
+        signal = switch
+    return switches
 
 
 class FrameDecoder:
-    """Takes frames in the order of their arrival; everything it knows of time comes with them."""
+    """Decodes frames in the order of their arrival."""
 
     def __init__(
-        self, readers: Mapping[int, MessageReader], watches: Sequence[NodeWatch] = (), warnings: Sequence[str] = ()
+        self, readers: Mapping[int, MessageReader], nodes: Sequence[NodeMonitor] = (), warnings: Sequence[str] = ()
     ) -> None:
         self.faults = BusFaults()
-        """What the bus says of itself."""
-        self._readers = dict(readers)
-        self._watches = tuple(watches)
-        self._notes: dict[int, Note] = {key: note for watch in watches for key, note in watch.frames().items()}
+        """What error frames report."""
         self.configuration_warnings = tuple(warnings)
-        """What is wrong with the files that say what is in the frames, a line each."""
+        """What is wrong with the files that describe the frames, a line each."""
+        self._readers = dict(readers)
+        self._nodes = tuple(nodes)
+        self._handlers: dict[int, FrameHandler] = {
+            key: handler for node in nodes for key, handler in node.handlers().items()
+        }
         self._unreadable = 0
         self._begun: float | None = None
 
     def begin(self, time: float) -> None:
-        """Listening begins at ``time`` (s); what does not come from then on is missed."""
+        """Listening begins at ``time`` (s); a message that does not come from then on is reported."""
         self._begun = time
 
     def decode(self, frame: can.Message, time: float) -> list[Sample]:
-        """The samples in ``frame``, which came or was true at ``time`` (s, of any clock that goes on steadily).
+        """The samples of ``frame``, which arrived or was true at ``time`` (s, of any clock that advances steadily).
 
-        Never raises: what cannot be used is counted.
+        Never raises: a frame that cannot be used is counted.
         """
         try:
             if frame.is_error_frame or frame.is_remote_frame:
                 if frame.is_error_frame:
                     self.faults.note(frame, time)
-                return NOTHING
+                return NO_SAMPLES
             self.faults.bus_off = False
             key = frame.arbitration_id + EXTENDED if frame.is_extended_id else frame.arbitration_id
-            if self._notes and (note := self._notes.get(key)) is not None:
-                note(frame.data, time)
+            if self._handlers and (handler := self._handlers.get(key)) is not None:
+                handler(frame.data, time)
             reader = self._readers.get(key)
-            return reader.take(frame.data, time) if reader is not None else NOTHING
-        except Exception:  # noqa: BLE001 - interfaces hand on what the wire gave them, and that may be anything
+            return reader.take(frame.data, time) if reader is not None else NO_SAMPLES
+        except Exception:  # noqa: BLE001 - interfaces deliver unchecked what was on the wire
             self._unreadable += 1
-            return NOTHING
+            return NO_SAMPLES
 
     @property
     def counters(self) -> Counters:
-        """What has been seen so far; ``reconnects`` are not its business."""
+        """What has been received so far; ``reconnects`` stays 0."""
         readers = self._readers.values()
         return Counters(
             received=sum(reader.received for reader in readers),
             bad=sum(reader.bad for reader in readers) + self._unreadable,
-            # What the controller had no room for is missed by pace or counter as well, unless a message has neither.
+            # The period or the counter of a message shows overflows as well, unless it has neither.
             lost=max(sum(reader.lost for reader in readers), self.faults.overflows),
         )
 
@@ -332,136 +314,149 @@ class FrameDecoder:
         lines = self.faults.warnings(now)
         for reader in self._readers.values():
             lines += reader.warnings(now, self._begun, unused=unused)
-        for watch in self._watches:
-            lines += watch.warnings(now)
+        for node in self._nodes:
+            lines += node.warnings(now)
         return lines
 
     def slowest_period(self) -> float | None:
-        """Of the messages that come regularly (s); None while there are none."""
-        paces = [reader.pace for reader in self._readers.values()]
-        return max((pace.period for pace in paces if pace.regular and pace.period is not None), default=None)
+        """The longest period (s) of the regular messages; None if there are none yet."""
+        estimates = [reader.periods for reader in self._readers.values()]
+        return max((one.period for one in estimates if one.regular and one.period is not None), default=None)
 
     def identifiers(self) -> list[tuple[int, bool]]:
-        """The arbitration IDs that are looked at, and whether each is an extended one."""
-        return [(key % EXTENDED, key >= EXTENDED) for key in sorted({*self._readers, *self._notes})]
+        """The arbitration IDs that are decoded, and whether each is an extended one."""
+        return [(key % EXTENDED, key >= EXTENDED) for key in sorted({*self._readers, *self._handlers})]
 
     def describe(self) -> list[str]:
-        """What will be read from where, and what is wrong with the files that say so, a line each."""
+        """What will be read from where, and what is wrong with the files that describe it, a line each."""
         lines = [line for reader in self._readers.values() for line in reader.describe()]
         return [*lines, *(f"warning: {line}" for line in self.configuration_warnings)]
 
 
-class _Drives:
-    """The CANopen nodes of which something is wanted."""
+def decoder_of(options: FrameOptions, setup: Setup) -> FrameDecoder:
+    """A decoder of the frames that contain the signals of ``setup``.
 
-    def __init__(self, options: FrameOptions, setup: Setup) -> None:
-        nodes = sorted({signal.source.node for signal in setup.signals if signal.source.node is not None})
-        self._drives = {}
-        if nodes:
-            from otolith_drivers.canbus.canopen import CanopenDrive  # noqa: PLC0415 - only CANopen drives cost its imports
+    Raises:
+        ConfigurationError: a signal is not where its source says, or a message table does not fit its message.
+    """
+    databases = [load_database(setup.folder / path) for path in options.databases()]
+    warnings = [line for database in databases for line in database.warnings()]
+    drives = _drives(options, setup)
+    frames: dict[int, _FrameContent] = {}
+    for signal in setup.signals:
+        request = _request(signal, databases, drives)
+        content = frames.setdefault(_key(request.message), _FrameContent())
+        content.requests.append(request)
+        if request.message not in content.messages:
+            content.messages.append(request.message)
+    warnings += [line for drive in drives.values() for line in drive.warnings]
+    tables = _tables_by_frame(frames, options.messages, databases, warnings)
+    readers = {
+        key: MessageReader(content.messages, content.requests, _rules(content, tables.get(key, MessageTable())))
+        for key, content in frames.items()
+    }
+    if len(warnings) > MAX_WARNINGS:
+        warnings = [*warnings[:MAX_WARNINGS], f"... and {len(warnings) - MAX_WARNINGS} more"]
+    return FrameDecoder(readers, [drive.monitor for drive in drives.values()], warnings)
 
-            for node in nodes:
-                sheet = options.data_sheet(node)
-                tables = tuple(table for table in options.pdo if table.node == node)
-                self._drives[node] = CanopenDrive(node, setup.folder / sheet if sheet is not None else None, tables)
 
-    def find(self, signal: Signal) -> SignalRequest:
-        return self._drives[signal.source.node].find(signal)
+@dataclass(slots=True)
+class _FrameContent:
+    """What is requested of one frame, and the descriptions of the frame that contain it."""
 
-    def warnings(self) -> list[str]:
-        return [line for drive in self._drives.values() for line in drive.warnings]
+    messages: list[Message] = field(default_factory=list)
+    requests: list[SignalRequest] = field(default_factory=list)
 
-    def watches(self) -> list[NodeWatch]:
-        return [NodeWatch(node, drive.emergency) for node, drive in self._drives.items()]
-
-
-def _find(signal: Signal, databases: Sequence[Loaded], drives: _Drives) -> SignalRequest:
-    if signal.source.node is not None:
-        return drives.find(signal)
-    if signal.source.id is not None:
-        return raw_signal(signal)
-    return find_in_databases(signal, databases)
+    def is_named(self, name: str) -> bool:
+        """Whether ``name`` is the name of a description or the arbitration ID."""
+        try:
+            return int(name, 0) == self.messages[0].frame_id
+        except ValueError:
+            return any(message.name == name for message in self.messages)
 
 
 def _key(message: Message) -> int:
     return message.frame_id + EXTENDED if message.is_extended_frame else message.frame_id
 
 
-@dataclass(slots=True)
-class _Frame:
-    messages: list[Message]
-    wanted: list[SignalRequest]
-
-    def is_called(self, name: str) -> bool:
-        try:
-            identifier = int(name, 0)
-        except ValueError:
-            return any(message.name == name for message in self.messages)
-        return identifier == self.messages[0].frame_id
-
-
-def _readers(
-    wanted: Sequence[SignalRequest],
-    tables: Mapping[str, MessageTable],
-    databases: Sequence[Loaded],
-    warnings: list[str],
-) -> dict[int, MessageReader]:
-    frames: dict[int, _Frame] = {}
-    for entry in wanted:
-        frame = frames.setdefault(_key(entry.message), _Frame([], []))
-        frame.wanted.append(entry)
-        if entry.message not in frame.messages:
-            frame.messages.append(entry.message)
-    rules = {key: MessageTable() for key in frames}
-    for name, table in tables.items():
-        meant = [key for key, frame in frames.items() if frame.is_called(name)]
-        if not meant:
-            _say_unused(name, frames, databases, warnings)
-        rules |= dict.fromkeys(meant, table)
+def _drives(options: FrameOptions, setup: Setup) -> dict[int, CanopenDrive]:
+    """The CANopen nodes whose objects are requested."""
+    nodes = sorted({signal.source.node for signal in setup.signals if signal.source.node is not None})
+    sheets = {node: options.data_sheet(node) for node in nodes}
+    tables = {node: tuple(table for table in options.pdo if table.node == node) for node in nodes}
     return {
-        key: MessageReader(frame.messages, frame.wanted, _rules(frame, rules[key])) for key, frame in frames.items()
+        node: CanopenDrive(node, setup.folder / sheet if sheet is not None else None, tables[node])
+        for node, sheet in sheets.items()
     }
 
 
-def _say_unused(name: str, frames: Mapping[int, _Frame], databases: Sequence[Loaded], warnings: list[str]) -> None:
-    if any(message.name == name for loaded in databases for message in loaded.messages):
-        warnings.append(f"driver.messages.{name}: no signal of it is wanted")
-        return
-    known = nearest(name, [message.name for frame in frames.values() for message in frame.messages])
-    raise ConfigurationError(f"no message {name!r} has a signal that is wanted: {known}", ("driver", "messages", name))
+def _request(signal: Signal, databases: Sequence[CanDatabase], drives: Mapping[int, CanopenDrive]) -> SignalRequest:
+    if signal.source.node is not None:
+        return drives[signal.source.node].request(signal)
+    if signal.source.id is not None:
+        return request_bits(signal)
+    return request_from_databases(signal, databases)
 
 
-def _rules(frame: _Frame, table: MessageTable) -> Rules:
-    message = frame.messages[0]
-    length = max(entry.length for entry in frame.messages)
+def _tables_by_frame(
+    frames: Mapping[int, _FrameContent],
+    tables: Mapping[str, MessageTable],
+    databases: Sequence[CanDatabase],
+    warnings: list[str],
+) -> dict[int, MessageTable]:
+    """The table of each frame; a table of a known message without requests is added to ``warnings``.
+
+    Raises:
+        ConfigurationError: a table names no known message.
+    """
+    by_frame: dict[int, MessageTable] = {}
+    for name, table in tables.items():
+        keys = [key for key, content in frames.items() if content.is_named(name)]
+        by_frame |= dict.fromkeys(keys, table)
+        if keys:
+            continue
+        if not any(message.name == name for database in databases for message in database.messages):
+            known = nearest(name, [message.name for content in frames.values() for message in content.messages])
+            raise ConfigurationError(
+                f"no message {name!r} has a signal of [signals]: {known}", ("driver", "messages", name)
+            )
+        warnings.append(f"driver.messages.{name}: [signals] has no signal of it")
+    return by_frame
+
+
+def _rules(content: _FrameContent, table: MessageTable) -> MessageRules:
+    message = content.messages[0]
+    length = max(described.length for described in content.messages)
     counter, checksum, needed = None, None, 0
     if table.counter is None:
-        if (found := counter_by_name(message, {entry.signal.name for entry in frame.wanted})) is not None:
-            counter = FrameCounter(found, table.modulo, declared=False)
+        requested = {request.signal.name for request in content.requests}
+        if (signal := counter_by_name(message, requested)) is not None:
+            counter = FrameCounter(signal, table.modulo, declared=False)
     elif table.counter is not False:
-        found = _signal(frame, table.counter, "counter")
-        counter, needed = FrameCounter(found, table.modulo, declared=True), bytes_needed(found)
+        signal = _signal(content, table.counter, "counter")
+        counter, needed = FrameCounter(signal, table.modulo, declared=True), bytes_needed(signal)
     if table.checksum is not None:
-        found = _signal(frame, table.checksum.signal, "checksum")
-        needed = max(needed, bytes_needed(found))
+        signal = _signal(content, table.checksum.signal, "checksum")
+        needed = max(needed, bytes_needed(signal))
         try:
-            checksum = checksum_of(found, table.checksum, max(length, needed))
+            checksum = checksum_test(signal, table.checksum, max(length, needed))
         except ValueError as error:
             raise ConfigurationError(str(error), ("driver", "messages", message.name, "checksum")) from error
-    return Rules(counter, checksum, table.period, needed)
+    return MessageRules(counter, checksum, table.period, needed)
 
 
-def _signal(frame: _Frame, said: str | BitRange, what: str) -> CanSignal:
-    """The signal called ``said`` in any description of the frame, or where it says."""
-    if isinstance(said, BitRange):
-        return said.as_signal(what)
-    names = []
-    for message in frame.messages:
-        for signal in message.signals:
-            names.append(signal.name)
-            if signal.name == said:
-                return signal
-    name = frame.messages[0].name
+def _signal(content: _FrameContent, where: str | BitRange, key: str) -> CanSignal:
+    """The signal named ``where`` in any description of the frame, or the bits ``where``.
+
+    Raises:
+        ConfigurationError: no description of the frame has such a signal.
+    """
+    if isinstance(where, BitRange):
+        return where.as_signal(key)
+    signals = {signal.name: signal for message in reversed(content.messages) for signal in message.signals}
+    if where in signals:
+        return signals[where]
+    name = content.messages[0].name
     raise ConfigurationError(
-        f"{name} has no signal {said!r}: {nearest(said, names)}", ("driver", "messages", name, what)
+        f"{name} has no signal {where!r}: {nearest(where, list(signals))}", ("driver", "messages", name, key)
     )

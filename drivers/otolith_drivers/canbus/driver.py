@@ -1,7 +1,6 @@
-"""The CAN driver: listens, stamps every frame, survives the bus going down.
+"""The CAN driver: receives frames, gives each its time, and reconnects after the bus has failed.
 
-There is no path to ``bus.send`` in this file: the driver cannot disturb the machine. What is in the frames is the
-business of ``can_decoder.py``.
+It cannot disturb the machine: nothing in this package sends. ``decoder.py`` makes samples of the frames.
 """
 
 import logging
@@ -14,39 +13,45 @@ import can
 
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.canbus.bus import (
-    MOST_BAD_IN_A_ROW,
+    MAX_CONSECUTIVE_BAD,
     BusOptions,
-    Drops,
+    DropCounter,
+    bus_error,
     enlarge_buffer,
     frames_dropped,
     is_gone,
     open_bus,
-    refusal,
 )
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import FrameOptions
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 from otolith_drivers.errors import DeviceError
-
-__all__ = ["CanReceiver", "Options", "Source", "build"]
 
 log = logging.getLogger(__name__)
 
-RECEIVE_TIMEOUT = 0.2  # s; how late a stop can be noticed
-BACKOFF_FIRST, BACKOFF_LONGEST = 0.2, 10.0  # s
-STAMP_TOLERANCE = 1.0  # s; a kernel stamp farther from now than this met a clock that was set
-LOOK_EVERY = 0.05  # s; how often the clocks are compared: 50 ms are the longest that a clock that was set can mislead
-CLOCK_TRIES, CLOCK_SPAN = 5, 2e-5  # s
-SILENT_PERIODS, SILENT_AT_LEAST, SILENT_AT_MOST = 10.0, 2.0, 60.0  # periods; s
-NEVER_HEARD = 10.0  # s; no period is known before anything came
+RECEIVE_TIMEOUT = 0.2  # s; how late a stop may be noticed
+FIRST_PAUSE, MAX_PAUSE = 0.2, 10.0  # s between attempts to reconnect
+MAX_STAMP_AGE = 1.0  # s; an older kernel stamp is from before the wall clock was set
+CLOCK_CHECK_PERIOD = 0.05  # s; how long a wall clock that was set can falsify times
+CLOCK_TRIES, CLOCK_PRECISION = 5, 2e-5  # s; readings of the clocks, and when one is good enough
+SILENT_PERIODS, MIN_SILENCE, MAX_SILENCE = 10.0, 2.0, 60.0  # periods; s; s: when a silent bus is opened anew
+UNKNOWN_PERIOD_SILENCE = 10.0  # s; the same while no period is known
 
 
-class Options(BusOptions, FrameOptions):
+class CanOptions(BusOptions, FrameOptions):
     """``[driver]`` with ``type = "can"``."""
 
 
-def build(options: Options, setup: Setup) -> "CanReceiver":
-    """A receiver of the frames in which the signals are."""
+Options = CanOptions  # the names that otolith_drivers.base.DriverType asks for
+Source = CanSource
+
+
+def build(options: CanOptions, setup: Setup) -> "CanReceiver":
+    """A receiver of the frames that contain the signals of ``setup``.
+
+    Raises:
+        ConfigurationError: see :func:`otolith_drivers.canbus.decoder.decoder_of`.
+    """
     return CanReceiver(options, decoder_of(options, setup))
 
 
@@ -61,17 +66,18 @@ class CanReceiver:
         self._link = Link(up=False, reason="not opened yet")
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._reconnects = self._unreadable = self._bad_in_a_row = 0
-        self._drops = Drops()
-        self._heard = self._opened = 0.0
-        self._patience = 0.0
+        self._reconnects = self._unreadable = self._consecutive_bad = 0
+        self._drops = DropCounter()
+        self._last_frame = self._opened = 0.0
+        self._next_reopening = 0.0
+        """s of silence after which the bus is opened anew; doubles each time."""
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         bus = self._connect()
         for line in self._decoder.configuration_warnings:
             log.warning("%s", line)
-        self._heard = self._opened
+        self._last_frame = self._opened
         self._decoder.begin(self._opened)
         self._thread = threading.Thread(target=self._receive, args=(bus, deliver), name="can-receive", daemon=True)
         self._thread.start()
@@ -84,12 +90,12 @@ class CanReceiver:
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
-        seen = self._decoder.counters
+        counters = self._decoder.counters
         return replace(
-            seen,
-            bad=seen.bad + self._unreadable,
-            # What the kernel dropped is missed by pace or counter as well, unless a message has neither.
-            lost=max(seen.lost, self._drops.total),
+            counters,
+            bad=counters.bad + self._unreadable,
+            # The period or the counter of a message shows dropped frames as well, unless it has neither.
+            lost=max(counters.lost, self._drops.total),
             reconnects=self._reconnects,
         )
 
@@ -101,10 +107,9 @@ class CanReceiver:
         if self._decoder.faults.bus_off:
             return Link(up=False, reason="bus off: the controller has left the bus after too many errors")
         now = time.monotonic()
-        silence = now - self._heard
-        alone = [f"nothing at all has come for {silence:.1f} s"] if silence > self._silence_limit() else []
-        warnings = (*alone, *self._drops.warnings(now), *self._decoder.warnings(now))
-        return replace(link, warnings=warnings)
+        silence = now - self._last_frame
+        silent = [f"no frame at all for {silence:.1f} s"] if silence > self._silence_limit() else []
+        return replace(link, warnings=(*silent, *self._drops.warnings(now), *self._decoder.warnings(now)))
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
@@ -117,8 +122,8 @@ class CanReceiver:
         ]
         bus = open_bus(self._options, filters, listen_only=True)
         enlarge_buffer(bus)
-        self._drops.begin()
-        self._bad_in_a_row = 0
+        self._drops.restart()
+        self._consecutive_bad = 0
         self._opened = time.monotonic()
         self._decoder.faults.bus_off = False
         self._link = Link(up=True)
@@ -128,20 +133,20 @@ class CanReceiver:
         while not self._stop.is_set():
             if bus is None:
                 bus = self._reconnect()
-            elif (trouble := self._take_frames(bus, deliver)) is not None:
-                self._link = Link(up=False, reason=trouble)
-                log.warning("CAN bus %s: %s; reconnecting", self._options.title(), trouble)
+            elif (failure := self._take_frames(bus, deliver)) is not None:
+                self._link = Link(up=False, reason=failure)
+                log.warning("CAN bus %s: %s; reconnecting", self._options.title(), failure)
                 _shut(bus)
                 bus = None
         if bus is not None:
             _shut(bus)
 
     def _take_frames(self, bus: can.BusABC, deliver: Deliver) -> str | None:
-        """Take what comes until the clocks are to be compared again; what is wrong if the bus must be opened anew."""
+        """Take frames until the next clock check; returns why the bus must be opened anew, or None."""
         receive, decode, clock = bus.recv, self._decoder.decode, time.monotonic
         begun = now = clock()
-        offset = wall_ahead()
-        while now - begun < LOOK_EVERY:
+        offset = wall_clock_offset()
+        while now - begun < CLOCK_CHECK_PERIOD:
             try:
                 frame = receive(RECEIVE_TIMEOUT)
                 now = clock()
@@ -149,67 +154,67 @@ class CanReceiver:
                     break
                 if samples := decode(frame, monotonic_of(frame.timestamp, now + offset, now)):
                     deliver(samples)
-            except Exception as error:  # noqa: BLE001 - interfaces raise whatever their vendor's library does
-                if self._only_a_bad_frame(error):
+            except Exception as error:  # noqa: BLE001 - interfaces raise whatever their vendor's library raises
+                if self._is_only_a_bad_frame(error):
                     return None
                 return f"{type(error).__name__}: {error}"
-            self._heard, self._bad_in_a_row = now, 0
-        return self._look(bus, now)
+            self._last_frame, self._consecutive_bad = now, 0
+        return self._check_bus(bus, now)
 
-    def _look(self, bus: can.BusABC, now: float) -> str | None:
-        """At what no frame tells; what is wrong if the bus must be opened anew."""
+    def _check_bus(self, bus: can.BusABC, now: float) -> str | None:
+        """Check what no frame shows: drops, bus off, silence. Returns why the bus must be opened anew, or None."""
         self._drops.note(frames_dropped(bus), now)
         if _is_off(bus):
             self._decoder.faults.bus_off = True
-        if now - self._heard < RECEIVE_TIMEOUT:
-            self._patience = 0.0
+        if now - self._last_frame < RECEIVE_TIMEOUT:
+            self._next_reopening = 0.0
             return None
-        silence = now - max(self._heard, self._opened)
-        if silence < max(self._patience, self._silence_limit()):
+        silence = now - max(self._last_frame, self._opened)
+        if silence < max(self._next_reopening, self._silence_limit()):
             return None
-        # Some interfaces never tell that their other end has gone.
-        self._patience = min(2.0 * silence, SILENT_AT_MOST)
-        return f"nothing has come for {silence:.1f} s"
+        # Some interfaces never report that their other end has gone.
+        self._next_reopening = min(2.0 * silence, MAX_SILENCE)
+        return f"no frame for {silence:.1f} s"
 
     def _silence_limit(self) -> float:
         period = self._decoder.slowest_period()
-        return NEVER_HEARD if period is None else max(SILENT_AT_LEAST, SILENT_PERIODS * period)
+        return UNKNOWN_PERIOD_SILENCE if period is None else max(MIN_SILENCE, SILENT_PERIODS * period)
 
-    def _only_a_bad_frame(self, error: Exception) -> bool:
-        """Whether what came could not be unpacked, while the bus itself stands."""
+    def _is_only_a_bad_frame(self, error: Exception) -> bool:
+        """Whether a frame could not be unpacked while the bus itself works; counts such frames."""
         if is_gone(error):
             return False
-        self._bad_in_a_row += 1
+        self._consecutive_bad += 1
         self._unreadable += 1
-        return self._bad_in_a_row <= MOST_BAD_IN_A_ROW
+        return self._consecutive_bad <= MAX_CONSECUTIVE_BAD
 
     def _reconnect(self) -> can.BusABC | None:
-        """Endless, with growing pauses that differ from machine to machine."""
-        pause = BACKOFF_FIRST
+        """Try until it succeeds, with growing random pauses; None if the driver is closed meanwhile."""
+        pause = FIRST_PAUSE
         while not self._stop.wait(pause * random.uniform(0.5, 1.0)):  # noqa: S311 - jitter, not a secret
             try:
                 bus = self._connect()
-            except Exception as error:  # noqa: BLE001 - as above; a DeviceError has a sentence of its own
-                trouble = str(error) if isinstance(error, DeviceError) else f"{type(error).__name__}: {error}"
+            except Exception as error:  # noqa: BLE001 - as above
+                failure = str(error) if isinstance(error, DeviceError) else f"{type(error).__name__}: {error}"
             else:
-                if (against := refusal(bus)) is None:
+                if (cause := bus_error(bus)) is None:
                     self._reconnects += 1
                     return bus
                 _shut(bus)
-                trouble = f"CAN bus {self._options.title()}: {against}"
-            self._link = Link(up=False, reason=trouble)
-            pause = min(2 * pause, BACKOFF_LONGEST)
+                failure = f"CAN bus {self._options.title()}: {cause}"
+            self._link = Link(up=False, reason=failure)
+            pause = min(2 * pause, MAX_PAUSE)
         return None
 
 
-def wall_ahead() -> float:
-    """How far the wall clock is ahead of the monotonic one (s), though this thread may be held up between the two."""
-    best, span = 0.0, float("inf")
+def wall_clock_offset() -> float:
+    """Wall clock minus monotonic clock (s): the best of several readings, since a thread may be held up in one."""
+    best, precision = 0.0, float("inf")
     for _ in range(CLOCK_TRIES):
         before, wall, after = time.monotonic(), time.time(), time.monotonic()
-        if after - before < span:
-            best, span = wall - 0.5 * (before + after), after - before
-        if span < CLOCK_SPAN:
+        if after - before < precision:
+            best, precision = wall - 0.5 * (before + after), after - before
+        if precision < CLOCK_PRECISION:
             break
     return best
 
@@ -217,22 +222,22 @@ def wall_ahead() -> float:
 def monotonic_of(stamp: float, wall: float, monotonic: float) -> float:
     """The kernel's wall-clock ``stamp`` on the monotonic clock, given both clocks now (all in seconds).
 
-    Where the wall clock was set between stamp and now, or the interface stamps relative to its own start, the time of
-    taking the frame is the better one.
+    If the wall clock was set after the stamp, or if the interface stamps relative to its own start, this is
+    ``monotonic``.
     """
     age = wall - stamp
-    return monotonic - age if 0.0 <= age < STAMP_TOLERANCE else monotonic
+    return monotonic - age if 0.0 <= age < MAX_STAMP_AGE else monotonic
 
 
 def _is_off(bus: can.BusABC) -> bool:
     try:
         return bus.state is can.BusState.ERROR
-    except Exception:  # noqa: BLE001 - many interfaces cannot tell
+    except Exception:  # noqa: BLE001 - many interfaces do not know their state
         return False
 
 
 def _shut(bus: can.BusABC) -> None:
     try:
         bus.shutdown()
-    except Exception as error:  # noqa: BLE001 - it is being given up for that very reason
+    except Exception as error:  # noqa: BLE001 - it is shut because it has failed
         log.debug("shutting the bus down: %s", error)

@@ -1,40 +1,268 @@
-"""What tells that frames are missing or repeated: their pace and their counter. No clock in here.
+"""Whether the received frames are complete and intact: periods, counters, checksums and error frames.
 
-Whether a frame is as it was sent: the checksums that makers put into their messages.
-
-What a bus says of itself in error frames, in the classes of Linux (``linux/can/error.h``). No clock in here.
+No clock in here: every time is an argument (s, of any clock that advances steadily).
 """
 
 import re
 import statistics
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import xor
 
 import can
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
 
 from otolith_drivers.canbus.options import ChecksumKind, ChecksumTable
-from otolith_drivers.canbus.signals import BitField, field
+from otolith_drivers.canbus.signals import RawReader, raw_reader
+
+# Thresholds; docs/reference/thresholds-canbus.md gives the origin of each.
+MIN_INTERVALS, MIN_SPAN, MAX_INTERVALS = 8, 0.25, 4096  # intervals; s; intervals: what a period estimate takes
+MIN_REGULAR_SHARE = 0.75  # of the intervals of a regular message are on time
+EARLY, LATE = 0.5, 1.5  # periods: half-way to the frame before and to the frame after
+TRACKING_GAIN = 0.02  # of the difference, with each frame: cheap oscillators drift
+MAX_OUTLIERS = 32  # intervals in a row that are not on time; then the period is estimated anew
+MAX_OUTAGE = 60.0  # s; a longer silence is a stop of the sender, not a loss of frames
+SILENT_PERIODS, MIN_SILENCE, MIN_IRREGULAR_SILENCE = 10.0, 0.5, 10.0  # periods; s; s
+MIN_COUNTER_RUN = 9  # steps of one in a row before a signal is used as a counter because of its name
+MIN_STUCK_FRAMES = 3  # repeated frames before a counter is reported as stuck
+ERROR_SHOWN, STATE_SHOWN = 10.0, 60.0  # s after the last error frame; s after the last report of a controller state
+
+COUNTER_NAMES = re.compile(
+    r"(?:^|[_a-z0-9])(?:(?:Alive|Rolling|Message|Msg|Sequence|Seq|Frame|Live)_?(?:Roll(?:ing)?_?)?(?:Counter|Count|Cntr|Cnt|Ctr|Cyc))$"
+    r"|^(?:Alive|Rolling|Message|Msg|Sequence|Seq|Frame|Live)_?(?:Counter|Count|Cntr|Cnt|Ctr)$"
+    r"|^(?:COUNTER|Counter|CNT|RC|ARC|SQC|Alive|ALIVE)$"
+    r"|_(?:COUNTER|Counter|CNT|Cnt|CTR|BZ|ARC|RC|SQC|MC)$"
+)
+"""How vendors name the counter of a message; BZ is the German ``Botschaftszähler``."""
+OTHER_COUNTER_NAMES = re.compile(
+    r"err|fault|puls|encod|revol|rotat|turn|start|hour|time|step|edge|tooth|batch|piece|part|lost|fail|bus_?off",
+    re.IGNORECASE,
+)
+"""Names of counters that count something else than messages."""
 
 
-def _xor(data: bytes) -> int:
-    found = 0
-    for byte in data:
-        found ^= byte
-    return found
+class PeriodEstimator:
+    """Estimates the period of a message and infers lost frames from their arrival times.
+
+    *Lateness* is the interval between two frames, in periods per frame sent. One interval is judged at a time:
+
+    - On time (lateness from ``EARLY`` to ``LATE``): the period tracks the interval.
+    - Late: frames are lost, or held up somewhere and about to arrive in a burst. The missing ones are *unconfirmed*.
+    - Early: a frame of a burst. It was held up and not lost, so there is one unconfirmed frame less.
+
+    Unconfirmed frames count as lost when the next frame is not early. After ``MAX_OUTLIERS`` intervals in a row that
+    are not on time, the period is estimated anew.
+
+    A frame counter gives the number of frames sent, but only modulo its cycle. The clock adds whole cycles, and these
+    stay unconfirmed likewise. ``docs/explanation/frame-periods.md`` derives the rule and shows examples.
+    """
+
+    def __init__(self, declared: float | None = None) -> None:
+        """``declared`` is the period (s) if the machine file gives it; it is then never estimated."""
+        self.period = declared
+        """s; None until it is known."""
+        self.regular = declared is not None
+        self.last: float | None = None
+        """Arrival (s) of the last new frame."""
+        self._declared = declared is not None
+        self._intervals: list[float] = []
+        self._outliers = 0
+        self._unconfirmed = 0
+        self._held_up = 0
+
+    def lost_before(self, time: float) -> int:
+        """Number of frames that count as lost now that a frame without a counter has arrived at ``time`` (s)."""
+        last, self.last = self.last, time
+        if last is None:
+            return 0
+        interval = time - last
+        if self.period is None or not self.regular:
+            self._learn(interval)
+            return 0
+        lateness = interval / self.period
+        if EARLY <= lateness <= LATE:
+            return self._accept(interval)
+        if lateness < EARLY and self._unconfirmed:
+            self._unconfirmed -= 1
+            return 0
+        starts_anew = self._count_outlier()
+        if starts_anew or lateness < EARLY:
+            return 0
+        confirmed, self._unconfirmed = self._unconfirmed, round(lateness) - 1 if interval < MAX_OUTAGE else 0
+        return confirmed
+
+    def sent_since_last(self, time: float, step: int, modulo: int) -> int:
+        """Number of frames sent since the last new one, this one included; 0 if this frame repeats the last one.
+
+        ``step`` is by how much the counter has advanced, modulo ``modulo``. Frames that were unconfirmed until now
+        are included.
+        """
+        if self.last is None:
+            self.last = time
+            return 1
+        interval = time - self.last
+        period = self.period if self.regular else None
+        expected = interval / period if period is not None and interval < MAX_OUTAGE else 0.0
+        in_cycles = 0
+        if step == 0 or expected > LATE:  # otherwise no cycle fits into the interval
+            step, in_cycles = _add_cycles(step, modulo, expected)
+        if step == 0:
+            return 0
+        self.last = time
+        per_frame = interval / (step + in_cycles)
+        if period is None:
+            self._learn(per_frame)
+            return step
+        lateness = per_frame / period
+        if EARLY <= lateness <= LATE:
+            return step + self._accept(per_frame, in_cycles)
+        if lateness < EARLY:
+            self._take_burst(step)
+            return step
+        confirmed, self._unconfirmed = self._unconfirmed, 0
+        self._held_up = int(expected) - step  # the counter excludes that these are lost
+        self._count_outlier()
+        return step + confirmed
+
+    def silence(self, now: float) -> float | None:
+        """Seconds without a frame at ``now`` (s), or None while that is no longer than normal."""
+        if self.last is None:
+            return None
+        shortest = MIN_SILENCE if self.regular else MIN_IRREGULAR_SILENCE
+        silence = now - self.last
+        return silence if silence > max(shortest, SILENT_PERIODS * (self.period or 0.0)) else None
+
+    def describe(self) -> str:
+        """The period, as a clause."""
+        if self.period is None:
+            return "its period is not known"
+        return f"it came every {period_text(self.period)}" + ("" if self.regular else " or so, not regularly")
+
+    def _take_burst(self, frames: int) -> None:
+        """Take ``frames`` that came early: what was unconfirmed was held up, and not lost."""
+        self._unconfirmed = 0
+        if self._held_up > 0:
+            self._held_up -= frames
+        else:
+            self._count_outlier()
+
+    def _accept(self, interval: float, unconfirmed: int = 0) -> int:
+        """Track an interval that is on time; returns the frames that it confirms as lost."""
+        self._outliers = 0
+        if not self._declared and self.period is not None:
+            self.period += TRACKING_GAIN * (interval - self.period)
+        confirmed, self._unconfirmed = self._unconfirmed, unconfirmed
+        return confirmed
+
+    def _count_outlier(self) -> bool:
+        """Count an interval that is not on time; True if the estimate starts anew because of it."""
+        self._outliers += 1
+        if self._outliers < MAX_OUTLIERS or self._declared:
+            return False
+        self.period, self.regular, self._outliers, self._unconfirmed = None, False, 0, 0
+        return True
+
+    def _learn(self, interval: float) -> None:
+        self._intervals.append(interval)
+        if (estimate := estimate_period(self._intervals)) is not None:
+            self.period, self.regular = estimate
+            self._intervals.clear()
 
 
-def _sum(data: bytes) -> int:
-    return sum(data) & 0xFF
+def estimate_period(intervals: Sequence[float]) -> tuple[float, bool] | None:
+    """Period (s) and whether the message is regular; None if there are too few ``intervals`` (s).
+
+    The median finds the period in spite of bursts. The mean must agree with it: in a long burst even the median is
+    wrong.
+    """
+    count, span = len(intervals), sum(intervals)
+    if count < MIN_INTERVALS or (span < MIN_SPAN and count < MAX_INTERVALS):
+        return None
+    median, mean = statistics.median(intervals), span / count
+    on_time = [interval for interval in intervals if EARLY * median <= interval <= LATE * median]
+    regular = len(on_time) >= MIN_REGULAR_SHARE * count and median > 0.0 and abs(mean / median - 1.0) < LATE - 1.0
+    return (statistics.fmean(on_time) if regular else mean), regular
 
 
-def _crc(name: str) -> Callable[[bytes], int]:
-    import crccheck.crc  # noqa: PLC0415 - most machines have none
+def _add_cycles(step: int, modulo: int, expected: float) -> tuple[int, int]:
+    """Frames that the counter shows, and frames in whole cycles that only the clock shows.
 
-    calculate: Callable[[bytes], int] = getattr(crccheck.crc, name).calc
-    return calculate
+    ``expected`` is the number of frames that fit into the interval. A step of 0 after whole cycles is one full cycle.
+    """
+    cycles = round((expected - step) / modulo)
+    if cycles <= 0:
+        return step, 0
+    return (step, cycles * modulo) if step else (modulo, (cycles - 1) * modulo)
+
+
+def period_text(period: float) -> str:
+    """``period`` (s) in milliseconds or seconds."""
+    return f"{period * 1e3:.1f} ms" if period < 1.0 else f"{period:.1f} s"
+
+
+class FrameCounter:
+    """The counter in a message. One that is only recognised by its name is not used before it has counted."""
+
+    def __init__(self, signal: CanSignal, modulo: int | None = None, *, declared: bool) -> None:
+        """``modulo`` is one more than the highest count; by default that of the database, or of the bits."""
+        self.name = signal.name
+        self.declared = declared
+        self.modulo = modulo or _modulo(signal)
+        self.repeated = 0
+        """Frames in a row that have repeated the last count."""
+        self._read: RawReader = raw_reader(signal)
+        self._trusted = declared
+        self._run = 0
+        self._last: int | None = None
+        self._corrupted = 0
+
+    def note_corrupted(self) -> None:
+        """Count a frame whose counter cannot be read: it was sent and did arrive, so it is not lost."""
+        self._corrupted += 1
+
+    def lost_before(self, data: bytes | bytearray, time: float, periods: PeriodEstimator) -> int | None:
+        """Number of frames that count as lost at this frame, or None if it repeats the last one."""
+        count = int(self._read(data)) % self.modulo
+        last, self._last = self._last, count
+        step = (count - last) % self.modulo if last is not None else 1
+        if not self._trusted:
+            self._run = self._run + 1 if step == 1 else 0
+            self._trusted, self._corrupted = self._run >= MIN_COUNTER_RUN, 0
+            return periods.lost_before(time)
+        sent = periods.sent_since_last(time, step, self.modulo)
+        if sent == 0:
+            self.repeated += 1
+            return None
+        self.repeated = 0
+        lost = sent - 1
+        if self._corrupted:
+            lost, self._corrupted = max(0, lost - self._corrupted), 0
+        return lost
+
+
+def _modulo(signal: CanSignal) -> int:
+    whole = 1 << signal.length
+    highest = signal.maximum
+    return int(highest) + 1 if highest is not None and 1.0 < highest < whole - 1 else whole
+
+
+def counter_by_name(message: Message, used: set[str]) -> CanSignal | None:
+    """The signal of ``message`` with the name of a counter; None if there are several, or if it is in ``used``."""
+    counters = [
+        signal
+        for signal in message.signals
+        if COUNTER_NAMES.search(signal.name)
+        and not OTHER_COUNTER_NAMES.search(signal.name)
+        and signal.name not in used
+        and signal.multiplexer_signal is None
+        and 2 <= signal.length <= 16
+        and not signal.is_signed
+        and not signal.conversion.is_float
+        and (signal.conversion.scale, signal.conversion.offset) == (1, 0)
+    ]
+    return counters[0] if len(counters) == 1 else None
 
 
 CRCS: dict[str, tuple[str, int]] = {
@@ -43,64 +271,56 @@ CRCS: dict[str, tuple[str, int]] = {
     "crc8-autosar": ("Crc8Autosar", 8),
     "crc16-ccitt-false": ("Crc16CcittFalse", 16),
 }
-"""Names in crccheck, and bits. The SAE polynomial that starts from zero is that of AUTOSAR's profile 1."""
+"""Class in crccheck, and bits. The SAE polynomial with initial value 0 is that of AUTOSAR's profile 1."""
+
+ChecksumTest = Callable[[bytes | bytearray], bool]
+"""Whether the checksum in the data of a frame is that of the bytes it covers."""
 
 
-def calculation(kind: ChecksumKind) -> tuple[Callable[[bytes], int], int]:
-    """What calculates a checksum, and how many bits it has."""
-    if kind in CRCS:
-        name, bits = CRCS[kind]
-        return _crc(name), bits
-    return {"xor": _xor, "sum8": _sum}[kind], 8
+def checksum_algorithm(kind: ChecksumKind) -> tuple[Callable[[bytes], int], int]:
+    """The function that calculates a checksum, and the number of its bits."""
+    if kind == "xor":
+        return lambda data: reduce(xor, data, 0), 8
+    if kind == "sum8":
+        return lambda data: sum(data) & 0xFF, 8
+    import crccheck.crc  # noqa: PLC0415 - most machines have none
+
+    name, bits = CRCS[kind]
+    return getattr(crccheck.crc, name).calc, bits
 
 
-@dataclass(frozen=True, slots=True)
-class Checksum:
-    """The checksum in a message."""
-
-    read: BitField
-    calculate: Callable[[bytes], int]
-    covered: tuple[slice, ...]
-    """The bytes of the frame that it covers."""
-    prefix: bytes = b""
-    suffix: bytes = b""
-    """Bytes that both sides know and the frame does not have: AUTOSAR's data ID."""
-
-    def holds(self, data: bytes | bytearray) -> bool:
-        """Whether the frame is as it was sent."""
-        covered = b"".join(bytes(data[part]) for part in self.covered)
-        return self.calculate(self.prefix + covered + self.suffix) == self.read(data)
-
-
-def checksum_of(signal: CanSignal, table: ChecksumTable, length: int) -> Checksum:
-    """The checksum in ``signal`` of a frame of ``length`` bytes, which ``table`` describes.
+def checksum_test(signal: CanSignal, table: ChecksumTable, length: int) -> ChecksumTest:
+    """The test for the checksum that ``table`` describes, in ``signal`` of a frame of ``length`` bytes.
 
     Raises:
-        ValueError: its bits are no whole bytes, too few or too many, or what it covers lies beyond the frame.
+        ValueError: the signal has not the bits of such a checksum, or the covered bytes exceed the frame.
     """
-    calculate, bits = calculation(table.kind)
+    calculate, bits = checksum_algorithm(table.kind)
     own, odd = divmod(signal.start if signal.byte_order == "little_endian" else signal.start - 7, 8)
     if odd or signal.length != bits or signal.is_signed or signal.conversion.is_float:
-        raise ValueError(f"{table.kind} takes {bits} bits, unsigned and whole bytes; {signal.name} is not so")
+        raise ValueError(f"{table.kind} takes {bits} bits, unsigned and in whole bytes; {signal.name} is different")
     first, last = table.over or (0, length - 1)
     if not 0 <= first <= last < length:
         raise ValueError(f"bytes {first} to {last} are not within the {length} bytes of the frame")
     around = (slice(first, min(own, last + 1)), slice(max(own + bits // 8, first), last + 1))
     covered = tuple(part for part in around if part.start < part.stop)
     prefix, suffix = (bytes.fromhex(text.replace(":", " ")) for text in (table.prefix, table.suffix))
-    return Checksum(field(signal), calculate, covered, prefix, suffix)
+    read = raw_reader(signal)
+
+    def matches(data: bytes | bytearray) -> bool:
+        return calculate(prefix + b"".join(bytes(data[part]) for part in covered) + suffix) == read(data)
+
+    return matches
 
 
-RECENT = 10.0  # s for which the last error is complained of
-STATE_HOLDS = 60.0  # s for which the controller is taken to be in the state it last reported
-
-BUS_OFF, RESTARTED, CONTROLLER = 0x40, 0x100, 0x04
-CLASSES: dict[int, str] = {
+# Bits of the arbitration ID of an error frame, and of its second data byte: linux/can/error.h.
+CONTROLLER, BUS_OFF, RESTARTED = 0x04, 0x40, 0x100
+ERROR_CLASSES: dict[int, str] = {
     0x01: "sending timed out",
     0x02: "arbitration lost",
-    CONTROLLER: "trouble of the controller",
+    CONTROLLER: "controller error",
     0x08: "protocol violated",
-    0x10: "trouble of the transceiver",
+    0x10: "transceiver error",
     0x20: "no acknowledgement",
     BUS_OFF: "bus off",
     0x80: "bus error",
@@ -112,58 +332,58 @@ CONTROLLER_STATES: dict[int, str] = {
     0x04: "many errors (receiving)",
     0x08: "many errors (sending)",
 }
-OVERFLOW_RECEIVING, ACTIVE_AGAIN = 0x01, 0x40  # bits of the first data byte beside those states
+OVERFLOW, ACTIVE_AGAIN = 0x01, 0x40
 
 
-def classes_of(frame: can.Message) -> list[str]:
-    """What an error frame says, in words; an interface that does not tell classes has 0 there."""
-    return [name for bit, name in CLASSES.items() if frame.arbitration_id & bit] or ["error frame"]
+def error_classes(frame: can.Message) -> list[str]:
+    """Names of the classes of an error frame; an interface that knows no classes has 0 in the arbitration ID."""
+    return [name for bit, name in ERROR_CLASSES.items() if frame.arbitration_id & bit] or ["error frame"]
 
 
 class BusFaults:
-    """Counts error frames by their class, and knows whether the controller has left the bus."""
+    """Counts error frames by their class and tracks the state of the CAN controller."""
 
     def __init__(self) -> None:
         self.bus_off = False
-        """Until a frame comes, or the bus is opened anew."""
+        """True from a bus-off report until the next frame, or until the bus is opened anew."""
         self.total = 0
         """Error frames, each of which may be of several classes."""
         self.counts: Counter[str] = Counter()
-        """By what they say."""
+        """Error frames of each class."""
         self.overflows = 0
-        """Times that the controller had no room for a frame."""
+        """How often the controller had no room for a frame."""
         self._state = ""
         self._latest = ""
-        self._at = 0.0
+        self._time = 0.0
 
     def note(self, frame: can.Message, time: float) -> None:
-        """An error frame, which came at ``time`` (s)."""
+        """Take an error frame, which arrived at ``time`` (s)."""
         self.total += 1
-        bits, names = frame.arbitration_id, classes_of(frame)
+        bits, names = frame.arbitration_id, error_classes(frame)
         if bits & CONTROLLER and len(frame.data) > 1:
-            names = [self._of_controller(frame.data[1]) if name == CLASSES[CONTROLLER] else name for name in names]
+            names[names.index(ERROR_CLASSES[CONTROLLER])] = self._controller_event(frame.data[1])
         self.counts.update(names)
         if bits & BUS_OFF:
             self.bus_off = True
         if bits & RESTARTED:
             self.bus_off, self._state = False, ""
-        self._latest, self._at = ", ".join(names), time
+        self._latest, self._time = ", ".join(names), time
 
     def warnings(self, now: float) -> list[str]:
         """What is wrong at ``now`` (s), a line each."""
         if not self.total:
             return []
         lines = []
-        age = now - self._at
-        if self._state and age < STATE_HOLDS:
-            lines.append(f"the CAN controller is {self._state}: look at cable, termination and bit rate")
-        if age < RECENT:
+        age = now - self._time
+        if self._state and age < STATE_SHOWN:
+            lines.append(f"the CAN controller is {self._state}: check cable, termination and bit rate")
+        if age < ERROR_SHOWN:
             lines.append(f"{self.total} error frames on the bus, the latest {max(age, 0.0):.1f} s ago: {self._latest}")
         return lines
 
-    def _of_controller(self, status: int) -> str:
-        if status & OVERFLOW_RECEIVING:
-            self.overflows += 1
+    def _controller_event(self, status: int) -> str:
+        """Name of what the second data byte reports, and remember the state that it reports."""
+        self.overflows += status & OVERFLOW
         if status & ACTIVE_AGAIN:
             self._state = ""
             return "error active again"
@@ -171,211 +391,4 @@ class BusFaults:
             if status & bit:
                 self._state = name
                 return name
-        return "controller had no room for a frame" if status & OVERFLOW_RECEIVING else CLASSES[CONTROLLER]
-
-
-LEARNED_FROM, LEARNED_OVER, MOST_INTERVALS = 8, 0.25, 4096  # intervals; s; intervals
-MOSTLY = 0.75  # of the intervals of something regular are like the one in the middle
-SOON, LATE = 0.5, 1.5  # of the period: what comes sooner was held up before, what comes later lacks a frame
-FOLLOWING = 0.02  # of the difference, with each frame: periods of cheap oscillators drift
-MOST_ODD = 32  # intervals in a row, after which the message has another period
-LONGEST_OUTAGE = 60.0  # s; who is silent for longer has stopped to send, and nothing is known to be lost
-SILENT_AFTER, SILENT_AT_LEAST = 10.0, 0.5  # periods; s
-IRREGULAR_SILENT_AT_LEAST = 10.0  # s
-PROOF = 8  # steps of one in a row, before a signal is believed to be a counter because of its name
-STANDS_STILL = 3  # repeated frames
-
-COUNTER_NAMES = re.compile(
-    r"(?:^|[_a-z0-9])(?:(?:Alive|Rolling|Message|Msg|Sequence|Seq|Frame|Live)_?(?:Roll(?:ing)?_?)?(?:Counter|Count|Cntr|Cnt|Ctr|Cyc))$"
-    r"|^(?:Alive|Rolling|Message|Msg|Sequence|Seq|Frame|Live)_?(?:Counter|Count|Cntr|Cnt|Ctr)$"
-    r"|^(?:COUNTER|Counter|CNT|RC|ARC|SQC|Alive|ALIVE)$"
-    r"|_(?:COUNTER|Counter|CNT|Cnt|CTR|BZ|ARC|RC|SQC|MC)$"
-)
-"""How vendors name the counter of a message; BZ is the German ``Botschaftszähler``."""
-NOT_OF_MESSAGES = re.compile(
-    r"err|fault|puls|encod|revol|rotat|turn|start|hour|time|step|edge|tooth|batch|piece|part|lost|fail|bus_?off",
-    re.IGNORECASE,
-)
-
-
-class PeriodEstimator:
-    """How often something comes, learned from when it came, unless it is declared."""
-
-    def __init__(self, declared: float | None = None) -> None:
-        self.period = declared
-        """s; None until it is known."""
-        self.regular = declared is not None
-        self.last: float | None = None
-        self._declared = declared is not None
-        self._intervals: list[float] = []
-        self._odd = 0
-        self._missing = 0
-        self._held_up = 0
-
-    def note(self, time: float) -> int:
-        """One has come at ``time``; how many are now known to be missing before it.
-
-        A gap counts once the next interval is a regular one: after a hold-up all come, in a burst.
-        """
-        last, self.last = self.last, time
-        if last is None:
-            return 0
-        elapsed = time - last
-        if self.period is None or not self.regular:
-            self._learn(elapsed)
-            return 0
-        ratio = elapsed / self.period
-        if SOON <= ratio <= LATE:
-            self._follow(elapsed)
-            missing, self._missing = self._missing, 0
-            return missing
-        if ratio < SOON and self._missing:
-            self._missing -= 1
-            return 0
-        if self._oddity() or ratio < SOON:
-            return 0
-        missing, self._missing = self._missing, round(ratio) - 1 if elapsed < LONGEST_OUTAGE else 0
-        return missing
-
-    def counted(self, time: float, step: int, modulo: int) -> int:
-        """The same for one that is counted ``step`` after the last, modulo ``modulo``: how many frames it is ahead.
-
-        An outage may be longer than the counter's cycle: it is then the number nearest to what the clock says. Whole
-        cycles count once the next interval is a regular one, with that one.
-        """
-        last, self.last = self.last, time
-        if last is None:
-            return 1
-        elapsed = time - last
-        if self.period is None or not self.regular:
-            if step:
-                self._learn(elapsed / step)
-            return step
-        if step == 1 and SOON <= elapsed / self.period <= LATE:  # as nearly always
-            self._follow(elapsed)
-            missing, self._missing = self._missing, 0
-            return 1 + missing
-        expected = elapsed / self.period if elapsed < LONGEST_OUTAGE else 0.0
-        cycles = max(0, round((expected - step) / modulo))
-        if cycles and not step:  # the count of the last frame, but not that frame
-            step, cycles = modulo, cycles - 1
-        if not step:
-            return 0
-        missing, self._missing = self._missing, cycles * modulo
-        ratio = elapsed / self.period / (step + cycles * modulo)
-        if SOON <= ratio <= LATE:
-            self._follow(ratio * self.period)
-            return step + missing
-        if ratio > LATE:
-            self._held_up = int(expected) - step
-        elif self._held_up > 0:
-            self._held_up -= step
-            return step
-        self._oddity()
-        return step + missing if ratio > LATE else step
-
-    def silent_for(self, now: float) -> float | None:
-        """Seconds without one, where that is longer than it ever should be."""
-        if self.last is None:
-            return None
-        least = SILENT_AT_LEAST if self.regular else IRREGULAR_SILENT_AT_LEAST
-        silence = now - self.last
-        return silence if silence > max(least, SILENT_AFTER * (self.period or 0.0)) else None
-
-    def pace(self) -> str:
-        """In words."""
-        if self.period is None:
-            return "at a pace that is not known"
-        return f"every {period_text(self.period)}" + ("" if self.regular else " or so, not regularly")
-
-    def _follow(self, interval: float) -> None:
-        self._odd = 0
-        if not self._declared and self.period is not None:
-            self.period += FOLLOWING * (interval - self.period)
-
-    def _oddity(self) -> bool:
-        """Whether there were so many that the period is learned anew."""
-        self._odd += 1
-        if self._odd < MOST_ODD or self._declared:
-            return False
-        self.period, self.regular, self._odd, self._missing = None, False, 0, 0
-        return True
-
-    def _learn(self, interval: float) -> None:
-        """By the mean of some time: in a burst that a hold-up has left, intervals are anything."""
-        self._intervals.append(interval)
-        count, span = len(self._intervals), sum(self._intervals)
-        if count < LEARNED_FROM or (span < LEARNED_OVER and count < MOST_INTERVALS):
-            return
-        middle, mean = statistics.median(self._intervals), span / count
-        inside = [entry for entry in self._intervals if SOON * middle <= entry <= LATE * middle]
-        self.regular = len(inside) >= MOSTLY * count and middle > 0.0 and abs(mean / middle - 1.0) < LATE - 1.0
-        self.period = statistics.fmean(inside) if self.regular else mean
-        self._intervals.clear()
-
-
-def period_text(period: float) -> str:
-    """A period as people say it."""
-    return f"{period * 1e3:.1f} ms" if period < 1.0 else f"{period:.1f} s"
-
-
-class FrameCounter:
-    """The counter in a message, declared or recognised by its name; the latter must first count to be believed."""
-
-    def __init__(self, signal: CanSignal, modulo: int | None = None, *, declared: bool) -> None:
-        """``modulo`` is one more than the highest count; without it that is the database's, or what the bits hold."""
-        self.name = signal.name
-        self.modulo = modulo or _modulo(signal)
-        self.standing = 0
-        """Frames since it last moved."""
-        self._read: BitField = field(signal)
-        self.declared = declared
-        self._trusted = declared
-        self._run = 0
-        self._last: int | None = None
-        self._spoiled = 0
-
-    def spoiled(self) -> None:
-        """A frame came whose counter cannot be believed: it will be missing in the count, but it is not lost."""
-        self._spoiled += 1
-
-    def missing(self, data: bytes | bytearray, time: float, pace: PeriodEstimator) -> int:
-        """Frames lost before this one; -1 where it is the one before once more."""
-        count = int(self._read(data)) % self.modulo
-        last, self._last = self._last, count
-        step = (count - last) % self.modulo if last is not None else 1
-        if not self._trusted:
-            self._run = self._run + 1 if step == 1 else 0
-            self._trusted, self._spoiled = self._run > PROOF, 0
-            return pace.note(time)
-        before = pace.last
-        ahead = pace.counted(time, step, self.modulo)
-        if ahead == 0:
-            pace.last = before  # time goes on from the last frame that was new
-            self.standing += 1
-            return -1
-        spoiled, self._spoiled, self.standing = self._spoiled, 0, 0
-        return max(0, ahead - 1 - spoiled)
-
-
-def _modulo(signal: CanSignal) -> int:
-    whole = 1 << signal.length
-    highest = signal.maximum
-    return int(highest) + 1 if highest is not None and 1.0 < highest < whole - 1 else whole
-
-
-def counter_by_name(message: Message, taken: set[str]) -> CanSignal | None:
-    """The signal of ``message`` that is called as counters are; none where several are, or where it is ``taken``."""
-    found = [
-        signal
-        for signal in message.signals
-        if COUNTER_NAMES.search(signal.name)
-        and not NOT_OF_MESSAGES.search(signal.name)
-        and signal.name not in taken
-        and signal.multiplexer_signal is None
-        and 2 <= signal.length <= 16
-        and not signal.is_signed
-        and not signal.conversion.is_float
-        and (signal.conversion.scale, signal.conversion.offset) == (1, 0)
-    ]
-    return found[0] if len(found) == 1 else None
+        return "controller had no room for a frame" if status & OVERFLOW else ERROR_CLASSES[CONTROLLER]

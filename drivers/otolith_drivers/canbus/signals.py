@@ -1,11 +1,7 @@
-"""What a machine file may say of where a signal is in the frames.
+"""Where a signal is in the frames: in a database, in bits that the machine file names, or in a CANopen object.
 
-Taking one signal out of the bytes of a frame, as fast as plain Python can.
-
-The layout is that of a :class:`cantools.database.Signal`, wherever that came from: a database, a line of the machine
-file or the object dictionary of a drive. What comes out is the raw number; scales, ranges and units come later.
-
-Where in the frames a signal is: in a database, in bits that the machine file names, or in an object of a drive.
+Each way leads to the layout of a :class:`cantools.database.Signal`. :func:`raw_reader` makes of it a function that
+reads the raw number; a :class:`SignalRequest` adds range, scale and unit.
 """
 
 import math
@@ -20,53 +16,43 @@ from cantools.database.conversion import BaseConversion
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Signal
-from otolith_drivers.canbus.database import Loaded
+from otolith_drivers.canbus.database import CanDatabase
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import factor
 
-FLOATS = {16: "e", 32: "f", 64: "d"}
-INTEGERS = {8: "b", 16: "h", 32: "i", 64: "q"}
-ORDERS = {"little_endian": "<", "big_endian": ">"}
+CLASSIC_LENGTH, FD_LENGTH = 8, 64  # bytes of a frame
+STANDARD_LIMIT, EXTENDED_LIMIT = 0x7FF, 0x1FFFFFFF  # arbitration IDs of 11 and of 29 bits
+MAX_VALUE = 1e300  # of a float, raw or scaled; the largest double is 1.8e308
+RANGE_TOLERANCE = 1e-6  # of a bound: 0.1 in a frame of 32-bit floats is above 0.1
 
-BitField = Callable[[bytes | bytearray], float]
+FLOAT_CODES = {16: "e", 32: "f", 64: "d"}
+INTEGER_CODES = {8: "b", 16: "h", 32: "i", 64: "q"}
+RawReader = Callable[[bytes | bytearray], float]
 """From the data of a frame that is long enough (see :func:`bytes_needed`) to the raw number."""
 
 
 def bytes_needed(signal: CanSignal) -> int:
-    """How long a frame must be to hold ``signal``."""
+    """Bytes that a frame must have to contain ``signal``."""
     return (_first_bit(signal) + signal.length + 7) // 8
 
 
-def field(signal: CanSignal) -> BitField:
-    """How to read ``signal``.
+def raw_reader(signal: CanSignal) -> RawReader:
+    """A function that reads the raw number of ``signal``.
 
     Raises:
-        ValueError: a floating-point number of a length that there is not, or nothing to be read.
+        ValueError: the signal has no bits, or is a floating-point number of a length that does not exist.
     """
     if signal.length < 1 or signal.start < 0:
         raise ValueError(f"{signal.length} bits from bit {signal.start} are no signal")
-    if signal.is_float and signal.length not in FLOATS:
+    codes = FLOAT_CODES if signal.is_float else INTEGER_CODES
+    if signal.is_float and signal.length not in codes:
         raise ValueError(f"a floating-point number has 16, 32 or 64 bits, not {signal.length}")
-    return _whole_bytes(signal) or _any_bits(signal)
-
-
-def _first_bit(signal: CanSignal) -> int:
-    """Counted from the first bit of the frame in the order of the signal's bytes."""
-    if signal.byte_order == "little_endian":
-        return signal.start
-    return 8 * (signal.start // 8) + 7 - signal.start % 8
-
-
-def _whole_bytes(signal: CanSignal) -> BitField | None:
-    """What the processor has a type for is unpacked at once."""
-    codes = FLOATS if signal.is_float else INTEGERS
     place, odd = divmod(_first_bit(signal), 8)
     if odd or signal.length not in codes:
-        return None
-    code = codes[signal.length]
-    code = code if signal.is_float or signal.is_signed else code.upper()
-    unpack = struct.Struct(ORDERS[signal.byte_order] + code).unpack_from
+        return _bit_reader(signal)
+    code = codes[signal.length] if signal.is_float or signal.is_signed else codes[signal.length].upper()
+    unpack = struct.Struct(("<" if signal.byte_order == "little_endian" else ">") + code).unpack_from
 
     def read(data: bytes | bytearray) -> float:
         value: float = unpack(data, place)[0]
@@ -75,19 +61,25 @@ def _whole_bytes(signal: CanSignal) -> BitField | None:
     return read
 
 
-def _any_bits(signal: CanSignal) -> BitField:
-    """Everything else by shifts of the whole frame as one integer."""
-    first, mask = _first_bit(signal), (1 << signal.length) - 1
-    end = bytes_needed(signal)
-    order = "little" if signal.byte_order == "little_endian" else "big"
-    shift = first if order == "little" else 8 * end - first - signal.length
+def _first_bit(signal: CanSignal) -> int:
+    """The first bit of ``signal``, counted from that of the frame in the byte order of the signal."""
+    if signal.byte_order == "little_endian":
+        return signal.start
+    return 8 * (signal.start // 8) + 7 - signal.start % 8
+
+
+def _bit_reader(signal: CanSignal) -> RawReader:
+    """The reader of a signal that is no whole number of bytes, or of bytes for which there is no type."""
+    end, mask = bytes_needed(signal), (1 << signal.length) - 1
+    order: Literal["little", "big"] = "little" if signal.byte_order == "little_endian" else "big"
+    shift = _first_bit(signal) if order == "little" else 8 * end - _first_bit(signal) - signal.length
     from_bytes = int.from_bytes
 
     def unsigned(data: bytes | bytearray) -> int:
-        return (from_bytes(data[:end], order) >> shift) & mask  # type: ignore[arg-type]
+        return (from_bytes(data[:end], order) >> shift) & mask
 
     if signal.is_float:
-        size, unpack = signal.length // 8, struct.Struct("<" + FLOATS[signal.length]).unpack
+        size, unpack = signal.length // 8, struct.Struct("<" + FLOAT_CODES[signal.length]).unpack
         return lambda data: float(unpack(unsigned(data).to_bytes(size, "little"))[0])
     if not signal.is_signed:
         return unsigned
@@ -95,12 +87,12 @@ def _any_bits(signal: CanSignal) -> BitField:
     return lambda data: (unsigned(data) ^ sign) - sign
 
 
-CLASSIC_LENGTH, FD_LENGTH = 8, 64  # bytes
-STANDARD_LIMIT, EXTENDED_LIMIT = 0x7FF, 0x1FFFFFFF
-
-
 def whole_number(written: object) -> object:
-    """An integer, be it written as a number or as a text like ``"0x181"``."""
+    """``written`` as an integer if it is a text like ``"0x181"``, otherwise unchanged.
+
+    Raises:
+        ValueError: it is a truth value, or a text that is no whole number.
+    """
     if isinstance(written, bool):
         raise ValueError(f"{written!r} is not a whole number")  # noqa: TRY004 - a fault of a file, not a bug
     if isinstance(written, str):
@@ -114,26 +106,31 @@ def whole_number(written: object) -> object:
 Identifier = Annotated[int, BeforeValidator(whole_number), Field(ge=0, le=EXTENDED_LIMIT)]
 
 
-class BitRange(StrictModel):
-    """Where some bits lie, in the words of a DBC."""
+class NumberFormat(StrictModel):
+    """How bits represent a number."""
 
-    start: Annotated[int, Field(ge=0, lt=8 * FD_LENGTH)]
-    """As in a DBC: the number of the lowest bit, or with ``byte_order = "big"`` of the highest."""
-    length: Annotated[int, Field(ge=1, le=64)]
-    """Bits."""
     byte_order: Literal["little", "big"] = "little"
     signed: bool = False
     float: bool = False
-    """An IEEE floating-point number; comes last, because it hides the type of that name."""
+    """Whether it is an IEEE floating-point number."""
+
+
+class BitRange(NumberFormat):
+    """The bits of a signal, counted as in a DBC."""
+
+    start: Annotated[int, Field(ge=0, lt=8 * FD_LENGTH)]
+    """Number of the lowest bit; with ``byte_order = "big"`` of the highest."""
+    length: Annotated[int, Field(ge=1, le=64)]
+    """Bits."""
 
     @model_validator(mode="after")
     def _a_float_has_a_known_length(self) -> Self:
-        if self.float and self.length not in (16, 32, 64):
+        if self.float and self.length not in FLOAT_CODES:
             raise ValueError(f"a floating-point number has 16, 32 or 64 bits, not {self.length}")
         return self
 
     def as_signal(self, name: str) -> CanSignal:
-        """The same in the words of cantools."""
+        """The same as a signal of cantools."""
         return CanSignal(
             name,
             self.start,
@@ -144,94 +141,85 @@ class BitRange(StrictModel):
         )
 
 
-BITS = tuple(BitRange.model_fields)
 KINDS: dict[str, tuple[str, ...]] = {
     "signal": ("message",),
-    "id": ("extended", "fd", *BITS),
+    "id": ("extended", "fd", *BitRange.model_fields),
     "node": ("object",),
 }
-"""The key that says where a signal is, and the keys that go with it alone."""
+"""The key that says where a signal is, and the keys that belong to it alone."""
+EXAMPLES = '{ signal = "..." }, { id = "0x181", start = 0, length = 16, unit = "V" } or { node = 5, object = "0x6078" }'
 
 
-class Source(StrictModel):
-    """``signal`` of a database, bits of the frames with ``id``, or ``object`` of the CANopen ``node``."""
+class CanSource(NumberFormat):
+    """Where a signal is: ``signal`` of a database, bits of the frames ``id``, or ``object`` of the CANopen ``node``."""
 
     signal: str | None = None
     message: str | None = None
-    """Where more than one message has a signal of this name."""
+    """Needed where several messages have a signal of this name."""
 
     id: Identifier | None = None
     extended: bool = False
     fd: bool = False
     start: int | None = None
     length: int | None = None
-    byte_order: Literal["little", "big"] = "little"
-    signed: bool = False
 
     node: Annotated[int, Field(ge=1, le=127)] | None = None
     object: str | None = None
     """``"0x6078"``, ``"0x6064:00"``, or the name in the object dictionary."""
 
     unit: str | None = None
-    """On the bus; in place of the database's."""
+    """On the bus; replaces that of the database."""
     scale: float = 1.0
-    """``unit`` per what is in the frame, or per the database's unit."""
+    """``unit`` per raw number, or per unit of the database."""
     offset: float = 0.0
-    """In ``unit``."""
+    """In ``unit``, added after ``scale``."""
     range: tuple[float, float] | None = None
-    """In ``unit``: what lies beyond is no reading; in place of the database's."""
-    float: bool = False
+    """In ``unit``; a value outside is no reading. Replaces that of the database."""
 
     @model_validator(mode="after")
-    def _is_of_one_kind(self) -> Self:
-        said = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if len(said) != 1:
-            ways = '{ signal = "..." } of a database, { id = "0x181", start = 0, length = 16, unit = "V" }'
-            raise ValueError(f'say where it is by one of {ways} or {{ node = 5, object = "0x6078", unit = "A" }}')
+    def _is_consistent(self) -> Self:
+        kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(kinds) != 1:
+            raise ValueError(f"give one of 'signal', 'id' and 'node': {EXAMPLES}")
         for kind, keys in KINDS.items():
-            if kind != said[0] and (strange := [key for key in keys if key in self.model_fields_set]):
-                raise ValueError(f"{strange[0]!r} goes with {kind!r}, not with {said[0]!r}")
+            if kind != kinds[0] and (foreign := [key for key in keys if key in self.model_fields_set]):
+                raise ValueError(f"{foreign[0]!r} belongs to {kind!r}, not to {kinds[0]!r}")
         if self.signal is not None and self.unit is None and (self.scale, self.offset) != (1.0, 0.0):
-            raise ValueError("'scale' and 'offset' come after those of the database: say by 'unit' what they lead to")
+            raise ValueError("'scale' and 'offset' change the unit of the database: set 'unit' to the new one")
         if self.node is not None and self.object is None:
             raise ValueError("'object' is missing: write object = \"0x6078\" or the like")
         if self.scale == 0.0:
-            raise ValueError("a scale of 0 leaves nothing of the signal")
+            raise ValueError("scale is 0: every value would be the offset")
         if self.range is not None and not self.range[0] < self.range[1]:
-            raise ValueError(f"range: {self.range[0]:g} is not under {self.range[1]:g}")
+            raise ValueError(f"range: {self.range[0]:g} is not below {self.range[1]:g}")
         if self.id is not None:
             self.bits()
         return self
 
     def bits(self) -> BitRange:
-        """Where the bits of ``id`` are.
+        """The bits in the frames ``id``.
 
         Raises:
-            ValueError: they do not fit into its frames.
+            ValueError: they are not given, or do not fit into the frames.
         """
-        assert self.id is not None  # noqa: S101 - asked for only then
-        if self.start is None or self.length is None:
+        if self.id is None or self.start is None or self.length is None:
             raise ValueError("'start' and 'length' (bits) are missing beside 'id'")
         if self.id > STANDARD_LIMIT and not self.extended:
             raise ValueError(f"id 0x{self.id:X} needs 29 bits: set extended = true")
-        found = BitRange(
-            start=self.start, length=self.length, byte_order=self.byte_order, signed=self.signed, float=self.float
-        )
-        size = FD_LENGTH if self.fd else CLASSIC_LENGTH
-        if (needed := bytes_needed(found.as_signal(""))) > size:
+        bits = BitRange.model_validate(self.model_dump(include=set(BitRange.model_fields)))
+        size, needed = FD_LENGTH if self.fd else CLASSIC_LENGTH, bytes_needed(bits.as_signal(""))
+        if needed > size:
             way_out = "" if self.fd or needed > FD_LENGTH else ", or set fd = true"
-            place = f"{self.length} bits from bit {self.start}"
-            raise ValueError(f"{place} reach into byte {needed} of a frame of {size}: correct start or length{way_out}")
-        return found
-
-
-LARGEST = 1e300
-ROUNDING = 1e-6  # of a bound: 0.1 in a frame of 32-bit floats is above 0.1
+            raise ValueError(
+                f"{self.length} bits from bit {self.start} reach into byte {needed} of a frame of {size}: "
+                f"correct start or length{way_out}"
+            )
+        return bits
 
 
 @dataclass(frozen=True, slots=True)
 class SignalRequest:
-    """A signal of the machine as the frames carry it."""
+    """A signal of the machine, and how to get it out of the frames."""
 
     name: str
     target_unit: str
@@ -241,7 +229,7 @@ class SignalRequest:
     """Where it is read, in words."""
     raw_low: float
     raw_high: float
-    """The raw numbers that are readings; one beyond is a code for "no reading", or wrong."""
+    """Lowest and highest raw number that is a reading; one beyond is an error code, or wrong."""
     scale: float
     offset: float
     """From a raw number to the target unit."""
@@ -251,169 +239,156 @@ class SignalRequest:
         return f"{self.name} [{self.target_unit}] from {self.origin}"
 
 
-def wanted_of(signal: Signal, message: Message, found: CanSignal, origin: str) -> SignalRequest:
-    """What ``signal`` is in ``message``, of which it is ``found``.
+def request_for(signal: Signal, message: Message, layout: CanSignal, origin: str) -> SignalRequest:
+    """The request for ``signal``, which is ``layout`` in ``message``.
 
     Raises:
-        ConfigurationError: it has no unit, or one that measures something else.
+        ConfigurationError: it has no unit, a unit of another quantity, or a scale that is 0 or not finite.
     """
     key = ("signals", signal.name)
-    source: Source = signal.source
-    unit = source.unit or found.unit
+    source: CanSource = signal.source
+    unit = source.unit or layout.unit
     if unit is None:
         raise ConfigurationError(f"{origin} has no unit: set 'unit' beside it", key)
     try:
-        scale, offset = factor(unit, signal.unit)
+        to_target, target_offset = factor(unit, signal.unit)
     except ValueError as error:
         raise ConfigurationError(f"{origin}: {error}", key) from error
-    inner = (float(found.conversion.scale), float(found.conversion.offset))
-    slope, zero = source.scale * inner[0], source.scale * inner[1] + source.offset
-    if slope == 0.0 or not math.isfinite(slope + zero):
+    inner = (float(layout.conversion.scale), float(layout.conversion.offset))
+    scale, offset = source.scale * inner[0], source.scale * inner[1] + source.offset
+    if scale == 0.0 or not math.isfinite(scale + offset):
         raise ConfigurationError(f"{origin} has a scale of {inner[0]:g} and an offset of {inner[1]:g}", key)
     if source.range is not None:
-        low, high = _raw_ends(*source.range, slope, zero)
+        low, high = _raw_range(*source.range, scale, offset)
     else:
-        low, high = _raw_ends(found.minimum, found.maximum, *inner)
-    limit = LARGEST / max(1.0, abs(scale * slope))  # beyond the largest float there is no value, in a frame or scaled
+        low, high = _raw_range(layout.minimum, layout.maximum, *inner)
+    limit = MAX_VALUE / max(1.0, abs(to_target * scale))
+    times = "" if source.scale == 1.0 else f" * {source.scale:g}"
+    plus = "" if source.offset == 0.0 else f" {source.offset:+g}"
     return SignalRequest(
         name=signal.name,
         target_unit=signal.unit,
         message=message,
-        signal=found,
-        origin=f"{origin}{_times(source)} [{unit}], frame 0x{message.frame_id:X}",
+        signal=layout,
+        origin=f"{origin}{times}{plus} [{unit}], frame 0x{message.frame_id:X}",
         raw_low=max(low, -limit),
         raw_high=min(high, limit),
-        scale=scale * slope,
-        offset=scale * zero + offset,
+        scale=to_target * scale,
+        offset=to_target * offset + target_offset,
     )
 
 
-def _raw_ends(low: float | None, high: float | None, slope: float, zero: float) -> tuple[float, float]:
-    """The raw numbers, a little apart, of which ``slope * number + zero`` is ``low`` and ``high``."""
-    if low is None or high is None or not low < high:  # [0|0] in a DBC means that nobody said
+def _raw_range(low: float | None, high: float | None, scale: float, offset: float) -> tuple[float, float]:
+    """The raw numbers of the range ``low`` to ``high`` with some tolerance; infinite if there is no range."""
+    if low is None or high is None or not low < high:  # [0|0] in a DBC means that there is none
         return -math.inf, math.inf
-    ends = sorted((float(end) - zero) / slope for end in (low, high))
-    slack = [ROUNDING * abs(end) if math.isfinite(end) else 0.0 for end in ends]
-    return ends[0] - slack[0], ends[1] + slack[1]
+    first, last = sorted((float(bound) - offset) / scale for bound in (low, high))
+    slack = [RANGE_TOLERANCE * abs(bound) if math.isfinite(bound) else 0.0 for bound in (first, last)]
+    return first - slack[0], last + slack[1]
 
 
-def _times(source: Source) -> str:
-    scale = "" if source.scale == 1.0 else f" * {source.scale:g}"
-    return scale if source.offset == 0.0 else f"{scale} {source.offset:+g}"
-
-
-def find_in_databases(signal: Signal, databases: Sequence[Loaded]) -> SignalRequest:
-    """``signal`` in the databases.
+def request_bits(signal: Signal) -> SignalRequest:
+    """The request for ``signal`` by the bits that its source names.
 
     Raises:
-        ConfigurationError: it is not there, is there twice, measures something else, or what it is remains open.
+        ConfigurationError: see :func:`request_for`.
+    """
+    source: CanSource = signal.source
+    layout, identifier = source.bits().as_signal(signal.name), source.id or 0
+    message = Message(
+        identifier,
+        f"0x{identifier:X}",
+        bytes_needed(layout),
+        [layout],
+        is_extended_frame=source.extended,
+        is_fd=source.fd,
+        strict=False,
+    )
+    bits = f"bits {source.start}+{source.length}" + (" big" if source.byte_order == "big" else "")
+    return request_for(signal, message, layout, f"{message.name} {bits}")
+
+
+Holder = tuple[CanDatabase, Message, CanSignal]
+WAY_OUT = "read it by 'id', 'start' and 'length', or correct the database"
+
+
+def request_from_databases(signal: Signal, databases: Sequence[CanDatabase]) -> SignalRequest:
+    """The request for ``signal`` by its name in the databases.
+
+    Raises:
+        ConfigurationError: it is not there, or not unambiguous, or faulty; see also :func:`request_for`.
     """
     key = ("signals", signal.name)
-    source: Source = signal.source
+    source: CanSource = signal.source
     if not databases:
         raise ConfigurationError('no database that describes the frames: set dbc = "..." in [driver]', key)
-    where = ", ".join(str(loaded.path) for loaded in databases)
-    holders = _holders(source, databases)
-    if not holders:
-        raise ConfigurationError(f"{where}: {_why_not(source, databases)}", key)
-    if len(holders) > 1:
-        _refuse_ambiguous(signal, holders, where)
-    loaded, message, found = holders[0]
-    if message.is_container:
-        raise ConfigurationError(f"{where}: {message.name} is a container message, which is not supported", key)
-    _refuse_faulty(signal, loaded, message, found, databases)
-    try:
-        return wanted_of(signal, message, found, f"{message.name}.{found.name}")
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{loaded.path}: {error}", error.key) from error
-
-
-def _holders(source: Source, databases: Sequence[Loaded]) -> list[tuple[Loaded, Message, CanSignal]]:
-    return [
-        (loaded, message, entry)
-        for loaded in databases
-        for message in loaded.messages
+    paths = ", ".join(str(database.path) for database in databases)
+    holders = [
+        (database, message, layout)
+        for database in databases
+        for message in database.messages
         if source.message in (None, message.name)
-        for entry in message.signals
-        if entry.name == source.signal
+        for layout in message.signals
+        if layout.name == source.signal
     ]
+    if not holders:
+        raise ConfigurationError(f"{paths}: {_why_missing(source, databases)}", key)
+    database, message, layout = holders[0]
+    if why := _why_ambiguous(source, holders, databases):
+        raise ConfigurationError(f"{paths}: {why}", key)
+    if message.is_container:
+        raise ConfigurationError(f"{paths}: {message.name} is a container message, which is not supported", key)
+    if why := _why_faulty(database, message, layout):
+        raise ConfigurationError(f"{database.path}: {why}: {WAY_OUT}", key)
+    try:
+        return request_for(signal, message, layout, f"{message.name}.{layout.name}")
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{database.path}: {error}", error.key) from error
 
 
-def _why_not(source: Source, databases: Sequence[Loaded]) -> str:
-    """Why there is no such signal, and what there is."""
-    unread = {name: why for loaded in databases for name, why in loaded.unread.items()}
-    messages = [message for loaded in databases for message in loaded.messages]
+def _why_missing(source: CanSource, databases: Sequence[CanDatabase]) -> str:
+    unread = {name: why for database in databases for name, why in database.unread.items()}
+    messages = [message for database in databases for message in database.messages]
     if source.message is not None:
         if source.message in unread:
             return f"message {source.message!r} cannot be read: {unread[source.message]}"
-        messages = [message for message in messages if message.name == source.message]
-        if not messages:
-            names = [message.name for loaded in databases for message in loaded.messages]
+        names = [message.name for message in messages]
+        if source.message not in names:
             return f"no message {source.message!r}: {nearest(source.message, names)}"
-    names = sorted({entry.name for message in messages for entry in message.signals})
+        messages = [message for message in messages if message.name == source.message]
+    names = sorted({layout.name for message in messages for layout in message.signals})
     more = f"; {len(unread)} messages cannot be read: {', '.join(list(unread)[:3])}" if unread else ""
     return f"no signal {source.signal!r}: {nearest(str(source.signal), names)}{more}"
 
 
-def _refuse_ambiguous(signal: Signal, holders: list[tuple[Loaded, Message, CanSignal]], where: str) -> None:
-    key = ("signals", signal.name)
+def _why_ambiguous(source: CanSource, holders: Sequence[Holder], databases: Sequence[CanDatabase]) -> str:
     names = sorted({message.name for _, message, _ in holders})
     if len(names) > 1:
-        raise ConfigurationError(
-            f"{where}: signal {signal.source.signal!r} is in {', '.join(names)}: set 'message' beside it", key
-        )
-    if len({_layout(message, found) for _, message, found in holders}) > 1:
-        raise ConfigurationError(
-            f"{where}: {names[0]}.{signal.source.signal} is described {len(holders)} times, and differently: "
-            "read it by 'id', 'start' and 'length', or correct the database",
-            key,
-        )
+        return f"signal {source.signal!r} is in {', '.join(names)}: set 'message' beside it"
+    if len({_layout_key(message, layout) for _, message, layout in holders}) > 1:
+        return f"{names[0]}.{source.signal} is described {len(holders)} times, and differently: {WAY_OUT}"
+    frame = _frame_key(holders[0][1])
+    messages = [message for database in databases for message in database.messages if _frame_key(message) == frame]
+    others = [message.name for message in messages if message.name != names[0]]
+    if others and source.message is None:
+        return f"frame 0x{frame[0]:X} is both {names[0]} and {others[0]}: set 'message' to the right one"
+    return ""
 
 
-def _refuse_faulty(
-    signal: Signal, loaded: Loaded, message: Message, found: CanSignal, databases: Sequence[Loaded]
-) -> None:
-    """Refuse what would make the value a matter of opinion."""
-    key, way_out = ("signals", signal.name), "read it by 'id', 'start' and 'length', or correct the database"
-    if faults := loaded.faults_of(message, found.name):
-        raise ConfigurationError(f"{loaded.path}: {faults[0].text}: {way_out}", key)
-    if found.conversion.is_float and found.length not in (16, 32, 64):
-        raise ConfigurationError(
-            f"{loaded.path}: {message.name}.{found.name} is a floating-point number of {found.length} bits: {way_out}",
-            key,
-        )
-    if signal.source.message is not None:
-        return
-    for other in databases:
-        for rival in other.messages:
-            same = (rival.frame_id, rival.is_extended_frame) == (message.frame_id, message.is_extended_frame)
-            if same and rival.name != message.name:
-                raise ConfigurationError(
-                    f"{other.path}: frame 0x{message.frame_id:X} is both {message.name} and {rival.name}: "
-                    "say which it is by 'message'",
-                    key,
-                )
+def _frame_key(message: Message) -> tuple[int, bool]:
+    return message.frame_id, message.is_extended_frame
 
 
-def _layout(message: Message, found: CanSignal) -> tuple[object, ...]:
-    conversion = found.conversion
-    where = (message.frame_id, message.is_extended_frame, found.start, found.length, found.byte_order)
-    what = (found.is_signed, conversion.is_float, conversion.scale, conversion.offset, found.unit)
-    return (*where, *what, found.multiplexer_signal, tuple(found.multiplexer_ids or ()))
+def _layout_key(message: Message, layout: CanSignal) -> tuple[object, ...]:
+    conversion = layout.conversion
+    where = (*_frame_key(message), layout.start, layout.length, layout.byte_order)
+    what = (layout.is_signed, conversion.is_float, conversion.scale, conversion.offset, layout.unit)
+    return (*where, *what, layout.multiplexer_signal, tuple(layout.multiplexer_ids or ()))
 
 
-def raw_signal(signal: Signal) -> SignalRequest:
-    """``signal`` by the bits that its source names.
-
-    Raises:
-        ConfigurationError: it has no unit, or one that measures something else.
-    """
-    source: Source = signal.source
-    assert source.id is not None  # noqa: S101 - asked for only then
-    found = source.bits().as_signal(signal.name)
-    size = bytes_needed(found)
-    message = Message(
-        source.id, f"0x{source.id:X}", size, [found], is_extended_frame=source.extended, is_fd=source.fd, strict=False
-    )
-    bits = f"bits {source.start}+{source.length}" + (" big" if source.byte_order == "big" else "")
-    return wanted_of(signal, message, found, f"{message.name} {bits}")
+def _why_faulty(database: CanDatabase, message: Message, layout: CanSignal) -> str:
+    if faults := database.faults_of(message, layout.name):
+        return faults[0].text
+    if layout.conversion.is_float and layout.length not in FLOAT_CODES:
+        return f"{message.name}.{layout.name} is a floating-point number of {layout.length} bits"
+    return ""

@@ -1,1 +1,1 @@
-"""The Modbus driver."""
+"""The Modbus driver, and its probe."""

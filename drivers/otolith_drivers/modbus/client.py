@@ -1,7 +1,4 @@
-"""A Modbus line that can be read and nothing else: pymodbus behind a door without a handle on the other side.
-
-Only function codes 3 (read holding registers) and 4 (read input registers) leave this file.
-"""
+"""A read-only Modbus client over pymodbus: only function codes 3 (holding registers) and 4 (input registers)."""
 
 import contextlib
 import errno
@@ -21,40 +18,41 @@ from pymodbus.exceptions import ConnectionException
 from pymodbus.framer import FramerType
 
 from otolith_drivers.modbus.options import LineOptions, Table
-from otolith_drivers.modbus.protocol import Broken, Refused, Silent
+from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
 
 FUNCTION_CODES: Final[dict[Table, int]] = {"holding": 3, "input": 4}
-HUSH_STEP, MOST_HUSH = 0.02, 5  # s; timeouts
-SILENT_LOG = logging.getLogger("pymodbus")
+DRAIN_STEP = 0.02  # s between looks for late bytes; engineering choice: at most 1 % of a core
+MAX_DRAIN = 5  # timeouts, after which a line that never falls silent is reopened all the same; engineering choice
 
 
-class Line:
-    """One host or serial port. For one thread, but for :meth:`abort`."""
+class ReadOnlyClient:
+    """A connection to one host or serial port, for one thread; only :meth:`abort` may be called from another."""
 
     def __init__(self, options: LineOptions) -> None:
-        SILENT_LOG.setLevel(logging.CRITICAL)  # it would write the last packets to the log with every error
+        # pymodbus would log the last packets with every error.
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
         self._options = options
         self._aborted = threading.Event()
         self._client = _client(options, self._aborted)
 
     def connect(self) -> None:
-        """Open the line.
+        """Open the connection.
 
         Raises:
-            Broken: it cannot be opened.
+            ConnectionLostError: it cannot be opened.
         """
-        try:  # by ourselves, as the library only logs why it cannot
-            self._client.socket = self._opened()
+        try:  # not by the library, which only logs the cause of a failure
+            self._client.socket = self._open()
         except (OSError, ValueError, termios.error) as error:
-            raise Broken(_cause(error)) from error
+            raise ConnectionLostError(_cause(error)) from error
 
     def close(self) -> None:
-        """Close it; may be called twice. What was on its way is lost, which is how a line is drained."""
+        """Close the connection; may be called twice."""
         with contextlib.suppress(OSError):
             self._client.close()  # type: ignore[no-untyped-call]  # of a library that is typed but for this
 
     def abort(self) -> None:
-        """From another thread: make a reading in progress end."""
+        """End a read in progress; callable from another thread."""
         self._aborted.set()
         handle = self._client.socket
         if isinstance(handle, socket.socket):
@@ -62,47 +60,46 @@ class Line:
                 handle.shutdown(socket.SHUT_RDWR)
 
     def read(self, device: int, table: Table, address: int, count: int) -> list[int]:
-        """The registers from ``address`` on, each 0 to 65535.
+        """Return ``count`` registers from ``address`` on, each 0 to 65535.
 
         Raises:
-            Refused: the device answers with an exception.
-            Silent: no answer in time, or one to another question; the line is to be opened anew before the next one.
-            Broken: the line is gone.
+            ExceptionReplyError: the device answers with an exception.
+            NoReplyError: no valid answer in time; the connection must be reopened before the next request.
+            ConnectionLostError: the connection failed.
         """
         read = self._client.read_holding_registers if table == "holding" else self._client.read_input_registers
         try:
             reply = read(address, count=count, device_id=device)
         except ConnectionException as error:
-            raise Broken("the connection was closed") from error
+            raise ConnectionLostError("the connection was closed") from error
         except ModbusException as error:
-            raise Silent(f"no answer within {self._options.timeout:g} s") from error
+            raise NoReplyError(f"no answer within {self._options.timeout:g} s") from error
         except OSError as error:
-            raise Broken(error.strerror or str(error)) from error
-        except Exception as error:  # what hostile bytes do to the library's decoder
-            raise Silent(f"an answer that cannot be understood ({type(error).__name__})") from error
+            raise ConnectionLostError(error.strerror or str(error)) from error
+        except Exception as error:  # the library's decoder may raise anything for corrupted bytes
+            raise NoReplyError(f"an answer that cannot be decoded ({type(error).__name__})") from error
         if reply.isError():
-            raise Refused(int(reply.exception_code))
+            raise ExceptionReplyError(int(reply.exception_code))
         if reply.function_code != FUNCTION_CODES[table] or len(reply.registers) != count:
-            raise Silent(f"an answer to another question: {len(reply.registers)} registers instead of {count}")
+            raise NoReplyError(f"an answer to another request: {len(reply.registers)} registers instead of {count}")
         return list(reply.registers)
 
     def drain(self) -> None:
-        """Close it, so that an answer that comes late is not taken for that to the next question.
+        """Close the connection so that a late answer is not taken for the answer to the next request.
 
-        Frames of a serial line have no number by which it could be told: there nothing must first have come for as
-        long as a device may take. A line that never is silent is not waited for.
+        Serial frames have no transaction number: the line must first have been silent for one timeout.
         """
         if self._options.host is None or self._options.framing == "rtu":
             now = time.monotonic()
-            silent, longest = now + self._options.timeout, now + MOST_HUSH * self._options.timeout
-            while not self._aborted.is_set() and (now := time.monotonic()) < min(silent, longest):
+            silent_at, latest = now + self._options.timeout, now + MAX_DRAIN * self._options.timeout
+            while not self._aborted.is_set() and (now := time.monotonic()) < min(silent_at, latest):
                 if self._discard():
-                    silent = now + self._options.timeout
-                self._aborted.wait(min(HUSH_STEP, max(0.0, silent - now)))
+                    silent_at = now + self._options.timeout
+                self._aborted.wait(min(DRAIN_STEP, max(0.0, silent_at - now)))
         self.close()
 
     def _discard(self) -> bool:
-        """Throw away what has come and nobody waits for; whether there was any."""
+        """Discard the bytes received so far; return whether there were any."""
         handle = self._client.socket
         try:
             if isinstance(handle, socket.socket):
@@ -111,23 +108,23 @@ class Line:
         except OSError:
             return False
 
-    def _opened(self) -> socket.socket | serial.Serial:
+    def _open(self) -> socket.socket | serial.Serial:
         options = self._options
         if options.host is not None:
-            return self._connected(options.host, options.port)
+            return self._open_socket(options.host, options.port)
         return serial.Serial(
             options.serial,
             baudrate=options.baudrate,
-            parity="N" if _is_pseudo(options.serial) else options.parity,
+            parity="N" if _is_pseudo_terminal(options.serial) else options.parity,
             stopbits=options.stop_bits,
             timeout=options.timeout,
             write_timeout=options.timeout,
             exclusive=True,
         )
 
-    def _connected(self, host: str, port: int) -> socket.socket:
-        """As ``socket.create_connection`` does, but :meth:`abort` ends it."""
-        cause = OSError(0, "the name stands for no address")
+    def _open_socket(self, host: str, port: int) -> socket.socket:
+        """Connect like ``socket.create_connection``, but so that :meth:`abort` ends it."""
+        cause = OSError(0, "the name has no address")
         for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
             connection = self._client.socket = socket.socket(family, kind, protocol)
             connection.settimeout(self._options.timeout)
@@ -145,7 +142,7 @@ class Line:
 
 
 class _SerialClient(ModbusSerialClient):
-    """Waits by the monotonic clock, as the library's own may be set back by an hour while it waits; ends when told."""
+    """Waits by the monotonic clock and ends on abort; the library waits by the wall clock, which may be set back."""
 
     aborted: threading.Event
 
@@ -161,10 +158,10 @@ class _SerialClient(ModbusSerialClient):
         return size
 
 
-class _WithoutEcho:
-    """What some adapters hear of themselves is taken out of what comes in.
+class _EchoFilter:
+    """Removes the echo of the request, which some serial adapters receive, from the answer.
 
-    A question for one register of those from 768 to 1023 on reads, with its checksum, like an answer.
+    With its checksum, a request for one register from 768 to 1023 is also a valid answer.
     """
 
     def __init__(self) -> None:
@@ -177,21 +174,20 @@ class _WithoutEcho:
         return data.removeprefix(self._sent)
 
 
-def _is_pseudo(port: str | None) -> bool:
-    """Whether it is a pseudo-terminal, which has no parity and, when it is opened again, refuses to be given any."""
+def _is_pseudo_terminal(port: str | None) -> bool:
+    """Whether it is a pseudo-terminal, which has no parity and rejects one when it is opened again."""
     return str(Path(port or "").resolve()).startswith("/dev/pts/")
 
 
 def _client(options: LineOptions, aborted: threading.Event) -> ModbusTcpClient | ModbusSerialClient:
     if options.host is not None:
-        framer = FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU
         return ModbusTcpClient(
             options.host,
             port=options.port,
-            framer=framer,
+            framer=FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU,
             timeout=options.timeout,
             retries=0,
-            trace_packet=_WithoutEcho() if options.framing == "rtu" else None,
+            trace_packet=_EchoFilter() if options.framing == "rtu" else None,
         )
     client = _SerialClient(
         options.serial or "",
@@ -200,7 +196,7 @@ def _client(options: LineOptions, aborted: threading.Event) -> ModbusTcpClient |
         stopbits=options.stop_bits,
         timeout=options.timeout,
         retries=0,
-        trace_packet=_WithoutEcho(),
+        trace_packet=_EchoFilter(),
     )
     client.aborted = aborted
     return client
@@ -209,7 +205,7 @@ def _client(options: LineOptions, aborted: threading.Event) -> ModbusTcpClient |
 def _cause(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno and error.errno > 0:
         return os.strerror(error.errno)
-    if isinstance(error, termios.error):  # which is no OSError
-        refused = error.args[0] == errno.EINVAL
-        return f"the port refuses these settings: {error.args[-1]}" if refused else str(error.args[-1])
+    if isinstance(error, termios.error):  # not an OSError
+        rejected = error.args[0] == errno.EINVAL
+        return f"the port refuses these settings: {error.args[-1]}" if rejected else str(error.args[-1])
     return (isinstance(error, OSError) and error.strerror) or str(error)

@@ -1,6 +1,7 @@
-"""The Modbus driver: reads registers at the pace of the window's grid, and survives whatever the line does.
+"""The Modbus driver: polls registers on the window's grid and reconnects after every fault.
 
-It can only read: see :mod:`otolith_drivers.modbus.client`. Times are those of the middle of each request's round trip.
+It can only read (see :mod:`otolith_drivers.modbus.client`). The time of a sample is the middle of its request's round
+trip.
 """
 
 import logging
@@ -11,42 +12,50 @@ import time
 from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
-from otolith_drivers.modbus.client import Line
-from otolith_drivers.modbus.options import Item, Options, Source, item_of
-from otolith_drivers.modbus.plausibility import OrderWatch, StalenessMonitor
-from otolith_drivers.modbus.protocol import Broken, Refused, Silent
-from otolith_drivers.modbus.schedule import PollSchedule, Request, Requests, plan, summary
+from otolith_drivers.modbus.client import ReadOnlyClient
+from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, RegisterSignal, register_signal
+from otolith_drivers.modbus.plausibility import OrderMonitor, StalenessMonitor
+from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
+from otolith_drivers.modbus.schedule import PollSchedule, Request, RequestSet, plan, summary
 
 __all__ = ["ModbusPoller", "Options", "Source", "build"]
 
 log = logging.getLogger(__name__)
 
-BACKOFF_FIRST, BACKOFF_LONGEST = 0.2, 10.0  # s
-LONGEST_END = 0.9  # s; only a name that is being looked up takes longer
-LONGEST_SLEEP = 0.2  # s; how late a stop can be noticed between rounds
+Options = ModbusOptions
+Source = ModbusSource
+
+BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect; engineering choice
+CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s. Only a name lookup in progress takes longer.
+MAX_SLEEP = 0.2  # s that a stop between two rounds may go unnoticed; engineering choice
 
 
-def build(options: Options, setup: Setup) -> "ModbusPoller":
-    """A poller of all signals of ``setup``, as often as its sample period asks."""
-    return ModbusPoller(options, [item_of(signal, options) for signal in setup.signals], setup.sample_period)
+def build(options: ModbusOptions, setup: Setup) -> "ModbusPoller":
+    """Return a poller of all signals of ``setup`` at its sample period.
+
+    Raises:
+        ConfigurationError: a unit has the wrong dimension, or a register does not exist.
+    """
+    return ModbusPoller(options, [register_signal(signal, options) for signal in setup.signals], setup.sample_period)
 
 
 class ModbusPoller:
-    """Implements :class:`otolith_drivers.base.Driver` over pymodbus, with a thread of its own."""
+    """Implements :class:`otolith_drivers.base.Driver` over pymodbus, with its own thread."""
 
     sampling = Sampling.POLLED
 
-    def __init__(self, options: Options, items: Sequence[Item], period: float) -> None:
+    def __init__(self, options: ModbusOptions, signals: Sequence[RegisterSignal], period: float) -> None:
         self._options = options
-        self._items = items
-        self._line = Line(options)
-        self._requests = Requests(plan(items, options.max_gap, options.max_registers))
-        self._pace = PollSchedule(period)
-        self._watch = OrderWatch(items)
-        self._held_back: dict[str, list[Sample]] = {}
-        self._freshness = StalenessMonitor()
+        self._signals = signals
+        self._client = ReadOnlyClient(options)
+        self._requests = RequestSet(plan(signals, options.max_gap, options.max_registers))
+        self._schedule = PollSchedule(period)
+        self._order = OrderMonitor(signals)
+        self._unjudged: dict[str, list[Sample]] = {}
+        """Samples by signal that wait for the first judgement of the byte order."""
+        self._staleness = StalenessMonitor()
         self._received = self._bad = self._lost = self._reconnects = 0
-        self._told = False
+        self._rate_logged = False
         self._up, self._was_up, self._reason = False, False, "not opened yet"
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -60,9 +69,9 @@ class ModbusPoller:
     def close(self) -> None:
         """See :meth:`otolith_drivers.base.Driver.close`."""
         self._stop.set()
-        self._line.abort()
+        self._client.abort()
         if self._thread is not None:
-            self._thread.join(timeout=LONGEST_END)
+            self._thread.join(timeout=CLOSE_TIMEOUT)
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
@@ -70,129 +79,128 @@ class ModbusPoller:
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
-        warnings = [*self._requests.warnings(time.monotonic()), *self._watch.warnings()]
-        warnings += self._freshness.warnings(self._requests.requests, self._pace.period)
-        described = f"{summary(self._requests.requests)}, {self._pace.describe()}"
-        period = self._pace.period if self._pace.known or self._pace.period > self._pace.asked else None
-        return Link(self._up, self._reason, tuple(warnings), described, period)
+        schedule, requests = self._schedule, self._requests.requests
+        warnings = [*self._requests.warnings(time.monotonic()), *self._order.warnings()]
+        warnings += self._staleness.warnings(requests, schedule.period)
+        period = schedule.period if schedule.known or schedule.period > schedule.requested else None
+        return Link(self._up, self._reason, tuple(warnings), f"{summary(requests)}, {schedule.describe()}", period)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
-        requests = self._requests.requests
-        hertz = 1.0 / self._pace.asked
-        lines = [
-            f"{self._options.title()}, read only (function codes 3 and 4): {summary(requests)}, {hertz:g} Hz asked"
-        ]
+        requests, period = self._requests.requests, self._schedule.requested
+        title = f"{self._options.title()}, read only (function codes 3 and 4)"
+        lines = [f"{title}: {summary(requests)}, {1.0 / period:g} Hz asked"]
         least = sum(self._options.least_time(request.count) for request in requests)
-        if least > self._pace.asked:
+        if least > period:
             lines.append(f"the line is too slow for that: at most {1.0 / least:.3g} Hz can be achieved")
-        return lines + [f"{item.name} [{item.target_unit}] from {item.describe()}" for item in self._items]
+        return lines + [f"{signal.name} [{signal.target_unit}] from {signal.describe()}" for signal in self._signals]
 
     def _run(self, deliver: Deliver) -> None:
-        self._pace.start(time.monotonic())
-        connected, pause = False, BACKOFF_FIRST
+        self._schedule.start(time.monotonic())
+        connected, backoff = False, BACKOFF_FIRST
         while not self._stop.is_set():
             try:
                 if not connected:
-                    self._line.connect()
-                    self._lose(self._pace.pass_over(time.monotonic()) * len(self._items))
-                    connected, pause = True, BACKOFF_FIRST
+                    self._client.connect()
+                    self._lost += self._schedule.pass_over(time.monotonic()) * len(self._signals)
+                    connected, backoff = True, BACKOFF_FIRST
                 self._wait()
                 if not self._stop.is_set():
                     connected = self._round(deliver)
             except Exception as error:
-                if self._stop.is_set():  # by ourselves
+                if self._stop.is_set():  # the connection was closed by the driver
                     break
-                if not isinstance(error, Broken):
+                if not isinstance(error, ConnectionLostError):
                     log.exception("%s", self._options.title())
                 self._go_down(str(error) or type(error).__name__)
                 connected = False
-                self._stop.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not a secret
-                pause = min(2.0 * pause, BACKOFF_LONGEST)
-                self._lose(self._pace.pass_over(time.monotonic()) * len(self._items))
-        self._line.close()
+                self._stop.wait(backoff * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not a secret
+                backoff = min(2.0 * backoff, BACKOFF_MAX)
+                self._lost += self._schedule.pass_over(time.monotonic()) * len(self._signals)
+        self._client.close()
 
     def _wait(self) -> None:
-        while not self._stop.is_set() and (left := self._pace.due - time.monotonic()) > 0.0:
-            self._stop.wait(min(left, LONGEST_SLEEP))
+        while not self._stop.is_set() and (left := self._schedule.due - time.monotonic()) > 0.0:
+            self._stop.wait(min(left, MAX_SLEEP))
 
     def _round(self, deliver: Deliver) -> bool:
-        """Read what is due; whether the line may be used for the next round as it is."""
+        """Send the requests that are due; return whether the connection may be used for the next round as it is."""
         begun = time.monotonic()
-        self._lose(self._pace.begin(begun) * len(self._items))
-        due = self._requests.due(begun)
+        self._lost += self._schedule.begin(begun) * len(self._signals)
         usable, answered, repeated = True, 0, True
-        for request in due:
+        for request in self._requests.due(begun):
             try:
                 repeated &= self._read(request, deliver)
-                answered += len(request.items)
-            except Refused as error:
+                answered += len(request.signals)
+            except ExceptionReplyError as error:
                 log.debug("%s: %s", request.describe(), error)
                 self._requests.refused(request, error, time.monotonic())
-            except Silent as error:
-                self._requests.silent(request, str(error), time.monotonic())
+            except NoReplyError as error:
+                self._requests.unanswered(request, str(error), time.monotonic())
                 usable = False
                 break
-            except Broken:
-                self._lose(len(self._items) - answered)
-                self._settle(deliver)
+            except ConnectionLostError:
+                self._end_reading(answered, deliver)
                 raise
             if self._options.pause:
                 self._stop.wait(self._options.pause)
-        self._lose(len(self._items) - answered)
-        self._settle(deliver)
+        self._end_reading(answered, deliver)
         if answered:
             self._come_up()
-        if answered == len(self._items) and self._pace.end(time.monotonic() - begun, repeated=repeated):
-            log.warning("%s: %s", self._options.title(), self._pace.describe())
-        if self._pace.known and not self._told and self._pace.achieved is not None:
-            self._told = True
-            log.info("%s: %s, %s", self._options.title(), summary(self._requests.requests), self._pace.describe())
-        return usable or self._drained()
+        if answered == len(self._signals):
+            self._end_complete_round(time.monotonic() - begun, repeated=repeated)
+        if not usable:
+            self._client.drain()
+            if self._requests.all_silent:
+                self._go_down("no device answers")
+        return usable
 
     def _read(self, request: Request, deliver: Deliver) -> bool:
-        """Read one request and hand on what is in it; whether it says the same as before."""
-        asked = time.monotonic()
-        registers = self._line.read(request.device, request.table, request.address, request.count)
-        moment = 0.5 * (asked + time.monotonic())
+        """Read one request and deliver its samples; return whether all registers repeat the previous values."""
+        sent = time.monotonic()
+        registers = self._client.read(request.device, request.table, request.address, request.count)
+        moment = 0.5 * (sent + time.monotonic())
         self._requests.answered(request)
-        repeated, stale = self._freshness.take(request, registers)
+        repeated, stale = self._staleness.take(request, registers)
         if stale:
-            self._bad += len(request.items)
+            self._bad += len(request.signals)
             return repeated
         samples = []
-        for item in request.items:
-            part = registers[item.address - request.address : item.end - request.address]
-            self._watch.take(item, part)
-            samples.append(Sample(item.name, moment, item.value(part)))
+        for signal in request.signals:
+            part = registers[signal.address - request.address : signal.end - request.address]
+            self._order.take(signal, part)
+            samples.append(Sample(signal.name, moment, signal.value(part)))
         for sample in samples:
-            if self._watch.unjudged(sample.signal):
-                self._held_back.setdefault(sample.signal, []).append(sample)
-        self._hand_on([sample for sample in samples if sample.signal not in self._held_back], deliver)
+            if self._order.is_unjudged(sample.signal):
+                self._unjudged.setdefault(sample.signal, []).append(sample)
+        self._deliver([sample for sample in samples if sample.signal not in self._unjudged], deliver)
         return repeated
 
-    def _settle(self, deliver: Deliver) -> None:
-        """Judge the order of bytes, and hand on what waited for it."""
-        self._watch.end_round()
-        for name in [name for name in self._held_back if not self._watch.unjudged(name)]:
-            self._hand_on(self._held_back.pop(name), deliver)
+    def _end_reading(self, answered: int, deliver: Deliver) -> None:
+        """Count the lost samples, judge the byte order, and deliver the samples that waited for it."""
+        self._lost += len(self._signals) - answered
+        self._order.end_round()
+        for name in [name for name in self._unjudged if not self._order.is_unjudged(name)]:
+            self._deliver(self._unjudged.pop(name), deliver)
 
-    def _hand_on(self, samples: Sequence[Sample], deliver: Deliver) -> None:
-        if self._stop.is_set():  # nobody waits for them any more
+    def _deliver(self, samples: Sequence[Sample], deliver: Deliver) -> None:
+        if self._stop.is_set():  # nothing is delivered after close
             return
-        kept = [sample for sample in samples if sample.signal not in self._watch.withheld]
-        good = sum(math.isfinite(sample.value) for sample in kept)
+        accepted = [sample for sample in samples if sample.signal not in self._order.withheld]
+        good = sum(math.isfinite(sample.value) for sample in accepted)
         self._received += good
         self._bad += len(samples) - good
-        if kept:
-            deliver(kept)
+        if accepted:
+            deliver(accepted)
 
-    def _drained(self) -> bool:
-        """After a question without an answer, an answer without a question may come: the line is opened anew."""
-        self._line.drain()
-        if self._requests.all_silent:
-            self._go_down("no device answers")
-        return False
+    def _end_complete_round(self, duration: float, *, repeated: bool) -> None:
+        """End a round in which all devices answered, and log a change of the period or the first known rate."""
+        if self._schedule.end(duration, repeated=repeated):
+            log.warning("%s: %s", self._options.title(), self._schedule.describe())
+        if self._schedule.known and not self._rate_logged and self._schedule.achieved is not None:
+            self._rate_logged = True
+            rate = self._schedule.describe()
+            log.info("%s: %s, %s", self._options.title(), summary(self._requests.requests), rate)
 
     def _come_up(self) -> None:
         if not self._up:
@@ -202,10 +210,7 @@ class ModbusPoller:
             log.info("%s: answers", self._options.title())
 
     def _go_down(self, reason: str) -> None:
-        self._line.close()
+        self._client.close()
         if reason != self._reason:
-            log.warning("%s: %s; tried again for ever", self._options.title(), reason)
+            log.warning("%s: %s; retried until it answers", self._options.title(), reason)
         self._up, self._reason = False, reason
-
-    def _lose(self, samples: int) -> None:
-        self._lost += samples

@@ -1,10 +1,8 @@
-"""Numbers in Modbus registers: the types, the four orders of their bytes, and fields of bits.
+"""Numbers in Modbus registers: types, byte orders and bit fields; and how a request can fail.
 
-A register has 16 bits, high byte first on the wire (Modbus Application Protocol V1.1b3, section 4.2). Where a number
-takes several, the standard is silent, so every order is met. They are written as telegraf writes them, by where the
-bytes A (highest) to D (lowest) of a number of 32 bits stand; numbers of 64 bits follow the same rule.
-
-How a reading of registers can fail: the device says no, nobody answers, or the line is broken.
+A register has 16 bits, high byte first on the wire (Modbus Application Protocol V1.1b3, section 4.2). The standard
+does not define the order of the registers of a longer number, so all orders occur. They are named by the positions of
+the bytes A (highest) to D (lowest) of a 32-bit number; 64-bit numbers follow the same rule.
 """
 
 import re
@@ -25,42 +23,20 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target device failed to respond",
 }
+PERMANENT_CODES = (1, 2, 3)
+"""Exceptions that a repeated request will meet again."""
+BUSY_CODES = (5, 6)
+"""Exceptions that ask to repeat the request later."""
 GATEWAY_CODES = (10, 11)
-
-
-class Refused(Exception):  # noqa: N818 - what the device has done, said in the words of the field
-    """The device answers that it does not want to.
-
-    Example scenarios: registers that it does not have, more of them than it gives at once, busy.
-    """
-
-    def __init__(self, code: int) -> None:
-        super().__init__(f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
-        self.code = code
-
-
-class Silent(Exception):  # noqa: N818
-    """No answer, or none to the question, in time; the line itself stands.
-
-    Example scenarios: device switched off, wrong device number, wrong baud rate, a late answer to an earlier question.
-    """
-
-
-class Broken(Exception):  # noqa: N818
-    """The line is gone.
-
-    Example scenarios: connection refused or closed, host unreachable, serial adapter pulled out.
-    """
-
+"""Exceptions by which a gateway reports that the device does not answer."""
 
 TypeName = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
 ORDERS: tuple[Order, ...] = get_args(Order)
 WORDS_SWAPPED: frozenset[Order] = frozenset({"CDAB", "DCBA"})
-"""The lowest register comes first."""
+"""Orders with the lowest register first."""
 BYTES_SWAPPED: frozenset[Order] = frozenset({"BADC", "DCBA"})
-"""In each register."""
-
+"""Orders with the low byte of each register first."""
 LETTERS: dict[TypeName, str] = {
     "int16": "h",
     "uint16": "H",
@@ -71,63 +47,93 @@ LETTERS: dict[TypeName, str] = {
     "float32": "f",
     "float64": "d",
 }
-"""Of each type the letter by which ``struct`` knows it."""
+"""Format characters of ``struct`` by type."""
 BITS = re.compile(r"(\d{1,2})(?:\.\.(\d{1,2}))?")
 
 
+class ExceptionReplyError(Exception):
+    """The device answers with an exception.
+
+    Examples: it does not have the registers, returns fewer at once, or is busy.
+    """
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
+        self.code = code
+
+    @property
+    def meaning(self) -> str:
+        """The exception's name in the standard."""
+        return EXCEPTIONS.get(self.code, str(self))
+
+
+class NoReplyError(Exception):
+    """No valid answer to the request arrives in time; the connection itself stands.
+
+    Examples: device switched off, wrong device number, wrong baud rate, a late answer to an earlier request.
+    """
+
+
+class ConnectionLostError(Exception):
+    """The connection fails.
+
+    Examples: connection refused or closed, host unreachable, serial adapter unplugged.
+    """
+
+
 def registers_of(kind: TypeName) -> int:
-    """How many registers a number takes."""
+    """Return the number of registers of a number."""
     return struct.calcsize(f">{LETTERS[kind]}") // 2
 
 
 def is_float(kind: TypeName) -> bool:
-    """Whether it is a number with an exponent."""
+    """Whether the type is a float."""
     return kind.startswith("float")
 
 
 def orders_of(kind: TypeName) -> tuple[Order, ...]:
-    """The orders that differ for a number of this type: one register has no order of words."""
+    """Return the orders that differ for this type: a single register has no word order."""
     return ORDERS if registers_of(kind) > 1 else ("ABCD", "BADC")
 
 
 def reader(kind: TypeName, order: Order) -> Callable[[Sequence[int]], float]:
-    """A function from the registers of a number (each 0 to 65535, in the order of their addresses) to the number."""
-    count = registers_of(kind)
-    words = struct.Struct(f"{'<' if order in BYTES_SWAPPED else '>'}{count}H")
+    """Return a function from a number's registers (each 0 to 65535, in the order of addresses) to the number."""
+    words = struct.Struct(f"{'<' if order in BYTES_SWAPPED else '>'}{registers_of(kind)}H")
     number = struct.Struct(f">{LETTERS[kind]}")
     backwards = order in WORDS_SWAPPED
 
     def read(registers: Sequence[int]) -> float:
-        found: float = number.unpack(words.pack(*(registers[::-1] if backwards else registers)))[0]
-        return found
+        value: float = number.unpack(words.pack(*(registers[::-1] if backwards else registers)))[0]
+        return value
 
     return read
 
 
 @dataclass(frozen=True, slots=True)
 class RegisterBits:
-    """Some bits of an integer, the lowest counted as 0."""
+    """A bit field of an integer; bit 0 is the lowest."""
 
     low: int
     high: int
 
     def of(self, value: float) -> int:
-        """The number that the bits of ``value`` make."""
+        """Return the field of the integer ``value``."""
         return (int(value) >> self.low) & ((1 << (self.high - self.low + 1)) - 1)
 
 
 def bits(written: str, kind: TypeName) -> RegisterBits:
-    """``"3"`` or ``"4..7"`` understood.
+    """Parse ``"3"`` or ``"4..7"``.
 
     Raises:
-        ValueError: malformed, upside down, of a float, or beyond the number's bits.
+        ValueError: malformed, not ascending, a field of a float, or beyond the bits of the type.
     """
     match = BITS.fullmatch(written.strip())
     if match is None:
         raise ValueError(f'bits {written!r}: write one bit like "3", or the lowest and highest like "4..7"')
     low, high = int(match[1]), int(match[2] or match[1])
     width = 16 * registers_of(kind)
-    if is_float(kind) or not low <= high < width:
-        allowed = "none, as it has no bits of its own" if is_float(kind) else f"0 to {width - 1}, the lower one first"
-        raise ValueError(f"bits {written!r}: of {kind} there are {allowed}")
+    if is_float(kind):
+        raise ValueError(f"bits {written!r}: a {kind} has no bit fields")
+    if not low <= high < width:
+        raise ValueError(f"bits {written!r}: {kind} has bits 0 to {width - 1}; write the lower one first")
     return RegisterBits(low, high)

@@ -1,4 +1,4 @@
-"""Simulated machines that stand in for real ones: own equations, own controllers, faults by scenario.
+"""Simulated machines with their own equations, controllers and faults.
 
 They import nothing of the daemon, so that the twin is never checked against itself.
 """

@@ -1,7 +1,7 @@
 """The DC motor of the paper with its drive: Eq. 11-13, Table 3, PI speed control, a load proportional to speed.
 
-Not simulated: the converter's switching, dry friction, brush voltage, temperature, and any delay between measuring and
-acting. Eq. 5 of the paper has the signs of load and motor torque the other way round; Eq. 12 is right and used here.
+Not simulated: switching of the converter, dry friction, brush voltage, temperature, delay between measurement and
+control. Eq. 5 of the paper has the signs of load and motor torque reversed; Eq. 12 is right and used here.
 """
 
 import math
@@ -13,24 +13,24 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.config_files import StrictModel
-from otolith_drivers.plant.faults import Array, PlantSample, Seconds, Unbalance, shaking
-from otolith_drivers.plant.scenario import POSITIVE, Scenario, Stretch, stretches
+from otolith_drivers.plant.faults import ROUNDING, Array, PlantSample, Seconds, Unbalance, shaking
+from otolith_drivers.plant.scenario import POSITIVE, Scenario, SimulationChunk, chunks
 from otolith_drivers.units import Quantity
 
 EULER_STEP = 1e-4  # s, as in the paper
-# s; a hundredth of the shortest time constant: the error stays below 1e-10 of the range, 1e-9 with an unbalance at the
-# speed of the shaft. A parameter holds for a step: one that drifts by 1 % per second adds 1e-8.
-RUNGE_KUTTA_STEP = 1e-3
+# A hundredth of the shortest time constant: the error is below 1e-10 of the range, 1e-9 with an unbalance.
+# A parameter is constant for a step: a drift of 1 % per second adds 1e-8. Guarded by test_scenario.py.
+RUNGE_KUTTA_STEP = 1e-3  # s
 
-# Current (A), speed (rad/s) and angle (rad): numbers, or arrays of several runs side by side.
 State = tuple[Any, Any, Any]
-# The integrator's steps: of each its moment (s) and, as in _rates, how fast current and speed change times its length.
+"""Current (A), speed (rad/s) and angle (rad): numbers, or arrays of several runs side by side."""
 Steps = Iterable[tuple[Any, ...]]
-# The shaft's acceleration by unbalances (rad/s²) at a moment (s) and an angle (rad).
+"""The steps of the integrator: the time (s) and the coefficients of :func:`_coefficients` of each."""
 Shake = Callable[[Any, Any], float]
+"""Acceleration of the shaft by unbalances (rad/s²) at a time (s) and an angle (rad)."""
 Integrate = Callable[[State, Any, float, Steps, Shake], State]
-# From the number of a sample period in its stretch, the state at its beginning and the voltage to the state at its end.
 Advance = Callable[[int, State, float], State]
+"""Maps the number of a sample period in its chunk, the state at its start and the voltage to the state at its end."""
 
 SIGNALS = {"ArmatureVoltage": "V", "ArmatureCurrent": "A", "RotorSpeed": "rad/s", "LoadTorque": "N*m"}
 UNITS = {"R_a": "ohm", "L_a": "H", "J": "kg*m^2", "K_e": "V*s/rad", "K_t": "N*m/A", "D": "N*m*s/rad"}
@@ -56,14 +56,14 @@ class SpeedController(StrictModel):
 
 
 class SetPoint(StrictModel):
-    """The speed asked for, from a moment on."""
+    """The set-point of the speed from ``at`` on."""
 
     at: Seconds
     speed: Annotated[float, BeforeValidator(Quantity("rad/s", -1e4, 1e4))]
 
 
 class MotorNoise(StrictModel):
-    """Standard deviation of each sensor; what the controller sees is as noisy as what the bus carries."""
+    """Standard deviation of each sensor; the controller sees the same noise as the bus carries."""
 
     current: Annotated[float, BeforeValidator(Quantity("A", 0.0))] = 0.0
     speed: Annotated[float, BeforeValidator(Quantity("rad/s", 0.0))] = 0.0
@@ -80,19 +80,19 @@ class MotorScenario(Scenario):
     plant: Literal["dc_motor"]
     parameters: MotorParameters = MotorParameters()
     load: Annotated[float, BeforeValidator(Quantity("N*m*s/rad", 0.0))] = 0.006
-    """Load torque per speed."""
+    """Load torque divided by speed."""
     controller: SpeedController = SpeedController()
     set_points: Annotated[tuple[SetPoint, ...], Field(min_length=1)]
     repeat_every: Seconds | None = None
-    """The set-points start again after this time; without it the last one stays."""
+    """The set-points are repeated with this period; without it the last one stays."""
     noise: MotorNoise = MotorNoise()
 
     @model_validator(mode="after")
     def _set_points_fit(self) -> Self:
-        moments = [point.at for point in self.set_points]
-        if moments != sorted(set(moments)):
+        times = [point.at for point in self.set_points]
+        if times != sorted(set(times)):
             raise ValueError("set_points must be in the order of their times, each time once")
-        if self.repeat_every is not None and moments[-1] >= self.repeat_every:
+        if self.repeat_every is not None and times[-1] >= self.repeat_every:
             raise ValueError(f"repeat_every ({self.repeat_every:g} s) must be later than the last set-point")
         return self
 
@@ -101,15 +101,15 @@ SCENARIO = MotorScenario
 
 
 def simulate(scenario: Any) -> Iterator[PlantSample]:
-    """The machine from rest, one tick per sample period, without end; the same for the same seed."""
+    """The samples of the motor from rest, one per sample period, without end; the same for the same seed."""
     noise, euler = scenario.noise, scenario.integrator == "euler"
     steps = max(1, round(scenario.sample_period / (EULER_STEP if euler else RUNGE_KUTTA_STEP)))
     state: State = (0.0, 0.0, 0.0)
     integral = 0.0
-    for stretch in stretches(scenario, steps, where=0.0 if euler else 0.5):
-        advance = _advance(scenario, stretch)
-        set_points = _set_points(scenario, stretch.times)
-        for index, errors in enumerate(stretch.noise):
+    for chunk in chunks(scenario, steps, where=0.0 if euler else 0.5):
+        advance = _advance(scenario, chunk)
+        set_points = _set_points(scenario, chunk.times)
+        for index, errors in enumerate(chunk.noise):
             current, speed, _ = state
             seen = speed + noise.speed * errors[1]
             voltage, integral = _control(scenario, set_points[index] - seen, integral)
@@ -119,14 +119,12 @@ def simulate(scenario: Any) -> Iterator[PlantSample]:
                 "RotorSpeed": seen,
                 "LoadTorque": scenario.load * speed + noise.load_torque * errors[2],
             }
-            yield PlantSample(
-                stretch.times.item(index), measured, stretch.truth[index] | {"i": current, "omega": speed}
-            )
+            yield PlantSample(chunk.times.item(index), measured, chunk.truth[index] | {"i": current, "omega": speed})
             state = advance(index, state, voltage)
 
 
 def _control(scenario: MotorScenario, error: float, integral: float) -> tuple[float, float]:
-    """Armature voltage for the next sample period, and the error's integral; it stops while the voltage is limited."""
+    """Voltage (V) for the next sample period and integral of the error; the limit holds the integral (anti-windup)."""
     gains = scenario.controller
     voltage = gains.K_p * error + gains.K_i * integral
     if abs(voltage) > gains.voltage_limit:
@@ -135,26 +133,27 @@ def _control(scenario: MotorScenario, error: float, integral: float) -> tuple[fl
 
 
 def _set_points(scenario: MotorScenario, times: Array) -> list[float]:
+    """The set-point of the speed (rad/s) at each of ``times`` (s)."""
     phases = times % scenario.repeat_every if scenario.repeat_every else times
-    moments = [point.at for point in scenario.set_points]
+    starts = [point.at for point in scenario.set_points]
     speeds = np.array([0.0, *(point.speed for point in scenario.set_points)])
-    found: list[float] = speeds[np.searchsorted(moments, phases + 1e-9, side="right")].tolist()
-    return found
+    current: list[float] = speeds[np.searchsorted(starts, phases + ROUNDING, side="right")].tolist()
+    return current
 
 
-def _advance(scenario: MotorScenario, stretch: Stretch) -> Advance:
+def _advance(scenario: MotorScenario, chunk: SimulationChunk) -> Advance:
     integrate = _euler if scenario.integrator == "euler" else _runge_kutta
-    step = scenario.sample_period / len(stretch.moments)
-    rates = _rates(scenario, stretch.parameters, step)
+    step = scenario.sample_period / len(chunk.step_times)
+    coefficients = _coefficients(scenario, chunk.parameters, step)
     unbalances = [fault for fault in scenario.faults if isinstance(fault, Unbalance)]
     if not unbalances:
-        return _linear(integrate, stretch, rates)
+        return _linear(integrate, chunk, coefficients)
     shake = shaking(unbalances)
-    return lambda index, state, voltage: integrate(state, voltage, step, stretch.steps(index, rates), shake)
+    return lambda index, state, voltage: integrate(state, voltage, step, chunk.steps(index, coefficients), shake)
 
 
-def _rates(scenario: MotorScenario, p: dict[str, Any], step: float) -> tuple[Any, ...]:
-    """Eq. 11 and 12 times ``step``: current by voltage, current and speed, then speed by current and speed."""
+def _coefficients(scenario: MotorScenario, p: dict[str, Any], step: float) -> tuple[Any, ...]:
+    """Eq. 11 and 12 times ``step``: of current by voltage, current and speed, then of speed by current and speed."""
     return (
         step / p["L_a"],
         step * p["R_a"] / p["L_a"],
@@ -164,15 +163,16 @@ def _rates(scenario: MotorScenario, p: dict[str, Any], step: float) -> tuple[Any
     )
 
 
-def _linear(integrate: Integrate, stretch: Stretch, rates: tuple[Any, ...]) -> Advance:
-    """Without unbalance the end of a sample period is linear in its beginning, and the angle matters to nothing.
+def _linear(integrate: Integrate, chunk: SimulationChunk, coefficients: tuple[Any, ...]) -> Advance:
+    """The same without unbalance: the final state is a linear function of the initial state and the voltage.
 
-    Three runs, from 1 A, from 1 rad/s and at 1 V, say what every run will do; each runs all sample periods at once.
+    Three runs, from 1 A, from 1 rad/s and at 1 V, give its matrix, for all sample periods of the chunk at once.
     """
     current, speed, voltage = np.eye(3)[:, :, np.newaxis]
-    steps = zip(stretch.moments, *(rate if np.ndim(rate) else repeat(rate) for rate in rates), strict=False)
-    current, speed, _ = integrate((current, speed, 0.0), voltage, 0.0, steps, lambda _moment, _angle: 0.0)
-    ends = np.broadcast_to(np.concatenate((current, speed)), (6, stretch.times.size)).T.tolist()
+    columns = (column if np.ndim(column) else repeat(column) for column in coefficients)
+    steps = zip(chunk.step_times, *columns, strict=False)
+    current, speed, _ = integrate((current, speed, 0.0), voltage, 0.0, steps, lambda _time, _angle: 0.0)
+    ends = np.broadcast_to(np.concatenate((current, speed)), (6, chunk.times.size)).T.tolist()
 
     def advance(index: int, state: State, voltage: float) -> State:
         i, w, angle = state
@@ -183,34 +183,35 @@ def _linear(integrate: Integrate, stretch: Stretch, rates: tuple[Any, ...]) -> A
 
 
 def _euler(state: State, voltage: Any, step: float, steps: Steps, shake: Shake) -> State:
-    """Eq. 11-13: the speed already uses the new current."""
+    """Eq. 11-13 by Euler's method; the speed already uses the new current."""
     i, w, angle = state
-    for moment, gain, resistance, back_emf, torque, friction in steps:
+    for time, gain, resistance, back_emf, torque, friction in steps:
         before = w
         i = i + gain * voltage - resistance * i - back_emf * w
-        w = w + torque * i - friction * w + step * shake(moment, angle)
+        w = w + torque * i - friction * w + step * shake(time, angle)
         angle = angle + step * before
     return i, w, angle
 
 
 def _runge_kutta(state: State, voltage: Any, step: float, steps: Steps, shake: Shake) -> State:
+    """Eq. 11-13 by the classical Runge-Kutta method of order 4."""
     i, w, angle = state
     half = step / 2
-    for moment, gain, resistance, back_emf, torque, friction in steps:
+    for time, gain, resistance, back_emf, torque, friction in steps:
         drive = gain * voltage
         i1 = drive - resistance * i - back_emf * w
-        w1 = torque * i - friction * w + step * shake(moment, angle)
+        w1 = torque * i - friction * w + step * shake(time, angle)
         i_, w_ = i + i1 / 2, w + w1 / 2
         i2 = drive - resistance * i_ - back_emf * w_
-        w2 = torque * i_ - friction * w_ + step * shake(moment + half, angle + half * w)
+        w2 = torque * i_ - friction * w_ + step * shake(time + half, angle + half * w)
         angle_ = angle + half * w_
         i_, w_ = i + i2 / 2, w + w2 / 2
         i3 = drive - resistance * i_ - back_emf * w_
-        w3 = torque * i_ - friction * w_ + step * shake(moment + half, angle_)
+        w3 = torque * i_ - friction * w_ + step * shake(time + half, angle_)
         angle_ = angle + step * w_
         i_, w_ = i + i3, w + w3
         i4 = drive - resistance * i_ - back_emf * w_
-        w4 = torque * i_ - friction * w_ + step * shake(moment + step, angle_)
+        w4 = torque * i_ - friction * w_ + step * shake(time + step, angle_)
         angle = angle + step * (w + (w1 + w2 + w3) / 6)
         i = i + (i1 + 2 * i2 + 2 * i3 + i4) / 6
         w = w + (w1 + 2 * w2 + 2 * w3 + w4) / 6

@@ -1,6 +1,6 @@
-"""The driver of the simulated machine in this very process: something to try things with, without any bus.
+"""The plant driver: a simulated machine in this process, without any bus.
 
-The scenario's faults happen as they do on a bus; those that a bus alone can have are refused.
+The scenario's faults act as on a bus; a fault that needs a real bus is refused.
 """
 
 import logging
@@ -12,31 +12,33 @@ from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setu
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.plant.faults import IN_PROCESS
-from otolith_drivers.plant.realtime import Summary, Turn, in_real_time, refuse_unfit
+from otolith_drivers.plant.realtime import NodeSummary, ScheduledSample, in_real_time, refuse_unfit
 from otolith_drivers.plant.scenario import Scenario, load_scenario
 from otolith_drivers.units import factor
-
-__all__ = ["Options", "PlantDriver", "Source", "build"]
 
 log = logging.getLogger(__name__)
 
 
-class Options(StrictModel):
+class PlantOptions(StrictModel):
     """``[driver]`` with ``type = "plant"``."""
 
     scenario: Path
-    """What happens to the machine; relative to the machine file."""
+    """The scenario file, relative to the machine file."""
 
 
-class Source(StrictModel):
-    """Which of its signals."""
+class PlantSource(StrictModel):
+    """The source of a signal."""
 
     signal: str
+    """Name of the signal in the simulated machine."""
+
+
+Options, Source = PlantOptions, PlantSource  # for base.DriverType
 
 
 @dataclass(frozen=True, slots=True)
-class _Wanted:
-    """A signal as the daemon wants it."""
+class PlantSignal:
+    """A wanted signal: its name in the daemon and in the machine, and the conversion between their units."""
 
     name: str
     signal: str
@@ -44,11 +46,11 @@ class _Wanted:
     offset: float
 
 
-def build(options: Options, setup: Setup) -> "PlantDriver":
-    """The machine of the scenario.
+def build(options: PlantOptions, setup: Setup) -> "PlantDriver":
+    """A driver for the machine of the scenario.
 
     Raises:
-        ConfigurationError: the scenario is wrong or has a fault of a bus, or the machine has no such signal.
+        ConfigurationError: a wrong scenario, a fault that needs a real bus, or a signal that the machine lacks.
     """
     path = setup.folder / options.scenario
     scenario = load_scenario(path)
@@ -59,28 +61,27 @@ def build(options: Options, setup: Setup) -> "PlantDriver":
     return PlantDriver(scenario, path, [_find(signal, scenario) for signal in setup.signals])
 
 
-def _find(signal: Signal, scenario: Scenario) -> _Wanted:
-    source: Source = signal.source
+def _find(signal: Signal, scenario: Scenario) -> PlantSignal:
+    source: PlantSource = signal.source
     key = ("signals", signal.name)
     if source.signal not in scenario.SIGNALS:
         known = nearest(source.signal, list(scenario.SIGNALS))
         raise ConfigurationError(f"plant {scenario.plant!r} has no signal {source.signal!r}: {known}", key)
     try:
-        scale, offset = factor(scenario.SIGNALS[source.signal], signal.unit)
+        return PlantSignal(signal.name, source.signal, *factor(scenario.SIGNALS[source.signal], signal.unit))
     except ValueError as error:
         raise ConfigurationError(f"signal {source.signal!r}: {error}", key) from error
-    return _Wanted(signal.name, source.signal, scale, offset)
 
 
 class PlantDriver:
-    """Implements :class:`otolith_drivers.base.Driver` over a simulated machine, which lives in a thread of its own.
+    """Implements :class:`otolith_drivers.base.Driver` over a simulated machine, which runs in a thread of its own.
 
-    A sample bears the time at which a bus would have brought it, however busy this computer is.
+    A sample has the time at which a bus would have carried it, however busy this computer is.
     """
 
     sampling = Sampling.CYCLIC
 
-    def __init__(self, scenario: Scenario, path: Path, wanted: list[_Wanted]) -> None:
+    def __init__(self, scenario: Scenario, path: Path, wanted: list[PlantSignal]) -> None:
         self._scenario, self._path, self._wanted = scenario, path, wanted
         self._counters = Counters()
         self._link = Link(up=False, reason="not opened yet")
@@ -90,7 +91,7 @@ class PlantDriver:
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         self._link = Link(up=True)
-        self._thread = threading.Thread(target=self._live, args=(deliver,), name="plant", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(deliver,), name="plant", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -112,28 +113,32 @@ class PlantDriver:
         units = self._scenario.SIGNALS
         signals = [f"{wanted.name} from {wanted.signal} [{units[wanted.signal]}]" for wanted in self._wanted]
         period = f"{1e3 * self._scenario.sample_period:g} ms"
-        return [f"plant {self._scenario.plant!r} of {self._path}, simulated here, a tick each {period}", *signals]
+        return [f"plant {self._scenario.plant!r} of {self._path}, simulated here, a sample each {period}", *signals]
 
-    def _live(self, deliver: Deliver) -> None:
+    def _run(self, deliver: Deliver) -> None:
         try:
-            for turn in in_real_time(self._scenario, Summary.of(self._scenario.faults), self._stop.is_set):
-                self._take(turn, deliver)
+            summary = NodeSummary.of(self._scenario.faults)
+            for scheduled in in_real_time(self._scenario, summary, self._stop.is_set):
+                self._take(scheduled, deliver)
         except Exception as error:
             self._link = Link(up=False, reason=f"{type(error).__name__}: {error}")
-            log.exception("the simulated machine has ended")
+            log.exception("the simulated machine stopped with an error")
 
-    def _take(self, turn: Turn, deliver: Deliver) -> None:
-        """Hand a tick on as it comes, or count what its bus withholds."""
-        counters, count = self._counters, len(self._wanted)
-        if self._link.up is turn.effect.gone:
-            back = Link(up=True), replace(counters, reconnects=counters.reconnects + 1)
-            silent = Link(up=False, reason="the scenario has the machine gone"), counters
-            self._link, counters = silent if turn.effect.gone else back
-        if turn.effect.withheld is not None:
+    def _take(self, scheduled: ScheduledSample, deliver: Deliver) -> None:
+        """Deliver a sample, or count it as lost if a fault withholds it."""
+        counters, count, gone = self._counters, len(self._wanted), scheduled.effect.gone
+        if gone and self._link.up:
+            self._link = Link(up=False, reason="the machine is off its bus, by a fault of the scenario (kind = 'gone')")
+        elif not gone and not self._link.up:
+            self._link, counters = Link(up=True), replace(counters, reconnects=counters.reconnects + 1)
+        if scheduled.effect.withheld is not None:
             self._counters = replace(counters, lost=counters.lost + count)
             return
         self._counters = replace(counters, received=counters.received + count)
-        measured = turn.tick.measured
+        measured = scheduled.sample.measured
         deliver(
-            [Sample(each.name, turn.due, each.scale * measured[each.signal] + each.offset) for each in self._wanted]
+            [
+                Sample(wanted.name, scheduled.due, wanted.scale * measured[wanted.signal] + wanted.offset)
+                for wanted in self._wanted
+            ]
         )

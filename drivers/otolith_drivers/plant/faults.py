@@ -1,18 +1,8 @@
-"""What can happen to a simulated machine, each fault one row: how it is written in a scenario and what it does.
+"""Faults of a simulated machine: how a scenario writes each of them, and what it does.
 
-What can happen to its sensors and to its bus is in ``sensor_faults`` and ``bus_faults``; the table of all is here.
-Laws of paper.txt section 5.2 and 5.3: exponential drift of a parameter, a torque or acceleration on the shaft.
-
-What a simulated machine says at each sampling instant.
-
-When something happens in a scenario.
-
-What can happen to a sensor on its way to the bus: the bus lies, while controller and truth do not.
-
-What can happen between a simulated machine and who listens: its bus, its line, its clock.
-
-A fault acts on whole ticks, and which ones depends on seed and scenario alone, so that a node can say exactly what it
-withheld.
+A fault of the machine changes a parameter or shakes the shaft (the laws of the paper, sections 5.2 and 5.3). A fault of
+a sensor changes what the bus carries, but neither the true values nor what the controller sees. A fault of the bus
+delays, withholds or spoils whole samples. Which samples are hit depends on the seed alone, so a node can report them.
 """
 
 import math
@@ -28,27 +18,105 @@ from otolith_drivers.config_files import StrictModel
 from otolith_drivers.modbus.protocol import Order
 from otolith_drivers.units import Quantity
 
+Array = NDArray[np.float64]
+Seconds = Annotated[float, BeforeValidator(Quantity("s", 0.0, 1e9))]
+Share = Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))]
+"""Share of the samples that are hit, each with this probability."""
+
+ROUNDING = 1e-9  # s; rounding error of a sample's time, a multiple of the sample period
+# Engineering choice: jitter delays by 3 standard deviations on average, so only 0.13 % are clipped at zero. Guarded by
+# test_faults.py.
+MEAN_DELAY = 3.0  # standard deviations
+GARBAGE_LENGTHS = 3, 12  # bytes; at least, and below; engineering choice: as long as short frames of CAN and Modbus
+REGISTERS = 65536  # that a Modbus address can name
+CAN, MODBUS_TCP, MODBUS_RTU, IN_PROCESS = "can", "modbus-tcp", "modbus-rtu", "in-process"
+MODBUS = frozenset({MODBUS_TCP, MODBUS_RTU})
+ALL_TRANSPORTS = MODBUS | {CAN, IN_PROCESS}
+
 
 @dataclass(frozen=True, slots=True)
 class PlantSample:
-    """One sampling instant."""
+    """The machine at one sampling instant."""
 
     time: float
     """s since the start of the scenario."""
     measured: dict[str, float]
-    """Signals by their name on the bus, as sensors and drive see them."""
+    """Signals by their name on the bus, as the sensors measure them."""
     truth: dict[str, float]
-    """The parameters as they are, and the states without noise."""
+    """The parameters, and the states without noise."""
 
 
-ROUNDING = 1e-9  # s; a tick's time is a multiple of the sample period, give or take the last bit
-Seconds = Annotated[float, BeforeValidator(Quantity("s", 0.0, 1e9))]
-Share = Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))]
-"""Of ticks, each by its own throw of the dice."""
+def fault_random(seed: int, number: int) -> np.random.Generator:
+    """Random numbers of fault ``number`` of a scenario; independent of other faults and of the sensor noise."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
+
+
+# Faults of the machine
+
+
+class Drift(StrictModel):
+    """Adds ``amount * (exp(rate * (t - start)) - 1)`` to a parameter: wear that accelerates."""
+
+    kind: Literal["drift"]
+    parameter: str
+    start: Seconds
+    amount: str
+    """In a unit of the parameter."""
+    rate: Annotated[float, BeforeValidator(Quantity("1/s", -10.0, 10.0))]
+    until: Seconds = 1e9
+    """From then on the parameter stays constant."""
+
+    def change(self, times: Array, amount: float) -> Array:
+        """What is added to the parameter at ``times`` (s), in its unit."""
+        return amount * np.expm1(self.rate * np.maximum(np.minimum(times, self.until) - self.start, 0.0))
+
+
+class Step(StrictModel):
+    """Adds ``amount`` to a parameter from ``start`` on."""
+
+    kind: Literal["step"]
+    parameter: str
+    start: Seconds
+    amount: str
+    """In a unit of the parameter."""
+
+    def change(self, times: Array, amount: float) -> Array:
+        """What is added to the parameter at ``times`` (s), in its unit."""
+        return np.where(times > self.start, amount, 0.0)
+
+
+class Unbalance(StrictModel):
+    """A sinusoidal angular acceleration of the shaft (Eq. 13), at a fixed frequency or an order of the shaft angle."""
+
+    kind: Literal["unbalance"]
+    start: Seconds
+    acceleration: Annotated[float, BeforeValidator(Quantity("rad/s^2", 0.0, 1e6))]
+    frequency: Annotated[float, BeforeValidator(Quantity("rad/s", 0.0, 1e4))] | None = None
+    order: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
+
+
+def shaking(unbalances: Iterable[Unbalance]) -> Callable[[float, float], float]:
+    """The acceleration (rad/s²) by all unbalances as a function of time (s) and shaft angle (rad)."""
+    sines = [(fault.start, fault.acceleration, fault.frequency or 0.0, fault.order or 0.0) for fault in unbalances]
+
+    def acceleration(time: float, angle: float) -> float:
+        total = 0.0
+        for start, amplitude, frequency, order in sines:
+            if time >= start:
+                total += amplitude * math.sin(frequency * time + order * angle)
+        return total
+
+    return acceleration
+
+
+# Faults of a sensor
+
+Distortion = Callable[[float], float]
+"""Maps what the sensor measures to what the bus carries; called once per sample, in order."""
 
 
 class Span(StrictModel):
-    """From ``start`` on, and before ``until``."""
+    """A fault that acts from ``start`` on and before ``until``."""
 
     start: Seconds
     until: Seconds = 1e9
@@ -60,66 +128,57 @@ class Span(StrictModel):
         return self
 
     def covers(self, time: float) -> bool:
-        """Whether ``time`` (s) is in it."""
+        """Whether the fault acts at ``time`` (s)."""
         return self.start - ROUNDING <= time < self.until - ROUNDING
 
 
-def generator(seed: int, number: int) -> np.random.Generator:
-    """The random numbers of fault ``number`` of a scenario: its own, and independent of the machine's noise."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
-
-
-# From what the sensor would say to what the bus carries; called once a tick, in their order.
-Distortion = Callable[[float], float]
-
-
-class _OfASignal(Span):
+class _SignalSpan(Span):
     signal: str
-    """By its name on the bus."""
+    """Name on the bus."""
 
 
-class Frozen(_OfASignal):
-    """The signal stays at what it was at ``start``, noise included."""
+class Frozen(_SignalSpan):
+    """The signal keeps its value at ``start``, noise included."""
 
     kind: Literal["frozen"]
 
     def distortion(self, _amount: float, _random: np.random.Generator) -> Distortion:
-        """What it does to the signal."""
-        held: list[float] = []
+        """Returns the first value for ever."""
+        first: list[float] = []
 
         def distort(value: float) -> float:
-            held.append(value)
-            del held[1:]
-            return held[0]
+            if not first:
+                first.append(value)
+            return first[0]
 
         return distort
 
 
-class Gain(_OfASignal):
-    """The signal is ``factor`` times what it should be: a wrong range, a drifting amplifier."""
+class Gain(_SignalSpan):
+    """The signal is multiplied by ``factor``: a wrong range, a drifting amplifier."""
 
     kind: Literal["gain"]
     factor: Annotated[float, BeforeValidator(Quantity("1", -1e6, 1e6))]
 
     def distortion(self, _amount: float, _random: np.random.Generator) -> Distortion:
-        """What it does to the signal."""
+        """Multiplies by ``factor``."""
         return lambda value: self.factor * value
 
 
-class Offset(_OfASignal):
-    """``amount`` is added to the signal: a zero that has moved."""
+class Offset(_SignalSpan):
+    """``amount`` is added to the signal: a shifted zero."""
 
     kind: Literal["offset"]
     amount: str
     """In a unit of the signal."""
 
     def distortion(self, amount: float, _random: np.random.Generator) -> Distortion:
-        """What it does to the signal."""
+        """Adds ``amount``."""
         return lambda value: value + amount
 
 
-class Spikes(_OfASignal):
-    """In a share of ticks ``amount`` is added to the signal or, as often, subtracted: a loose contact, a bad cable."""
+class Spikes(_SignalSpan):
+    """In a share of the samples ``amount`` is added or, as often, subtracted: a loose contact, a bad cable."""
 
     kind: Literal["spikes"]
     share: Share
@@ -127,7 +186,7 @@ class Spikes(_OfASignal):
     """In a unit of the signal."""
 
     def distortion(self, amount: float, random: np.random.Generator) -> Distortion:
-        """What it does to the signal."""
+        """Adds or subtracts ``amount`` at random."""
 
         def distort(value: float) -> float:
             hit, up = random.random(2)
@@ -141,128 +200,128 @@ class Spikes(_OfASignal):
 SensorFault = Frozen | Gain | Offset | Spikes
 
 
-def distorted(ticks: Iterable[PlantSample], faults: list[tuple[SensorFault, Distortion]]) -> Iterator[PlantSample]:
-    """``ticks`` as the bus carries them; several faults of a signal act one after the other."""
-    for tick in ticks:
-        measured = dict(tick.measured)
+def distorted(samples: Iterable[PlantSample], faults: list[tuple[SensorFault, Distortion]]) -> Iterator[PlantSample]:
+    """``samples`` as the bus carries them; several faults of a signal act in their order."""
+    for sample in samples:
+        measured = dict(sample.measured)
         for fault, distort in faults:
-            if fault.covers(tick.time):
+            if fault.covers(sample.time):
                 measured[fault.signal] = distort(measured[fault.signal])
-        yield replace(tick, measured=measured)
+        yield replace(sample, measured=measured)
 
 
-CAN, MODBUS_TCP, MODBUS_RTU, IN_PROCESS = "can", "modbus-tcp", "modbus-rtu", "in-process"
-MODBUS = frozenset({MODBUS_TCP, MODBUS_RTU})
-ALL = MODBUS | {CAN, IN_PROCESS}
-MEAN_LATENESS = 3.0  # standard deviations of jitter, as no tick can be sent before it was
-GARBAGE_LENGTHS = 3, 12  # bytes
-REGISTERS = 65536
+# Faults of the bus. Each has ACTS_ON, the transports on which it can happen, and act(), which adds its effect on one
+# sample to that of the faults before it.
 
 
 @dataclass(frozen=True, slots=True)
-class Effect:
-    """What the faults of the bus make of one tick."""
+class BusEffect:
+    """What the faults of the bus do to one sample."""
 
     acting: tuple[int, ...] = ()
-    """Which of the faults, by their number among all of the scenario."""
+    """Numbers of the faults that act, counted over all faults of the scenario."""
     delay: float = 0.0
-    """s; how much later than it was the tick is sent."""
+    """s by which the sample is sent late."""
     withheld: int | None = None
-    """The number of the fault that lets nobody have the tick; the first, if several would."""
+    """Number of the first fault that withholds the sample."""
     gone: bool = False
+    """Whether the device is off the bus."""
     order: Order | None = None
-    """Instead of the scenario's."""
+    """Order of bytes and words instead of the scenario's."""
     refusals: tuple[tuple[int, "Refusal"], ...] = ()
-    """Each with its number."""
+    """Refusals of reads, each with its number."""
     garbage: tuple[bytes, ...] = ()
+    """Bytes that are put on the bus."""
+
+    def withhold(self, number: int, *, gone: bool = False) -> "BusEffect":
+        """This effect, with the sample withheld by fault ``number`` unless another has done so."""
+        return replace(self, withheld=number if self.withheld is None else self.withheld, gone=self.gone or gone)
 
 
 class Dropouts(Span):
-    """A share of ticks is not sent; over Modbus, what is asked during such a tick is not answered."""
+    """A share of the samples is not sent; over Modbus, requests during such a sample are not answered."""
 
-    ACTS_ON: ClassVar[frozenset[str]] = ALL
+    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["dropouts"]
     share: Share
 
-    def act(self, effect: Effect, number: int, random: np.random.Generator) -> Effect:
-        """On one tick."""
-        if random.random() >= self.share:
-            return effect
-        return replace(effect, withheld=_first(effect.withheld, number))
+    def act(self, effect: BusEffect, number: int, random: np.random.Generator) -> BusEffect:
+        """Withhold some samples."""
+        return effect if random.random() >= self.share else effect.withhold(number)
 
 
 class Gone(Span):
-    """The device is silent, then back: no frame, no answer; over Modbus TCP its port and connections are closed."""
+    """The device sends and answers nothing; over Modbus TCP its port and connections are closed."""
 
-    ACTS_ON: ClassVar[frozenset[str]] = ALL
+    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["gone"]
 
-    def act(self, effect: Effect, number: int, _: np.random.Generator) -> Effect:
-        """On one tick."""
-        return replace(effect, withheld=_first(effect.withheld, number), gone=True)
+    def act(self, effect: BusEffect, number: int, _: np.random.Generator) -> BusEffect:
+        """Withhold all samples."""
+        return effect.withhold(number, gone=True)
 
 
 class Jitter(Span):
-    """The moment at which a tick is sent strays by this standard deviation about a mean of three: late, never early."""
+    """Samples are sent late: normally distributed with this deviation about a mean of three deviations, never early."""
 
-    ACTS_ON: ClassVar[frozenset[str]] = ALL
+    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["jitter"]
     deviation: Annotated[float, BeforeValidator(Quantity("s", 0.0, 1.0))]
 
-    def act(self, effect: Effect, _: int, random: np.random.Generator) -> Effect:
-        """On one tick."""
-        lateness = self.deviation * max(MEAN_LATENESS + random.standard_normal(), 0.0)
-        return replace(effect, delay=effect.delay + lateness)
+    def act(self, effect: BusEffect, _: int, random: np.random.Generator) -> BusEffect:
+        """Delay each sample by another time."""
+        delay = self.deviation * max(MEAN_DELAY + random.standard_normal(), 0.0)
+        return replace(effect, delay=effect.delay + delay)
 
 
 class ClockStep(StrictModel):
-    """The node's clock is set: from ``start`` on ticks come later by ``by``, or earlier if that is below zero.
+    """The clock of the node is set: from ``start`` on samples come later by ``by``, or earlier if it is negative.
 
-    Those that come earlier come in a burst at first, as a node does that makes up for time it believes to have lost.
+    Samples that come earlier start with a burst, like those of a node that catches up with its clock.
     """
 
-    ACTS_ON: ClassVar[frozenset[str]] = ALL
+    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["clock_step"]
     start: Seconds
     by: Annotated[float, BeforeValidator(Quantity("s", -60.0, 60.0))]
 
     def covers(self, time: float) -> bool:
-        """Whether it has happened by ``time`` (s)."""
+        """Whether the clock was set before ``time`` (s)."""
         return time >= self.start - ROUNDING
 
-    def act(self, effect: Effect, _: int, __: np.random.Generator) -> Effect:
-        """On one tick."""
+    def act(self, effect: BusEffect, _: int, __: np.random.Generator) -> BusEffect:
+        """Delay each sample by the same time."""
         return replace(effect, delay=effect.delay + self.by)
 
 
 class WordOrder(Span):
-    """Registers come in another order of bytes and words, as after a change of the drive's settings."""
+    """Registers have another order of bytes and words, as after a change of the drive's settings."""
 
     ACTS_ON: ClassVar[frozenset[str]] = MODBUS
     kind: Literal["word_order"]
     order: Order
 
-    def act(self, effect: Effect, _: int, __: np.random.Generator) -> Effect:
-        """On one tick."""
+    def act(self, effect: BusEffect, _: int, __: np.random.Generator) -> BusEffect:
+        """Change the order."""
         return replace(effect, order=self.order)
 
 
 class Garbage(Span):
-    """In a share of ticks something else is on the bus as well: a stranger's frame, or bytes that are none of ours."""
+    """With a share of the samples comes something else: a frame of another node, or bytes that are no frame."""
 
     ACTS_ON: ClassVar[frozenset[str]] = MODBUS | {CAN}
     kind: Literal["garbage"]
     share: Share
 
-    def act(self, effect: Effect, _: int, random: np.random.Generator) -> Effect:
-        """On one tick."""
+    def act(self, effect: BusEffect, _: int, random: np.random.Generator) -> BusEffect:
+        """Add bytes to some samples."""
         if random.random() >= self.share:
             return effect
         return replace(effect, garbage=(*effect.garbage, random.bytes(int(random.integers(*GARBAGE_LENGTHS)))))
 
 
 class Refusal(Span):
-    """Whoever reads one of the registers ``first`` to ``last`` gets an exception instead."""
+    """A read of any of the registers ``first`` to ``last`` gets an exception."""
 
     ACTS_ON: ClassVar[frozenset[str]] = MODBUS
     kind: Literal["exception"]
@@ -277,97 +336,34 @@ class Refusal(Span):
             raise ValueError(f"last ({self.last}) must not be below first ({self.first})")
         return self
 
-    def act(self, effect: Effect, number: int, _: np.random.Generator) -> Effect:
-        """On one tick."""
+    def act(self, effect: BusEffect, number: int, _: np.random.Generator) -> BusEffect:
+        """Add this refusal."""
         return replace(effect, refusals=(*effect.refusals, (number, self)))
 
     def concerns(self, address: int, count: int) -> bool:
-        """Whether a read of ``count`` registers from ``address`` on touches it."""
+        """Whether a read of ``count`` registers from ``address`` on includes one of these registers."""
         return address <= self.last and self.first < address + count
 
 
 BusFault = Dropouts | Gone | Jitter | ClockStep | WordOrder | Garbage | Refusal
+Fault = Annotated[Drift | Step | Unbalance | SensorFault | BusFault, Field(discriminator="kind")]
 
 
 class FaultInjector:
-    """All faults of the bus of one scenario, each with random numbers of its own."""
+    """All faults of the bus of a scenario, each with random numbers of its own."""
 
     def __init__(self, faults: Sequence[object], seed: int) -> None:
-        """``faults`` are all of the scenario; those of machine and sensors are not looked at."""
+        """``faults`` are all faults of the scenario; those of machine and sensors are ignored."""
         self._faults = [
-            (number, fault, generator(seed, number))
+            (number, fault, fault_random(seed, number))
             for number, fault in enumerate(faults)
             if isinstance(fault, BusFault)
         ]
 
-    def at(self, time: float) -> Effect:
-        """On the tick at ``time`` (s); to be asked once for each tick, in their order."""
-        effect = Effect()
+    def at(self, time: float) -> BusEffect:
+        """The effect on the sample at ``time`` (s); must be called once for each sample, in their order."""
+        effect = BusEffect()
         for number, fault, random in self._faults:
             if fault.covers(time) and (after := fault.act(effect, number, random)) is not effect:
                 effect = replace(after, acting=(*after.acting, number))
         return effect
-
-
-def _first(before: int | None, number: int) -> int:
-    return number if before is None else before
-
-
-Array = NDArray[np.float64]
-
-
-class Drift(StrictModel):
-    """``amount * (exp(rate * (t - start)) - 1)`` added to a parameter: wear that feeds on itself."""
-
-    kind: Literal["drift"]
-    parameter: str
-    start: Seconds
-    amount: str
-    """In a unit of the parameter."""
-    rate: Annotated[float, BeforeValidator(Quantity("1/s", -10.0, 10.0))]
-    until: Seconds = 1e9
-    """From then on the parameter stays where it has come to: an exponential has no other end."""
-
-    def change(self, times: Array, amount: float) -> Array:
-        """What is added to the parameter at ``times`` (s), in its unit."""
-        return amount * np.expm1(self.rate * np.maximum(np.minimum(times, self.until) - self.start, 0.0))
-
-
-class Step(StrictModel):
-    """``amount`` added to a parameter from ``start`` on: a sudden fault."""
-
-    kind: Literal["step"]
-    parameter: str
-    start: Seconds
-    amount: str
-
-    def change(self, times: Array, amount: float) -> Array:
-        """What is added to the parameter at ``times`` (s), in its unit."""
-        return np.where(times > self.start, amount, 0.0)
-
-
-class Unbalance(StrictModel):
-    """A sinusoidal angular acceleration of the shaft (Eq. 13), of a fixed frequency or an order of the shaft angle."""
-
-    kind: Literal["unbalance"]
-    start: Seconds
-    acceleration: Annotated[float, BeforeValidator(Quantity("rad/s^2", 0.0, 1e6))]
-    frequency: Annotated[float, BeforeValidator(Quantity("rad/s", 0.0, 1e4))] | None = None
-    order: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
-
-
-def shaking(unbalances: Iterable[Unbalance]) -> Callable[[float, float], float]:
-    """The acceleration by all of them, in rad/s², at a time (s) and a shaft angle (rad)."""
-    sines = [(fault.start, fault.acceleration, fault.frequency or 0.0, fault.order or 0.0) for fault in unbalances]
-
-    def acceleration(time: float, angle: float) -> float:
-        total = 0.0
-        for start, amplitude, frequency, order in sines:
-            if time >= start:
-                total += amplitude * math.sin(frequency * time + order * angle)
-        return total
-
-    return acceleration
-
-
-Fault = Annotated[Drift | Step | Unbalance | SensorFault | BusFault, Field(discriminator="kind")]

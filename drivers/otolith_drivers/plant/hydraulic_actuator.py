@@ -2,10 +2,10 @@
 
 Not simulated: compressibility, the mass of piston and load, friction of the seal, the valve's own dynamics.
 
-Read so: Bernoulli without density means a density of 1 kg/m³; 1000 kg is a force of 1000·g; F_resist is zero; the valve
-is limited to [0, A_max]; it opens where the piston is above its reference, the sign that closes the loop stably. Eq. 16
-takes the flow from the pressure of the step before; a real machine has no step, so the accurate integrator solves for
-the pressure.
+The paper leaves open, and here holds: the density in Bernoulli's equation is 1 kg/m³; 1000 kg is a force of 1000·g;
+F_resist is zero; the valve is limited to [0, A_max]; it opens if the piston is above its reference (for a stable loop).
+Eq. 16 takes the flow from the pressure of the previous step; a real machine has no step, so the accurate
+integrator solves for the pressure.
 """
 
 import math
@@ -17,10 +17,10 @@ from pydantic import BeforeValidator
 
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.plant.faults import PlantSample
-from otolith_drivers.plant.scenario import POSITIVE, Scenario, Stretch, stretches
+from otolith_drivers.plant.scenario import POSITIVE, Scenario, SimulationChunk, chunks
 from otolith_drivers.units import Quantity
 
-STEP = 1e-4  # s: of the integrator and, as in the paper, of the controller
+STEP = 1e-4  # s; of the integrator and the controller, as in the paper
 SIGNALS = {"ValveArea": "m^2", "LoadForce": "N", "PistonPosition": "m", "SystemPressure": "Pa"}
 UNITS = {
     "k_spring": "N/m",
@@ -43,7 +43,7 @@ class LiftParameters(StrictModel):
     A_piston: Annotated[float, BeforeValidator(Quantity(UNITS["A_piston"], POSITIVE))] = 0.196349375
     rho: Annotated[float, BeforeValidator(Quantity(UNITS["rho"], POSITIVE))] = 1.0
     leak: Annotated[float, BeforeValidator(Quantity(UNITS["leak"], -0.9, 10.0))] = 0.0
-    """C of Eq. 18: the pressure is (1 + C) times that without a leak."""
+    """C of Eq. 18: a leak multiplies the pressure by (1 + C)."""
 
 
 class PositionController(StrictModel):
@@ -56,7 +56,7 @@ class PositionController(StrictModel):
 
 
 class Reference(StrictModel):
-    """The position asked for, a sine."""
+    """The set-point of the position, a sine."""
 
     amplitude: Annotated[float, BeforeValidator(Quantity("m", 0.0, 10.0))] = 0.45
     frequency: Annotated[float, BeforeValidator(Quantity("Hz", 0.0, 10.0))] = 0.005
@@ -88,33 +88,33 @@ SCENARIO = LiftScenario
 
 
 def simulate(scenario: Any) -> Iterator[PlantSample]:
-    """The lift from its lowest reference on, one tick per sample period, without end; the same for the same seed."""
+    """The samples of the lift from position 0 on, one per sample period, without end; the same for the same seed."""
     noise = scenario.noise
-    for stretch, index, position, pressure, valve in _run(scenario):
-        errors = stretch.noise[index]
+    for chunk, index, position, pressure, valve in _run(scenario):
+        errors = chunk.noise[index]
         measured = {
             "ValveArea": valve + noise.valve * errors[0],
             "LoadForce": scenario.load,
             "PistonPosition": position + noise.position * errors[1],
             "SystemPressure": pressure + noise.pressure * errors[2],
         }
-        yield PlantSample(stretch.times.item(index), measured, stretch.truth[index] | {"x": position, "p": pressure})
+        yield PlantSample(chunk.times.item(index), measured, chunk.truth[index] | {"x": position, "p": pressure})
 
 
-def _run(scenario: LiftScenario) -> Iterator[tuple[Stretch, int, float, float, float]]:
-    """Position (m), pressure (Pa) and valve (m²) at each sampling instant; the controller acts at every step."""
+def _run(scenario: LiftScenario) -> Iterator[tuple[SimulationChunk, int, float, float, float]]:
+    """Chunk and index in it, position (m), pressure (Pa), valve area (m²) of each sample; control runs every step."""
     gains, accurate = scenario.controller, scenario.integrator == "accurate"
     k_p, k_i, k_d, n = gains.K_p, gains.K_i, gains.K_d, gains.N
     steps = max(1, round(scenario.sample_period / STEP))
     step = scenario.sample_period / steps
     position, filtered = 0.0, 0.0
     pressure, integral = _balance_of_flows(scenario)
-    for stretch in stretches(scenario, steps, where=0.0):
-        columns = _columns(scenario, stretch)
-        for index in range(stretch.times.size):
-            for number, values in enumerate(stretch.steps(index, columns)):
+    for chunk in chunks(scenario, steps, where=0.0):
+        columns = _columns(scenario, chunk)
+        for index in range(chunk.times.size):
+            for number, values in enumerate(chunk.steps(index, columns)):
                 _, wanted, a_max, inflow, outflow, rest, spring, damping = values
-                # Eq. 17 with the forward operator z: what is held has been summed up to the step before.
+                # Eq. 17 in discrete time: integral and filter include the errors up to the previous step.
                 error = position - wanted
                 derivative = n * (k_d * error - filtered)
                 valve = k_p * error + integral + derivative
@@ -131,7 +131,7 @@ def _run(scenario: LiftScenario) -> Iterator[tuple[Stretch, int, float, float, f
                 else:
                     root = math.sqrt(pressure) if pressure > 0.0 else 0.0
                 if number == 0:
-                    yield stretch, index, position, pressure, valve
+                    yield chunk, index, position, pressure, valve
                 if accurate:
                     middle = position + step / 2 * (inflow - flow * root)
                     root = _root_of_pressure(blocked + spring * middle, drag)
@@ -141,14 +141,14 @@ def _run(scenario: LiftScenario) -> Iterator[tuple[Stretch, int, float, float, f
                     pressure = rest + spring * position + damping * velocity
 
 
-def _columns(scenario: LiftScenario, stretch: Stretch) -> tuple[Any, ...]:
-    """Of each step: the position asked for, the valve's limit, and Eq. 7, 8, 16 and 18 as numbers.
+def _columns(scenario: LiftScenario, chunk: SimulationChunk) -> tuple[Any, ...]:
+    """Values of each step: position set-point, limit of the valve, and the coefficients of Eq. 7, 8, 16 and 18.
 
-    The piston moves with ``inflow - outflow * valve * sqrt(pressure)``; the pressure is
+    The velocity of the piston is ``inflow - outflow * valve * sqrt(pressure)``; the pressure is
     ``rest + spring * position + damping * velocity``.
     """
-    p, reference = stretch.parameters, scenario.reference
-    wanted = reference.amplitude * np.sin(2.0 * math.pi * reference.frequency * stretch.moments)
+    p, reference = chunk.parameters, scenario.reference
+    wanted = reference.amplitude * np.sin(2.0 * math.pi * reference.frequency * chunk.step_times)
     area = p["A_piston"]
     per_force = (1.0 + p["leak"]) / area
     flows = p["q_pump"] / area, (2.0 / p["rho"]) ** 0.5 / area
@@ -156,12 +156,12 @@ def _columns(scenario: LiftScenario, stretch: Stretch) -> tuple[Any, ...]:
 
 
 def _balance_of_flows(scenario: LiftScenario) -> tuple[float, float]:
-    """Pressure and valve at first, so that the loop has nothing to recover from."""
+    """Initial pressure (Pa) and valve area (m²), with which the lift stands still."""
     p = scenario.parameters
     pressure = scenario.load / p.A_piston
     return pressure, p.q_pump / math.sqrt(2.0 * (1.0 + p.leak) * pressure / p.rho)
 
 
 def _root_of_pressure(blocked: float, drag: float) -> float:
-    """The root of the pressure that its own flow leaves as it is: ``blocked - drag * root``."""
+    """Root of the pressure p that solves ``p = blocked - drag * sqrt(p)``; 0 without a solution."""
     return 2.0 * blocked / (drag + math.sqrt(drag * drag + 4.0 * blocked)) if blocked > 0.0 else 0.0

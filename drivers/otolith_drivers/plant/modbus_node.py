@@ -1,8 +1,7 @@
-"""The simulated machine as a Modbus drive in real time, on a port (TCP) or on a serial line of its own (RTU).
+"""The simulated machine as a Modbus drive in real time, on a TCP port or on a simulated serial line (RTU).
 
-What a simulated machine answers as a Modbus device: its registers at the latest tick, and nothing that writes.
-
-pymodbus speaks: frames, checksums, limits of requests. Here is what the device makes of a request that is one.
+pymodbus handles frames, checksums and limits of requests in a thread of its own; :class:`ModbusDrive` answers valid
+requests from the registers of the latest sample. Nothing can be written.
 """
 
 import asyncio
@@ -14,10 +13,10 @@ import os
 import socket
 import sys
 import threading
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from pymodbus import FramerType
 from pymodbus.constants import ExcCodes
@@ -27,45 +26,46 @@ from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.plant.faults import Effect
+from otolith_drivers.plant.faults import BusEffect
 from otolith_drivers.plant.pseudo_terminal import LineTransport, SerialLine, default_link
-from otolith_drivers.plant.realtime import Summary, TruthFile, Turn, in_real_time
-from otolith_drivers.plant.register_map import ModbusOptions, RegisterMap
+from otolith_drivers.plant.realtime import Node, NodeSummary, ScheduledSample, TruthFile
+from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
 from otolith_drivers.plant.scenario import Scenario
 
-READS = frozenset({3, 4})  # holding and input registers: the functions that are answered
-UNREADABLE = 0  # stands for the function of a request that cannot be decoded
+READ_FUNCTIONS = frozenset({3, 4})  # holding and input registers: the functions that are answered
+UNDECODABLE = 0  # function code under which requests are counted that cannot be decoded
+# Engineering choice: 1/25 of Python's default, so that the simulation delays an answer by less than a millisecond.
+# No test guards it.
+SWITCH_INTERVAL = 2e-4  # s
+SERVER_TIMEOUT = 30.0  # s; engineering choice; a hanging server thread ends with an error instead of a hanging node
 
 
 @dataclass(frozen=True, slots=True)
-class _ConnectionState:
-    """What the device is between two ticks; put in place of the one before as a whole."""
+class _DriveState:
+    """The device between two samples; replaced as a whole, so a read never mixes two samples."""
 
     registers: list[int]
-    effect: Effect
+    effect: BusEffect
+    summary: NodeSummary
+    """In which requests are counted."""
 
 
 class ModbusDrive:
-    """The device. Its ticks come from one thread and its requests from another, the only one that counts requests."""
+    """The device. One thread updates it; another one, that of the server, answers and counts requests."""
 
-    def __init__(self, options: ModbusOptions, registers: RegisterMap, *, alone: bool) -> None:
-        """``alone``: who asks for another device hears that there is none; else it is for others on the line to say."""
-        self._options, self._map, self._alone = options, registers, alone
-        self._state = _ConnectionState([0] * registers.size, Effect())
-        self._done = Summary({})
+    def __init__(self, options: NodeModbusOptions, registers: RegisterMap, *, point_to_point: bool) -> None:
+        """With ``point_to_point`` a request to another device is refused; on a shared line it stays unanswered."""
+        self._options, self._map, self._point_to_point = options, registers, point_to_point
+        self._state = _DriveState([0] * registers.size, BusEffect(), NodeSummary({}))
 
-    def begin(self, done: Summary) -> None:
-        """Count in ``done`` from now on."""
-        self._done = done
-
-    def live(self, turn: Turn) -> None:
-        """Take over a tick, all registers at once."""
-        order = turn.effect.order or self._options.order
-        registers = self._map.encode(turn.tick.measured, turn.index, order)
-        self._state = _ConnectionState(registers, turn.effect)
+    def update(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
+        """Replace all registers at once by those of a sample; requests are counted in ``summary``."""
+        order = scheduled.effect.order or self._options.order
+        registers = self._map.encode(scheduled.sample.measured, scheduled.index, order)
+        self._state = _DriveState(registers, scheduled.effect, summary)
 
     def device(self) -> SimDevice:
-        """For pymodbus, which asks :meth:`answer` before it looks here."""
+        """The device for pymodbus, which reads it after :meth:`answer` has admitted a request."""
 
         async def refresh(
             _function: int, _start: int, _address: int, _count: int, registers: list[int], values: object
@@ -79,232 +79,215 @@ class ModbusDrive:
         return SimDevice(id=self._options.device, simdata=[data], action=refresh)
 
     async def answer(self, request: ModbusPDU, context: Any) -> ModbusPDU | None:
-        """To ``request``, or None for silence; ``context`` is pymodbus' own."""
+        """The answer to ``request``, or None for no answer; ``context`` is that of pymodbus."""
         function = request.function_code
-        if not (state := self._heard(request.dev_id, function)):
+        if not (state := self._state_for(request.dev_id, function)):
             return None
         if request.dev_id != self._options.device:
             return ExceptionResponse(function, ExcCodes.GATEWAY_NO_RESPONSE)
-        if function not in READS:
-            self._done.refused[function] += 1
+        if function not in READ_FUNCTIONS:
+            state.summary.refused[function] += 1
             return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)
         for number, refusal in state.effect.refusals:
             if refusal.concerns(request.address, request.count):
-                self._done.faults[number].refused += 1
+                state.summary.faults[number].refused += 1
                 return ExceptionResponse(function, refusal.code)
         return await request.datastore_update(context, request.dev_id)
 
-    def refuses_unreadable(self, device: int) -> bool:
-        """Whether to say that a request cannot be decoded."""
-        if not self._heard(device, UNREADABLE):
+    def refuses_undecodable(self, device: int) -> bool:
+        """Whether a request that cannot be decoded gets an exception; counts it."""
+        if not (state := self._state_for(device, UNDECODABLE)):
             return False
-        self._done.refused[UNREADABLE] += 1
+        state.summary.refused[UNDECODABLE] += 1
         return True
 
-    def answered(self) -> None:
-        """Another answer is on its way."""
-        self._done.answers += 1
+    def count_answer(self) -> None:
+        """Count another answer."""
+        self._state.summary.answers += 1
 
-    def _heard(self, device: int, function: int) -> _ConnectionState | None:
-        """The state that answers a request; None if it stays unanswered. Either is counted."""
+    def _state_for(self, device: int, function: int) -> _DriveState | None:
+        """The state that answers a request, or None if it stays unanswered; counts the request."""
         state = self._state
-        if device != self._options.device and not self._alone:
+        if device != self._options.device and not self._point_to_point:
             return None
-        self._done.functions[function] += 1
+        state.summary.functions[function] += 1
         if state.effect.withheld is not None:
-            self._done.faults[state.effect.withheld].withheld += 1
+            state.summary.faults[state.effect.withheld].withheld += 1
             return None
         return state
 
 
-class Conversation(ServerRequestHandler):
-    """With one client, or with all on a line."""
+class DriveRequestHandler(ServerRequestHandler):
+    """Handles the requests of one TCP client, or of all clients on a serial line."""
 
-    server: "Server"
+    server: "DriveServer"
 
-    def __init__(self, server: "Server") -> None:
-        """For one who has come."""
-        super().__init__(server, None, None, None)  # type: ignore[no-untyped-call] # pymodbus does not say
+    def __init__(self, server: "DriveServer") -> None:
+        super().__init__(server, None, None, None)  # type: ignore[no-untyped-call] # untyped in pymodbus
 
     async def handle_request(self) -> None:
-        """Answer what has come, or be silent."""
+        """Answer the latest request; called by pymodbus."""
         request = self.last_pdu
         if request is None or (response := await self.server.drive.answer(request, self.server.context)) is None:
             return
         response.transaction_id, response.dev_id = request.transaction_id, request.dev_id
-        self._say(response)
+        self._respond(response)
 
     def server_send(self, pdu: ModbusPDU, addr: tuple[Any, ...] | None) -> None:
-        """What pymodbus itself answers: to a request that it cannot decode."""
-        if self.server.drive.refuses_unreadable(pdu.dev_id):
-            self._say(pdu)
+        """Send the exception of pymodbus for a request that it cannot decode; called by pymodbus."""
+        if self.server.drive.refuses_undecodable(pdu.dev_id):
+            self._respond(pdu)
 
-    def disturb(self, data: bytes) -> None:
-        """Put bytes on the line that are no answer."""
+    def send_garbage(self, data: bytes) -> None:
+        """Send bytes that are no answer."""
         if self.transport is not None:
             self.send(data)
 
-    def _say(self, response: ModbusPDU) -> None:
-        if self.transport is None:  # the client has gone meanwhile
-            return
-        self.server.drive.answered()
-        self.pdu_send(response)
+    def _respond(self, response: ModbusPDU) -> None:
+        if self.transport is not None:  # None if the client has disconnected
+            self.server.drive.count_answer()
+            self.pdu_send(response)
 
 
-class Server(ModbusTcpServer):
-    """A server of pymodbus that answers what ``drive`` does, on whatever ``attach`` makes."""
+Attach = Callable[["DriveServer"], Awaitable[Any]]
+"""Attaches a server to its line: returns a listening server, or a transport and its protocol."""
+
+
+class DriveServer(ModbusTcpServer):
+    """A server of pymodbus that answers for ``drive``, on TCP or a serial line."""
 
     def __init__(self, drive: ModbusDrive, framer: FramerType) -> None:
-        """To be made where its event loop runs."""
+        """Must be called in the event loop of the server."""
         super().__init__(drive.device(), framer=framer)
         self.drive = drive
 
-    async def begin(self, attach: Callable[[], Awaitable[Any]]) -> None:
-        """Serve what ``attach`` makes: a listening server, or a transport and its protocol."""
-        self.call_create = attach  # type: ignore[assignment]  # declared as what its own constructor gives
+    async def start(self, attach: Attach) -> "DriveServer":
+        """Serve the line of ``attach`` in the background."""
+        self.call_create = lambda: attach(self)  # type: ignore[assignment,return-value]  # typed by its own constructor
         await self.serve_forever(background=True)
+        return self
 
-    def callback_new_connection(self) -> Conversation:
-        """For a client that has come."""
-        return Conversation(self)
+    async def stop(self) -> None:
+        """Close the line and all connections."""
+        await self.shutdown()  # type: ignore[no-untyped-call] # untyped in pymodbus
+        await asyncio.sleep(0)  # connections close in the next iteration of the loop
 
-    def disturb(self, data: bytes) -> None:
-        """Put bytes on all lines that are no answer."""
-        for conversation in self.active_connections.values():
-            if isinstance(conversation, Conversation):
-                conversation.disturb(data)
+    def callback_new_connection(self) -> DriveRequestHandler:
+        """A handler for a new client; called by pymodbus."""
+        return DriveRequestHandler(self)
+
+    def send_garbage(self, data: bytes) -> None:
+        """Send bytes that are no answer on all connections."""
+        for handler in self.active_connections.values():
+            if isinstance(handler, DriveRequestHandler):
+                handler.send_garbage(data)
 
 
-SWITCH_INTERVAL = 2e-4  # s; how long the machine's equations may keep a request waiting
-PATIENCE = 30.0  # s; with the server's thread
+class _ModbusNode(Node):
+    """A node over a server of pymodbus."""
 
+    FRAMER: ClassVar[FramerType]
+    CLOSES_WHEN_GONE: ClassVar[bool]
+    """Whether the line itself disappears with the device."""
 
-class _ModbusNode(ABC):
-    """Implements :class:`otolith_drivers.plant.realtime.Node` over pymodbus, whose server has a thread of its own."""
-
-    FRAMER: FramerType
-
-    def __init__(self, scenario: Scenario, *, alone: bool) -> None:
-        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would say of requests is counted
-        self._scenario = scenario
+    def __init__(self, scenario: Scenario, *, point_to_point: bool) -> None:
+        logging.getLogger("pymodbus").setLevel(
+            logging.CRITICAL
+        )  # it warns of each wrong request; they are counted here
+        super().__init__(scenario)
         self._map = RegisterMap(scenario.modbus, scenario.SIGNALS)
-        self._drive = ModbusDrive(scenario.modbus, self._map, alone=alone)
-        self._server: Server | None = None
+        self._drive = ModbusDrive(scenario.modbus, self._map, point_to_point=point_to_point)
+        self._server: DriveServer | None = None
 
     def title(self) -> str:
         """See :meth:`otolith_drivers.plant.realtime.Node.title`."""
         options, units = self._scenario.modbus, self._scenario.SIGNALS
         registers = [f"{address} {name} [{units[name]}]" for name, address in self._map.addresses.items()]
-        what = f"{self._scenario.plant} on {self._where()}, device {options.device}, {options.type} {options.order}"
+        what = f"{self._scenario.plant} on {self._place()}, device {options.device}, {options.type} {options.order}"
         return f"{what}: {', '.join(registers)}, {self._map.counter} tick counter"
 
-    def run(self, truth: TruthFile | None, stopped: Callable[[], bool], duration: float = math.inf) -> Summary:
+    def run(self, truth: TruthFile | None, stopped: Callable[[], bool], duration: float = math.inf) -> NodeSummary:
         """See :meth:`otolith_drivers.plant.realtime.Node.run`."""
-        done = Summary.of(self._scenario.faults)
-        self._drive.begin(done)
-        with _quick_switches(), _Loop() as loop:
+        with _short_switch_interval(), _LoopThread() as self._loop:
             try:
-                for turn in in_real_time(self._scenario, done, stopped, duration):
-                    self._drive.live(turn)
-                    self._be_there(loop, there=not (turn.effect.gone and self._vanishes()))
-                    for data in turn.effect.garbage:
-                        loop.call(self._disturb, data)
-                    if truth is not None:
-                        truth.note(turn)
+                return super().run(truth, stopped, duration)
             finally:
-                self._be_there(loop, there=False)
-        return done
+                self._set_online(online=False)
 
-    @abstractmethod
-    def close(self) -> None:
-        """See :meth:`otolith_drivers.plant.realtime.Node.close`."""
+    def _publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
+        self._drive.update(scheduled, summary)
+        self._set_online(online=not (scheduled.effect.gone and self.CLOSES_WHEN_GONE))
+        if self._server is not None:
+            for data in scheduled.effect.garbage:
+                self._loop.call(self._server.send_garbage, data)
 
-    def say(self, done: Summary) -> str:
-        """See :meth:`otolith_drivers.plant.realtime.Node.say`."""
-        functions = ", ".join(f"{count} of function {code}" for code, count in sorted(done.functions.items()))
+    def summary_line(self, summary: NodeSummary) -> str:
+        """See :meth:`otolith_drivers.plant.realtime.Node.summary_line`."""
+        functions = ", ".join(f"{count} of function {code}" for code, count in sorted(summary.functions.items()))
         return (
-            f"{done.answers} answers to {done.functions.total()} requests ({functions or 'none'}), "
-            f"{done.refused.total()} refused, {done.withheld} withheld, "
-            f"in {done.seconds:.1f} s of simulated time, {done.stalls} stalls"
+            f"{summary.answers} answers to {summary.functions.total()} requests ({functions or 'none'}), "
+            f"{summary.refused.total()} refused, {summary.withheld} withheld, "
+            f"in {summary.seconds:.1f} s of simulated time, {summary.stalls} stalls"
         )
 
-    @abstractmethod
-    def _where(self) -> str:
-        """In words."""
-
-    @abstractmethod
-    def _vanishes(self) -> bool:
-        """Whether a client can see from the line alone that the device is gone."""
-
-    @abstractmethod
-    async def _attach(self, server: Server) -> Any:
-        """The line, as pymodbus wants it."""
-
-    def _be_there(self, loop: "_Loop", *, there: bool) -> None:
-        if there and self._server is None:
-            self._prepare()
-            self._server = loop.wait_for(self._begin())
-        elif not there:
+    def _set_online(self, *, online: bool) -> None:
+        """Start or stop the server, unless it is already so."""
+        if online and self._server is None:
+            self._server = self._loop.wait_for(self._start(self._open_line()))
+        elif not online:
             if self._server is not None:
                 server, self._server = self._server, None
-                loop.wait_for(_end(server))
-            self._withdraw()
+                self._loop.wait_for(server.stop())
+            if self.CLOSES_WHEN_GONE:
+                self.close()
+
+    async def _start(self, attach: Attach) -> DriveServer:
+        return await DriveServer(self._drive, self.FRAMER).start(attach)
 
     @abstractmethod
-    def _prepare(self) -> None:
-        """Whatever may fail before the server can begin."""
+    def _place(self) -> str:
+        """The line, as a text for users."""
 
     @abstractmethod
-    def _withdraw(self) -> None:
-        """Nothing is left that a client could see, if the device vanishes at all."""
+    def _open_line(self) -> Attach:
+        """Open the line if it is closed.
 
-    async def _begin(self) -> Server:
-        server = Server(self._drive, self.FRAMER)
-        await server.begin(lambda: self._attach(server))
-        return server
-
-    def _disturb(self, data: bytes) -> None:
-        if self._server is not None:
-            self._server.disturb(data)
+        Raises:
+            DeviceError: it cannot be opened.
+        """
 
 
 class TcpNode(_ModbusNode):
-    """On a port."""
+    """A drive on a TCP port."""
 
     FRAMER = FramerType.SOCKET
+    CLOSES_WHEN_GONE = True
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the port.
+        """Listen on the port.
 
         Raises:
-            DeviceError: it is in use, or may not be used.
+            DeviceError: it is in use, or not permitted.
         """
-        super().__init__(scenario, alone=True)
+        super().__init__(scenario, point_to_point=True)
         self._socket: socket.socket | None = self._listen()
 
     def close(self) -> None:
         """See :meth:`otolith_drivers.plant.realtime.Node.close`."""
-        self._withdraw()
-
-    def _where(self) -> str:
-        return f"Modbus TCP {self._scenario.modbus.host}:{self._scenario.modbus.port}"
-
-    def _vanishes(self) -> bool:
-        return True
-
-    def _prepare(self) -> None:
-        if self._socket is None:
-            self._socket = self._listen()
-
-    def _withdraw(self) -> None:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
-    async def _attach(self, server: Server) -> Any:
-        listening, self._socket = self._socket, None  # asyncio closes it with the server
-        assert listening is not None  # noqa: S101 - it has just been prepared
-        return await asyncio.get_running_loop().create_server(server.handle_new_connection, sock=listening)
+    def _place(self) -> str:
+        return f"Modbus TCP {self._scenario.modbus.host}:{self._scenario.modbus.port}"
+
+    def _open_line(self) -> Attach:
+        listening, self._socket = self._socket or self._listen(), None  # asyncio closes it with the server
+
+        async def attach(server: DriveServer) -> Any:
+            return await asyncio.get_running_loop().create_server(server.handle_new_connection, sock=listening)
+
+        return attach
 
     def _listen(self) -> socket.socket:
         host, port = self._scenario.modbus.host, self._scenario.modbus.port
@@ -315,60 +298,51 @@ class TcpNode(_ModbusNode):
             number = error.errno if isinstance(error, OSError) else None
             cause = os.strerror(number) if number is not None and number in errno.errorcode else str(error)
             raise DeviceError(
-                f"{self._where()} cannot be listened on: {cause}; is a second plant running? Stop it, "
+                f"{self._place()} cannot be listened on: {cause}; is a second plant running? Stop it, "
                 "or set modbus.port (and modbus.host) in the scenario"
             ) from error
 
 
 class RtuNode(_ModbusNode):
-    """On a serial line that ends here and in a file which a client opens like ``/dev/ttyUSB0``."""
+    """A drive on a pseudo-terminal, which a client opens like ``/dev/ttyUSB0``."""
 
     FRAMER = FramerType.RTU
+    CLOSES_WHEN_GONE = False
 
     def __init__(self, scenario: Scenario) -> None:
-        """Make the line.
+        """Create the line.
 
         Raises:
-            DeviceError: its name is taken, or the kernel has no terminal left.
+            DeviceError: its path exists, or the kernel has no terminal left.
         """
-        super().__init__(scenario, alone=False)
+        super().__init__(scenario, point_to_point=False)
         self._line = SerialLine(scenario.modbus.line or default_link())
 
     def close(self) -> None:
         """See :meth:`otolith_drivers.plant.realtime.Node.close`."""
         self._line.close()
 
-    def _where(self) -> str:
+    def _place(self) -> str:
         options = self._scenario.modbus
-        pace = "8N1" if options.pace_line else "without timing"
-        return f"Modbus RTU {self._line.link} ({options.baudrate} baud, {pace})"
+        timing = "8N1" if options.pace_line else "without timing"
+        return f"Modbus RTU {self._line.link} ({options.baudrate} baud, {timing})"
 
-    def _vanishes(self) -> bool:
-        return False
+    def _open_line(self) -> Attach:
+        baudrate = self._scenario.modbus.baudrate if self._scenario.modbus.pace_line else math.inf
 
-    def _prepare(self) -> None:
-        return
+        async def attach(server: DriveServer) -> Any:
+            handler = server.handle_new_connection()
+            transport = LineTransport(self._line.device_end, handler, baudrate)
+            handler.connection_made(transport)
+            return transport, handler
 
-    def _withdraw(self) -> None:
-        return
-
-    async def _attach(self, server: Server) -> Any:
-        options = self._scenario.modbus
-        conversation = server.handle_new_connection()
-        transport = LineTransport(self._line.ours, conversation, options.baudrate if options.pace_line else math.inf)
-        conversation.connection_made(transport)
-        return transport, conversation
+        return attach
 
 
-async def _end(server: Server) -> None:
-    await server.shutdown()  # type: ignore[no-untyped-call] # pymodbus does not say
-    await asyncio.sleep(0)  # connections close in the next round of the loop
-
-
-class _Loop:
+class _LoopThread:
     """An event loop in a thread."""
 
-    def __enter__(self) -> "_Loop":
+    def __enter__(self) -> "_LoopThread":
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="modbus-serve", daemon=True)
         self._thread.start()
@@ -376,20 +350,20 @@ class _Loop:
 
     def __exit__(self, *_: object) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(PATIENCE)
+        self._thread.join(SERVER_TIMEOUT)
         self._loop.close()
 
     def call(self, function: Callable[..., None], *arguments: object) -> None:
-        """In the loop, soon."""
+        """Call ``function`` in the loop, soon."""
         self._loop.call_soon_threadsafe(function, *arguments)
 
     def wait_for(self, work: Coroutine[Any, Any, Any]) -> Any:
-        """What ``work`` gives, done in the loop."""
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result(PATIENCE)
+        """The result of ``work``, run in the loop."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(SERVER_TIMEOUT)
 
 
 @contextlib.contextmanager
-def _quick_switches() -> Iterator[None]:
+def _short_switch_interval() -> Iterator[None]:
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)
     try:

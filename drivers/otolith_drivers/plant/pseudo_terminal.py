@@ -1,4 +1,4 @@
-"""A serial line that is a pseudo-terminal: its other end is opened like ``/dev/ttyUSB0``, and bytes take their time."""
+"""A serial line as a pseudo-terminal: a client opens it like ``/dev/ttyUSB0``, and bytes take their time."""
 
 import asyncio
 import contextlib
@@ -13,146 +13,151 @@ from typing import Protocol
 from otolith_drivers.errors import DeviceError
 
 BITS_PER_BYTE = 10  # 8N1: start, eight of data, stop
-SILENCE, SHORTEST_SILENCE = 3.5, 1.75e-3  # bytes, s: what ends a frame of Modbus RTU
-UNPACED_SILENCE = 0.05  # s; without timing on the line, what is surely no pause within a frame
-PIECE = 1e-3  # s; bytes are put on the line in pieces of this length, as the event loop's clock is no finer
-MOST_AT_ONCE = 4096  # bytes; what the kernel keeps of a terminal
+# End of a frame by the Modbus serial line specification: a silence of 3.5 characters, 1.75 ms above 19200 baud.
+SILENCE = 3.5  # bytes
+MIN_SILENCE = 1.75e-3  # s
+# Engineering choices; test_modbus_node.py guards the second.
+UNPACED_SILENCE = 0.05  # s; end of a frame on a line without timing: longer than a pause within a write
+WRITE_INTERVAL = 1e-3  # s; bytes are written in pieces of this length, the resolution of the event loop's clock
+MAX_READ = 4096  # bytes; the kernel buffers no more for a terminal
 DEFAULT_NAME = "ttyOtolith"
 
 
-class Receiver(Protocol):
-    """Who takes what arrives: the part of pymodbus' protocol that a line needs."""
+class FrameReceiver(Protocol):
+    """The part of pymodbus' protocol that a line needs."""
 
     recv_buffer: bytes
 
     def data_received(self, data: bytes) -> None:
-        """Bytes, as they come."""
+        """Take bytes that have arrived."""
 
 
 def default_link() -> Path:
-    """Where a line is found if nobody says it: this user's runtime folder, else the one for temporary files."""
+    """Default path of a line: in this user's runtime folder, else in the folder for temporary files."""
     return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / DEFAULT_NAME
 
 
 class SerialLine:
-    """Both ends of the terminal, and a name for the one that a client opens."""
+    """Both ends of a pseudo-terminal, and a link to the one that a client opens."""
 
     def __init__(self, link: Path) -> None:
-        """Make the line.
+        """Create the line.
 
         Raises:
-            DeviceError: the name is taken or cannot be made, or the kernel has no terminal left.
+            DeviceError: the path exists or cannot be created, or the kernel has no terminal left.
         """
         try:
-            # The client's end stays open here as well: without anybody on it, reading ours would be an error.
-            self.ours, self._theirs = pty.openpty()
+            # The client's end stays open here too: reading a terminal that nobody has open is an error.
+            self.device_end, self._client_end = pty.openpty()
         except OSError as error:
             raise DeviceError(
                 f"no pseudo-terminal for the serial line: {error.strerror}; is /dev/pts mounted?"
             ) from error
-        tty.setraw(self._theirs)
-        os.set_blocking(self.ours, False)
+        tty.setraw(self._client_end)
+        os.set_blocking(self.device_end, False)
         self.link = link
         try:
-            _make_link(link, os.ttyname(self._theirs))
+            _create_link(link, os.ttyname(self._client_end))
         except (DeviceError, OSError) as error:
-            os.close(self.ours)
-            os.close(self._theirs)
+            os.close(self.device_end)
+            os.close(self._client_end)
             if isinstance(error, DeviceError):
                 raise
-            raise DeviceError(f"{link}: no serial line can be made there: {error.strerror}; set modbus.line") from error
+            raise DeviceError(
+                f"{link}: the serial line cannot be created: {error.strerror}; set modbus.line"
+            ) from error
 
     def close(self) -> None:
-        """Give up both ends and the name."""
+        """Close both ends and remove the link."""
         with contextlib.suppress(OSError):
             self.link.unlink()
-        os.close(self.ours)
-        os.close(self._theirs)
+        os.close(self.device_end)
+        os.close(self._client_end)
 
 
-def _make_link(link: Path, terminal: str) -> None:
+def _create_link(link: Path, terminal: str) -> None:
     if link.is_symlink() and (not link.exists() or str(link.readlink()) == terminal):
-        link.unlink()  # of a node that was killed: its terminal is gone, or has become ours
+        link.unlink()  # left by a node that was killed: its terminal is gone, or is now this one
     try:
         link.symlink_to(terminal)
     except FileExistsError:
         raise DeviceError(
-            f"{link}: is there already: is a second plant running? Stop it, remove the file, or set modbus.line"
+            f"{link}: exists already: is a second plant running? Stop it, remove the file, or set modbus.line"
         ) from None
 
 
 class LineTransport(asyncio.Transport):
-    """The drive's end, for a protocol of pymodbus.
+    """The end of the drive, for a protocol of pymodbus.
 
-    A frame ends with silence, as Modbus RTU says, and what comes after it is another one, so that bytes that were no
-    frame cost no more than themselves. An answer that nobody reads is lost when the terminal is full, as on a wire.
+    A silence ends a frame, as in Modbus RTU, so bytes that are no frame do not spoil the next frame. An answer that
+    nobody reads is lost if the terminal is full, as on a wire.
     """
 
-    def __init__(self, end: int, receiver: Receiver, baudrate: float) -> None:
-        """``end`` is the file descriptor of ours; ``baudrate`` in bit/s, infinite for a line without timing."""
+    def __init__(self, end: int, receiver: FrameReceiver, baudrate: float) -> None:
+        """``end`` is the file descriptor of the drive's end; ``baudrate`` in bit/s, infinite for no timing."""
         super().__init__()
         self._end, self._receiver = end, receiver
-        self._byte = BITS_PER_BYTE / baudrate  # s
+        self._byte_time = BITS_PER_BYTE / baudrate  # s
         self._paced = math.isfinite(baudrate)
-        self._silence = max(SILENCE * self._byte, SHORTEST_SILENCE) if self._paced else UNPACED_SILENCE
+        self._silence = max(SILENCE * self._byte_time, MIN_SILENCE) if self._paced else UNPACED_SILENCE
         self._loop = asyncio.get_running_loop()
-        self._heard = bytearray()
-        self._heard_until = -math.inf
-        self._frame: asyncio.TimerHandle | None = None
-        self._waiting = bytearray()
-        self._free_at = 0.0
-        self._piece: asyncio.TimerHandle | None = None
-        self._loop.add_reader(end, self._hear)
+        self._received = bytearray()
+        self._received_until = -math.inf  # s, clock of the loop
+        self._frame_timer: asyncio.TimerHandle | None = None
+        self._unsent = bytearray()
+        self._sent_until = 0.0  # s, clock of the loop
+        self._write_timer: asyncio.TimerHandle | None = None
+        self._loop.add_reader(end, self._read)
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Put bytes on the line."""
-        if not self._waiting:
-            self._free_at = self._loop.time()
-        self._waiting += data
-        if self._piece is None:
-            self._put()
+        """Send bytes."""
+        if not self._unsent:
+            self._sent_until = self._loop.time()
+        self._unsent += data
+        if self._write_timer is None:
+            self._write_due()
 
     def close(self) -> None:
-        """Neither hear nor say anything more; the line itself stays. May be called twice."""
+        """Stop reading and writing; the line itself stays. May be called twice."""
         self._loop.remove_reader(self._end)
-        for handle in (self._frame, self._piece):
-            if handle is not None:
-                handle.cancel()
+        for timer in (self._frame_timer, self._write_timer):
+            if timer is not None:
+                timer.cancel()
 
-    def _hear(self) -> None:
+    def _read(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            data = os.read(self._end, MOST_AT_ONCE)
+            data = os.read(self._end, MAX_READ)
             now = self._loop.time()
             if not self._paced:
-                if now > self._heard_until + self._silence:
+                if now > self._received_until + self._silence:
                     self._receiver.recv_buffer = b""
-                self._heard_until = now
+                self._received_until = now
                 self._receiver.data_received(data)
                 return
-            self._heard += data
-            self._heard_until = max(now, self._heard_until) + len(data) * self._byte
-            if self._frame is not None:
-                self._frame.cancel()
-            self._frame = self._loop.call_at(self._heard_until + self._silence, self._end_frame)
+            self._received += data
+            self._received_until = max(now, self._received_until) + len(data) * self._byte_time
+            if self._frame_timer is not None:
+                self._frame_timer.cancel()
+            self._frame_timer = self._loop.call_at(self._received_until + self._silence, self._end_frame)
 
     def _end_frame(self) -> None:
-        self._frame = None
-        data = bytes(self._heard)
-        self._heard.clear()
+        self._frame_timer = None
+        data = bytes(self._received)
+        self._received.clear()
         self._receiver.recv_buffer = b""
         self._receiver.data_received(data)
 
-    def _put(self) -> None:
-        """What has had the time to be on the line; the rest in a moment."""
-        self._piece = None
+    def _write_due(self) -> None:
+        """Write the bytes whose time on the line has passed, and set a timer for the rest."""
+        self._write_timer = None
         now = self._loop.time()
-        passed = min(math.floor((now - self._free_at) / self._byte), len(self._waiting)) if self._paced else None
-        ready = bytes(self._waiting[:passed])
+        due = min(math.floor((now - self._sent_until) / self._byte_time), len(self._unsent)) if self._paced else None
+        ready = bytes(self._unsent[:due])
         if ready:
             with contextlib.suppress(BlockingIOError):
                 os.write(self._end, ready)
-            del self._waiting[:passed]
-            self._free_at += len(ready) * self._byte
-        if self._waiting:
-            piece = min(max(math.ceil(PIECE / self._byte), 1), len(self._waiting))
-            self._piece = self._loop.call_at(self._free_at + piece * self._byte, self._put)
+            del self._unsent[:due]
+            self._sent_until += len(ready) * self._byte_time
+        if self._unsent:
+            piece = min(max(math.ceil(WRITE_INTERVAL / self._byte_time), 1), len(self._unsent))
+            self._write_timer = self._loop.call_at(self._sent_until + piece * self._byte_time, self._write_due)

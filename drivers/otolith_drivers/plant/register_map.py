@@ -1,4 +1,4 @@
-"""The simulated machine's registers as a Modbus drive: where each signal is, and how a number becomes registers."""
+"""The registers of the simulated Modbus drive: the address of each signal, and numbers as registers."""
 
 import math
 import struct
@@ -11,7 +11,7 @@ from otolith_drivers.config_files import StrictModel
 from otolith_drivers.modbus.protocol import BYTES_SWAPPED, LETTERS, WORDS_SWAPPED, Order
 from otolith_drivers.units import Quantity
 
-SPACING = 2  # registers from one signal to the next, whatever the type
+SPACING = 2  # registers from one signal to the next, of any type
 COUNTER_VALUES = 65536
 
 Type = Literal["float32", "int32", "int16"]
@@ -23,22 +23,22 @@ RANGES: dict[Type, tuple[float, float]] = {
 }
 
 
-class ModbusOptions(StrictModel):
+class NodeModbusOptions(StrictModel):
     """``[modbus]`` of a scenario."""
 
     host: str = "127.0.0.1"
-    """Where Modbus TCP listens: on this computer only, unless said."""
+    """Address on which Modbus TCP listens; the default is reachable from this computer only."""
     port: Annotated[int, Field(ge=1, le=65535)] = 1502
     device: Annotated[int, Field(ge=1, le=247)] = 1
     order: Order = "ABCD"
     type: Type = "float32"
     scale: dict[str, str] = Field(default_factory=dict)
-    """Of each signal what a count of 1 means, like ``"1 mA"``; integers need it."""
+    """Value of one count of each signal, like ``"1 mA"``; needed for integers."""
     line: Path | None = None
-    """Of Modbus RTU: the name under which the serial line can be opened, relative to the scenario."""
+    """Modbus RTU: path of the serial line for the client, relative to the scenario."""
     baudrate: Annotated[int, Field(ge=300, le=4_000_000)] = 115200
     pace_line: bool = True
-    """Bytes take their time on the line, as 8N1 at ``baudrate``; without it they are there at once."""
+    """Whether bytes take the time of 8N1 at ``baudrate``; otherwise they arrive at once."""
 
     @model_validator(mode="after")
     def _type_fits(self) -> Self:
@@ -48,13 +48,13 @@ class ModbusOptions(StrictModel):
 
 
 class RegisterMap:
-    """Which registers hold what, and their content at a tick."""
+    """The address of each signal, and the content of all registers at a sample."""
 
-    def __init__(self, options: ModbusOptions, signals: dict[str, str]) -> None:
-        """``signals``: the unit of each; ``options`` name a scale for each of them if they need one.
+    def __init__(self, options: NodeModbusOptions, signals: dict[str, str]) -> None:
+        """``signals`` has the unit of each; integers need a scale of each in ``options``.
 
         Raises:
-            ValueError: a scale is missing, of an unknown signal, or in a unit of something else.
+            ValueError: a scale is missing, of an unknown signal, or in a unit of another dimension.
         """
         self.addresses = {name: SPACING * number for number, name in enumerate(signals)}
         self.counter = SPACING * len(signals)
@@ -64,7 +64,7 @@ class RegisterMap:
         self._scales = _scales(options, signals)
 
     def encode(self, measured: dict[str, float], index: int, order: Order) -> list[int]:
-        """All registers: ``measured`` in its units, ``index`` of the tick; a value beyond the type stays at its end."""
+        """All registers at sample ``index``; a value beyond the range of the type saturates."""
         registers: list[int] = []
         for name in self.addresses:
             registers += self._words(measured[name] / self._scales[name], order)
@@ -80,13 +80,15 @@ class RegisterMap:
         return [*words, *[0] * (SPACING - len(words))]
 
 
-def _scales(options: ModbusOptions, signals: dict[str, str]) -> dict[str, float]:
+def _scales(options: NodeModbusOptions, signals: dict[str, str]) -> dict[str, float]:
     if options.type == "float32":
         return dict.fromkeys(signals, 1.0)
     if unknown := options.scale.keys() - signals.keys():
-        raise ValueError(f"modbus.scale names {min(unknown)!r}, which is no signal; there are {', '.join(signals)}")
+        raise ValueError(
+            f"modbus.scale names {min(unknown)!r}, which is no signal; the signals are {', '.join(signals)}"
+        )
     if missing := [name for name in signals if name not in options.scale]:
-        raise ValueError(f"type {options.type!r} needs modbus.scale of {', '.join(missing)}: what a count of 1 means")
+        raise ValueError(f"type {options.type!r} needs modbus.scale of {', '.join(missing)}: the value of one count")
     scales = {name: Quantity(unit, difference=True)(options.scale[name]) for name, unit in signals.items()}
     for name, scale in scales.items():
         if not math.isfinite(scale) or scale <= 0.0:

@@ -1,7 +1,4 @@
-"""What every scenario says, whatever the machine: seed, bus, sampling, and what happens to it.
-
-The table of simulated machines: one row each.
-"""
+"""Scenarios: what all simulated machines share, the table of machines, and time in chunks for their integrators."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -28,26 +25,32 @@ from otolith_drivers.plant.faults import (
     Step,
     Unbalance,
     distorted,
-    generator,
+    fault_random,
 )
-from otolith_drivers.plant.register_map import ModbusOptions, RegisterMap
+from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
 from otolith_drivers.units import Quantity
 
-POSITIVE = 1e-12
+# Each module has SCENARIO, the model of its scenario files, and simulate(scenario), its samples without end.
+PLANTS = {
+    "dc_motor": "otolith_drivers.plant.dc_motor",
+    "hydraulic_actuator": "otolith_drivers.plant.hydraulic_actuator",
+}
+POSITIVE = 1e-12  # lower bound of a parameter that must be above zero, in its unit
 SENSORS = 3  # with noise, on every machine
-STRETCH_PERIODS = 256  # numpy's overhead is shared by so many, and a node in real time is held up for few ms
-STRETCH_STEPS = 32768  # at most, however many a sample period has
+# Engineering choices: large enough to share numpy's overhead, small enough to delay a node in real time by few ms.
+CHUNK_PERIODS = 256  # sample periods
+CHUNK_STEPS = 32768  # steps of the integrator, at most
 
 
 class Scenario(StrictModel):
     """The part of a scenario file that all machines share."""
 
     UNITS: ClassVar[dict[str, str]]
-    """Of each parameter that a fault may change."""
+    """Unit of each parameter that a fault may change."""
     SIGNALS: ClassVar[dict[str, str]]
-    """What the machine measures, and the unit of each."""
+    """Unit of each signal that the machine measures."""
     HAS_SHAFT: ClassVar[bool] = False
-    """Whether an unbalance means anything."""
+    """Whether the machine can have an unbalance."""
 
     plant: str
     seed: int = 1
@@ -56,7 +59,7 @@ class Scenario(StrictModel):
     sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-3, 1.0))] = 0.01
     dbc: Path
     bus: BusOptions = BusOptions()
-    modbus: ModbusOptions = ModbusOptions()
+    modbus: NodeModbusOptions = NodeModbusOptions()
     parameters: Any
     noise: Any
     """Standard deviation of each sensor."""
@@ -82,12 +85,12 @@ class Scenario(StrictModel):
 
     def _check_unbalance(self, fault: Unbalance) -> None:
         if not self.HAS_SHAFT:
-            raise ValueError(f"plant {self.plant!r} has no shaft that could be out of balance")
+            raise ValueError(f"plant {self.plant!r} has no shaft, so it can have no unbalance")
         if (fault.frequency is None) == (fault.order is None):
-            raise ValueError("an unbalance has either a frequency or an order of the shaft angle")
+            raise ValueError("an unbalance needs either a frequency or an order of the shaft angle")
 
     def amount(self, fault: Drift | Step | SensorFault) -> float:
-        """Of a fault, in the unit of its parameter or signal; 0 of one that has none."""
+        """The amount of a fault in the unit of its parameter or signal; 0 if the fault has none."""
         match fault:
             case Drift() | Step():
                 return Quantity(self.UNITS[fault.parameter])(fault.amount)
@@ -96,9 +99,9 @@ class Scenario(StrictModel):
         return 0.0
 
     def distortions(self) -> list[tuple[SensorFault, Distortion]]:
-        """What its sensors do to their signals, anew from the start; each has random numbers of its own."""
+        """The faults of the sensors with new distortions, each with random numbers of its own."""
         return [
-            (fault, fault.distortion(self.amount(fault), generator(self.seed, number)))
+            (fault, fault.distortion(self.amount(fault), fault_random(self.seed, number)))
             for number, fault in enumerate(self.faults)
             if isinstance(fault, SensorFault)
         ]
@@ -109,71 +112,11 @@ def _check_name(name: str, what: str, known: dict[str, str]) -> None:
         raise ValueError(f"a fault names {what} {name!r}: {nearest(name, list(known))}")
 
 
-@dataclass(frozen=True, slots=True)
-class Stretch:
-    """Some sample periods in a row, and what is known of them before the machine has lived them."""
-
-    times: Array
-    """Of the sampling instants, s."""
-    noise: list[list[float]]
-    """Of each sensor at each of them, in standard deviations."""
-    truth: list[dict[str, float]]
-    """The parameters at each of them."""
-    moments: Array
-    """When each step of the integrator begins, s: a row for each step, a column for each sample period."""
-    parameters: dict[str, Any]
-    """In each step: an array like ``moments``, or the number that holds in all of them."""
-
-    def steps(self, index: int, columns: Iterable[Any]) -> Iterator[tuple[float, ...]]:
-        """Of one sample period the steps: the moment of each, and what ``columns``, like parameters, say of it."""
-        values = (column[:, index].tolist() if isinstance(column, np.ndarray) else repeat(column) for column in columns)
-        return zip(self.moments[:, index].tolist(), *values, strict=False)
-
-
-def stretches(scenario: Scenario, steps: int, where: float) -> Iterator[Stretch]:
-    """The time of ``scenario`` without end, each sample period divided into ``steps``.
-
-    The parameters of a step are those that hold at ``where`` in it: 0 at its beginning, 0.5 in its middle.
-    """
-    random = np.random.default_rng(scenario.seed)
-    changes = [(fault, scenario.amount(fault)) for fault in scenario.faults if isinstance(fault, Drift | Step)]
-    size = max(1, min(STRETCH_PERIODS, STRETCH_STEPS // steps))
-    step = scenario.sample_period / steps
-    begins = step * np.arange(steps, dtype=np.float64)[:, np.newaxis]
-    for first in count(0, size):
-        times = np.arange(first, first + size, dtype=np.float64) * scenario.sample_period
-        now = _parameters(scenario, changes, times)
-        values = zip(*(np.broadcast_to(value, size).tolist() for value in now.values()), strict=True)
-        yield Stretch(
-            times=times,
-            noise=random.standard_normal((size, SENSORS)).tolist(),
-            truth=[dict(zip(now, row, strict=True)) for row in values],
-            moments=times + begins,
-            parameters=_parameters(scenario, changes, times + begins + where * step),
-        )
-
-
-def _parameters(scenario: Scenario, changes: list[tuple[Drift | Step, float]], times: Array) -> dict[str, Any]:
-    """Each parameter at ``times`` (s), in its unit: an array, or a number if nothing changes it meanwhile."""
-    values: dict[str, Any] = dict(scenario.parameters)
-    for fault, amount in changes:
-        change = fault.change(times, amount)
-        values[fault.parameter] += change if np.ptp(change) else change.item(0)
-    return values
-
-
-# Each module has SCENARIO, the model of its scenario files, and simulate(scenario), its ticks without end.
-PLANTS = {
-    "dc_motor": "otolith_drivers.plant.dc_motor",
-    "hydraulic_actuator": "otolith_drivers.plant.hydraulic_actuator",
-}
-
-
 def load_scenario(path: Path) -> Scenario:
-    """The scenario in ``path``, the files that it names made relative to it.
+    """The scenario in ``path``; the paths in it are made relative to its folder.
 
     Raises:
-        ConfigurationError: unreadable, an unknown plant, or one line per fault.
+        ConfigurationError: unreadable file, an unknown plant, or a line for each wrong key.
     """
     page = read(path)
     data = parse(page)
@@ -181,21 +124,70 @@ def load_scenario(path: Path) -> Scenario:
     name = data.get("plant")
     if not isinstance(name, str) or name not in PLANTS:
         raise ConfigurationError(f"{page.place(('plant',))}: no plant {name!r}: {nearest(str(name), list(PLANTS))}")
-    scenario: Scenario = validate(data, _module(name).SCENARIO, page)
+    scenario: Scenario = validate(data, import_module(PLANTS[name]).SCENARIO, page)
     line = scenario.modbus.line
     modbus = scenario.modbus.model_copy(update={"line": None if line is None else path.parent / line})
     return scenario.model_copy(update={"dbc": path.parent / scenario.dbc, "modbus": modbus})
 
 
 def simulate(scenario: Scenario) -> Iterator[PlantSample]:
-    """The machine of ``scenario``, one tick per sample period, without end; the same for the same seed.
+    """The samples of the machine without end, one per sample period; the same for the same seed.
 
-    What is measured is as its sensors say it, faults included; what happens on the bus is not in it.
+    Faults of the machine and of its sensors are in them, faults of the bus are not.
     """
-    ticks: Iterator[PlantSample] = _module(scenario.plant).simulate(scenario)
+    samples: Iterator[PlantSample] = import_module(PLANTS[scenario.plant]).simulate(scenario)
     distortions = scenario.distortions()
-    return distorted(ticks, distortions) if distortions else ticks
+    return distorted(samples, distortions) if distortions else samples
 
 
-def _module(name: str) -> Any:
-    return import_module(PLANTS[name])
+@dataclass(frozen=True, slots=True)
+class SimulationChunk:
+    """Some sample periods in a row, with all that does not depend on the state of the machine."""
+
+    times: Array
+    """(periods,) sampling instants, s."""
+    noise: list[list[float]]
+    """Noise of each sensor at each instant, in standard deviations."""
+    truth: list[dict[str, float]]
+    """The parameters at each instant."""
+    step_times: Array
+    """(steps, periods) start of each step of the integrator, s."""
+    parameters: dict[str, Any]
+    """The parameters in each step: an array like ``step_times``, or a number if constant."""
+
+    def steps(self, index: int, columns: Iterable[Any]) -> Iterator[tuple[float, ...]]:
+        """The steps of a sample period: for each its time (s) and its values of ``columns``, shaped like parameters."""
+        values = (column[:, index].tolist() if isinstance(column, np.ndarray) else repeat(column) for column in columns)
+        return zip(self.step_times[:, index].tolist(), *values, strict=False)
+
+
+def chunks(scenario: Scenario, steps: int, where: float) -> Iterator[SimulationChunk]:
+    """The time of ``scenario`` without end, each sample period divided into ``steps``.
+
+    ``where`` in a step its parameters are taken: 0 at its start, 0.5 in its middle.
+    """
+    random = np.random.default_rng(scenario.seed)
+    changes = [(fault, scenario.amount(fault)) for fault in scenario.faults if isinstance(fault, Drift | Step)]
+    size = max(1, min(CHUNK_PERIODS, CHUNK_STEPS // steps))
+    step = scenario.sample_period / steps
+    starts = step * np.arange(steps, dtype=np.float64)[:, np.newaxis]
+    for first in count(0, size):
+        times = np.arange(first, first + size, dtype=np.float64) * scenario.sample_period
+        now = _parameters(scenario, changes, times)
+        values = zip(*(np.broadcast_to(value, size).tolist() for value in now.values()), strict=True)
+        yield SimulationChunk(
+            times=times,
+            noise=random.standard_normal((size, SENSORS)).tolist(),
+            truth=[dict(zip(now, row, strict=True)) for row in values],
+            step_times=times + starts,
+            parameters=_parameters(scenario, changes, times + starts + where * step),
+        )
+
+
+def _parameters(scenario: Scenario, changes: list[tuple[Drift | Step, float]], times: Array) -> dict[str, Any]:
+    """Each parameter at ``times`` (s), in its unit: an array, or a number if it is constant."""
+    values: dict[str, Any] = dict(scenario.parameters)
+    for fault, amount in changes:
+        change = fault.change(times, amount)
+        values[fault.parameter] += change if np.ptp(change) else change.item(0)
+    return values

@@ -1,1 +1,1 @@
-"""Recorded samples: tables as text, logs of a CAN bus, our own recordings. All become rows of numbers."""
+"""Recorded data as rows of numbers: text tables, CAN logs, recordings of Otolith."""

@@ -1,10 +1,8 @@
-"""The replay driver: a recording in the place of a machine, in real time or as fast as its samples are taken.
+"""The replay driver: a recorded file instead of a machine, in real time or as fast as its samples are taken.
 
-    file -> [thread replay-read] rows -> [thread replay] samples at their time
+    file -> [thread replay-read] chunks of rows -> [thread replay] samples at their time
 
-What is read lies ahead of what is delivered, so that a long stretch of a file holds nothing up.
-
-Reading a file ahead of its use, so that a long stretch of it holds nothing up.
+A chunk is read while the one before it is delivered, so that reading delays no sample.
 """
 
 import contextlib
@@ -25,74 +23,39 @@ from otolith_drivers.config_files import StrictModel, validated
 from otolith_drivers.errors import ConfigurationError, DeviceError, OtolithError
 from otolith_drivers.replay.readers import Array, Reader, Rows, format_of, holds_frames
 
-AHEAD = 2  # stretches
-POLL = 0.1  # s; how late an end can be noticed
-
-
-def read_ahead(stretches: Iterator[Rows], stop: threading.Event) -> Iterator[Rows]:
-    """``stretches``, read in a thread of its own until ``stop`` is set; what it raises is raised here."""
-    ready: queue.Queue[Rows | Exception | None] = queue.Queue(AHEAD)
-    ended = threading.Event()
-    thread = threading.Thread(target=_read, args=(stretches, ready, ended), name="replay-read", daemon=True)
-    thread.start()
-    try:
-        while not stop.is_set():
-            with contextlib.suppress(queue.Empty):
-                entry = ready.get(timeout=POLL)
-                if isinstance(entry, Exception):
-                    raise entry
-                if entry is None:
-                    return
-                yield entry
-    finally:
-        ended.set()
-        thread.join(timeout=1.0)
-
-
-def _read(stretches: Iterator[Rows], ready: "queue.Queue[Rows | Exception | None]", ended: threading.Event) -> None:
-    def give(entry: Rows | Exception | None) -> bool:
-        while not ended.is_set():
-            with contextlib.suppress(queue.Full):
-                ready.put(entry, timeout=POLL)
-                return True
-        return False
-
-    try:
-        for rows in stretches:
-            if not give(rows):
-                return
-        give(None)
-    except Exception as error:  # noqa: BLE001 - it is raised again where the rows are used
-        give(error)
-
+# Engineering choices. The driver contract guards the delays of a stop, test_driver.py the chunks and rows at once.
+PREFETCHED_CHUNKS = 2  # read before they are needed; more would only take memory
+QUEUE_POLL = 0.1  # s; delay of a stop while a chunk is awaited
+MAX_WAIT = 0.2  # s; delay of a stop while the next row is awaited: a driver must close within 1 s
+MAX_ROWS_AT_ONCE = 500  # delivered together; bounds how long one call of deliver() takes
+SILENCE_WARNING = 60.0  # s without a row in the file, after which the link warns
 
 log = logging.getLogger(__name__)
 
-AT_ONCE = 500  # rows that are delivered together, at most
-LONGEST_WAIT = 0.2  # s; how late a stop can be noticed
-LONG_SILENCE = 60.0  # s without a row in the file, after which it is worth a word
 
-
-class Options(StrictModel):
+class ReplayOptions(StrictModel):
     """``[driver]`` with ``type = "replay"``."""
 
     file: Path
-    """A table, a log of a CAN bus or a recording of ours."""
+    """A table, a CAN log or a recording of Otolith."""
     pace: Literal["real time", "as fast as possible"] = "real time"
     repeat: bool = False
-    """Begin again at the end, as if the machine went on."""
+    """Start again at the end of the file; time goes on."""
     can: dict[str, Any] | None = None
-    """For a log of a CAN bus: what ``[driver]`` with ``type = "can"`` would say of its frames."""
+    """For a CAN log: the keys that ``[driver]`` with ``type = "can"`` would have."""
 
 
-class Source(StrictModel):
-    """Depends on the file: ``column`` and ``unit`` for a table, what the CAN driver takes for a log of a bus."""
+class ReplaySource(StrictModel):
+    """Keys that depend on the format: ``column`` and ``unit`` of a table, those of the CAN driver for a CAN log."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
 
-def build(options: Options, setup: Setup) -> "Replayer":
-    """A driver for the file, which is looked into for the signals."""
+Options, Source = ReplayOptions, ReplaySource  # for base.DriverType
+
+
+def build(options: ReplayOptions, setup: Setup) -> "ReplayDriver":
+    """A driver for the file, which is opened once to check that it has the signals."""
     path = setup.folder / options.file
     open_file = opener(path, options, setup)
     try:
@@ -101,14 +64,14 @@ def build(options: Options, setup: Setup) -> "Replayer":
     except ConfigurationError as error:
         raise ConfigurationError(str(error), error.key or ("driver", "file")) from error
     title = f"recording {path}, {'in real time' if options.pace == 'real time' else options.pace}"
-    return Replayer(open_file, options, setup.sample_period, [title + ", over and over" * options.repeat, *lines])
+    return ReplayDriver(open_file, options, setup.sample_period, [title + ", repeated" * options.repeat, *lines])
 
 
-def opener(path: Path, options: Options, setup: Setup) -> Callable[[], Reader]:
-    """What opens ``path`` as often as it is asked to, with the sources of ``setup`` read as its format wants them.
+def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Reader]:
+    """A function that opens ``path``; the sources of ``setup`` are validated for its format.
 
     Raises:
-        ConfigurationError: a source or the table ``can`` is not what the format asks for.
+        ConfigurationError: a source, or the table ``can``, does not fit the format.
     """
     kind = format_of(path)
     can = None
@@ -117,13 +80,13 @@ def opener(path: Path, options: Options, setup: Setup) -> Callable[[], Reader]:
 
         if options.can is None:
             raise ConfigurationError(
-                "missing: what is in the frames of the log: can = { dbc = ... }", ("driver", "can")
+                "missing: the description of the frames in the log: can = { dbc = ... }", ("driver", "can")
             )
-        said = {key: value for key, value in options.can.items() if key != "type"}
-        can = validated(said, CanOptions, ("driver", "can"))
+        keys = {key: value for key, value in options.can.items() if key != "type"}
+        can = validated(keys, CanOptions, ("driver", "can"))
     signals = tuple(
-        Signal(entry.name, entry.unit, validated(entry.source.model_dump(), kind.Source, ("signals", entry.name)))
-        for entry in setup.signals
+        Signal(signal.name, signal.unit, validated(signal.source.model_dump(), kind.Source, ("signals", signal.name)))
+        for signal in setup.signals
     )
     wanted = Setup(signals, setup.folder, setup.sample_period)
 
@@ -138,21 +101,23 @@ def opener(path: Path, options: Options, setup: Setup) -> Callable[[], Reader]:
     return open_file
 
 
-class Replayer:
+class ReplayDriver:
     """Implements :class:`otolith_drivers.base.Driver` over a file."""
 
     sampling = Sampling.CYCLIC
 
-    def __init__(self, open_file: Callable[[], Reader], options: Options, gap: float, lines: list[str]) -> None:
-        """``gap`` is how long (s) after the last row the first one comes again, ``lines`` what is read."""
+    def __init__(
+        self, open_file: Callable[[], Reader], options: ReplayOptions, gap: float, description: list[str]
+    ) -> None:
+        """``gap`` is the time in seconds from the last row to the first one of the next repetition."""
         self._open_file = open_file
         self._paced, self._repeat = options.pace == "real time", options.repeat
         self._gap = gap
-        self._lines = lines
+        self._description = description
         self._reader: Reader | None = None
-        self._down = "not opened yet"
+        self._down_reason = "not opened yet"
         self._received = self._bad = self._bad_before = self._lost_before = 0
-        self._clock = -math.inf  # s, monotonic; of the latest row that is due
+        self._clock = -math.inf  # s, monotonic; time of the next row, or of the last one delivered
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -162,8 +127,8 @@ class Replayer:
             reader = self._open_file()
         except OtolithError as error:
             raise DeviceError(str(error)) from error
-        self._down, self._clock = "", time.monotonic()
-        self._thread = threading.Thread(target=self._play, args=(reader, deliver), name="replay", daemon=True)
+        self._down_reason, self._clock = "", time.monotonic()
+        self._thread = threading.Thread(target=self._run, args=(reader, deliver), name="replay", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -181,40 +146,40 @@ class Replayer:
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
         reader = self._reader
-        lines = [] if reader is None else reader.warnings()
+        warnings = [] if reader is None else reader.warnings()
         silence = self._clock - time.monotonic()
-        if self._paced and not self._down and silence > LONG_SILENCE:
-            lines.append(f"the file has nothing for another {silence:.0f} s")
-        return Link(up=not self._down, reason=self._down, warnings=tuple(lines))
+        if self._paced and not self._down_reason and silence > SILENCE_WARNING:
+            warnings.append(f"the next row of the file comes in {silence:.0f} s")
+        return Link(up=not self._down_reason, reason=self._down_reason, warnings=tuple(warnings))
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
-        return self._lines
+        return self._description
 
-    def _play(self, reader: Reader, deliver: Deliver) -> None:
+    def _run(self, reader: Reader, deliver: Deliver) -> None:
         begin = self._clock
         try:
             while True:
                 self._reader = reader
                 with reader:
-                    self._once(reader, deliver, begin)
+                    self._play_once(reader, deliver, begin)
                 if not self._repeat or self._stop.is_set():
                     break
                 begin = self._clock + self._gap
                 following = self._open_file()
                 self._bad_before, self._lost_before = self._bad, self._lost_before + reader.lost
                 reader = following
-            self._down = "closed" if self._stop.is_set() else "the recording has ended"
+            self._down_reason = "closed" if self._stop.is_set() else "the recording has ended"
         except OtolithError as error:
-            self._down = str(error)
+            self._down_reason = str(error)
         except Exception as error:
-            self._down = f"{type(error).__name__}: {error}"
-            log.exception("the replay ended")
+            self._down_reason = f"{type(error).__name__}: {error}"
+            log.exception("the replay stopped with an error")
 
-    def _once(self, reader: Reader, deliver: Deliver, begin: float) -> None:
-        """The whole file, its first row at ``begin`` (s, monotonic)."""
+    def _play_once(self, reader: Reader, deliver: Deliver, begin: float) -> None:
+        """Deliver the whole file, its first row at ``begin`` (s, monotonic)."""
         offset: float | None = None
-        for rows in read_ahead(reader.stretches(), self._stop):
+        for rows in prefetch(reader.chunks(), self._stop):
             if offset is None:
                 offset = begin - float(rows.times[0])
             self._deliver(rows, rows.times + offset, deliver)
@@ -222,17 +187,17 @@ class Replayer:
             self._bad = self._bad_before + reader.bad
 
     def _deliver(self, rows: Rows, times: Array, deliver: Deliver) -> None:
-        """Each row when its time has come; rows that go back in time come with those above them."""
+        """Deliver each row at its time; a row that goes back in time comes with the row above it."""
         clock = np.maximum.accumulate(np.maximum(times, self._clock))
         at = 0
         while at < len(clock) and not self._stop.is_set():
-            until = min(at + AT_ONCE, len(clock))
+            until = min(at + MAX_ROWS_AT_ONCE, len(clock))
             if self._paced:
                 now = time.monotonic()
                 until = min(until, int(np.searchsorted(clock, now, side="right")))
                 self._clock = float(clock[at])
                 if until <= at:
-                    self._stop.wait(min(self._clock - now, LONGEST_WAIT))
+                    self._stop.wait(min(self._clock - now, MAX_WAIT))
                     continue
             samples = _samples(rows, times, slice(at, until))
             self._received += len(samples)
@@ -242,11 +207,50 @@ class Replayer:
 
 
 def _samples(rows: Rows, times: Array, part: slice) -> list[Sample]:
-    """In the order of the rows; a cell without a reading is none."""
-    found = []
+    """The readings of some rows, in the order of the rows."""
+    numbered = []
     for name, values in rows.columns.items():
-        there = np.flatnonzero(np.isfinite(values[part]))
-        pairs = zip(times[part][there].tolist(), values[part][there].tolist(), strict=True)
-        found += [(row, Sample(name, *pair)) for row, pair in zip(there.tolist(), pairs, strict=True)]
-    found.sort(key=lambda entry: entry[0])
-    return [sample for _, sample in found]
+        present = np.flatnonzero(np.isfinite(values[part]))
+        readings = zip(present.tolist(), times[part][present].tolist(), values[part][present].tolist(), strict=True)
+        numbered += [(row, Sample(name, moment, value)) for row, moment, value in readings]
+    numbered.sort(key=lambda pair: pair[0])
+    return [sample for _, sample in numbered]
+
+
+def prefetch(chunks: Iterator[Rows], stop: threading.Event) -> Iterator[Rows]:
+    """``chunks``, read in a thread of their own until ``stop`` is set; an exception in it is raised here."""
+    ready: queue.Queue[Rows | Exception | None] = queue.Queue(PREFETCHED_CHUNKS)
+    ended = threading.Event()
+    thread = threading.Thread(target=_read, args=(chunks, ready, ended), name="replay-read", daemon=True)
+    thread.start()
+    try:
+        while not stop.is_set():
+            with contextlib.suppress(queue.Empty):
+                rows = ready.get(timeout=QUEUE_POLL)
+                if isinstance(rows, Exception):
+                    raise rows
+                if rows is None:
+                    return
+                yield rows
+    finally:
+        ended.set()
+        thread.join(timeout=1.0)
+
+
+def _read(chunks: Iterator[Rows], ready: "queue.Queue[Rows | Exception | None]", ended: threading.Event) -> None:
+    """Put all chunks into ``ready``, then None or the exception that ended them."""
+
+    def put(rows: Rows | Exception | None) -> None:
+        while not ended.is_set():
+            with contextlib.suppress(queue.Full):
+                ready.put(rows, timeout=QUEUE_POLL)
+                return
+
+    try:
+        for rows in chunks:
+            put(rows)
+            if ended.is_set():
+                return
+        put(None)
+    except Exception as error:  # noqa: BLE001 - it is raised again in prefetch
+        put(error)

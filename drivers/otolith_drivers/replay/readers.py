@@ -1,115 +1,161 @@
-"""The table of formats: which reader takes a file, by the end of its name.
-
-What every reader gives: rows of numbers, and the count of what could not become one.
-
-Opening a file of recorded data, packed by gzip or not.
-"""
+"""Recorded files: the rows that every reader returns, the file under it, and the table of formats."""
 
 import gzip
 import io
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from otolith_drivers.base import Setup
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
-from importlib import import_module
-from typing import Any, cast
-
-from otolith_drivers.base import Setup
-from otolith_drivers.config_files import StrictModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
-LATEST = 1e11  # s; a time beyond is in another unit, or wrong
+# Seconds since 1970 reach 1e11 in the year 5138; milliseconds since 1970 passed it in 1973, so a column of them without
+# its unit is refused. Guarded by tests/golden/replays/nanoseconds.
+MAX_TIME = 1e11  # s
+GZIP = ".gz"
+BUFFER = 1 << 16  # bytes; the start of the file from which its encoding is recognised
+
+# Formats by the end of the file name. The module is imported only when a file asks for it.
+CAN_LOG = "otolith_drivers.replay.can_log"
+READERS: dict[str, str] = {
+    ".asc": CAN_LOG,
+    ".blf": CAN_LOG,
+    ".log": CAN_LOG,
+    ".trc": CAN_LOG,
+    ".rrd": "otolith_drivers.replay.recording",
+}
+TABLE = "otolith_drivers.replay.tables"  # all other files
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """A stretch of recorded data, in the order of the file."""
+    """A chunk of recorded data, in the order of the file."""
 
     times: Array
     """(rows,) s, finite."""
     columns: dict[str, Array]
-    """(rows,) of each signal in its unit, not a number where there is no reading."""
+    """(rows,) of each signal in its unit, NaN where there is no reading."""
     lines: Integers
     """(rows,) numbers of their lines, frames or records, from 1."""
     bad: Integers
-    """(rows,) how much of the file was bad up to and with each row."""
+    """(rows,) number of bad lines, cells or frames up to and with each row."""
 
 
-class Reader(Protocol):
-    """A file of recorded data, open; a context that closes it."""
+class Reader(ABC):
+    """An open file of recorded data; a context manager that closes it."""
 
-    @property
-    def path(self) -> Path:
-        """Of the file."""
+    place: str
+    """What ``Rows.lines`` numbers: ``line``, ``frame`` or ``record``."""
+    is_table = False
+    """Whether the file is a text table, whose times may be in a unit that it does not name."""
+    ignored: tuple[str, ...] = ()
+    """Names of the columns that no signal uses."""
 
-    @property
-    def place(self) -> str:
-        """What is numbered in it: ``line``, ``frame`` or ``record``."""
+    def __init__(self, path: Path, data: "DataFile | None" = None) -> None:
+        self.path = path
+        self._data = data
 
-    @property
-    def ignored(self) -> tuple[str, ...]:
-        """Columns that nobody asked for."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if self._data is not None:
+            self._data.close()
 
     @property
     def progress(self) -> float:
         """Share of the file that was read, 0 to 1."""
+        return 0.0 if self._data is None else self._data.progress
 
     @property
+    @abstractmethod
     def bad(self) -> int:
-        """How much came that could not be used."""
+        """Number of rows, cells, frames or records that could not be used."""
 
     @property
     def lost(self) -> int:
-        """Samples that the file shows to have been sent, and does not hold."""
+        """Samples that were sent but are not in the file, as its counters show."""
+        return 0
 
-    def stretches(self) -> Iterator[Rows]:
-        """All rows, some ten thousand at a time; once.
+    @abstractmethod
+    def chunks(self) -> Iterator[Rows]:
+        """All rows, some ten thousand at a time; can be iterated once.
 
         Raises:
-            ConfigurationError: none can be used, or the file is something else.
+            ConfigurationError: no row can be used, or the file has another format.
         """
 
+    @abstractmethod
     def describe(self) -> list[str]:
-        """What is read from where, a line per signal."""
+        """The source of each signal, a line per signal."""
 
+    @abstractmethod
     def summary_lines(self) -> list[str]:
-        """How much was read and what was wrong with it, in a few words each; first of what, and how much."""
+        """Counts of what was read and of what was bad, a few words each; the number of rows first."""
 
+    @abstractmethod
     def warnings(self) -> list[str]:
-        """What a user should know of the file before trusting what was made of it, a line each."""
+        """What limits the trust in the data, a line each."""
 
-    def __enter__(self) -> "Reader": ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    def _cut_off(self) -> list[str]:
+        """The warning for a compressed file that ends too early."""
+        return [f"cut off: {self._data.truncation}"] if self._data is not None and self._data.truncation else []
 
 
-GZIP = ".gz"
-BUFFER = 1 << 16  # bytes; what can be looked at before anything is read
+class Format(Protocol):
+    """What a module of the table of formats has."""
+
+    Source: type[StrictModel]
+    """The place of a signal in such a file."""
+
+    def open_log(self, path: Path, setup: Setup, can: Any | None) -> Reader:
+        """The open file; ``can`` describes the frames of a CAN log.
+
+        Raises:
+            ConfigurationError: the file is missing, or does not have the signals of ``setup``.
+        """
 
 
-class Opened:
-    """The bytes of a file, how many of them were read, and whether its packing broke off."""
+def suffix_of(path: Path) -> str:
+    """The suffix that names the format, in lower case; ``.gz`` is removed first."""
+    name = path.with_suffix("") if path.suffix.lower() == GZIP else path
+    return name.suffix.lower()
+
+
+def holds_frames(path: Path) -> bool:
+    """Whether the file is a CAN log, which cannot be read without a description of its frames."""
+    return READERS.get(suffix_of(path)) == CAN_LOG
+
+
+def format_of(path: Path) -> Format:
+    """The module that reads ``path``."""
+    return cast("Format", import_module(READERS.get(suffix_of(path), TABLE)))
+
+
+class DataFile:
+    """The bytes of a file, decompressed if its name ends in ``.gz``."""
 
     def __init__(self, path: Path) -> None:
         """Open ``path``.
 
         Raises:
-            ConfigurationError: no such file, or not to be read.
+            ConfigurationError: the file is missing or cannot be read.
         """
         try:
             if path.exists() and not path.is_file():
@@ -118,8 +164,8 @@ class Opened:
         except OSError as error:
             raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
         self._size, self._read = max(path.stat().st_size, 1), 0
-        self._unpacked = _Unpacked(self._raw) if path.suffix.lower() == GZIP else None
-        self.stream = self._raw if self._unpacked is None else io.BufferedReader(self._unpacked, BUFFER)
+        self._gzip = _TruncatedGzip(self._raw) if path.suffix.lower() == GZIP else None
+        self.stream = self._raw if self._gzip is None else io.BufferedReader(self._gzip, BUFFER)
 
     @property
     def progress(self) -> float:
@@ -129,80 +175,37 @@ class Opened:
         return min(1.0, self._read / self._size)
 
     @property
-    def torn(self) -> str:
-        """Why the rest of a packed file cannot be had; empty if it can, or was not asked for yet."""
-        return "" if self._unpacked is None else self._unpacked.torn
+    def truncation(self) -> str:
+        """Why the rest of a compressed file cannot be read; empty if it can, or was not reached yet."""
+        return "" if self._gzip is None else self._gzip.truncation
 
     def close(self) -> None:
-        """Give it back."""
+        """Close the file; its progress stays known."""
         _ = self.progress
         self.stream.close()
         self._raw.close()
 
 
-class _Unpacked(io.RawIOBase):
-    """Ends where the packing breaks off, as a file does that was cut there."""
+class _TruncatedGzip(io.RawIOBase):
+    """A gzip stream that ends where the compressed data end or are damaged, instead of raising."""
 
     def __init__(self, raw: BinaryIO) -> None:
         self._file = gzip.GzipFile(fileobj=raw)
-        self.torn = ""
+        self.truncation = ""
 
     def readable(self) -> bool:
         return True
 
-    def readinto(self, room: "WriteableBuffer") -> int:
-        view = memoryview(room)
+    def readinto(self, buffer: "WriteableBuffer") -> int:
+        view = memoryview(buffer)
         try:
-            found = self._file.read1(len(view))  # more at once would be lost where the packing breaks off
+            data = self._file.read1(len(view))  # read() would lose what comes before the damage
         except (EOFError, OSError, zlib.error) as error:
-            self.torn = str(error)
+            self.truncation = str(error)
             return 0
-        view[: len(found)] = found
-        return len(found)
+        view[: len(data)] = data
+        return len(data)
 
     def close(self) -> None:
         self._file.close()
         super().close()
-
-
-# The module is imported only when a file asks for it.
-CAN_LOG = "otolith_drivers.replay.can_log"
-READERS: dict[str, str] = {
-    ".asc": CAN_LOG,
-    ".blf": CAN_LOG,
-    ".log": CAN_LOG,
-    ".trc": CAN_LOG,
-    ".rrd": "otolith_drivers.replay.recording",
-}
-TABLE = "otolith_drivers.replay.tables"
-"""Everything else is text with a column per signal."""
-
-
-class Format(Protocol):
-    """What a row of the table points to: a module with these two names."""
-
-    Source: type[StrictModel]
-    """Where in such a file a signal is."""
-
-    def open_log(self, path: Path, setup: Setup, can: Any | None) -> Reader:
-        """The file, open; ``can`` is what ``[driver]`` says of frames, for a log of them.
-
-        Raises:
-            ConfigurationError: no such file, or not what ``setup`` asks for.
-        """
-
-
-def suffix_of(path: Path) -> str:
-    """The end of the name that tells the format, whatever packs the file."""
-    name = path.with_suffix("") if path.suffix.lower() == GZIP else path
-    return name.suffix.lower()
-
-
-def holds_frames(path: Path) -> bool:
-    """Whether it is a log of a CAN bus, which cannot be read without what describes the frames."""
-    return READERS.get(suffix_of(path)) == CAN_LOG
-
-
-def format_of(path: Path) -> Format:
-    """The module that reads ``path``."""
-    return cast("Format", import_module(READERS.get(suffix_of(path), TABLE)))

@@ -1,4 +1,4 @@
-"""CAN databases as vendors write them: found with the name of what is near, and read in spite of what is wrong."""
+"""CAN databases as vendors write them: faults are tolerated, unusable files are refused with a way out."""
 
 import time
 from pathlib import Path
@@ -8,8 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
-from otolith_drivers.canbus.database import Loaded, load_database, load_dbc
-from otolith_drivers.canbus.signals import Source, find_in_databases
+from otolith_drivers.canbus.database import CanDatabase, load_database, load_dbc
+from otolith_drivers.canbus.signals import CanSource, request_from_databases
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.drivers.can_frames import dbc, decoder, frame, values
@@ -23,7 +23,7 @@ SPEED = {"omega": ("rad/s", {"signal": "Speed"})}
 FULL = bytes([0xE8, 0x03, 0xD0, 0x07, 0, 0, 0, 0])
 
 
-def loaded(path: Path, text: str | bytes) -> Loaded:
+def loaded(path: Path, text: str | bytes) -> CanDatabase:
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return load_database(path)
 
@@ -31,15 +31,15 @@ def loaded(path: Path, text: str | bytes) -> Loaded:
 @pytest.mark.parametrize(
     ("unit", "source", "sentence"),
     [
-        ("rad/s", Source(signal="RotorSped"), "no signal 'RotorSped': did you mean 'RotorSpeed'?"),
-        ("rad/s", Source(signal="RotorSpeed", message="Motor"), "no message 'Motor'"),
-        ("A", Source(signal="RotorSpeed"), "unit 'rad/s' does not measure what 'A' does"),
-        ("1", Source(signal="ElectricalAliveCounter"), "has no unit: set 'unit' beside it"),
+        ("rad/s", CanSource(signal="RotorSped"), "no signal 'RotorSped': did you mean 'RotorSpeed'?"),
+        ("rad/s", CanSource(signal="RotorSpeed", message="Motor"), "no message 'Motor'"),
+        ("A", CanSource(signal="RotorSpeed"), "unit 'rad/s' does not measure what 'A' does"),
+        ("1", CanSource(signal="ElectricalAliveCounter"), "has no unit: set 'unit' beside it"),
     ],
 )
-def test_refusals(unit: str, source: Source, sentence: str) -> None:
+def test_signals_that_cannot_be_resolved_are_refused(unit: str, source: CanSource, sentence: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        find_in_databases(Signal("n", unit, source), [load_database(DBC)])
+        request_from_databases(Signal("n", unit, source), [load_database(DBC)])
     assert sentence in str(caught.value)
     assert caught.value.key == ("signals", "n")
     assert "\n" not in str(caught.value)
@@ -59,15 +59,27 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("content", BROKEN.values(), ids=BROKEN.keys())
-def test_a_broken_database_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
+def test_broken_databases_are_refused_in_one_line(tmp_path: Path, content: str) -> None:
     path = tmp_path / "broken.dbc"
     with pytest.raises(ConfigurationError) as caught:
-        find_in_databases(Signal("n", "V", Source(signal="S")), [loaded(path, content)])
+        request_from_databases(Signal("n", "V", CanSource(signal="S")), [loaded(path, content)])
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.timed
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (dbc('BO_ 1 A: 32769 X\n SG_ S : 0|8@1+ (1,0) [0|0] "" X'), "a length or a start beyond 4096 bytes"),
+        (dbc(MOTOR, after="SG_MUL_VAL_ 1 S M 0-65537;"), "a multiplexer of more than 65536 values"),
+    ],
+)
+def test_excessive_numbers_are_refused_before_parsing(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(ConfigurationError, match=sentence):
+        loaded(tmp_path / "excessive.dbc", text)
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -79,14 +91,14 @@ def test_a_broken_database_is_refused_in_one_line(tmp_path: Path, content: str) 
         ("bomb.sym", 'FormatVersion=6.0\nTitle="x"\n\n{SEND}\n\n[M]\nID=000h-1FFFFFFFh\nLen=8\n'),
     ],
 )
-def test_bombs_of_other_formats_are_refused(tmp_path: Path, name: str, text: str) -> None:
+def test_memory_bombs_in_other_formats_are_refused(tmp_path: Path, name: str, text: str) -> None:
     begun = time.monotonic()
     with pytest.raises(ConfigurationError, match="not a CAN database"):
         loaded(tmp_path / name, text)
     assert time.monotonic() - begun < within(2.0)
 
 
-def test_a_huge_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+def test_huge_files_and_folders_are_refused(tmp_path: Path) -> None:
     with (tmp_path / "huge.dbc").open("wb") as file:
         file.truncate(1 << 30)
     for path in (tmp_path / "huge.dbc", tmp_path, Path("/dev/zero")):
@@ -94,18 +106,18 @@ def test_a_huge_file_and_a_folder_are_refused(tmp_path: Path) -> None:
             load_database(path)
 
 
-def test_the_data_sheet_of_a_canopen_drive_is_called_by_its_name() -> None:
-    with pytest.raises(ConfigurationError, match=r'not a CAN database: name it by eds = "\.\.\." in \[driver\]'):
+def test_an_eds_given_as_dbc_is_refused_with_the_way_out() -> None:
+    with pytest.raises(ConfigurationError, match=r'not a CAN database: set eds = "\.\.\." in \[driver\]'):
         load_database(EXAMPLES / "canopen-drive.eds")
 
 
-def test_a_database_that_is_in_order_has_no_warnings() -> None:
+def test_correct_databases_have_no_warnings() -> None:
     for path in sorted(EXAMPLES.glob("*.dbc")):
         assert load_database(path).warnings() == []
         assert load_dbc(path).messages
 
 
-def test_overlapping_signals_of_others_are_a_warning_and_wanted_ones_an_error(tmp_path: Path) -> None:
+def test_overlap_is_an_error_only_for_requested_signals(tmp_path: Path) -> None:
     text = dbc(
         MOTOR,
         """BO_ 642 Other: 8 Drive
@@ -113,15 +125,15 @@ def test_overlapping_signals_of_others_are_a_warning_and_wanted_ones_an_error(tm
  SG_ Two : 8|16@1+ (1,0) [0|0] "V" Monitor
  SG_ Three : 32|16@1+ (1,0) [0|0] "V" Monitor""",
     )
-    found = decoder(tmp_path, SPEED, text)
-    assert "warning: drive.dbc: Other.Two and Other.One overlap" in found.describe()
-    assert values(found.decode(frame(385, FULL), 0.0)) == {"omega": pytest.approx(10.0)}
+    frame_decoder = decoder(tmp_path, SPEED, text)
+    assert "warning: drive.dbc: Other.Two and Other.One overlap" in frame_decoder.describe()
+    assert values(frame_decoder.decode(frame(385, FULL), 0.0)) == {"omega": pytest.approx(10.0)}
     decoder(tmp_path, {"U": ("V", {"signal": "Three"})}, text)  # the message is faulty, but not where it is read
     with pytest.raises(ConfigurationError, match=r"Other.Two and Other.One overlap: read it by 'id'"):
         decoder(tmp_path, {"U": ("V", {"signal": "One"})}, text)
 
 
-def test_a_signal_beyond_its_frame_is_told_and_refused_only_where_it_is_wanted(tmp_path: Path) -> None:
+def test_signal_beyond_frame_is_an_error_only_if_requested(tmp_path: Path) -> None:
     text = dbc(MOTOR, 'BO_ 642 Other: 2 Drive\n SG_ One : 8|16@1+ (1,0) [0|0] "V" Monitor')
     assert (
         "warning: drive.dbc: Other.One lies beyond the 2 bytes of its frame"
@@ -131,12 +143,18 @@ def test_a_signal_beyond_its_frame_is_told_and_refused_only_where_it_is_wanted(t
         decoder(tmp_path, {"U": ("V", {"signal": "One"})}, text)
 
 
-def test_a_frame_described_twice_needs_a_word_which_it_is(tmp_path: Path) -> None:
+def test_warnings_of_a_faulty_database_are_limited(tmp_path: Path) -> None:
+    others = [f'BO_ {700 + n} Other{n}: 1 Drive\n SG_ S{n} : 8|8@1+ (1,0) [0|0] "V" Monitor' for n in range(30)]
+    warnings = decoder(tmp_path, SPEED, dbc(MOTOR, *others)).configuration_warnings
+    assert (len(warnings), warnings[-1]) == (21, "... and 10 more")
+
+
+def test_a_frame_described_twice_needs_the_message(tmp_path: Path) -> None:
     text = dbc(MOTOR, 'BO_ 385 Rival: 8 Drive\n SG_ Power : 0|16@1- (1,0) [0|0] "W" Monitor')
-    with pytest.raises(ConfigurationError, match="frame 0x181 is both Motor and Rival: say which it is by 'message'"):
+    with pytest.raises(ConfigurationError, match="frame 0x181 is both Motor and Rival: set 'message' to the right one"):
         decoder(tmp_path, SPEED, text)
-    found = decoder(tmp_path, {"omega": ("rad/s", {"signal": "Speed", "message": "Motor"})}, text)
-    assert "warning: drive.dbc: frame 0x181 is described 2 times: Motor, Rival" in found.describe()
+    frame_decoder = decoder(tmp_path, {"omega": ("rad/s", {"signal": "Speed", "message": "Motor"})}, text)
+    assert "warning: drive.dbc: frame 0x181 is described 2 times: Motor, Rival" in frame_decoder.describe()
 
 
 def test_a_name_in_two_messages_needs_the_message(tmp_path: Path) -> None:
@@ -145,15 +163,15 @@ def test_a_name_in_two_messages_needs_the_message(tmp_path: Path) -> None:
         decoder(tmp_path, SPEED, text)
 
 
-def test_several_databases_are_one(tmp_path: Path) -> None:
+def test_several_databases_are_searched(tmp_path: Path) -> None:
     (tmp_path / "a.dbc").write_text(dbc(MOTOR), encoding="utf-8")
     (tmp_path / "b.dbc").write_text(
         dbc('BO_ 642 Supply: 8 Drive\n SG_ Voltage : 0|16@1+ (0.1,0) [0|0] "V" Monitor'), encoding="utf-8"
     )
     wishes = {**SPEED, "U": ("V", {"signal": "Voltage"})}
-    found = decoder(tmp_path, wishes, dbc=["a.dbc", "b.dbc"])
-    assert values(found.decode(frame(642, bytes([100] + [0] * 7)), 0.0)) == {"U": pytest.approx(10.0)}
-    assert values(found.decode(frame(385, FULL), 0.0)) == {"omega": pytest.approx(10.0)}
+    frame_decoder = decoder(tmp_path, wishes, dbc=["a.dbc", "b.dbc"])
+    assert values(frame_decoder.decode(frame(642, bytes([100] + [0] * 7)), 0.0)) == {"U": pytest.approx(10.0)}
+    assert values(frame_decoder.decode(frame(385, FULL), 0.0)) == {"omega": pytest.approx(10.0)}
 
 
 @pytest.mark.parametrize(
@@ -165,33 +183,35 @@ def test_several_databases_are_one(tmp_path: Path) -> None:
         "SOMETHING_NEW_ 1 2 3;",
     ],
 )
-def test_what_is_not_needed_may_be_broken(tmp_path: Path, after: str) -> None:
-    found = decoder(tmp_path, SPEED, dbc(MOTOR, after=after))
-    assert values(found.decode(frame(385, FULL), 0.0)) == {"omega": pytest.approx(10.0)}
-    assert any(line.startswith("warning: drive.dbc: only its messages could be read") for line in found.describe())
+def test_broken_comments_and_attributes_are_tolerated(tmp_path: Path, after: str) -> None:
+    frame_decoder = decoder(tmp_path, SPEED, dbc(MOTOR, after=after))
+    assert values(frame_decoder.decode(frame(385, FULL), 0.0)) == {"omega": pytest.approx(10.0)}
+    assert any(
+        line.startswith("warning: drive.dbc: only its messages could be read") for line in frame_decoder.describe()
+    )
 
 
-def test_a_message_that_cannot_be_read_costs_only_itself(tmp_path: Path) -> None:
+def test_an_unreadable_message_does_not_affect_others(tmp_path: Path) -> None:
     text = dbc('BO_ 642 Sick: 8 Drive\n SG_ One : 0|zero@1+ (1,0) [0|0] "V" Monitor', MOTOR)
-    found = decoder(tmp_path, SPEED, text)
-    assert any("message Sick cannot be read" in line for line in found.describe())
+    frame_decoder = decoder(tmp_path, SPEED, text)
+    assert any("message Sick cannot be read" in line for line in frame_decoder.describe())
     with pytest.raises(ConfigurationError, match="message 'Sick' cannot be read"):
         decoder(tmp_path, {"U": ("V", {"signal": "One", "message": "Sick"})}, text)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
-def test_the_encoding_is_found_out(tmp_path: Path, encoding: str) -> None:
+def test_the_encoding_is_detected(tmp_path: Path, encoding: str) -> None:
     text = dbc('BO_ 642 Heat: 8 Drive\n SG_ Winding : 0|8@1+ (1,-40) [0|0] "°C" Monitor')
-    found = loaded(tmp_path / "heat.dbc", text.encode(encoding))
-    assert found.messages[0].signals[0].unit == "°C"
-    assert found.warnings() == []
+    database = loaded(tmp_path / "heat.dbc", text.encode(encoding))
+    assert database.messages[0].signals[0].unit == "°C"
+    assert database.warnings() == []
 
 
-def test_bytes_of_no_encoding_are_told(tmp_path: Path) -> None:
+def test_bytes_of_no_known_encoding_are_a_warning(tmp_path: Path) -> None:
     text = dbc(MOTOR, after='CM_ "Gr\x81\xdf";').encode("latin-1")
-    found = loaded(tmp_path / "odd.dbc", text)
-    assert [message.name for message in found.messages] == ["Motor"]
-    assert "neither UTF-8 nor Windows-1252" in found.warnings()[0]
+    database = loaded(tmp_path / "odd.dbc", text)
+    assert [message.name for message in database.messages] == ["Motor"]
+    assert "neither UTF-8 nor Windows-1252" in database.warnings()[0]
 
 
 KCD = """<?xml version="1.0" encoding="UTF-8"?>
@@ -219,10 +239,13 @@ Var=Current signed 16,16 /u:A /f:0.001
 
 
 @pytest.mark.parametrize(("suffix", "text"), [("dbc", dbc(MOTOR)), ("kcd", KCD), ("sym", SYM), ("txt", dbc(MOTOR))])
-def test_every_format_gives_the_same(tmp_path: Path, suffix: str, text: str) -> None:
+def test_every_format_gives_the_same_signals(tmp_path: Path, suffix: str, text: str) -> None:
     wishes = {**SPEED, "i": ("A", {"signal": "Current"})}
-    found = decoder(tmp_path, wishes, text, suffix)
-    assert values(found.decode(frame(385, FULL), 0.0)) == {"omega": pytest.approx(10.0), "i": pytest.approx(2.0)}
+    frame_decoder = decoder(tmp_path, wishes, text, suffix)
+    assert values(frame_decoder.decode(frame(385, FULL), 0.0)) == {
+        "omega": pytest.approx(10.0),
+        "i": pytest.approx(2.0),
+    }
 
 
 def mutations(text: str) -> st.SearchStrategy[str]:
@@ -234,27 +257,27 @@ def mutations(text: str) -> st.SearchStrategy[str]:
     )
 
     def apply(edits: list[tuple[int, int, str]]) -> str:
-        found = text
+        mutated = text
         for place, length, instead in edits:
-            found = found[:place] + instead + found[place + length :]
-        return found
+            mutated = mutated[:place] + instead + mutated[place + length :]
+        return mutated
 
     return st.lists(pieces, min_size=1, max_size=6).map(apply)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=5000)
 @given(data=st.data(), kind=st.sampled_from([("dbc", DBC.read_text(encoding="utf-8")), ("kcd", KCD), ("sym", SYM)]))
-def test_a_mutated_database_is_read_or_refused_in_one_line(
+def test_mutated_databases_are_read_or_refused_in_one_line(
     tmp_path: Path, data: st.DataObject, kind: tuple[str, str]
 ) -> None:
     suffix, text = kind
     mutated = data.draw(mutations(text))
     wish = "RotorSpeed" if suffix == "dbc" else "Speed"
     try:
-        found = decoder(tmp_path, {"omega": ("rad/s", {"signal": wish})}, mutated, suffix)
+        frame_decoder = decoder(tmp_path, {"omega": ("rad/s", {"signal": wish})}, mutated, suffix)
     except ConfigurationError as error:
-        assert "\n" not in str(error)  # noqa: PT017 - either way is right
+        assert "\n" not in str(error)  # noqa: PT017 - both outcomes are allowed
         return
-    for identifier, extended in found.identifiers():
+    for identifier, extended in frame_decoder.identifiers():
         for content in (FULL, b"", bytes([255] * 8)):
-            found.decode(frame(identifier, content, extended=extended), 0.0)
+            frame_decoder.decode(frame(identifier, content, extended=extended), 0.0)

@@ -1,4 +1,4 @@
-"""The receiver on real buses between processes: what it survives, what it tells, and that it never sends."""
+"""The receiver on real buses between processes: reconnects, warnings, counters, and that it never sends."""
 
 import ast
 import os
@@ -20,7 +20,7 @@ from msgpack import packb as pack
 from otolith_drivers.base import Sample, Setup
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, enlarge_buffer, frames_dropped, open_bus
-from otolith_drivers.canbus.driver import CanReceiver, Options, build
+from otolith_drivers.canbus.driver import CanOptions, CanReceiver, build
 from tests.conftest import OwnMachine, free_port
 from tests.drivers.can_frames import frame, signals
 from tests.waiting import PATIENCE
@@ -47,7 +47,7 @@ def until(condition: Callable[[], bool], within: float = PATIENCE) -> bool:
 
 
 def receiver(wishes: Any = None, **options: Any) -> CanReceiver:
-    return build(Options.model_validate(options), Setup(signals(wishes or RAW), Path(), 0.01))
+    return build(CanOptions.model_validate(options), Setup(signals(wishes or RAW), Path(), 0.01))
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def opened(bus_options: dict[str, Any]) -> Iterator[tuple[CanReceiver, can.BusAB
 
 
 @pytest.mark.parametrize("kind", ["classic", "fd"])
-def test_what_another_process_sends_arrives_whole(bus_options: dict[str, Any], kind: str) -> None:
+def test_frames_of_another_process_arrive_complete(bus_options: dict[str, Any], kind: str) -> None:
     wishes = RAW if kind == "classic" else {"V_a": ("V", {**RAW["V_a"][1], "fd": True})}
     options = {**bus_options, "fd": kind == "fd", "messages": COUNTED}
     driver, got = receiver(wishes, **options), list[Sample]()
@@ -79,12 +79,12 @@ def test_what_another_process_sends_arrives_whole(bus_options: dict[str, Any], k
     assert (driver.counters().bad, driver.counters().reconnects) == (0, 0)
 
 
-def test_a_classic_bus_does_not_take_fd_frames(bus_options: dict[str, Any]) -> None:
+def test_data_bitrate_needs_fd(bus_options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="data_bitrate is that of CAN FD"):
         BusOptions(**bus_options, data_bitrate="2 Mbit/s")
 
 
-def test_bus_off_is_a_link_that_is_down_until_frames_come(
+def test_link_is_down_from_bus_off_to_the_next_frame(
     opened: tuple[CanReceiver, can.BusABC, list[Sample]],
 ) -> None:
     driver, bus, got = opened
@@ -97,7 +97,7 @@ def test_bus_off_is_a_link_that_is_down_until_frames_come(
     assert any("bus off" in line for line in driver.link().warnings)
 
 
-def test_what_is_no_frame_in_long_runs_opens_the_bus_anew(
+def test_many_unreadable_frames_open_the_bus_anew(
     opened: tuple[CanReceiver, can.BusABC, list[Sample]], own_machine: OwnMachine
 ) -> None:
     driver, bus, got = opened
@@ -113,10 +113,10 @@ def test_what_is_no_frame_in_long_runs_opens_the_bus_anew(
     assert until(lambda: len(got) == 1)
 
 
-def test_frames_of_any_make_do_not_end_the_thread(
+def test_malformed_frames_do_not_end_the_thread(
     opened: tuple[CanReceiver, can.BusABC, list[Sample]], own_machine: OwnMachine
 ) -> None:
-    """What is a frame by its form may still have anything in its fields."""
+    """A frame with the right fields may have any value in them."""
     _, bus, got = opened
     fields = {
         "timestamp": 0.0,
@@ -142,7 +142,7 @@ def test_frames_of_any_make_do_not_end_the_thread(
     assert all(isinstance(sample.time, float) and sample.value == sample.value for sample in got)
 
 
-def test_complaints_come_through_the_link(bus_options: dict[str, Any]) -> None:
+def test_link_has_the_warnings_of_the_decoder(bus_options: dict[str, Any]) -> None:
     driver = receiver(**bus_options, messages=COUNTED)
     driver.open(lambda _: None)
     assert driver.link().warnings == ()
@@ -151,7 +151,7 @@ def test_complaints_come_through_the_link(bus_options: dict[str, Any]) -> None:
 
 
 class SocketCand(threading.Thread):
-    """As much of socketcand as a client needs; ``silent`` is a server whose machine lost its power."""
+    """The part of socketcand that a client needs; ``silent`` is a server that lost its power."""
 
     def __init__(self, port: int) -> None:
         super().__init__(daemon=True)
@@ -188,8 +188,8 @@ class SocketCand(threading.Thread):
             return
 
 
-def test_a_server_that_died_silently_is_asked_anew() -> None:
-    """python-can gives None for ever; the machine is there again all the same."""
+def test_a_silent_server_is_connected_anew() -> None:
+    """python-can returns None for ever; the driver opens the bus anew."""
     port = free_port(socket.SOCK_STREAM)
     server = SocketCand(port)
     server.start()
@@ -213,15 +213,15 @@ def test_a_server_that_died_silently_is_asked_anew() -> None:
     server.join(2.0)
 
 
-def test_an_adapter_is_told_to_listen_only() -> None:
-    """Of slcan that is a command on the line; a frame never goes out."""
+def test_adapters_get_the_listen_only_command() -> None:
+    """An slcan adapter has a command for it; no frame is written."""
     for listen_only, command in ((True, b"L\r"), (False, b"O\r")):
         master, slave = pty.openpty()
         options = BusOptions(interface="slcan", channel=os.ttyname(slave), listen_only=listen_only)
         bus = open_bus(options, listen_only=True)
-        said = b""
-        while command not in said:
-            said += os.read(master, 100)
+        written = b""
+        while command not in written:
+            written += os.read(master, 100)
         before = len(list(Path("/proc/self/fd").iterdir()))
         enlarge_buffer(bus)
         assert frames_dropped(bus) is None
@@ -229,11 +229,11 @@ def test_an_adapter_is_told_to_listen_only() -> None:
         bus.shutdown()
         os.close(master)
         os.close(slave)
-        assert b"t" not in said
+        assert b"t" not in written
 
 
-def test_there_is_no_way_to_send() -> None:
-    """No file of the driver names ``send`` or anything else that transmits, but the plant's node may."""
+def test_no_code_of_the_package_sends() -> None:
+    """No file of the driver names ``send`` or anything else that transmits; the node of the plant may."""
     folder = Path(can_receiver.__file__).parent
     for path in folder.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -241,7 +241,7 @@ def test_there_is_no_way_to_send() -> None:
             assert not name.startswith(("send", "sdo", "nmt", "remote_request")), f"{path.name}: {name}"
 
 
-def test_what_the_kernel_drops_is_counted(bus_options: dict[str, Any]) -> None:
+def test_frames_that_the_kernel_drops_are_counted(bus_options: dict[str, Any]) -> None:
     options = BusOptions(**bus_options)
     with open_bus(options) as slow, open_bus(options) as sender:
         with socket.socket(fileno=os.dup(slow.fileno())) as handle:
@@ -257,7 +257,7 @@ def test_what_the_kernel_drops_is_counted(bus_options: dict[str, Any]) -> None:
         assert frames_dropped(slow) == 200 - got
 
 
-def test_the_buffer_for_frames_is_enlarged(bus_options: dict[str, Any]) -> None:
+def test_the_receive_buffer_is_enlarged(bus_options: dict[str, Any]) -> None:
     with open_bus(BusOptions(**bus_options)) as bus, socket.socket(fileno=os.dup(bus.fileno())) as handle:
         before = handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         enlarge_buffer(bus)

@@ -1,4 +1,4 @@
-"""Error frames: counted by their class, told in words, and a controller off the bus is a link that is down."""
+"""Error frames: counted by class, reported in words; bus off means that the link is down."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def error(identifier: int, data: bytes = bytes(8)) -> can.Message:
         (0x00, b"", "error frame"),
     ],
 )
-def test_each_class_has_a_name(identifier: int, data: bytes, word: str) -> None:
+def test_each_error_class_has_a_name(identifier: int, data: bytes, word: str) -> None:
     faults = BusFaults()
     faults.note(error(identifier, data), 1.0)
     assert faults.total == 1
@@ -39,33 +39,33 @@ def test_each_class_has_a_name(identifier: int, data: bytes, word: str) -> None:
     assert faults.warnings(1000.0) == []
 
 
-def test_bus_off_lasts_until_something_comes(tmp_path: Path) -> None:
-    found = decoder(tmp_path, RAW)
-    assert found.decode(error(0x40), 0.0) == []
-    assert found.faults.bus_off
-    found.decode(frame(0x181, bytes(8)), 0.1)
-    assert not found.faults.bus_off
-    assert found.counters.bad == 0
+def test_bus_off_lasts_until_the_next_frame(tmp_path: Path) -> None:
+    frame_decoder = decoder(tmp_path, RAW)
+    assert frame_decoder.decode(error(0x40), 0.0) == []
+    assert frame_decoder.faults.bus_off
+    frame_decoder.decode(frame(0x181, bytes(8)), 0.1)
+    assert not frame_decoder.faults.bus_off
+    assert frame_decoder.counters.bad == 0
 
 
-def test_what_the_controller_had_no_room_for_is_lost(tmp_path: Path) -> None:
-    found = decoder(tmp_path, RAW)
-    found.decode(error(0x04, bytes([0, 1] + [0] * 6)), 0.0)
-    assert found.counters.lost == 1
+def test_controller_overflows_are_lost_samples(tmp_path: Path) -> None:
+    frame_decoder = decoder(tmp_path, RAW)
+    frame_decoder.decode(error(0x04, bytes([0, 1] + [0] * 6)), 0.0)
+    assert frame_decoder.counters.lost == 1
 
 
-def test_error_passive_is_told_until_it_is_over() -> None:
+def test_error_passive_is_a_warning_until_it_ends() -> None:
     faults = BusFaults()
     faults.note(error(0x04, bytes([0, 0x20])), 0.0)
     assert faults.warnings(30.0) == [
-        "the CAN controller is error passive (sending): look at cable, termination and bit rate"
+        "the CAN controller is error passive (sending): check cable, termination and bit rate"
     ]
     faults.note(error(0x04, bytes([0, 0x40])), 31.0)
     assert all("controller is" not in line for line in faults.warnings(32.0))
 
 
 @given(st.lists(st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8)), max_size=50))
-def test_any_error_frame_is_counted_once(frames: list[tuple[int, bytes]]) -> None:
+def test_every_error_frame_is_counted_once(frames: list[tuple[int, bytes]]) -> None:
     faults = BusFaults()
     for place, (identifier, data) in enumerate(frames):
         faults.note(error(identifier, data), float(place))

@@ -1,4 +1,4 @@
-"""What is heard on a bus: pace, what changes, what a database makes of it, and what frames without one seem to be."""
+"""Probing a bus: periods, what changes, signals of a database, and numbers in frames without one."""
 
 import tomllib
 
@@ -12,7 +12,7 @@ from rich.console import Console
 from otolith.cli.probe_view import can_document, marked, remarks, tables
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.database import load_dbc
-from otolith_drivers.canbus.probe import MOST_IDENTIFIERS, Picture, can_driver_lines, can_signal_lines, canopen_name
+from otolith_drivers.canbus.probe import MAX_IDENTIFIERS, Picture, can_driver_lines, can_signal_lines, canopen_name
 from tests.conftest import EXAMPLES
 
 
@@ -20,8 +20,8 @@ def frame(identifier: int, data: bytes, **keys: bool) -> can.Message:
     return can.Message(arbitration_id=identifier, data=data, is_extended_id=keys.pop("extended", False), **keys)
 
 
-def heard_of(picture: Picture, count: int = 100, period: float = 0.01, jitter: float = 0.0) -> None:
-    """A speed that swings through zero in frames of 0x123, and nothing else."""
+def receive_sine(picture: Picture, count: int = 100, period: float = 0.01, jitter: float = 0.0) -> None:
+    """Frames of 0x123 with a speed that oscillates about zero, and nothing else."""
     random = np.random.default_rng(1)
     for index in range(count):
         speed = round(1000 * np.sin(0.1 * index))
@@ -31,19 +31,19 @@ def heard_of(picture: Picture, count: int = 100, period: float = 0.01, jitter: f
         )
 
 
-def test_pace_and_what_changes() -> None:
+def test_period_jitter_and_changed_bytes() -> None:
     picture = Picture()
-    heard_of(picture, jitter=0.001)
-    (heard,) = picture.ordered()
-    assert heard.period == pytest.approx(0.01, rel=0.02)
-    assert 0.0005 < heard.jitter < 0.0025
-    assert heard.regular
-    assert heard.lengths == {4}
-    assert marked(heard).endswith("] 00 55")
-    assert marked(heard).startswith("[")
+    receive_sine(picture, jitter=0.001)
+    (observed,) = picture.ordered()
+    assert observed.period == pytest.approx(0.01, rel=0.02)
+    assert 0.0005 < observed.jitter < 0.0025
+    assert observed.regular
+    assert observed.lengths == {4}
+    assert marked(observed).endswith("] 00 55")
+    assert marked(observed).startswith("[")
 
 
-def test_what_comes_anyhow_is_called_irregular() -> None:
+def test_frames_without_a_period_are_irregular() -> None:
     picture, moment = Picture(), 0.0
     for gap in [0.001, 0.5, 0.002, 0.003, 0.4, 0.001] * 10:
         moment += gap
@@ -51,9 +51,9 @@ def test_what_comes_anyhow_is_called_irregular() -> None:
     assert not picture.ordered()[0].regular
 
 
-def test_a_field_that_moves_becomes_a_line_that_says_where_it_is() -> None:
+def test_a_number_that_moves_becomes_a_signal_line() -> None:
     picture = Picture()
-    heard_of(picture)
+    receive_sine(picture)
     lines = list(can_signal_lines(picture))
     table = tomllib.loads("\n".join(lines))["signals"]["NAME"]
     assert table == {
@@ -67,7 +67,7 @@ def test_a_field_that_moves_becomes_a_line_that_says_where_it_is() -> None:
     }
 
 
-def test_extended_and_long_frames_say_so() -> None:
+def test_lines_mark_extended_and_fd_frames() -> None:
     picture = Picture()
     for index in range(100):
         data = round(3000 + 300 * np.sin(0.1 * index)).to_bytes(2, "little") + bytes(10)
@@ -89,7 +89,7 @@ def test_the_database_gives_names_values_and_ranges() -> None:
     assert (speed.low, speed.beyond) == (-2.0, 1)
     assert speed.high == pytest.approx(327.67)
     assert [message.name for message in picture.missing()] == ["MotorElectrical"]
-    assert "in the database, but not heard: MotorElectrical" in list(remarks(picture))
+    assert "in the database, but not received: MotorElectrical" in list(remarks(picture))
     lines = list(can_signal_lines(picture))
     assert 'NAME = { signal = "RotorSpeed" }  # rad/s, 327.67 now' in lines
     assert not any("Alive" in line for line in lines)
@@ -109,22 +109,22 @@ def test_the_database_gives_names_values_and_ranges() -> None:
         (0x790, ""),
     ],
 )
-def test_identifiers_of_canopen(identifier: int, name: str) -> None:
+def test_canopen_identifiers(identifier: int, name: str) -> None:
     assert canopen_name(identifier) == name
 
 
-def test_canopen_is_only_claimed_where_somebody_sends_heartbeats() -> None:
+def test_canopen_is_certain_only_with_heartbeats() -> None:
     picture = Picture()
     picture.take(frame(0x185, bytes(8)), 0.0)
     assert picture.guess(picture.ordered()[0]) == "TPDO 1 of node 5, if CANopen"
     picture.take(frame(0x705, b"\x05"), 0.1)
-    assert [picture.guess(heard) for heard in picture.ordered()] == [
+    assert [picture.guess(observed) for observed in picture.ordered()] == [
         "CANopen TPDO 1 of node 5",
         "CANopen heartbeat of node 5: operational",
     ]
 
 
-def test_error_frames_are_counted_by_kind_and_are_no_frames() -> None:
+def test_error_frames_are_counted_by_class() -> None:
     picture = Picture()
     for bits in (0x20, 0x20, 0x08 | 0x80, 0):
         picture.take(can.Message(arbitration_id=bits, is_error_frame=True, data=bytes(8)), 0.0)
@@ -136,13 +136,13 @@ def test_error_frames_are_counted_by_kind_and_are_no_frames() -> None:
     assert next(remarks(picture)).startswith("4 error frames: 2 no acknowledgement")
 
 
-def test_a_bus_of_any_number_of_identifiers_takes_bounded_memory() -> None:
+def test_memory_is_bounded_for_any_number_of_ids() -> None:
     picture = Picture()
-    for identifier in range(MOST_IDENTIFIERS + 100):
+    for identifier in range(MAX_IDENTIFIERS + 100):
         picture.take(frame(identifier, b"", extended=True), 0.0)
-    assert len(picture.observed) == MOST_IDENTIFIERS
+    assert len(picture.observed) == MAX_IDENTIFIERS
     assert picture.left_out == 100
-    assert picture.frames == MOST_IDENTIFIERS + 100
+    assert picture.frames == MAX_IDENTIFIERS + 100
 
 
 frames = st.builds(
@@ -180,6 +180,6 @@ def test_any_frames_make_tables_and_lines(
     for table in tables(picture, width):
         console.print(table)
     assert picture.frames + picture.error_frames == len(came)
-    said = can_document(picture, BusOptions(), None, 1.0)
-    assert len(said["frames"]) == len(picture.observed)
+    document = can_document(picture, BusOptions(), None, 1.0)
+    assert len(document["frames"]) == len(picture.observed)
     tomllib.loads("\n".join(can_driver_lines(BusOptions(), picture, None)))

@@ -1,4 +1,4 @@
-"""Values out of frames: raw signals, floats, ranges, multiplexers, FD; what has no value has a flag."""
+"""Decoded values: raw bits, floats, ranges, multiplexers, FD; a value that is no reading is NaN."""
 
 import math
 import struct
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from otolith_drivers.canbus.decoder import FrameDecoder
 from otolith_drivers.canbus.options import FrameOptions
-from otolith_drivers.canbus.signals import Source
+from otolith_drivers.canbus.signals import CanSource
 from otolith_drivers.errors import ConfigurationError
 from tests.drivers.can_frames import dbc, decoder, frame, values
 
@@ -39,19 +39,22 @@ MULTIPLEXED = dbc(
 )
 
 
-def test_raw_signals_need_no_database(tmp_path: Path) -> None:
+def test_signals_by_their_bits_need_no_database(tmp_path: Path) -> None:
     wishes = {
         "V_a": ("V", RAW),
         "i": ("A", {**RAW, "start": 23, "byte_order": "big", "unit": "mA", "scale": 10, "offset": 5}),
         "x": ("m", {"id": 0x18FF50E5, "extended": True, "start": 32, "length": 32, "float": True, "unit": "mm"}),
     }
-    found = decoder(tmp_path, wishes)
+    frame_decoder = decoder(tmp_path, wishes)
     data = struct.pack("<h", -250) + struct.pack(">h", 300) + bytes(4)
-    assert values(found.decode(frame(0x181, data), 0.0)) == {"V_a": pytest.approx(-2.5), "i": pytest.approx(3.005)}
+    assert values(frame_decoder.decode(frame(0x181, data), 0.0)) == {
+        "V_a": pytest.approx(-2.5),
+        "i": pytest.approx(3.005),
+    }
     wide = bytes(4) + struct.pack("<f", 12.5)
-    assert values(found.decode(frame(0x18FF50E5, wide, extended=True), 0.0)) == {"x": pytest.approx(0.0125)}
-    assert found.decode(frame(0x181, data, extended=True), 0.0) == []
-    assert found.counters.bad == 0
+    assert values(frame_decoder.decode(frame(0x18FF50E5, wide, extended=True), 0.0)) == {"x": pytest.approx(0.0125)}
+    assert frame_decoder.decode(frame(0x181, data, extended=True), 0.0) == []
+    assert frame_decoder.counters.bad == 0
 
 
 @pytest.mark.parametrize(
@@ -69,80 +72,102 @@ def test_raw_signals_need_no_database(tmp_path: Path) -> None:
         ({"length": 24, "float": True}, "a floating-point number has 16, 32 or 64 bits, not 24"),
         ({"length": 65}, "64"),
         ({"start": None}, "'start' and 'length' (bits) are missing beside 'id'"),
-        ({"scale": 0}, "a scale of 0 leaves nothing"),
-        ({"range": [5, 5]}, "5 is not under 5"),
-        ({"signal": "Speed"}, "say where it is by one of"),
-        ({"object": "0x6078"}, "'object' goes with 'node', not with 'id'"),
+        ({"scale": 0}, "scale is 0: every value would be the offset"),
+        ({"range": [5, 5]}, "5 is not below 5"),
+        ({"signal": "Speed"}, "give one of 'signal', 'id' and 'node'"),
+        ({"object": "0x6078"}, "'object' belongs to 'node', not to 'id'"),
     ],
 )
-def test_a_raw_signal_that_cannot_be_meant_is_refused(change: dict[str, Any], sentence: str) -> None:
+def test_invalid_sources_are_refused(change: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValidationError) as caught:
-        Source.model_validate({**RAW, **change}).bits()
+        CanSource.model_validate({**RAW, **change}).bits()
     assert sentence in str(caught.value)
 
 
-def test_a_databases_signal_may_mean_something_else(tmp_path: Path) -> None:
-    """The current of a motor is the force of an axis; but whoever says a scale must say of what."""
-    with pytest.raises(ValidationError, match="say by 'unit' what they lead to"):
-        Source.model_validate({"signal": "Iq_Measured", "scale": 2})
+def test_unit_and_scale_replace_those_of_the_database(tmp_path: Path) -> None:
+    """The current of a motor may stand for the force of an axis; a scale needs a unit."""
+    with pytest.raises(ValidationError, match="set 'unit' to the new one"):
+        CanSource.model_validate({"signal": "Iq_Measured", "scale": 2})
     source = {"signal": "Iq_Measured", "unit": "kN", "scale": 0.05, "offset": 1, "range": [-1, 2]}
-    found = decoder(tmp_path, {"F": ("N", source)}, ODRIVE)
-    assert values(found.decode(frame(20, struct.pack("<ff", 0.0, 4.0)), 0.0)) == {"F": pytest.approx(1200.0)}
-    assert math.isnan(found.decode(frame(20, struct.pack("<ff", 0.0, 20.5)), 0.0)[0].value)
+    frame_decoder = decoder(tmp_path, {"F": ("N", source)}, ODRIVE)
+    assert values(frame_decoder.decode(frame(20, struct.pack("<ff", 0.0, 4.0)), 0.0)) == {"F": pytest.approx(1200.0)}
+    assert math.isnan(frame_decoder.decode(frame(20, struct.pack("<ff", 0.0, 20.5)), 0.0)[0].value)
 
 
-def test_an_odrives_floats_are_read_although_its_ranges_say_nothing(tmp_path: Path) -> None:
+def test_floats_with_an_empty_range_are_read(tmp_path: Path) -> None:
     wishes = {"x": ("rad", {"signal": "Pos_Estimate"}), "i_q": ("A", {"signal": "Iq_Measured"})}
-    found = decoder(tmp_path, wishes, ODRIVE)
-    assert values(found.decode(frame(9, struct.pack("<ff", 0.5, 3.0)), 0.0)) == {"x": pytest.approx(math.pi)}
-    assert values(found.decode(frame(20, struct.pack("<ff", 0.0, -4.25)), 0.0)) == {"i_q": -4.25}
-    assert found.counters.bad == 0
+    frame_decoder = decoder(tmp_path, wishes, ODRIVE)
+    assert values(frame_decoder.decode(frame(9, struct.pack("<ff", 0.5, 3.0)), 0.0)) == {"x": pytest.approx(math.pi)}
+    assert values(frame_decoder.decode(frame(20, struct.pack("<ff", 0.0, -4.25)), 0.0)) == {"i_q": -4.25}
+    assert frame_decoder.counters.bad == 0
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_float_that_is_not_finite_is_no_reading(tmp_path: Path, value: float) -> None:
-    found = decoder(tmp_path, {"i_q": ("A", {"signal": "Iq_Measured"})}, ODRIVE)
-    got = found.decode(frame(20, struct.pack("<ff", 0.0, value)), 1.0)
+def test_floats_that_are_not_finite_are_no_reading(tmp_path: Path, value: float) -> None:
+    frame_decoder = decoder(tmp_path, {"i_q": ("A", {"signal": "Iq_Measured"})}, ODRIVE)
+    got = frame_decoder.decode(frame(20, struct.pack("<ff", 0.0, value)), 1.0)
     assert [math.isnan(sample.value) for sample in got] == [True]
-    assert (found.counters.received, found.counters.bad) == (1, 1)
-    assert "i_q of" in found.warnings(2.0)[0]
+    assert (frame_decoder.counters.received, frame_decoder.counters.bad) == (1, 1)
+    assert "i_q of" in frame_decoder.warnings(2.0)[0]
 
 
-def test_a_range_holds_to_its_very_ends_and_can_be_said_otherwise(tmp_path: Path) -> None:
+def test_range_includes_its_bounds_and_can_be_replaced(tmp_path: Path) -> None:
     text = dbc('BO_ 5 M: 8 Drive\n SG_ U : 0|16@1- (0.002,0) [-65|65] "V" Monitor')
     for source, limit in ({"signal": "U"}, 65.0), ({"signal": "U", "range": [-60, 60]}, 60.0):
-        found = decoder(tmp_path, {"U": ("V", source)}, text)
+        frame_decoder = decoder(tmp_path, {"U": ("V", source)}, text)
         for raw in (round(limit / 0.002), round(-limit / 0.002)):
-            assert not math.isnan(found.decode(frame(5, struct.pack("<h6x", raw)), 0.0)[0].value)
+            assert not math.isnan(frame_decoder.decode(frame(5, struct.pack("<h6x", raw)), 0.0)[0].value)
             beyond = raw + (1 if raw > 0 else -1)
-            assert math.isnan(found.decode(frame(5, struct.pack("<h6x", beyond)), 0.0)[0].value)
-        assert found.counters.bad == 2
+            assert math.isnan(frame_decoder.decode(frame(5, struct.pack("<h6x", beyond)), 0.0)[0].value)
+        assert frame_decoder.counters.bad == 2
 
 
-def test_another_multiplexer_value_is_no_missing_value(tmp_path: Path) -> None:
+def test_multiplexed_signals_miss_nothing_in_other_frames(tmp_path: Path) -> None:
     wishes = {
         "T": ("N*m", {"signal": "Torque"}),
         "heat": ("K", {"signal": "Heat"}),
         "U": ("V", {"signal": "Always"}),
     }
-    found = decoder(tmp_path, wishes, MULTIPLEXED)
-    assert values(found.decode(frame(100, bytes([0, 5, 0x10, 0x27, 0, 0, 0, 0])), 0.0)) == {"U": 5.0, "T": 100.0}
-    got = values(found.decode(frame(100, bytes([1, 6, 0xFA, 0, 0, 0, 0, 0])), 0.01))
+    frame_decoder = decoder(tmp_path, wishes, MULTIPLEXED)
+    assert values(frame_decoder.decode(frame(100, bytes([0, 5, 0x10, 0x27, 0, 0, 0, 0])), 0.0)) == {
+        "U": 5.0,
+        "T": 100.0,
+    }
+    got = values(frame_decoder.decode(frame(100, bytes([1, 6, 0xFA, 0, 0, 0, 0, 0])), 0.01))
     assert got == {"U": 6.0, "heat": pytest.approx(298.15)}
-    assert values(found.decode(frame(100, bytes([77, 7] + [0] * 6)), 0.02)) == {"U": 7.0}
-    assert (found.counters.received, found.counters.bad) == (5, 0)
+    assert values(frame_decoder.decode(frame(100, bytes([77, 7] + [0] * 6)), 0.02)) == {"U": 7.0}
+    assert (frame_decoder.counters.received, frame_decoder.counters.bad) == (5, 0)
 
 
-def test_a_multiplexer_value_that_stays_away_is_told(tmp_path: Path) -> None:
-    found = decoder(tmp_path, {"T": ("N*m", {"signal": "Torque"}), "heat": ("degC", {"signal": "Heat"})}, MULTIPLEXED)
-    found.begin(0.0)
+def test_a_silent_multiplexer_value_is_a_warning(tmp_path: Path) -> None:
+    frame_decoder = decoder(
+        tmp_path, {"T": ("N*m", {"signal": "Torque"}), "heat": ("degC", {"signal": "Heat"})}, MULTIPLEXED
+    )
+    frame_decoder.begin(0.0)
     for index in range(2000):
         which = index % 2 if index < 1000 else 0
-        found.decode(frame(100, bytes([which] + [0] * 7)), index * 0.01)
-    assert found.warnings(20.0) == ["Values (0x64) with Which = 1 silent for 10.0 s; it came every 20.0 ms"]
+        frame_decoder.decode(frame(100, bytes([which] + [0] * 7)), index * 0.01)
+    assert frame_decoder.warnings(20.0) == ["Values (0x64) with Which = 1 silent for 10.0 s; it came every 20.0 ms"]
 
 
-def test_nested_multiplexers_are_followed(tmp_path: Path) -> None:
+def test_a_float_at_the_bound_of_its_range_is_a_reading(tmp_path: Path) -> None:
+    """The 32-bit number next to 0.1 is above 0.1."""
+    source = {"id": 5, "start": 0, "length": 32, "float": True, "unit": "V", "range": [0, 0.1]}
+    frame_decoder = decoder(tmp_path, {"U": ("V", source)})
+    assert values(frame_decoder.decode(frame(5, struct.pack("<f", 0.1)), 0.0)) == {"U": pytest.approx(0.1)}
+
+
+def test_a_multiplexer_value_that_never_comes_is_a_warning(tmp_path: Path) -> None:
+    """After a hundred periods of the message, since not every frame has it."""
+    frame_decoder = decoder(tmp_path, {"heat": ("degC", {"signal": "Heat"})}, MULTIPLEXED)
+    frame_decoder.begin(0.0)
+    for index in range(121):
+        frame_decoder.decode(frame(100, bytes(8)), index * 0.1)
+    assert frame_decoder.warnings(9.9) == []
+    assert frame_decoder.warnings(10.5) == ["Values (0x64) with Which = 1 has not come once in 10.5 s"]
+
+
+def test_nested_multiplexers_are_decoded(tmp_path: Path) -> None:
     text = dbc(
         """BO_ 100 Values: 8 Drive
  SG_ Outer M : 0|4@1+ (1,0) [0|0] "" Monitor
@@ -150,38 +175,39 @@ def test_nested_multiplexers_are_followed(tmp_path: Path) -> None:
  SG_ Deep m2 : 8|8@1+ (1,0) [0|0] "V" Monitor""",
         after="SG_MUL_VAL_ 100 Inner Outer 1-1;\nSG_MUL_VAL_ 100 Deep Inner 2-3;",
     )
-    found = decoder(tmp_path, {"U": ("V", {"signal": "Deep"})}, text)
+    frame_decoder = decoder(tmp_path, {"U": ("V", {"signal": "Deep"})}, text)
     for first, expected in ((0x21, [9.0]), (0x31, [9.0]), (0x11, []), (0x22, [])):
-        got = found.decode(frame(100, bytes([first, 9] + [0] * 6)), 0.0)
+        got = frame_decoder.decode(frame(100, bytes([first, 9] + [0] * 6)), 0.0)
         assert [sample.value for sample in got] == expected
 
 
-def test_short_frames_are_bad_and_told(tmp_path: Path) -> None:
-    found = decoder(tmp_path, {"V_a": ("V", {**RAW, "start": 16})})
+def test_short_frames_are_bad_and_a_warning(tmp_path: Path) -> None:
+    frame_decoder = decoder(tmp_path, {"V_a": ("V", {**RAW, "start": 16})})
     for time in (0.0, 0.1):
-        assert found.decode(frame(0x181, bytes(3)), time) == []
-    assert found.counters.bad == 2
-    assert found.warnings(1.1) == [
-        "0x181: a frame of 3 bytes, of which there should be 4; 2 in all, the last 1.0 s ago"
-    ]
+        assert frame_decoder.decode(frame(0x181, bytes(3)), time) == []
+    assert frame_decoder.counters.bad == 2
+    assert frame_decoder.warnings(1.1) == ["0x181: a frame of 3 bytes instead of 4; 2 in all, the last 1.0 s ago"]
 
 
-def test_fd_frames_reach_beyond_eight_bytes(tmp_path: Path) -> None:
+def test_fd_frames_have_more_than_eight_bytes(tmp_path: Path) -> None:
     wishes = {"V_a": ("V", {**RAW, "start": 496, "fd": True})}
-    found = decoder(tmp_path, wishes)
-    got = found.decode(frame(0x181, bytes(62) + struct.pack("<h", 123), fd=True), 0.0)
+    frame_decoder = decoder(tmp_path, wishes)
+    got = frame_decoder.decode(frame(0x181, bytes(62) + struct.pack("<h", 123), fd=True), 0.0)
     assert values(got) == {"V_a": pytest.approx(1.23)}
 
 
-def test_a_table_of_a_message_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_tables_of_unknown_messages_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        ConfigurationError, match=r"no message 'Axis0_Get_Iqq' has a signal that is wanted: did you mean"
+        ConfigurationError, match=r"no message 'Axis0_Get_Iqq' has a signal of \[signals\]: did you mean"
     ):
         decoder(tmp_path, {"i": ("A", {"signal": "Iq_Measured"})}, ODRIVE, messages={"Axis0_Get_Iqq": {}})
-    found = decoder(
+    frame_decoder = decoder(
         tmp_path, {"i": ("A", {"signal": "Iq_Measured"})}, ODRIVE, messages={"Axis0_Get_Encoder_Estimates": {}}
     )
-    assert "warning: driver.messages.Axis0_Get_Encoder_Estimates: no signal of it is wanted" in found.describe()
+    assert (
+        "warning: driver.messages.Axis0_Get_Encoder_Estimates: [signals] has no signal of it"
+        in frame_decoder.describe()
+    )
 
 
 HOSTILE = st.one_of(st.binary(max_size=64), st.none(), st.integers(), st.text(max_size=8), st.lists(st.integers()))
@@ -205,22 +231,22 @@ def hardened(tmp_path_factory: pytest.TempPathFactory) -> FrameDecoder:
     flags=st.tuples(st.booleans(), st.booleans(), st.booleans()),
     time=st.floats(0, 1e9),
 )
-def test_nothing_that_comes_ends_the_decoder_or_gives_a_value_without_a_flag(
+def test_hostile_frames_neither_raise_nor_give_wrong_values(
     hardened: FrameDecoder, data: object, identifier: object, flags: tuple[bool, bool, bool], time: float
 ) -> None:
-    """Interfaces hand on what the wire gives them, unchecked: anything may be in the place of anything."""
-    found, message = hardened, frame(9, b"")
+    """Interfaces deliver unchecked what was on the wire, so any field may hold any object."""
+    frame_decoder, message = hardened, frame(9, b"")
     message.arbitration_id, message.data = identifier, data  # type: ignore[assignment]
     message.is_extended_id, message.is_error_frame, message.is_remote_frame = flags
-    before = found.counters
-    got = found.decode(message, time)
-    after = found.counters
+    before = frame_decoder.counters
+    got = frame_decoder.decode(message, time)
+    after = frame_decoder.counters
     assert after.received - before.received == len(got)
     unusable = sum(not math.isfinite(sample.value) for sample in got)
     assert after.bad - before.bad >= unusable
     assert all(abs(sample.value) < 1e301 for sample in got if math.isfinite(sample.value))
-    assert all("\n" not in line for line in found.warnings(time))
+    assert all("\n" not in line for line in frame_decoder.warnings(time))
 
 
-def test_the_options_of_a_bus_know_one_database_or_several() -> None:
-    assert [len(FrameOptions(dbc=entry).databases()) for entry in (Path("a"), (Path("a"), Path("b")), ())] == [1, 2, 0]
+def test_options_take_one_database_or_several() -> None:
+    assert [len(FrameOptions(dbc=paths).databases()) for paths in (Path("a"), (Path("a"), Path("b")), ())] == [1, 2, 0]

@@ -1,4 +1,4 @@
-"""Bits out of frames: what cantools reads from the same layout is what we read."""
+"""Raw numbers in frames: read as cantools reads them from the same layout."""
 
 import math
 import struct
@@ -11,7 +11,7 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith_drivers.canbus.signals import bytes_needed, field
+from otolith_drivers.canbus.signals import bytes_needed, raw_reader
 
 
 @st.composite
@@ -33,27 +33,27 @@ def layouts(draw: st.DrawFn) -> CanSignal:
 
 
 @given(layouts(), st.binary(min_size=64, max_size=64))
-def test_what_is_read_is_what_cantools_reads(signal: CanSignal, data: bytes) -> None:
+def test_raw_numbers_are_those_of_cantools(signal: CanSignal, data: bytes) -> None:
     expected = Message(1, "M", 64, [signal], is_fd=True).decode_simple(data, decode_choices=False)["S"]
     assert isinstance(expected, int | float)
-    got = field(signal)(bytearray(data))
+    got = raw_reader(signal)(bytearray(data))
     assert got == expected or (math.isnan(got) and math.isnan(expected))
 
 
 @given(layouts(), st.binary(min_size=64, max_size=64))
-def test_no_byte_beyond_those_needed_is_looked_at(signal: CanSignal, data: bytes) -> None:
+def test_bytes_beyond_those_needed_have_no_effect(signal: CanSignal, data: bytes) -> None:
     needed = bytes_needed(signal)
-    got, whole = field(signal)(data[:needed]), field(signal)(data)
+    got, whole = raw_reader(signal)(data[:needed]), raw_reader(signal)(data)
     assert got == whole or (math.isnan(got) and math.isnan(whole))
 
 
 @pytest.mark.parametrize(("start", "length", "is_float"), [(0, 0, False), (-1, 8, False), (0, 24, True)])
-def test_what_is_no_number_is_refused(start: int, length: int, is_float: bool) -> None:
+def test_layouts_that_are_no_number_are_refused(start: int, length: int, is_float: bool) -> None:
     with pytest.raises(ValueError, match="bits"):
-        field(CanSignal("S", start, length, conversion=BaseConversion.factory(is_float=is_float)))
+        raw_reader(CanSignal("S", start, length, conversion=BaseConversion.factory(is_float=is_float)))
 
 
-def test_a_double_across_bytes_is_read() -> None:
+def test_a_double_that_is_not_byte_aligned() -> None:
     signal = CanSignal("S", 3, 64, conversion=BaseConversion.factory(is_float=True))
     data = (int.from_bytes(struct.pack("<d", -2.5), "little") << 3).to_bytes(9, "little")
-    assert field(signal)(data) == -2.5
+    assert raw_reader(signal)(data) == -2.5

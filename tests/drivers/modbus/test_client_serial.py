@@ -1,4 +1,4 @@
-"""The Modbus driver on a serial line, where no reply tells which question it answers; the device is a thread."""
+"""The Modbus driver on a serial line, whose replies do not name their request; the device is a thread."""
 
 import os
 import pty
@@ -22,13 +22,13 @@ TIMEOUT = 0.2  # s
 
 
 class Device:
-    """Whose registers hold their own addresses. ``delay`` gives of each question the s until its answer, if any."""
+    """Registers hold their own addresses; ``delay`` returns the s from a request to its reply, None for no reply."""
 
     def __init__(self) -> None:
         self.master, self.slave = pty.openpty()
-        self.delay: Callable[[int], float | None] = lambda question: 0.0
-        self.questions = 0
-        self.echo: Callable[[int], bool] = lambda question: False
+        self.delay: Callable[[int], float | None] = lambda number: 0.0
+        self.requests = 0
+        self.echo: Callable[[int], bool] = lambda number: False
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="device")
         self._thread.start()
@@ -40,39 +40,39 @@ class Device:
         os.close(self.slave)
 
     def _serve(self) -> None:
-        asked, answers = b"", list[tuple[float, bytes]]()
+        received, replies = b"", list[tuple[float, bytes]]()
         while not self._end.is_set():
             if select.select([self.master], [], [], 0.002)[0]:
-                asked += os.read(self.master, 256)
-            if len(asked) >= 8:
-                question, asked = asked[:8], asked[8:]
-                self.questions += 1
-                if self.echo(self.questions):
-                    answers.append((time.monotonic(), question))
-                if (delay := self.delay(self.questions)) is not None:
-                    answers.append((time.monotonic() + delay, answer(question)))
-            for due in [entry for entry in answers if entry[0] <= time.monotonic()]:
+                received += os.read(self.master, 256)
+            if len(received) >= 8:
+                request, received = received[:8], received[8:]
+                self.requests += 1
+                if self.echo(self.requests):
+                    replies.append((time.monotonic(), request))
+                if (delay := self.delay(self.requests)) is not None:
+                    replies.append((time.monotonic() + delay, reply_to(request)))
+            for due in [reply for reply in replies if reply[0] <= time.monotonic()]:
                 os.write(self.master, due[1])
-                answers.remove(due)
+                replies.remove(due)
 
 
-def answer(question: bytes) -> bytes:
-    number, function, address, count = struct.unpack(">BBHH", question[:6])
+def reply_to(request: bytes) -> bytes:
+    number, function, address, count = struct.unpack(">BBHH", request[:6])
     body = bytes([number, function, 2 * count]) + struct.pack(f">{count}H", *range(address, address + count))
     return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
 
 
 @pytest.fixture
 def device() -> Iterator[Device]:
-    found = Device()
+    device = Device()
     try:
-        yield found
+        yield device
     finally:
-        found.close()
+        device.close()
 
 
 def poller(device: Device, timeout: float = TIMEOUT) -> ModbusPoller:
-    """Even parity, as Modbus has it unless said."""
+    """A driver with even parity, the default of Modbus."""
     signals = tuple(
         Signal(name, "V", Source.model_validate({"register": address, "type": "int16", "unit": "V"}))
         for name, address in REGISTERS.items()
@@ -81,82 +81,81 @@ def poller(device: Device, timeout: float = TIMEOUT) -> ModbusPoller:
     return build(options, Setup(signals, Path(), 0.01))
 
 
-def test_a_late_reply_is_not_taken_for_the_next_one_of_the_same_size(device: Device) -> None:
-    device.delay = lambda question: 1.5 * TIMEOUT if question % 20 == 0 else 0.0
+def test_late_reply_is_not_taken_for_the_next_one(device: Device) -> None:
+    device.delay = lambda number: 1.5 * TIMEOUT if number % 20 == 0 else 0.0
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
-        wait_for(lambda: device.questions > 100)
+        wait_for(lambda: device.requests > 100, 30.0)
     finally:
         driver.close()
     assert driver.counters().lost > 0
     assert {(sample.signal, sample.value) for sample in samples} == set(REGISTERS.items())
 
 
-def test_what_an_adapter_hears_of_itself_is_no_answer(device: Device) -> None:
-    """The question for register 1000 alone reads like an answer of -6144."""
-    device.echo = lambda question: question % 2 == 0
-    device.delay = lambda question: None if question % 20 == 0 else 0.0
+def test_echo_of_the_request_is_no_answer(device: Device) -> None:
+    """The request for register 1000 alone is a valid reply of -6144."""
+    device.echo = lambda number: number % 2 == 0
+    device.delay = lambda number: None if number % 20 == 0 else 0.0
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
-        wait_for(lambda: device.questions > 100)
+        wait_for(lambda: device.requests > 100, 30.0)
     finally:
         driver.close()
     assert len(samples) > 50
     assert {(sample.signal, sample.value) for sample in samples} == set(REGISTERS.items())
 
 
-def test_a_silent_line_is_opened_again_and_heard_again(device: Device) -> None:
-    """A pseudo-terminal refuses its parity the second time."""
+def test_silent_line_is_reopened(device: Device) -> None:
+    """A pseudo-terminal rejects a parity the second time."""
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
         wait_for(lambda: len(samples) > 10)
-        device.delay = lambda question: None
+        device.delay = lambda number: None
         wait_for(lambda: not driver.link().up)
-        device.delay = lambda question: 0.0
-        wait_for(lambda: driver.link().up)
+        device.delay = lambda number: 0.0
+        wait_for(lambda: driver.link().up, 20.0)
     finally:
         driver.close()
     assert driver.counters().reconnects == 1
 
 
-def test_a_clock_that_is_set_back_does_not_hold_up_the_line(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wall_clock_set_back_does_not_block_the_line(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     driver, samples, wall = poller(device), list[Sample](), time.time
     driver.open(samples.extend)
     try:
         wait_for(lambda: len(samples) > 10)
-        device.delay = lambda question: None
-        asked = device.questions
-        wait_for(lambda: device.questions > asked)
+        device.delay = lambda number: None
+        requests = device.requests
+        wait_for(lambda: device.requests > requests)
         monkeypatch.setattr(time, "time", lambda: wall() - 3600.0)
         wait_for(lambda: not driver.link().up)
     finally:
         driver.close()
 
 
-@pytest.mark.timed
-def test_a_slow_device_does_not_delay_the_end(device: Device) -> None:
-    device.delay = lambda question: None
+def test_slow_device_does_not_delay_close(device: Device) -> None:
+    device.delay = lambda number: None
     driver = poller(device, 10.0)
     driver.open(lambda _: None)
-    wait_for(lambda: device.questions > 0)
+    wait_for(lambda: device.requests > 0)
     begun = time.monotonic()
     driver.close()
     assert time.monotonic() - begun < within(1.0)
     assert not [thread for thread in threading.enumerate() if thread.name == "modbus-poll"]
 
 
-def test_what_a_port_refuses_is_told_and_tried_again(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An adapter that is pulled out while it is opened: the library lets through what is no OSError."""
+def test_termios_error_is_reported_and_retried(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An adapter is unplugged while it is opened: the library raises what is no OSError."""
 
-    def pulled_out(*_: object) -> None:
+    def unplugged(*_: object) -> None:
         raise termios.error(5, "Input/output error")
 
     driver = poller(device)
     with monkeypatch.context() as broken:
-        broken.setattr("termios.tcsetattr", pulled_out)
+        broken.setattr("termios.tcsetattr", unplugged)
         driver.open(lambda _: None)
         wait_for(lambda: driver.link().reason == "Input/output error")
     try:

@@ -1,4 +1,4 @@
-"""The Modbus driver over TCP: what is read when, from devices that are slow, refuse, or are not there."""
+"""The Modbus driver over TCP, with devices that are slow, refuse requests, or are missing."""
 
 import contextlib
 import re
@@ -17,8 +17,8 @@ from tests.drivers.modbus_servers import Behaviour, odd_server
 from tests.waiting import wait_for, within
 
 
-def test_only_function_codes_3_and_4_are_ever_sent() -> None:
-    """Looked at on the wire, through success, refusal, silence and reconnection."""
+def test_only_function_codes_3_and_4_are_sent() -> None:
+    """Recorded by the server, through success, refusal, silence and reconnection."""
     behaviour = Behaviour(floats(24.0, 1.5), refuse=lambda _, address, __: 2 if address == 50 else None)
     port = free_port(socket.SOCK_STREAM)
     sources = [source(register=0), source(register=2, table="input"), source(register=50)]
@@ -31,8 +31,8 @@ def test_only_function_codes_3_and_4_are_ever_sent() -> None:
     assert set(behaviour.functions) == {3, 4}
 
 
-def test_every_slot_of_the_grid_is_a_sample_or_is_counted_as_lost() -> None:
-    """However the server goes and comes back: received + lost is what was asked for."""
+def test_each_sample_of_the_grid_is_received_or_lost() -> None:
+    """Across a restart of the server, received + lost is what was requested."""
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
     begun = time.monotonic()
     with Listener(poller(port, TWO)) as listener:
@@ -48,13 +48,13 @@ def test_every_slot_of_the_grid_is_a_sample_or_is_counted_as_lost() -> None:
     assert counters.received == len(listener.samples)
     assert counters.bad == 0
     assert counters.reconnects == 1
-    asked = (counters.received + counters.lost) / len(TWO)
-    assert asked == pytest.approx(elapsed / PERIOD, abs=0.3 / PERIOD)  # as far as the last pause was accounted for
+    requested = (counters.received + counters.lost) / len(TWO)
+    assert requested == pytest.approx(elapsed / PERIOD, abs=0.3 / PERIOD)  # the last backoff may not be counted yet
     assert counters.lost > 0
 
 
-def test_a_refused_register_costs_only_itself() -> None:
-    """Read along with others it makes the device refuse them all: the request is split until it is alone."""
+def test_refused_register_affects_no_other() -> None:
+    """In a request with others it makes the device refuse all: the request is split until it is alone."""
     behaviour = Behaviour(floats(24.0, 1.5, 7.0), refuse=lambda _, at, count: 2 if at <= 2 < at + count else None)
     port = free_port(socket.SOCK_STREAM)
     with odd_server(behaviour, port), Listener(poller(port, [*TWO, source(register=4)])) as listener:
@@ -69,7 +69,7 @@ def test_a_refused_register_costs_only_itself() -> None:
         listener.wait(lambda link: not link.warnings)
 
 
-def test_a_device_that_gives_fewer_registers_is_asked_for_fewer() -> None:
+def test_requests_are_split_to_the_devices_limit() -> None:
     sources = [source(register=4 * index) for index in range(20)]
     behaviour = Behaviour(floats(*([3.0] * 40)), refuse=lambda _, __, count: 3 if count > 16 else None)
     port = free_port(socket.SOCK_STREAM)
@@ -78,8 +78,8 @@ def test_a_device_that_gives_fewer_registers_is_asked_for_fewer() -> None:
         listener.wait(lambda link: not link.warnings)
 
 
-def test_one_dead_device_does_not_stop_another() -> None:
-    """On the same line; it is tried again, and found when it is back."""
+def test_dead_device_does_not_stop_another() -> None:
+    """On the same line; it is retried, and read when it is back."""
     behaviour, port = Behaviour(floats(24.0, 1.5), silent=lambda device: device == 2), free_port(socket.SOCK_STREAM)
     sources = [source(register=0, device=1), source(register=2, device=2)]
     with odd_server(behaviour, port), Listener(poller(port, sources)) as listener:
@@ -92,7 +92,7 @@ def test_one_dead_device_does_not_stop_another() -> None:
         listener.wait(lambda link: not link.warnings)
 
 
-def test_times_are_those_of_the_middle_of_the_round_trip() -> None:
+def test_sample_time_is_the_middle_of_the_round_trip() -> None:
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
     middles: list[float] = []
 
@@ -102,77 +102,70 @@ def test_times_are_those_of_the_middle_of_the_round_trip() -> None:
         middles.append(0.5 * (begun + time.monotonic()))  # a busy computer may sleep longer
         return reply
 
-    behaviour.spoil = slow
+    behaviour.corrupt = slow
     with odd_server(behaviour, port), Listener(poller(port, TWO, 0.1)) as listener:
         wait_for(lambda: len(listener.of("s0")) >= 25)
     behind = sorted(middle - sample.time for middle, sample in zip(middles, listener.of("s0"), strict=False))
     assert behind[len(behind) // 2] == pytest.approx(0.0, abs=0.004)
 
 
-@pytest.mark.timed
-def test_a_line_too_slow_for_the_rate_says_what_it_achieves() -> None:
-    """And then keeps to a coarser grid, evenly."""
+def test_slow_line_reports_its_achieved_rate() -> None:
+    """And polls evenly on a coarser grid."""
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
 
     def slow(reply: bytes) -> bytes:
         time.sleep(0.02)
         return reply
 
-    behaviour.spoil = slow
+    behaviour.corrupt = slow
     with odd_server(behaviour, port), Listener(poller(port, TWO)) as listener:
         listener.wait(lambda link: link.period is not None and "not known" not in link.plan)
         link = listener.driver.link()
         assert link.period is not None
         assert 0.02 < link.period < within(0.05)
         assert "100 Hz asked" in link.plan
-        listener.wait(keeps_its_period)
+        achieved = re.search(r"([\d.]+) achieved", link.plan)
+        assert achieved is not None
+        assert float(achieved[1]) == pytest.approx(1 / link.period, rel=0.1)  # a busy computer keeps it only roughly
 
 
-def keeps_its_period(link: Link) -> bool:
-    achieved = re.search(r"([\d.]+) achieved", link.plan)
-    assert achieved is not None
-    assert link.period is not None
-    return float(achieved[1]) == pytest.approx(1 / link.period, rel=0.1)  # once a busy computer lets it
-
-
-def test_a_line_that_breaks_in_every_round_keeps_nothing_back_for_ever() -> None:
-    """The device hangs up after each first answer."""
+def test_line_that_breaks_each_round_still_delivers() -> None:
+    """The device closes the connection after each first answer."""
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
 
-    def hang_up(reply: bytes) -> bytes:
+    def close_connection(reply: bytes) -> bytes:
         if behaviour.asked[-1][2] == 50:
             raise OSError
         return reply
 
-    behaviour.spoil = hang_up
+    behaviour.corrupt = close_connection
     with odd_server(behaviour, port), Listener(poller(port, [source(register=0), source(register=50)])) as listener:
         wait_for(lambda: len(listener.of("s0")) > 25)
 
 
-@pytest.mark.timed
-def test_a_host_that_swallows_everything_does_not_delay_the_end() -> None:
+def test_unresponsive_host_does_not_delay_close() -> None:
     with socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as stack:
-        for _ in range(4):  # beyond its backlog nobody is answered
+        for _ in range(4):  # beyond its backlog, connections are not answered
             waiting = stack.enter_context(socket.socket())
             waiting.setblocking(False)
             waiting.connect_ex(full.getsockname())
         driver = poller(full.getsockname()[1], TWO, timeout="10 s")
         driver.open(lambda _: None)
-        time.sleep(0.2)  # it has long begun to connect
+        time.sleep(0.2)  # long enough to begin to connect
         begun = time.monotonic()
         driver.close()
         assert time.monotonic() - begun < within(0.5)
     assert not [thread for thread in threading.enumerate() if thread.name == "modbus-poll"]
 
 
-def test_closing_is_no_broken_connection(caplog: pytest.LogCaptureFixture) -> None:
+def test_close_logs_no_warning(caplog: pytest.LogCaptureFixture) -> None:
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
 
     def slow(reply: bytes) -> bytes:
-        time.sleep(0.02)  # so that closing interrupts a reading
+        time.sleep(0.02)  # so that close interrupts a request
         return reply
 
-    behaviour.spoil = slow
+    behaviour.corrupt = slow
     with odd_server(behaviour, port):
         for _ in range(3):
             with Listener(poller(port, TWO)) as listener:
@@ -180,7 +173,7 @@ def test_closing_is_no_broken_connection(caplog: pytest.LogCaptureFixture) -> No
     assert not [record.message for record in caplog.records if record.levelname == "WARNING"]
 
 
-def test_an_unreachable_host_is_waited_for() -> None:
+def test_unreachable_host_is_retried() -> None:
     port = free_port(socket.SOCK_STREAM)
     with Listener(poller(port, TWO)) as listener:
         listener.wait(lambda link: "refused" in link.reason)
@@ -195,14 +188,14 @@ def test_an_unreachable_host_is_waited_for() -> None:
         ({"register": 0, "unit": "A"}, "does not measure what 'V' does"),
     ],
 )
-def test_refusals(keys: dict[str, object], sentence: str) -> None:
+def test_invalid_signal_names_its_key(keys: dict[str, object], sentence: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         poller(502, [source(**keys)])
     assert sentence in str(caught.value)
     assert caught.value.key == ("signals", "s0")
 
 
-def test_who_takes_the_samples_may_fail_without_ending_the_reading() -> None:
+def test_failing_deliver_does_not_end_the_thread() -> None:
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
     calls: list[int] = []
 

@@ -1,4 +1,4 @@
-"""Looking at Modbus devices: which registers there are, who answers, how fast; on servers that do not always oblige."""
+"""The survey, scan and timing of the probe, against devices that refuse, are busy or silent."""
 
 import socket
 from collections.abc import Iterator
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.modbus.client import Line
+from otolith_drivers.modbus.client import ReadOnlyClient
 from otolith_drivers.modbus.options import LineOptions
 from otolith_drivers.modbus.probe import (
     Block,
-    Client,
+    ProbeClient,
     Speed,
     open_line,
     possible_rate,
@@ -27,13 +27,13 @@ from tests.drivers.modbus_servers import Behaviour, odd_server
 
 
 @contextmanager
-def asking(behaviour: Behaviour, timeout: str = "0.1 s") -> Iterator[Client]:
+def connected(behaviour: Behaviour, timeout: str = "0.1 s") -> Iterator[ProbeClient]:
     port = free_port(socket.SOCK_STREAM)
     options = LineOptions.model_validate({"host": "127.0.0.1", "port": port, "timeout": timeout})
-    line = Line(options)
+    line = ReadOnlyClient(options)
     with odd_server(behaviour, port):
         open_line(line, options)
-        yield Client(line, options, 1, "holding")
+        yield ProbeClient(line, options, 1, "holding")
         line.close()
 
 
@@ -45,8 +45,8 @@ def quiet(_: str) -> None:
     pass
 
 
-def having(registers: set[int]) -> Behaviour:
-    """A device that has these registers alone, and refuses whatever touches another one."""
+def device_with(registers: set[int]) -> Behaviour:
+    """A device that has these registers only, and refuses a request for any other."""
     return Behaviour(
         {}, refuse=lambda _, address, count: None if set(range(address, address + count)) <= registers else 2
     )
@@ -63,96 +63,99 @@ def having(registers: set[int]) -> Behaviour:
         set(np.random.default_rng(4).integers(0, 64, 20).tolist()),
     ],
 )
-def test_what_is_refused_is_split_until_it_is_known_what_there_is(registers: set[int]) -> None:
-    behaviour = having(registers)
-    with asking(behaviour) as asker:
-        found = survey(asker, 0, 63, never, quiet)
-    readable = {at for block in found.blocks for at in range(block.address, block.end)}
+def test_survey_lists_exactly_the_readable_registers(registers: set[int]) -> None:
+    behaviour = device_with(registers)
+    with connected(behaviour) as client:
+        result = survey(client, 0, 63, never, quiet)
+    readable = {at for block in result.blocks for at in range(block.address, block.end)}
     assert readable == registers
-    assert set(found.refused) == set(range(64)) - registers
-    for one, other in zip(found.blocks, found.blocks[1:], strict=False):
+    assert set(result.refused) == set(range(64)) - registers
+    for one, other in zip(result.blocks, result.blocks[1:], strict=False):
         assert one.end < other.address, "what can be read at once is"
     assert set(behaviour.functions) == {3}, "nothing but reading is ever asked for"
 
 
-def test_the_answer_is_said_in_words() -> None:
-    with asking(having({*range(20), *range(60, 64)})) as asker:
-        lines = survey(asker, 0, 63, never, quiet).describe(first_address=1)
+def test_survey_is_described_in_words() -> None:
+    with connected(device_with({*range(20), *range(60, 64)})) as client:
+        lines = survey(client, 0, 63, never, quiet).describe(first_address=1)
     assert lines == [
         "registers 1 to 20 and 61 to 64 can be read",
         "registers 21 to 60 refused: illegal data address",
     ]
 
 
-def test_a_device_that_gives_only_some_at_once_is_found_out() -> None:
-    with asking(Behaviour({}, refuse=lambda _, __, count: 3 if count > 32 else None)) as asker:
-        found = survey(asker, 0, 99, never, quiet)
-    assert {at for block in found.blocks for at in range(block.address, block.end)} == set(range(100))
-    assert 24 <= found.most <= 32
+def test_survey_measures_the_devices_limit() -> None:
+    with connected(Behaviour({}, refuse=lambda _, __, count: 3 if count > 32 else None)) as client:
+        result = survey(client, 0, 99, never, quiet)
+    assert {at for block in result.blocks for at in range(block.address, block.end)} == set(range(100))
+    assert 24 <= result.max_registers <= 32
 
 
-def test_numbers_of_two_registers_that_cannot_be_read_by_halves_are_found() -> None:
+def test_survey_keeps_register_pairs_whole() -> None:
     behaviour = Behaviour({}, refuse=lambda _, at, count: 2 if at % 2 or count % 2 or at + count > 30 else None)
-    with asking(behaviour) as asker:
-        found = survey(asker, 0, 63, never, quiet)
-    assert found.blocks == [Block(0, 30)]
+    with connected(behaviour) as client:
+        result = survey(client, 0, 63, never, quiet)
+    assert result.blocks == [Block(0, 30)]
 
 
-def test_a_busy_device_is_asked_again() -> None:
+def test_busy_device_is_asked_again() -> None:
     answers = iter([6, 6, None, None, None])
-    with asking(Behaviour({0: 7}, refuse=lambda *_: next(answers))) as asker:
-        assert survey(asker, 0, 0, never, quiet).blocks == [Block(0, 1)]
+    with connected(Behaviour({0: 7}, refuse=lambda *_: next(answers))) as client:
+        assert survey(client, 0, 0, never, quiet).blocks == [Block(0, 1)]
 
 
-def test_a_device_that_keeps_silent_is_an_error_with_a_way_out() -> None:
-    with asking(Behaviour({}, silent=lambda _: True)) as asker, pytest.raises(DeviceError, match=r"no answer.*--scan"):
-        survey(asker, 0, 63, never, quiet)
+def test_silent_device_is_an_error_with_a_remedy() -> None:
+    with (
+        connected(Behaviour({}, silent=lambda _: True)) as client,
+        pytest.raises(DeviceError, match=r"no answer.*--scan"),
+    ):
+        survey(client, 0, 63, never, quiet)
 
 
-def test_a_gateway_without_that_device_is_an_error() -> None:
-    with asking(Behaviour({}, refuse=lambda *_: 11)) as asker, pytest.raises(DeviceError, match="gateway"):
-        survey(asker, 0, 63, never, quiet)
+def test_gateway_without_the_device_is_an_error() -> None:
+    with connected(Behaviour({}, refuse=lambda *_: 11)) as client, pytest.raises(DeviceError, match="gateway"):
+        survey(client, 0, 63, never, quiet)
 
 
-def test_readings_are_many_and_timed() -> None:
-    with asking(Behaviour({3: 77})) as asker:
-        found = survey(asker, 0, 9, never, quiet)
-        asker.round_trips.clear()
-        readings = watch(asker, found.blocks, 0.3, never, quiet)
+def test_watch_reads_repeatedly_and_times_requests() -> None:
+    with connected(Behaviour({3: 77})) as client:
+        result = survey(client, 0, 9, never, quiet)
+        client.round_trips.clear()
+        readings = watch(client, result.blocks, 0.3, never, quiet)
         assert [block for block, _ in readings.items()] == [Block(0, 10)]
         words = readings[Block(0, 10)]
         assert words.shape[0] >= 5
         assert set(words[:, 3]) == {77}
-        (speed,) = speeds(asker, found.blocks)
+        (speed,) = speeds(client, result.blocks)
     assert 0.0 < speed.median <= speed.slow < 0.3
     assert "10 registers in one request" in speed.describe()
 
 
-def test_one_round_is_read_even_in_no_time() -> None:
-    with asking(Behaviour({})) as asker:
-        readings = watch(asker, [Block(0, 2)], 0.0, never, quiet)
+def test_watch_reads_at_least_one_round() -> None:
+    with connected(Behaviour({})) as client:
+        readings = watch(client, [Block(0, 2)], 0.0, never, quiet)
     assert readings[Block(0, 2)].shape == (1, 2)
 
 
 @pytest.mark.parametrize(
     ("slow", "rate"), [((0.0004,), 1000), ((0.005,), 100), ((0.005, 0.005), 50), ((0.3,), 2), ((20.0,), 0)]
 )
-def test_the_rate_that_is_called_possible_leaves_room(slow: tuple[float, ...], rate: float) -> None:
+def test_possible_rate_leaves_a_margin(slow: tuple[float, ...], rate: float) -> None:
     assert possible_rate([Speed(10, each, each) for each in slow]) == rate
 
 
-def test_a_scan_lists_those_that_answer_also_with_an_exception() -> None:
+def test_scan_lists_devices_that_answer_or_refuse() -> None:
     behaviour = Behaviour(
         {0: 1},
         silent=lambda device: device not in (3, 7, 9),
         refuse=lambda device, *_: {7: 2, 9: 11}.get(device),
     )
-    with asking(behaviour, "0.05 s") as asker:
-        found = scan(asker, range(1, 12), 0, never, quiet)
-    assert [(answer.device, answer.reply) for answer in found] == [(3, ""), (7, "illegal data address")]
+    with connected(behaviour, "0.05 s") as client:
+        answers = scan(client, range(1, 12), 0, never, quiet)
+    assert [(answer.device, answer.reply) for answer in answers] == [(3, ""), (7, "illegal data address")]
 
 
-def test_addresses_in_words() -> None:
+def test_spans_of_addresses_in_words() -> None:
     assert spans([5]) == "register 5"
     assert spans([3, 1, 2, 9]) == "registers 1 to 3 and 9"
     assert spans(list(range(0, 60, 2))).endswith("and 23 more")

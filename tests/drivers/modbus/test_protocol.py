@@ -1,4 +1,4 @@
-"""From registers to numbers, whatever stands in them."""
+"""Registers to numbers, for all types, orders and contents."""
 
 import math
 
@@ -7,13 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
-from otolith_drivers.modbus.options import Options, Source, item_of
+from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, register_signal
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, bits, reader, registers_of
 from tests.drivers.registers import KINDS, item, registers
 
 
 @given(st.sampled_from(KINDS), st.sampled_from(ORDERS), st.data())
-def test_numbers_come_back_from_their_registers(kind: TypeName, order: Order, data: st.DataObject) -> None:
+def test_reader_inverts_the_encoding(kind: TypeName, order: Order, data: st.DataObject) -> None:
     width = 16 * registers_of(kind)
     if kind.startswith("float"):
         number: float = data.draw(st.floats(width=32 if width == 32 else 64, allow_nan=False))
@@ -24,32 +24,32 @@ def test_numbers_come_back_from_their_registers(kind: TypeName, order: Order, da
 
 
 @given(st.sampled_from(KINDS), st.sampled_from(ORDERS), st.lists(st.integers(0, 65535), min_size=4, max_size=4))
-def test_any_registers_are_a_finite_value_or_none(kind: TypeName, order: Order, words: list[int]) -> None:
+def test_any_registers_are_a_finite_value_or_nan(kind: TypeName, order: Order, words: list[int]) -> None:
     value = item(type=kind, order=order, scale=1e300).value(words[: registers_of(kind)])
     assert math.isfinite(value) or math.isnan(value)
 
 
 @given(st.integers(0, 65535), st.integers(0, 15), st.integers(0, 15))
-def test_bits_are_cut_out_of_an_integer(word: int, one: int, other: int) -> None:
+def test_bit_field_of_an_integer(word: int, one: int, other: int) -> None:
     low, high = sorted((one, other))
-    found = item(type="uint16", bits=f"{low}..{high}").value([word])
-    assert found == int(f"{word:016b}"[15 - high : 16 - low], 2)
+    value = item(type="uint16", bits=f"{low}..{high}").value([word])
+    assert value == int(f"{word:016b}"[15 - high : 16 - low], 2)
 
 
 @pytest.mark.parametrize(("written", "kind"), [("4..2", "uint16"), ("16", "int16"), ("x", "int16"), ("1", "float32")])
-def test_bits_that_are_not_there_are_refused(written: str, kind: TypeName) -> None:
+def test_invalid_bit_field_is_refused(written: str, kind: TypeName) -> None:
     with pytest.raises(ValueError, match="bits"):
         bits(written, kind)
 
 
-def test_scale_offset_and_unit_are_applied_in_this_order() -> None:
+def test_scale_offset_and_unit_are_applied_in_order() -> None:
     assert item(type="int16", scale=0.1, offset=-5.0, unit="mV").value([200]) == pytest.approx(0.015)
 
 
-def test_a_value_out_of_range_is_no_reading() -> None:
+def test_value_out_of_range_is_nan() -> None:
     assert math.isnan(item(type="int16", unit="V", range=(-10.0, 10.0)).value([11]))
 
 
-def test_files_may_count_registers_from_one() -> None:
-    source = Source.model_validate({"register": 1, "type": "int16", "unit": "V"})
-    assert item_of(Signal("s", "V", source), Options(host="localhost", first_address=1)).address == 0
+def test_first_address_shifts_registers() -> None:
+    source = ModbusSource.model_validate({"register": 1, "type": "int16", "unit": "V"})
+    assert register_signal(Signal("s", "V", source), ModbusOptions(host="localhost", first_address=1)).address == 0

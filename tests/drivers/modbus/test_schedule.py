@@ -1,4 +1,4 @@
-"""Which registers are read together, and when."""
+"""Requests, their backoff, and the grid of rounds."""
 
 import math
 from collections.abc import Sequence
@@ -9,165 +9,173 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith_drivers.modbus.options import Item, Options
-from otolith_drivers.modbus.protocol import Refused, TypeName
-from otolith_drivers.modbus.schedule import EASY, LONGEST_REST, ROUNDS, PollSchedule, Requests, plan, split
+from otolith_drivers.modbus.options import ModbusOptions, RegisterSignal
+from otolith_drivers.modbus.protocol import ExceptionReplyError, TypeName
+from otolith_drivers.modbus.schedule import (
+    DECISION_ROUNDS,
+    FAST_DECISIONS,
+    MAX_PAUSE,
+    PollSchedule,
+    RequestSet,
+    plan,
+    split,
+)
 from tests.drivers.registers import KINDS, item
 
-places = st.lists(
+register_places = st.lists(
     st.tuples(st.integers(1, 2), st.sampled_from(["holding", "input"]), st.integers(0, 300), st.sampled_from(KINDS)),
     min_size=1,
     max_size=30,
 )
 
 
-def items_at(found: Sequence[tuple[int, str, int, TypeName]]) -> list[Item]:
+def signals_at(places: Sequence[tuple[int, str, int, TypeName]]) -> list[RegisterSignal]:
     return [
         item(f"s{index}", device=device, table=table, register=address, type=kind)
-        for index, (device, table, address, kind) in enumerate(found)
+        for index, (device, table, address, kind) in enumerate(places)
     ]
 
 
-@given(places, st.integers(0, 20), st.integers(4, 125))
-def test_a_plan_reads_everything_within_the_limits(
-    found: list[tuple[int, str, int, TypeName]], gap: int, most: int
+@given(register_places, st.integers(0, 20), st.integers(4, 125))
+def test_plan_reads_all_signals_within_the_limits(
+    places: list[tuple[int, str, int, TypeName]], gap: int, most: int
 ) -> None:
-    requests = plan(items_at(found), gap, most)
-    names = [entry.name for request in requests for entry in request.items]
-    assert sorted(names) == sorted(f"s{index}" for index in range(len(found)))
+    requests = plan(signals_at(places), gap, most)
+    names = [signal.name for request in requests for signal in request.signals]
+    assert sorted(names) == sorted(f"s{index}" for index in range(len(places)))
     for request in requests:
         assert request.count <= most
-        wanted = {at for entry in request.items for at in range(entry.address, entry.end)}
+        wanted = {at for signal in request.signals for at in range(signal.address, signal.end)}
         assert {request.address, request.address + request.count - 1} <= wanted
         unwanted = 0
         for at in range(request.address, request.address + request.count):
             unwanted = 0 if at in wanted else unwanted + 1
             assert unwanted <= gap
-        assert all((entry.device, entry.table) == (request.device, request.table) for entry in request.items)
+        assert all((signal.device, signal.table) == (request.device, request.table) for signal in request.signals)
 
 
-@given(places)
-def test_splitting_ends_with_single_registers_and_loses_none(found: list[tuple[int, str, int, TypeName]]) -> None:
-    whole = plan(items_at(found), 20, 125)
+@given(register_places)
+def test_split_ends_with_single_signals(places: list[tuple[int, str, int, TypeName]]) -> None:
+    whole = plan(signals_at(places), 20, 125)
     pieces = list(whole)
     for _ in range(100):
         pieces = [part for request in pieces for part in split(request)]
-    assert sorted(entry.name for piece in pieces for entry in piece.items) == sorted(
-        entry.name for request in whole for entry in request.items
+    assert sorted(signal.name for piece in pieces for signal in piece.signals) == sorted(
+        signal.name for request in whole for signal in request.signals
     )
-    for piece in pieces:  # what is left together overlaps
-        for before, after in zip(piece.items, piece.items[1:], strict=False):
-            assert after.address < max(entry.end for entry in piece.items if entry.address <= before.address)
+    for piece in pieces:  # signals that stay together overlap
+        for before, after in zip(piece.signals, piece.signals[1:], strict=False):
+            assert after.address < max(signal.end for signal in piece.signals if signal.address <= before.address)
 
 
-def test_a_pace_that_fits_is_kept_and_one_that_does_not_is_lengthened_evenly() -> None:
-    pace, now = PollSchedule(0.01), 100.0
-    pace.start(now)
-    for _ in range(3 * ROUNDS):
-        now = max(now, pace.due)
-        assert pace.begin(now) == 0
+def test_period_is_kept_or_lengthened_to_what_fits() -> None:
+    schedule, now = PollSchedule(0.01), 100.0
+    schedule.start(now)
+    for _ in range(3 * DECISION_ROUNDS):
+        now = max(now, schedule.due)
+        assert schedule.begin(now) == 0
         now += 0.004
-        assert not pace.end(0.004, repeated=False)
-    assert pace.achieved == pytest.approx(0.01)
+        assert not schedule.end(0.004, repeated=False)
+    assert schedule.achieved == pytest.approx(0.01)
     missed = 0
-    for _ in range(5 * ROUNDS):
-        now = max(now, pace.due)
-        missed += pace.begin(now)
+    for _ in range(5 * DECISION_ROUNDS):
+        now = max(now, schedule.due)
+        missed += schedule.begin(now)
         now += 0.021
-        pace.end(0.021, repeated=False)
-    assert pace.period == 0.025
-    assert pace.achieved == pytest.approx(0.025)
+        schedule.end(0.021, repeated=False)
+    assert schedule.period == 0.025
+    assert schedule.achieved == pytest.approx(0.025)
     assert missed > 0
-    assert "100 Hz asked, 40.0 achieved" in pace.describe()
-    for _ in range(EASY * ROUNDS + 2 * ROUNDS):
-        now = max(now, pace.due)
-        pace.begin(now)
+    assert "100 Hz asked, 40.0 achieved" in schedule.describe()
+    for _ in range(FAST_DECISIONS * DECISION_ROUNDS + 2 * DECISION_ROUNDS):
+        now = max(now, schedule.due)
+        schedule.begin(now)
         now += 0.004
-        pace.end(0.004, repeated=False)
-    assert pace.period == 0.01
+        schedule.end(0.004, repeated=False)
+    assert schedule.period == 0.01
 
 
-def test_a_computer_that_was_busy_for_a_moment_does_not_change_the_grid() -> None:
-    pace, now = PollSchedule(0.01), 0.0
-    pace.start(now)
-    for index in range(10 * ROUNDS):
-        now = max(now, pace.due)
-        pace.begin(now)
+def test_busy_computer_does_not_change_the_period() -> None:
+    schedule, now = PollSchedule(0.01), 0.0
+    schedule.start(now)
+    for index in range(10 * DECISION_ROUNDS):
+        now = max(now, schedule.due)
+        schedule.begin(now)
         duration = 0.03 if index % 20 == 0 else 0.004
         now += duration
-        assert not pace.end(duration, repeated=False)
+        assert not schedule.end(duration, repeated=False)
 
 
 @given(st.lists(st.floats(0.0, 3.0), min_size=1, max_size=50))
-def test_every_slot_is_begun_or_told_as_left_out(pauses: list[float]) -> None:
-    pace, now = PollSchedule(0.01), 0.0
-    pace.start(now)
+def test_each_round_is_begun_or_counted_as_skipped(pauses: list[float]) -> None:
+    schedule, now = PollSchedule(0.01), 0.0
+    schedule.start(now)
     begun = missed = 0
     for pause in pauses:
-        if now >= pace.due:
-            missed += pace.begin(now)
+        if now >= schedule.due:
+            missed += schedule.begin(now)
             begun += 1
         now += pause
-        missed += pace.pass_over(now)
-    assert begun + missed == math.floor(now / 0.01 + 1e-6) + 1 or pace.due - now <= 0.01 + 1e-6
-    assert abs(begun + missed - (pace.due / 0.01)) < 1e-6 * (1 + begun + missed)
+        missed += schedule.pass_over(now)
+    assert begun + missed == math.floor(now / 0.01 + 1e-6) + 1 or schedule.due - now <= 0.01 + 1e-6
+    assert abs(begun + missed - (schedule.due / 0.01)) < 1e-6 * (1 + begun + missed)
 
 
-def test_reading_moves_away_from_the_moment_at_which_the_device_renews_its_registers() -> None:
-    pace, now = PollSchedule(0.01), 0.0
-    pace.start(now)
+def test_aliasing_shifts_the_grid() -> None:
+    schedule, now = PollSchedule(0.01), 0.0
+    schedule.start(now)
     phases = set()
     for index in range(500):
-        now = pace.due
-        pace.begin(now)
+        now = schedule.due
+        schedule.begin(now)
         phases.add(round(now / 0.01, 3) % 1.0)
-        pace.end(0.001, repeated=index < 200 and index % 4 == 0)
+        schedule.end(0.001, repeated=index < 200 and index % 4 == 0)
     assert phases == {0.0, 0.25, 0.5}
 
 
-def test_a_beat_that_stays_wherever_one_reads_is_not_run_away_from_for_ever() -> None:
-    """It is a coarse register, and every step is a disturbance of the grid."""
-    pace, now, steps = PollSchedule(0.1), 0.0, 0
-    pace.start(now)
+def test_lasting_aliasing_shifts_ever_more_seldom() -> None:
+    """It is a coarse register, and each shift disturbs the grid."""
+    schedule, now, steps = PollSchedule(0.1), 0.0, 0
+    schedule.start(now)
     for index in range(20_000):
-        before, now = now, pace.due
+        before, now = now, schedule.due
         steps += now - before > 0.11
-        pace.begin(now)
-        pace.end(0.001, repeated=index % 5 == 0)
+        schedule.begin(now)
+        schedule.end(0.001, repeated=index % 5 == 0)
     assert steps <= 15
 
 
-def test_the_pause_before_a_dead_device_is_asked_again_is_bounded() -> None:
-    requests = Requests(plan([item("a", device=1), item("b", device=2)], 0, 125))
+def test_backoff_of_a_dead_device_is_bounded() -> None:
+    requests = RequestSet(plan([item("a", device=1), item("b", device=2)], 0, 125))
     dead, now, asked = requests.requests[1], 0.0, []
     for _ in range(2000):
         now += 0.1
         for request in requests.due(now):
             if request == dead:
-                requests.silent(request, "no answer", now)
+                requests.unanswered(request, "no answer", now)
                 asked.append(now)
             else:
                 requests.answered(request)
     pauses = np.diff(asked)
-    assert pauses.max() <= LONGEST_REST + 0.2
-    assert len(asked) >= 200.0 / (LONGEST_REST + 0.2)
+    assert pauses.max() <= MAX_PAUSE + 0.2
+    assert len(asked) >= 200.0 / (MAX_PAUSE + 0.2)
     assert len(asked) <= 40
 
 
-def test_a_busy_device_is_asked_again_at_once_and_left_alone_only_after_a_while() -> None:
-    requests = Requests(plan([item("a")], 0, 125))
+def test_busy_device_is_paused_after_three_failures() -> None:
+    requests = RequestSet(plan([item("a")], 0, 125))
     only = requests.requests[0]
     for _ in range(2):
-        requests.refused(only, Refused(6), 1.0)
+        requests.refused(only, ExceptionReplyError(6), 1.0)
         assert requests.due(1.0) == [only]
-    requests.refused(only, Refused(6), 1.0)
+    requests.refused(only, ExceptionReplyError(6), 1.0)
     assert requests.due(1.0) == []
     assert "server device busy" in requests.warnings(1.0)[0]
 
 
-def test_the_lines_least_time_is_that_of_its_characters() -> None:
-    line = Options(serial="/dev/ttyUSB0", baudrate=9600)
+def test_least_time_counts_serial_characters() -> None:
+    line = ModbusOptions(serial="/dev/ttyUSB0", baudrate=9600)
     assert line.least_time(10) == pytest.approx((8 + 5 + 20 + 7) * 11 / 9600)
-    without_parity = Options(serial="/dev/ttyUSB0", baudrate=9600, parity="N")
+    without_parity = ModbusOptions(serial="/dev/ttyUSB0", baudrate=9600, parity="N")
     assert without_parity.least_time(10) == pytest.approx((8 + 5 + 20 + 7) * 10 / 9600)
     assert Path(line.serial or "").name in line.title()

@@ -1,4 +1,4 @@
-"""The simulated machine in the daemon's own process: every tick is delivered or counted, at its time or later."""
+"""The plant driver: every sample is delivered or counted as lost, at its time or later."""
 
 import threading
 import time
@@ -25,7 +25,7 @@ TICK = 0.01  # s
 
 @pytest.fixture
 def scenario(tmp_path: Path) -> Callable[[str], Path]:
-    """The demo's with other faults."""
+    """The demo scenario with other faults."""
 
     def write(faults: str) -> Path:
         text = (EXAMPLES / "scenarios" / "demo.toml").read_text(encoding="utf-8").split("[[faults]]")[0]
@@ -40,8 +40,8 @@ def driver_of(path: Path, signals: tuple[Signal, ...] = SIGNALS) -> Driver:
     return build(Options(scenario=Path(path.name)), Setup(signals, path.parent, TICK))
 
 
-def hear(driver: Driver, enough: Callable[[list[Sample]], bool]) -> list[Sample]:
-    """All samples, once there are enough of them and the driver is closed."""
+def receive(driver: Driver, enough: Callable[[list[Sample]], bool]) -> list[Sample]:
+    """Open the driver, wait for enough samples, close it and return them."""
     got: list[Sample] = []
     news = threading.Event()
 
@@ -58,36 +58,36 @@ def hear(driver: Driver, enough: Callable[[list[Sample]], bool]) -> list[Sample]
     return got
 
 
-def test_what_it_delivers_and_loses_is_the_scenario(scenario: Callable[[str], Path]) -> None:
+def test_plant_driver_delivers_and_loses_the_scenarios_samples(scenario: Callable[[str], Path]) -> None:
     path = scenario('[[faults]]\nkind = "dropouts"\nshare = 0.3\nstart = "0.1 s"\n')
     driver = driver_of(path)
-    got = hear(driver, lambda got: len(got) >= 200)
+    got = receive(driver, lambda got: len(got) >= 200)
     counters, loaded = driver.counters(), load_scenario(path)
     assert (counters.received, counters.bad, counters.reconnects) == (len(got), 0, 0)
-    interference = FaultInjector(loaded.faults, loaded.seed)
-    ticks = list(islice(simulate(loaded), (counters.received + counters.lost) // 2))
-    sent = [tick for tick in ticks if interference.at(tick.time).withheld is None]
-    assert counters.lost == 2 * (len(ticks) - len(sent)) > 0
-    assert [sample.value for sample in got[::2]] == [1e3 * tick.measured["ArmatureCurrent"] for tick in sent]
-    assert [sample.value for sample in got[1::2]] == [tick.measured["RotorSpeed"] for tick in sent]
+    injector = FaultInjector(loaded.faults, loaded.seed)
+    samples = list(islice(simulate(loaded), (counters.received + counters.lost) // 2))
+    sent = [sample for sample in samples if injector.at(sample.time).withheld is None]
+    assert counters.lost == 2 * (len(samples) - len(sent)) > 0
+    assert [sample.value for sample in got[::2]] == [1e3 * sample.measured["ArmatureCurrent"] for sample in sent]
+    assert [sample.value for sample in got[1::2]] == [sample.measured["RotorSpeed"] for sample in sent]
 
 
-def test_a_tick_is_late_as_the_scenario_says_and_never_early(scenario: Callable[[str], Path]) -> None:
-    """The clock goes back by 0.3 s for 0.5 s; ticks that stray do not overtake each other."""
+def test_plant_driver_delays_samples_in_order_never_early(scenario: Callable[[str], Path]) -> None:
+    """The clock is late by 0.3 s for 0.5 s; delayed samples stay in order."""
     steps = "".join(f'[[faults]]\nkind = "clock_step"\nby = "{by} s"\nstart = "{start} s"\n'
                     for by, start in ((0.3, 0.5), (-0.3, 1.0)))  # fmt: skip
     path = scenario(steps + '[[faults]]\nkind = "jitter"\ndeviation = "5 ms"\nstart = "0 s"\n')
     begun = time.monotonic()
-    times = [sample.time for sample in hear(driver_of(path), lambda got: len(got) >= 300)[::2]]
+    times = [sample.time for sample in receive(driver_of(path), lambda got: len(got) >= 300)[::2]]
     assert times == sorted(times)
     loaded = load_scenario(path)
-    interference = FaultInjector(loaded.faults, loaded.seed)
-    due = [index * TICK + interference.at(index * TICK).delay for index in range(len(times))]
+    injector = FaultInjector(loaded.faults, loaded.seed)
+    due = [index * TICK + injector.at(index * TICK).delay for index in range(len(times))]
     assert all(moment - begun >= earliest for moment, earliest in zip(times, due, strict=True))
     assert times[50] - begun >= 0.8
 
 
-def test_a_machine_that_is_gone_says_so_and_comes_back(scenario: Callable[[str], Path]) -> None:
+def test_plant_driver_reports_gone_and_reconnects(scenario: Callable[[str], Path]) -> None:
     driver = driver_of(scenario('[[faults]]\nkind = "gone"\nstart = "0.2 s"\nuntil = "0.6 s"\n'))
     got: list[Sample] = []
     reasons: list[str] = []
@@ -112,7 +112,7 @@ def test_a_machine_that_is_gone_says_so_and_comes_back(scenario: Callable[[str],
         ("", Signal("i", "V", Source(signal="ArmatureCurrent")), "does not measure what 'V' does"),
     ],
 )
-def test_what_cannot_be_had_is_refused_with_its_key(
+def test_plant_driver_refuses_with_the_key(
     scenario: Callable[[str], Path], faults: str, signal: Signal, message: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=message) as caught:

@@ -1,4 +1,4 @@
-"""What happens to sensors and bus of the simulated machine: the bus lies, the machine does not, and seeds decide."""
+"""Faults of sensors and bus of the simulated machine, its register map, and their documentation."""
 
 import tomllib
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.modbus.protocol import Order
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.faults import (
+    BusEffect,
     BusFault,
     ClockStep,
     Dropouts,
-    Effect,
     Fault,
     FaultInjector,
     Frozen,
@@ -34,7 +34,7 @@ from otolith_drivers.plant.faults import (
     WordOrder,
 )
 from otolith_drivers.plant.realtime import NODES, refuse_unfit
-from otolith_drivers.plant.register_map import ModbusOptions, RegisterMap
+from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES
 
@@ -52,13 +52,13 @@ OTHERS = (
 FAULTS = st.lists(st.sampled_from([HALF, AWAY, *OTHERS]), max_size=4)
 
 
-def ticks(scenario: MotorScenario, *faults: Fault) -> list[PlantSample]:
+def samples_of(scenario: MotorScenario, *faults: Fault) -> list[PlantSample]:
     changed = scenario.model_copy(update={"faults": (*scenario.faults, *faults)})
     return list(islice(simulate(changed), round(SECONDS / PERIOD)))
 
 
-def column(found: list[PlantSample], name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    return np.array([tick.measured[name] for tick in found])
+def column(samples: list[PlantSample], name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    return np.array([sample.measured[name] for sample in samples])
 
 
 SENSOR_FAULTS: dict[str, SensorFault] = {
@@ -70,9 +70,9 @@ SENSOR_FAULTS: dict[str, SensorFault] = {
 
 
 @pytest.mark.parametrize("kind", SENSOR_FAULTS)
-def test_only_the_bus_lies(scenario: MotorScenario, kind: str) -> None:
-    """Truth, the controller's voltage and the other sensors are those of the machine without the fault, bit for bit."""
-    right, wrong = ticks(scenario), ticks(scenario, SENSOR_FAULTS[kind])
+def test_sensor_fault_changes_the_bus_value_only(scenario: MotorScenario, kind: str) -> None:
+    """Truth, voltage and the other sensors are bit-identical to those without the fault."""
+    right, wrong = samples_of(scenario), samples_of(scenario, SENSOR_FAULTS[kind])
     for one, other in zip(right, wrong, strict=True):
         assert one.truth == other.truth
         assert {**other.measured, "RotorSpeed": one.measured["RotorSpeed"]} == one.measured
@@ -91,23 +91,22 @@ def test_only_the_bus_lies(scenario: MotorScenario, kind: str) -> None:
         assert np.count_nonzero(error) == pytest.approx(60, abs=4 * (300 * 0.2 * 0.8) ** 0.5)
 
 
-def test_a_frozen_sensor_may_lie_as_well(scenario: MotorScenario) -> None:
-    """Faults of one signal act in the order of the file."""
+def test_sensor_faults_of_a_signal_act_in_file_order(scenario: MotorScenario) -> None:
     frozen, gain = SENSOR_FAULTS["frozen"], SENSOR_FAULTS["gain"]
-    right = column(ticks(scenario), "RotorSpeed")
-    assert column(ticks(scenario, frozen, gain), "RotorSpeed")[799] == pytest.approx(1.1 * right[500])
+    right = column(samples_of(scenario), "RotorSpeed")
+    assert column(samples_of(scenario, frozen, gain), "RotorSpeed")[799] == pytest.approx(1.1 * right[500])
     doubled = Gain(kind="gain", signal="RotorSpeed", factor=2.0, start="0 s")
-    assert column(ticks(scenario, doubled, frozen), "RotorSpeed")[799] == 2.0 * right[500]
+    assert column(samples_of(scenario, doubled, frozen), "RotorSpeed")[799] == 2.0 * right[500]
 
 
-def effects(faults: Sequence[BusFault], seed: int = 1, count: int = 400) -> list[Effect]:
-    interference = FaultInjector(faults, seed)
-    return [interference.at(index * PERIOD) for index in range(count)]
+def effects(faults: Sequence[BusFault], seed: int = 1, count: int = 400) -> list[BusEffect]:
+    injector = FaultInjector(faults, seed)
+    return [injector.at(index * PERIOD) for index in range(count)]
 
 
 @given(FAULTS, st.integers(0, 2**31), st.sampled_from([HALF, AWAY]))
-def test_the_dice_of_a_fault_are_its_own(faults: list[BusFault], seed: int, another: BusFault) -> None:
-    """The same seed gives the same faults, and one more fault does not move those before it."""
+def test_bus_faults_have_independent_random_numbers(faults: list[BusFault], seed: int, another: BusFault) -> None:
+    """The same seed gives the same faults, and another fault does not change those before it."""
     before, after = effects(faults, seed), effects([*faults, another], seed)
     assert before == effects(faults, seed)
     for one, other in zip(before, after, strict=True):
@@ -116,7 +115,7 @@ def test_the_dice_of_a_fault_are_its_own(faults: list[BusFault], seed: int, anot
 
 
 @given(FAULTS)
-def test_a_fault_acts_only_in_its_time(faults: list[BusFault]) -> None:
+def test_bus_fault_acts_only_in_its_span(faults: list[BusFault]) -> None:
     for index, effect in enumerate(effects(faults)):
         for number in effect.acting:
             assert faults[number].covers(index * PERIOD)
@@ -125,40 +124,40 @@ def test_a_fault_acts_only_in_its_time(faults: list[BusFault]) -> None:
             assert effect.withheld is not None
 
 
-def test_another_seed_loses_other_ticks_but_as_many() -> None:
+def test_dropouts_of_two_seeds_differ_but_are_as_many() -> None:
     lost = [[effect.withheld is not None for effect in effects([HALF], seed)] for seed in (1, 2)]
     assert lost[0] != lost[1]
-    for found in lost:
-        assert sum(found) == sum(found[100:300]) == pytest.approx(100, abs=4 * (200 * 0.25) ** 0.5)
+    for is_lost in lost:
+        assert sum(is_lost) == sum(is_lost[100:300]) == pytest.approx(100, abs=4 * (200 * 0.25) ** 0.5)
 
 
-def test_jitter_strays_as_much_as_it_says_and_never_early() -> None:
+def test_jitter_has_its_deviation_and_is_never_early() -> None:
     faults = [Jitter(kind="jitter", deviation="2 ms", start="0 s")]
     delays = np.array([effect.delay for effect in effects(faults, count=4000)])
     assert delays.std() == pytest.approx(0.002, rel=0.05)
     assert delays.min() >= 0.0
 
 
-def test_a_fault_that_cannot_happen_on_a_bus_is_refused_there() -> None:
-    found = load_scenario(EXAMPLES / "scenarios" / "word-order.toml")
+def test_fault_is_refused_on_a_transport_that_cannot_have_it() -> None:
+    scenario = load_scenario(EXAMPLES / "scenarios" / "word-order.toml")
     for transport in ("can", "in-process"):
         with pytest.raises(ConfigurationError, match=r"faults\[0\].*'word_order' cannot happen on"):
-            refuse_unfit(found, transport)
-    refuse_unfit(found, "modbus-tcp")
+            refuse_unfit(scenario, transport)
+    refuse_unfit(scenario, "modbus-tcp")
     assert set(NODES) == {"can", "modbus-tcp", "modbus-rtu"}
 
 
-def test_every_fault_and_every_default_is_in_the_docs() -> None:
+def test_docs_have_every_fault_and_every_modbus_default() -> None:
     page = (Path(__file__).parents[3] / "docs" / "simulated-machines.md").read_text(encoding="utf-8")
     rows = {line.split("`")[1]: line for line in page.splitlines() if line.startswith("| `")}
     classes = {get_args(each.model_fields["kind"].annotation)[0]: each for each in get_args(get_args(Fault)[0])}
     assert rows.keys() == classes.keys()
     for kind, each in classes.items():
-        said = set(each.model_fields) - {"kind", "start", "until"}
-        assert {name for name in said if f"`{name}`" not in rows[kind]} == set()
+        fields = set(each.model_fields) - {"kind", "start", "until"}
+        assert {name for name in fields if f"`{name}`" not in rows[kind]} == set()
     written = tomllib.loads(page.split("```toml")[1].split("```")[0])["modbus"]
-    assert ModbusOptions.model_validate(written) == ModbusOptions()
-    assert {"scale", "line", *written} == set(ModbusOptions.model_fields)
+    assert NodeModbusOptions.model_validate(written) == NodeModbusOptions()
+    assert {"scale", "line", *written} == set(NodeModbusOptions.model_fields)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +172,7 @@ def test_every_fault_and_every_default_is_in_the_docs() -> None:
         ('kind = "gonne"', "gone"),
     ],
 )
-def test_a_wrong_fault_gets_its_sentence(tmp_path: Path, wrong: str, message: str) -> None:
+def test_wrong_fault_is_refused_with_the_reason(tmp_path: Path, wrong: str, message: str) -> None:
     text = (EXAMPLES / "scenarios" / "sensor-gain.toml").read_text(encoding="utf-8")
     path = tmp_path / "wrong.toml"
     path.write_text(f'{text.split("[[faults]]")[0]}\n[[faults]]\n{wrong}\nstart = "0 s"\n', encoding="utf-8")
@@ -191,16 +190,16 @@ BYTES = {"ABCD": [0, 1, 2, 3], "DCBA": [3, 2, 1, 0], "BADC": [1, 0, 3, 2], "CDAB
     st.integers(0, 2**20),
     st.sampled_from(sorted(BYTES)),
 )
-def test_float_registers_in_any_order(one: float, other: float, index: int, order: Order) -> None:
-    registers = RegisterMap(ModbusOptions(), SIGNALS).encode({"speed": one, "current": other}, index, order)
+def test_register_map_encodes_floats_in_any_order(one: float, other: float, index: int, order: Order) -> None:
+    registers = RegisterMap(NodeModbusOptions(), SIGNALS).encode({"speed": one, "current": other}, index, order)
     assert registers[4] == index % 65536
     data = np.array(registers[:4], ">u2").view("u1").reshape(2, 4)[:, np.argsort(BYTES[order])]
     assert np.array_equal(np.ascontiguousarray(data).view(">f4").ravel(), np.array([one, other], np.float32))
 
 
 @pytest.mark.parametrize(("kind", "low", "high"), [("int16", -(2**15), 2**15 - 1), ("int32", -(2**31), 2**31 - 1)])
-def test_integer_registers_count_and_saturate(kind: str, low: int, high: int) -> None:
-    options = ModbusOptions.model_validate({"type": kind, "scale": {"speed": "1 rpm", "current": "1 mA"}})
+def test_register_map_scales_and_saturates_integers(kind: str, low: int, high: int) -> None:
+    options = NodeModbusOptions.model_validate({"type": kind, "scale": {"speed": "1 rpm", "current": "1 mA"}})
     registers = RegisterMap(options, SIGNALS)
 
     def read(current: float) -> int:
@@ -220,6 +219,6 @@ def test_integer_registers_count_and_saturate(kind: str, low: int, high: int) ->
         ({"scale": {"speed": "1 rpm"}}, 'scale is for type = "int16"'),
     ],
 )
-def test_a_wrong_register_map_is_refused(options: dict[str, object], message: str) -> None:
+def test_register_map_refuses_wrong_options(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RegisterMap(ModbusOptions.model_validate(options), SIGNALS)
+        RegisterMap(NodeModbusOptions.model_validate(options), SIGNALS)

@@ -1,4 +1,4 @@
-"""The simulated machine as a Modbus drive, in a process of its own, asked by a client that is not ours."""
+"""The simulated Modbus drive in a process of its own, read by the clients of pymodbus and by raw bytes."""
 
 import asyncio
 import math
@@ -28,8 +28,8 @@ from tests.waiting import wait_for as wait_until
 
 
 @pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
-def test_each_read_is_one_tick_of_the_scenario(drive: Callable[..., Drive], transport: str) -> None:
-    """Holding and input registers alike, to the last bit of a float32, and never a mixture of two ticks."""
+def test_modbus_read_is_one_sample_of_the_scenario(drive: Callable[..., Drive], transport: str) -> None:
+    """Holding and input registers, bit by bit of a float32, and never a mixture of two samples."""
     node, seen = drive("", transport), list[Sequence[int]]()
     with node.client() as client:
         while not seen or seen[-1][COUNTER] < 50:
@@ -45,19 +45,19 @@ def test_each_read_is_one_tick_of_the_scenario(drive: Callable[..., Drive], tran
     assert code == 0
     assert done["functions"] == {"3": len(seen) // 2 + 2, "4": len(seen) // 2}
     assert done["answers"] == len(seen) + 2
-    assert f"{len(seen) + 2} answers to {len(seen) + 2} requests" in node.said
+    assert f"{len(seen) + 2} answers to {len(seen) + 2} requests" in node.stderr
     assert not node.line.is_symlink()
 
 
-def test_an_asynchronous_client_reads_the_same(drive: Callable[..., Drive]) -> None:
+def test_modbus_asynchronous_client_reads_the_same(drive: Callable[..., Drive]) -> None:
     node = drive()
 
     async def read() -> list[Sequence[int]]:
         client = AsyncModbusTcpClient("127.0.0.1", port=node.port, timeout=PATIENCE, retries=0)
         assert await client.connect()
-        found = [(await client.read_holding_registers(0, count=REGISTERS)).registers for _ in range(100)]
+        reads = [(await client.read_holding_registers(0, count=REGISTERS)).registers for _ in range(100)]
         client.close()
-        return found
+        return reads
 
     seen = asyncio.run(read())
     ticks = node.ticks(seen[-1][COUNTER] + 1)
@@ -80,7 +80,7 @@ NO_READS: dict[int, Callable[[Client], ModbusPDU]] = {
 
 
 @pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
-def test_nothing_can_be_written(drive: Callable[..., Drive], transport: str) -> None:
+def test_modbus_node_refuses_every_other_function(drive: Callable[..., Drive], transport: str) -> None:
     """Every function that does not read registers is illegal, counted, and without any effect."""
     node = drive("", transport)
     with node.client() as client:
@@ -93,14 +93,14 @@ def test_nothing_can_be_written(drive: Callable[..., Drive], transport: str) -> 
     assert done["refused"] == {str(function): 1 for function in NO_READS}
 
 
-def test_another_device_is_not_there(drive: Callable[..., Drive]) -> None:
+def test_modbus_tcp_refuses_another_device(drive: Callable[..., Drive]) -> None:
     node = drive("", "modbus-tcp", "device = 7")
     with node.client() as client:
         assert client.read_holding_registers(0, count=2, device_id=1).exception_code == 11
         assert not client.read_holding_registers(0, count=2, device_id=7).isError()
 
 
-def test_on_a_line_only_the_device_that_is_asked_speaks(drive: Callable[..., Drive]) -> None:
+def test_modbus_rtu_ignores_another_device(drive: Callable[..., Drive]) -> None:
     node = drive("", "modbus-rtu", "device = 7")
     with node.client() as client:
         with pytest.raises(ModbusException, match="No response"):
@@ -113,7 +113,7 @@ REQUEST = bytes.fromhex("01 03 00 00 00 09 85 cc")  # nine registers from 0 on, 
 
 
 @pytest.mark.parametrize("baudrate", [9600, 115200])
-def test_bytes_take_their_time_on_the_line(drive: Callable[..., Drive], baudrate: int) -> None:
+def test_serial_line_paces_bytes(drive: Callable[..., Drive], baudrate: int) -> None:
     """A read takes what both frames take; 9600 baud leave time for less than 30 reads of four signals per second."""
     node = drive("", "modbus-rtu", f"baudrate = {baudrate}")
     line = os.open(node.line, os.O_RDWR | os.O_NOCTTY)
@@ -126,8 +126,8 @@ def test_bytes_take_their_time_on_the_line(drive: Callable[..., Drive], baudrate
     os.close(line)
 
 
-def test_noise_on_the_line_costs_no_more_than_itself(drive: Callable[..., Drive]) -> None:
-    """Half a request is forgotten after silence, as Modbus RTU says."""
+def test_serial_line_noise_does_not_spoil_the_next_request(drive: Callable[..., Drive]) -> None:
+    """A partial request is dropped after a silence, as Modbus RTU specifies."""
     node = drive("", "modbus-rtu")
     line = os.open(node.line, os.O_RDWR | os.O_NOCTTY)
     for rubbish in (REQUEST[:5], b"\xff\x00\xff", REQUEST[:-1] + b"\x00"):
@@ -138,7 +138,7 @@ def test_noise_on_the_line_costs_no_more_than_itself(drive: Callable[..., Drive]
     os.close(line)
 
 
-def test_no_bytes_of_a_client_bring_the_drive_down(drive: Callable[..., Drive]) -> None:
+def test_modbus_node_survives_random_bytes(drive: Callable[..., Drive]) -> None:
     """What a stranger sends costs its own connection at most, and nothing of it is believed."""
     node, random = drive(), np.random.default_rng(7)
     for _ in range(100):
@@ -152,11 +152,9 @@ def test_no_bytes_of_a_client_bring_the_drive_down(drive: Callable[..., Drive]) 
 
 
 @pytest.mark.parametrize(
-    ("transport", "message"), [("modbus-tcp", "Address already in use"), ("modbus-rtu", "is there already")]
+    ("transport", "message"), [("modbus-tcp", "Address already in use"), ("modbus-rtu", "exists already")]
 )
-def test_a_second_drive_in_the_same_place_is_one_line(
-    drive: Callable[..., Drive], transport: str, message: str
-) -> None:
+def test_second_modbus_node_is_refused_in_one_line(drive: Callable[..., Drive], transport: str, message: str) -> None:
     node = drive("", transport)
     second = subprocess.run(node.command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert second.returncode == 2
@@ -168,7 +166,7 @@ def test_a_second_drive_in_the_same_place_is_one_line(
 
 
 @pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
-def test_ctrl_c_leaves_nothing_behind(drive: Callable[..., Drive], transport: str) -> None:
+def test_modbus_node_removes_its_link_on_ctrl_c(drive: Callable[..., Drive], transport: str) -> None:
     node = drive("", transport)
     with node.client() as client:
         wait_for(client, past(0))
@@ -178,7 +176,7 @@ def test_ctrl_c_leaves_nothing_behind(drive: Callable[..., Drive], transport: st
     assert not node.line.is_symlink()
 
 
-def test_the_name_of_a_drive_that_was_killed_can_be_had_again(drive: Callable[..., Drive]) -> None:
+def test_serial_line_replaces_the_link_of_a_killed_node(drive: Callable[..., Drive]) -> None:
     killed = drive("", "modbus-rtu")
     killed.close()
     assert killed.line.is_symlink()
@@ -187,7 +185,7 @@ def test_the_name_of_a_drive_that_was_killed_can_be_had_again(drive: Callable[..
 
 
 @pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
-def test_a_node_ends_with_all_that_it_began(drive: Callable[..., Drive], transport: str) -> None:
+def test_modbus_node_leaks_no_thread_or_descriptor(drive: Callable[..., Drive], transport: str) -> None:
     """No thread and no descriptor is left, however often the device was gone."""
     faults = "".join(f'[[faults]]\nkind = "gone"\nstart = "0.{n} s"\nuntil = "0.{n}5 s"\n' for n in range(5))
     node = drive(faults, transport)
@@ -205,7 +203,7 @@ def test_a_node_ends_with_all_that_it_began(drive: Callable[..., Drive], transpo
         wait_until(lambda: threading.active_count() <= threads[0] and own.num_fds() <= descriptors[0])
 
 
-def test_a_lift_says_what_it_measures_in_integers(drive: Callable[..., Drive], tmp_path: Path) -> None:
+def test_modbus_node_of_the_lift_in_integers(drive: Callable[..., Drive], tmp_path: Path) -> None:
     node = drive()
     node.close()
     text = (EXAMPLES / "scenarios" / "hydraulic-fluid.toml").read_text(encoding="utf-8")
@@ -216,7 +214,7 @@ def test_a_lift_says_what_it_measures_in_integers(drive: Callable[..., Drive], t
     node.process = subprocess.Popen(node.command, stderr=subprocess.PIPE, text=True)
     with node.client() as client:
         registers = wait_for(client, past(10)).registers
-    found = np.array(registers[:COUNTER], ">u2").view(">i4") * [1e-8, 1.0, 1e-5, 1.0]
+    values = np.array(registers[:COUNTER], ">u2").view(">i4") * [1e-8, 1.0, 1e-5, 1.0]
     wanted = node.ticks(registers[COUNTER] + 1)[-1]
     assert all(math.isclose(one, other, abs_tol=step) for one, other, step in
-               zip(found, wanted, (1e-8, 1.0, 1e-5, 1.0), strict=True))  # fmt: skip
+               zip(values, wanted, (1e-8, 1.0, 1e-5, 1.0), strict=True))  # fmt: skip

@@ -22,7 +22,7 @@ LATER = Unbalance(kind="unbalance", start="1 s", acceleration="5 rad/s^2", order
 
 
 def names(value: object) -> str | None:
-    """Of a tuple of faults, to call a test by."""
+    """Test identifier of a tuple of faults."""
     return "-".join(fault.kind for fault in value) or "healthy" if isinstance(value, tuple) else None
 
 
@@ -32,25 +32,25 @@ def run(scenario: Scenario, seconds: float) -> list[PlantSample]:
 
 @pytest.fixture
 def quiet(scenario: MotorScenario) -> MotorScenario:
-    """Without noise and faults, asked for 10 rad/s from the start."""
+    """The motor without noise and faults, with a set-point of 10 rad/s from the start."""
     changes = {"noise": type(scenario.noise)(), "faults": (), "set_points": (SetPoint(at="0 s", speed="10 rad/s"),)}
     return scenario.model_copy(update={**changes, "repeat_every": None})
 
 
 @pytest.fixture
 def lift() -> LiftScenario:
-    """The paper's with a valve that reaches its limit, and parameters that change."""
-    found = load_scenario(EXAMPLES / "scenarios" / "hydraulic-leak.toml")
-    assert isinstance(found, LiftScenario)
+    """The lift of the paper with a valve that reaches its limit, and with parameters that change."""
+    loaded = load_scenario(EXAMPLES / "scenarios" / "hydraulic-leak.toml")
+    assert isinstance(loaded, LiftScenario)
     faults = (
         Drift(kind="drift", parameter="D", start="0.1 s", amount="5 N*s/m", rate="0.5 1/s"),
         Drift(kind="drift", parameter="q_pump", start="0 s", amount="0.001 m^3/s", rate="-0.5 1/s"),
         Step(kind="step", parameter="leak", start="1 s", amount="0.2 1"),
     )
-    return found.model_copy(update={"faults": faults, "parameters": type(found.parameters)(A_max="63.2 mm^2")})
+    return loaded.model_copy(update={"faults": faults, "parameters": type(loaded.parameters)(A_max="63.2 mm^2")})
 
 
-def test_settles_where_the_equations_say(quiet: MotorScenario) -> None:
+def test_motor_settles_at_the_solution_of_its_equations(quiet: MotorScenario) -> None:
     last = run(quiet, 200.0)[-1]
     speed, p = last.truth["omega"], quiet.parameters
     assert speed == pytest.approx(10.0, rel=1e-4)
@@ -58,18 +58,20 @@ def test_settles_where_the_equations_say(quiet: MotorScenario) -> None:
     assert last.measured["ArmatureVoltage"] == pytest.approx(p.R_a * last.truth["i"] + p.K_e * speed, rel=1e-6)
 
 
-def test_the_same_seed_gives_the_same_run(scenario: Scenario) -> None:
+def test_scenario_same_seed_gives_the_same_run(scenario: Scenario) -> None:
     assert run(scenario, 1.0) == run(scenario, 1.0)
     assert run(scenario, 1.0) != run(scenario.model_copy(update={"seed": 7}), 1.0)
 
 
-def test_noise_is_as_large_as_the_scenario_says(scenario: MotorScenario) -> None:
-    ticks = run(scenario, 60.0)
-    spread = math.sqrt(sum((tick.measured["ArmatureCurrent"] - tick.truth["i"]) ** 2 for tick in ticks) / len(ticks))
+def test_scenario_noise_has_its_deviation(scenario: MotorScenario) -> None:
+    samples = run(scenario, 60.0)
+    spread = math.sqrt(
+        sum((sample.measured["ArmatureCurrent"] - sample.truth["i"]) ** 2 for sample in samples) / len(samples)
+    )
     assert spread == pytest.approx(scenario.noise.current, rel=0.05)
 
 
-def test_integrators_agree_on_the_machine(quiet: MotorScenario) -> None:
+def test_motor_integrators_agree(quiet: MotorScenario) -> None:
     accurate = run(quiet, 5.0)[-1].truth
     euler = run(quiet.model_copy(update={"integrator": "euler"}), 5.0)[-1].truth
     assert euler["omega"] == pytest.approx(accurate["omega"], rel=1e-3)
@@ -77,7 +79,7 @@ def test_integrators_agree_on_the_machine(quiet: MotorScenario) -> None:
 
 
 def resistance(scenario: MotorScenario, time: float) -> float:
-    """By the laws of the paper, with a step that acts after its moment."""
+    """Resistance (ohm) by the laws of the paper; a step acts after its time."""
     value = scenario.parameters.R_a
     for fault in scenario.faults:
         if isinstance(fault, Drift) and fault.parameter == "R_a":
@@ -96,15 +98,15 @@ def unbalance(scenario: MotorScenario, time: float, angle: float) -> float:
 
 
 @pytest.mark.parametrize("faults", [(), (WEAR,), (SHAKE,), (LATER, SHAKE, WEAR, SHORT)], ids=names)
-def test_euler_is_equation_11_to_13_to_the_letter(quiet: MotorScenario, faults: tuple[Fault, ...]) -> None:
+def test_motor_by_euler_is_equation_11_to_13(quiet: MotorScenario, faults: tuple[Fault, ...]) -> None:
     quiet = quiet.model_copy(update={"integrator": "euler", "faults": faults})
     p, i, w, angle = quiet.parameters, 0.0, 0.0, 0.0
-    for tick in run(quiet, 2.7):
-        assert tick.truth["i"] == pytest.approx(i, rel=1e-12, abs=1e-14)
-        assert tick.truth["omega"] == pytest.approx(w, rel=1e-12, abs=1e-14)
+    for sample in run(quiet, 2.7):
+        assert sample.truth["i"] == pytest.approx(i, rel=1e-12, abs=1e-14)
+        assert sample.truth["omega"] == pytest.approx(w, rel=1e-12, abs=1e-14)
         for step in range(100):
-            time = tick.time + step * 1e-4
-            i_new = i + 1e-4 * (tick.measured["ArmatureVoltage"] - resistance(quiet, time) * i - p.K_e * w) / p.L_a
+            time = sample.time + step * 1e-4
+            i_new = i + 1e-4 * (sample.measured["ArmatureVoltage"] - resistance(quiet, time) * i - p.K_e * w) / p.L_a
             w_new = w + 1e-4 * (i_new * p.K_t - quiet.load * w - p.D * w) / p.J
             w_new += 1e-4 * unbalance(quiet, time, angle)
             i, w, angle = i_new, w_new, angle + 1e-4 * w
@@ -115,7 +117,7 @@ def test_euler_is_equation_11_to_13_to_the_letter(quiet: MotorScenario, faults: 
     [((), 1e-10), ((SHORT,), 1e-10), ((SHAKE,), 1e-10), ((IMBALANCE, SHORT), 1e-9), ((WEAR,), 2e-8)],
     ids=names,
 )
-def test_the_accurate_motor_solves_its_equations(quiet: MotorScenario, faults: tuple[Fault, ...], error: float) -> None:
+def test_accurate_motor_agrees_with_scipy(quiet: MotorScenario, faults: tuple[Fault, ...], error: float) -> None:
     quiet = quiet.model_copy(update={"faults": faults})
     p, state = quiet.parameters, np.zeros(3)
 
@@ -124,84 +126,85 @@ def test_the_accurate_motor_solves_its_equations(quiet: MotorScenario, faults: t
         acceleration = (p.K_t * i - (p.D + quiet.load) * w) / p.J + unbalance(quiet, time, angle)
         return [(voltage - resistance(quiet, time) * i - p.K_e * w) / p.L_a, acceleration, w]
 
-    ticks = run(quiet, 2.7)
-    highest = {name: max(abs(tick.truth[name]) for tick in ticks) for name in ("i", "omega")}
-    for tick, after in pairwise(ticks):
-        # A hair later, so that what begins at a sampling instant has begun.
-        period, voltage = (tick.time + 1e-12, after.time), (tick.measured["ArmatureVoltage"],)
+    samples = run(quiet, 2.7)
+    highest = {name: max(abs(sample.truth[name]) for sample in samples) for name in ("i", "omega")}
+    for sample, after in pairwise(samples):
+        # 1 ps later, so that a fault that starts at a sampling instant acts.
+        period, voltage = (sample.time + 1e-12, after.time), (sample.measured["ArmatureVoltage"],)
         state = solve_ivp(rates, period, state, method="DOP853", rtol=1e-13, atol=1e-15, args=voltage).y[:, -1]
         assert after.truth["i"] == pytest.approx(state[0], abs=error * highest["i"])
         assert after.truth["omega"] == pytest.approx(state[1], abs=error * highest["omega"])
 
 
-def test_truth_follows_the_laws_of_the_faults(quiet: MotorScenario) -> None:
+def test_motor_truth_follows_the_laws_of_the_faults(quiet: MotorScenario) -> None:
     quiet = quiet.model_copy(update={"faults": (WEAR, SHORT)})
-    for tick in run(quiet, 6.0):
-        assert tick.truth["R_a"] == pytest.approx(resistance(quiet, tick.time), rel=1e-13)
-        assert tick.truth["D"] == quiet.parameters.D
+    for sample in run(quiet, 6.0):
+        assert sample.truth["R_a"] == pytest.approx(resistance(quiet, sample.time), rel=1e-13)
+        assert sample.truth["D"] == quiet.parameters.D
 
 
-def test_set_points_come_at_their_times_and_again(quiet: MotorScenario) -> None:
+def test_motor_set_points_at_their_times_and_repeated(quiet: MotorScenario) -> None:
     points = (SetPoint(at="0.5 s", speed="10 rad/s"), SetPoint(at="0.7 s", speed="-5 rad/s"))
     changes = {"set_points": points, "controller": type(quiet.controller)(K_i="0 V/rad")}
     for repeat_every, later in ((None, -5.0), (1.0, 10.0)):
-        ticks = run(quiet.model_copy(update=changes | {"repeat_every": repeat_every}), 4.0)
-        wanted = [tick.measured["ArmatureVoltage"] / 0.3 + tick.truth["omega"] for tick in ticks]
+        samples = run(quiet.model_copy(update=changes | {"repeat_every": repeat_every}), 4.0)
+        wanted = [sample.measured["ArmatureVoltage"] / 0.3 + sample.truth["omega"] for sample in samples]
         assert [wanted[n] for n in (49, 50, 69, 70)] == pytest.approx([0.0, 10.0, 10.0, -5.0])
         assert wanted[360] == pytest.approx(later)
 
 
-def test_the_voltage_stays_within_its_limit(quiet: MotorScenario) -> None:
+def test_motor_voltage_stays_within_its_limit(quiet: MotorScenario) -> None:
     changes = {"controller": type(quiet.controller)(voltage_limit="2 V"), "repeat_every": None}
-    voltages = [tick.measured["ArmatureVoltage"] for tick in run(quiet.model_copy(update=changes), 2.0)]
+    voltages = [sample.measured["ArmatureVoltage"] for sample in run(quiet.model_copy(update=changes), 2.0)]
     assert max(voltages) == 2.0
     wanted = (SetPoint(at="0 s", speed="-10 rad/s"),)
     voltages = [
-        tick.measured["ArmatureVoltage"] for tick in run(quiet.model_copy(update=changes | {"set_points": wanted}), 2.0)
+        sample.measured["ArmatureVoltage"]
+        for sample in run(quiet.model_copy(update=changes | {"set_points": wanted}), 2.0)
     ]
     assert min(voltages) == -2.0
 
 
 def leak_and_more(lift: LiftScenario, time: float) -> tuple[float, float, float]:
-    """Leak, damping and pump flow at a time, by the faults of ``lift``."""
+    """Leak, damping (N·s/m) and pump flow (m³/s) at a time (s), by the faults of ``lift``."""
     damping = 100.0 + 5.0 * (math.exp(0.5 * max(time - 0.1, 0.0)) - 1.0)
     return 0.2 if time > 1.0 else 0.0, damping, 0.02 + 0.001 * (math.exp(-0.5 * time) - 1.0)
 
 
-def test_the_lift_by_euler_is_the_papers_equations_to_the_letter(lift: LiftScenario) -> None:
+def test_lift_by_euler_is_the_papers_equations(lift: LiftScenario) -> None:
     p, g = lift.parameters, lift.controller
     x, pressure, filtered = 0.0, lift.load / p.A_piston, 0.0
     integral = p.q_pump / math.sqrt(2.0 * pressure / p.rho)
-    ticks = run(lift, 3.0)
-    for tick in ticks:
+    samples = run(lift, 3.0)
+    for sample in samples:
         for step in range(100):
-            time = tick.time + step * 1e-4
+            time = sample.time + step * 1e-4
             leak, damping, pump = leak_and_more(lift, time)
             error = x - 0.45 * math.sin(2.0 * math.pi * 0.005 * time)
             derivative = g.N * (g.K_d * error - filtered)
             valve = min(max(g.K_p * error + integral + derivative, 0.0), p.A_max)
             if step == 0:
-                found = tick.truth["x"], tick.truth["p"], tick.measured["ValveArea"]
-                assert found == pytest.approx((x, pressure, valve), rel=1e-9, abs=1e-12)
+                state = sample.truth["x"], sample.truth["p"], sample.measured["ValveArea"]
+                assert state == pytest.approx((x, pressure, valve), rel=1e-9, abs=1e-12)
             integral += g.K_i * error * 1e-4 if 0.0 < valve < p.A_max else 0.0
             filtered += derivative * 1e-4
             velocity = (pump - valve * math.sqrt(2.0 * pressure / p.rho)) / p.A_piston
             x += 1e-4 * velocity
             pressure = (1.0 + leak) * (lift.load + p.k_spring * x + damping * velocity) / p.A_piston
-    assert min(valves := [tick.measured["ValveArea"] for tick in ticks]) < p.A_max
+    assert min(valves := [sample.measured["ValveArea"] for sample in samples]) < p.A_max
     assert max(valves) == p.A_max
 
 
-def test_the_pressure_of_the_accurate_lift_is_what_its_own_flow_leaves(lift: LiftScenario) -> None:
+def test_accurate_lift_pressure_balances_its_flow(lift: LiftScenario) -> None:
     p = lift.parameters
-    for tick in run(lift.model_copy(update={"integrator": "accurate"}), 3.0):
-        leak, damping, pump = leak_and_more(lift, tick.time)
-        velocity = (pump - tick.measured["ValveArea"] * math.sqrt(2.0 * tick.truth["p"] / p.rho)) / p.A_piston
-        force = lift.load + p.k_spring * tick.truth["x"] + damping * velocity
-        assert tick.truth["p"] == pytest.approx((1.0 + leak) * force / p.A_piston, rel=1e-12)
+    for sample in run(lift.model_copy(update={"integrator": "accurate"}), 3.0):
+        leak, damping, pump = leak_and_more(lift, sample.time)
+        velocity = (pump - sample.measured["ValveArea"] * math.sqrt(2.0 * sample.truth["p"] / p.rho)) / p.A_piston
+        force = lift.load + p.k_spring * sample.truth["x"] + damping * velocity
+        assert sample.truth["p"] == pytest.approx((1.0 + leak) * force / p.A_piston, rel=1e-12)
 
 
-def test_integrators_agree_on_the_lift(lift: LiftScenario) -> None:
+def test_lift_integrators_agree(lift: LiftScenario) -> None:
     accurate = run(lift.model_copy(update={"integrator": "accurate"}), 3.0)
     for one, other in zip(accurate, run(lift, 3.0), strict=True):
         assert one.truth["x"] == pytest.approx(other.truth["x"], abs=1e-5)
@@ -211,7 +214,7 @@ def test_integrators_agree_on_the_lift(lift: LiftScenario) -> None:
 @pytest.mark.parametrize(
     ("name", "parameter", "final"), [("armature-resistance", "R_a", 5.6), ("bearing-wear", "D", 0.00227)]
 )
-def test_the_papers_degradations_end_where_the_paper_says(name: str, parameter: str, final: float) -> None:
+def test_paper_degradations_end_at_the_papers_values(name: str, parameter: str, final: float) -> None:
     fault = load_scenario(EXAMPLES / "scenarios" / f"{name}.toml").faults[0]
     assert isinstance(fault, Drift)
     initial = {"R_a": 6.5, "D": 0.00143}[parameter]
@@ -221,12 +224,12 @@ def test_the_papers_degradations_end_where_the_paper_says(name: str, parameter: 
     assert at_start == 0.0
 
 
-def test_demo_loses_more_than_five_percent_of_the_resistance(scenario: Scenario) -> None:
+def test_demo_loses_five_percent_of_the_resistance(scenario: Scenario) -> None:
     last = run(scenario, 90.0)[-1].truth["R_a"]
     assert last < 0.95 * 6.5
 
 
-def test_unbalance_by_order_turns_with_the_shaft() -> None:
+def test_unbalance_by_order_follows_the_shaft_angle() -> None:
     by_order = Unbalance(kind="unbalance", start="0 s", acceleration="5 rad/s^2", order=2.0)
     acceleration = shaking([by_order])
     assert acceleration(1.0, math.pi / 4) == pytest.approx(5.0)
@@ -234,6 +237,8 @@ def test_unbalance_by_order_turns_with_the_shaft() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((EXAMPLES / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
-def test_every_scenario_can_be_run(path: Path) -> None:
-    ticks = run(load_scenario(path), 0.1)
-    assert all(math.isfinite(value) for tick in ticks for value in (*tick.measured.values(), *tick.truth.values()))
+def test_every_shipped_scenario_runs(path: Path) -> None:
+    samples = run(load_scenario(path), 0.1)
+    assert all(
+        math.isfinite(value) for sample in samples for value in (*sample.measured.values(), *sample.truth.values())
+    )

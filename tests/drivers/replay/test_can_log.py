@@ -1,4 +1,4 @@
-"""Logs of a CAN bus say what the bus said, and what is wrong with them is counted and located."""
+"""CAN logs: the samples and windows of the live bus; damage is counted and located."""
 
 import gzip
 import re
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith.acquisition.alignment import Limits
+from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.playback import Playback
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Window
@@ -34,37 +34,35 @@ def frames(scenario: MotorScenario) -> list[can.Message]:
 
 
 def read(path: Path) -> tuple[list[Rows], str, list[str]]:
-    """All rows, what was found, and the complaints."""
+    """All rows, the summary and the warnings."""
     with opened(path) as log:
-        rows = list(log.stretches())
+        rows = list(log.chunks())
         return rows, ", ".join(log.summary_lines()), log.warnings()
 
 
-def windows_of(stretches: list[Rows]) -> list[Window]:
-    playback = Playback(tuple(UNITS), RECORDS, PERIOD, Limits())
-    return [window for rows in stretches for window in playback.windows(rows)] + list(playback.rest())
+def windows_of(chunks: list[Rows]) -> list[Window]:
+    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
+    return [window for rows in chunks for window in playback.windows(rows)] + list(playback.rest())
 
 
 @pytest.mark.parametrize("suffix", PACKED)
-def test_what_was_logged_is_what_the_driver_would_have_said(
-    tmp_path: Path, frames: list[can.Message], suffix: str
-) -> None:
-    rows, found, warnings = read(written(tmp_path, frames, suffix))
-    heard = live(frames)
-    assert samples_of(rows) == [(sample.signal, sample.value) for sample in heard]
+def test_can_log_samples_equal_live_samples(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
+    rows, summary, warnings = read(written(tmp_path, frames, suffix))
+    from_bus = live(frames)
+    assert samples_of(rows) == [(sample.signal, sample.value) for sample in from_bus]
     times = np.concatenate([part.times for part in rows])
     expected = np.array([frame.timestamp for frame in frames if frame.arbitration_id != 0x7FF])
     assert np.diff(times) == pytest.approx(np.diff(expected), abs=2e-6)  # the formats count microseconds
     if not suffix.startswith(".asc"):  # whose times begin with the log
         assert times == pytest.approx(expected, abs=2e-6)
-    assert f"{len(frames)} frames read, {TICKS} of other messages, 0 bad" in found
+    assert f"{len(frames)} frames read, {TICKS} of other messages, 0 bad" in summary
     assert warnings == []
 
 
 def cut_live(frames: list[can.Message]) -> list[Window]:
-    """As the service does, while the frames come."""
+    """The windows that the service would cut while the frames come."""
     rings = Rings(tuple(UNITS), 4 * RECORDS)
-    windower = Windower(tuple(UNITS), RECORDS, PERIOD, Limits())
+    windower = Windower(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
     samples, windows = live(frames), list[Window]()
     now, last = BEGUN, samples[-1].time
     while now < last + 0.5:
@@ -79,19 +77,19 @@ def cut_live(frames: list[can.Message]) -> list[Window]:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_its_windows_are_those_of_the_live_bus(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
+def test_can_log_windows_equal_live_windows(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
     replayed = windows_of(read(written(tmp_path, frames, suffix))[0])
-    heard = cut_live(frames)
-    assert len(replayed) == len(heard) == TICKS // RECORDS
-    for one, other in zip(replayed, heard, strict=True):
+    from_bus = cut_live(frames)
+    assert len(replayed) == len(from_bus) == TICKS // RECORDS
+    for one, other in zip(replayed, from_bus, strict=True):
         assert np.array_equal(one.values, other.values)
         assert not one.missing.any()
         assert one.quality.verdict == "good"
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_where_a_log_goes_back_in_time_is_said(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
-    """Writers of text put a stamp that goes back forward; a log that two programs wrote has none of that."""
+def test_can_log_locates_frames_out_of_order(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
+    """Text writers correct times that go back, so lines are moved; a BLF is written in this order."""
     path = written(tmp_path, frames, suffix)
     if suffix == ".blf":
         late = frames[:3]
@@ -105,9 +103,9 @@ def test_where_a_log_goes_back_in_time_is_said(tmp_path: Path, frames: list[can.
         lines[first + 2000 : first + 2000] = lines[first : first + 3]
         path.write_text("".join(lines[:first] + lines[first + 30 :]), encoding="utf-8")
         place = first + 1971
-    playback = Playback(tuple(UNITS), RECORDS, PERIOD, Limits())
+    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
     with opened(path) as log:
-        for rows in log.stretches():
+        for rows in log.chunks():
             list(playback.windows(rows))
     assert playback.counts.reordered == playback.counts.late == 2
     assert playback.counts.first_late is not None
@@ -116,14 +114,14 @@ def test_where_a_log_goes_back_in_time_is_said(tmp_path: Path, frames: list[can.
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_message_that_is_not_in_it_is_told(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
+def test_can_log_warns_of_a_missing_message(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
     electrical = [frame for frame in frames if frame.arbitration_id != 0x281]
     _, _, warnings = read(written(tmp_path, electrical, suffix))
     assert any("0x281) has not come once" in line for line in warnings)
 
 
 @pytest.mark.parametrize(
-    ("suffix", "torn"),
+    ("suffix", "damaged"),
     [
         (".log", "(1700000001.5) vcan0 181#01\n"),
         (".log", "(1700000001.5) vcan0 1"),
@@ -137,35 +135,33 @@ def test_a_message_that_is_not_in_it_is_told(tmp_path: Path, frames: list[can.Me
         (".trc", "    100       five DT  1     0181 Rx -  8    00 00 00 00 00 00 00 00\n"),
     ],
 )
-def test_a_line_that_is_torn_is_counted_and_located(
-    tmp_path: Path, frames: list[can.Message], suffix: str, torn: str
+def test_can_log_counts_and_locates_a_damaged_line(
+    tmp_path: Path, frames: list[can.Message], suffix: str, damaged: str
 ) -> None:
     path = written(tmp_path, frames[:300], suffix)
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     first = next(index for index, line in enumerate(lines) if FRAME.search(line))
-    lines.insert(first + 150, torn if torn.endswith("\n") else torn + "\n")
+    lines.insert(first + 150, damaged if damaged.endswith("\n") else damaged + "\n")
     path.write_text("".join(lines), encoding="utf-8")
-    rows, found, warnings = read(path)
+    rows, summary, warnings = read(path)
     assert samples_of(rows) == [(sample.signal, sample.value) for sample in live(frames[:300])]
-    assert "1 bad" in found
+    assert "1 bad" in summary
     assert len(warnings) == 1
     assert f"bad: 1, the first in line {first + 151}: " in warnings[0]
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".trc"])
-def test_the_last_line_of_a_writer_that_was_killed_is_not_believed(
-    tmp_path: Path, frames: list[can.Message], suffix: str
-) -> None:
+def test_can_log_rejects_a_last_line_without_end(tmp_path: Path, frames: list[can.Message], suffix: str) -> None:
     path = written(tmp_path, frames[:300], suffix)
     text = path.read_text(encoding="utf-8").rstrip()
     path.write_text(text.removesuffix("End TriggerBlock").rstrip()[:-7], encoding="utf-8")
-    _, found, warnings = read(path)
-    assert "300 frames read" in found or "299 frames read" in found
-    assert "1 bad" in found
+    _, summary, warnings = read(path)
+    assert "300 frames read" in summary or "299 frames read" in summary
+    assert "1 bad" in summary
     assert "line" in warnings[0]
 
 
-def test_what_is_cut_off_is_said(tmp_path: Path, frames: list[can.Message]) -> None:
+def test_can_log_warns_of_a_truncated_file(tmp_path: Path, frames: list[can.Message]) -> None:
     whole = written(tmp_path, frames, ".blf").read_bytes()
     path = tmp_path / "cut.blf"
     path.write_bytes(whole[: len(whole) // 2])
@@ -179,11 +175,11 @@ def test_what_is_cut_off_is_said(tmp_path: Path, frames: list[can.Message]) -> N
     assert any("cut off" in line for line in warnings)
 
 
-def test_a_blf_of_a_writer_that_was_killed_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_can_log_refuses_a_blf_without_header(tmp_path: Path) -> None:
     path = tmp_path / "killed.blf"
     for content in (b"", b"LOGG", b"\0" * 4096, b"no BLF at all, but long enough for the head of one" * 10):
         path.write_bytes(content)
-        with pytest.raises(ConfigurationError, match=r"killed\.blf: no BLF file, or one whose writer was killed"):
+        with pytest.raises(ConfigurationError, match=r"killed\.blf: is not a BLF file, or its writer was killed"):
             opened(path)
     writer = can.BLFWriter(path)
     writer.file.flush()
@@ -192,13 +188,13 @@ def test_a_blf_of_a_writer_that_was_killed_is_refused_with_the_reason(tmp_path: 
     writer.stop()
 
 
-def test_a_log_without_these_frames_names_them(tmp_path: Path) -> None:
+def test_can_log_without_wanted_frames_names_them(tmp_path: Path) -> None:
     other = can.Message(arbitration_id=0x123, data=bytes(8), is_extended_id=False, timestamp=1.0)
     with pytest.raises(ConfigurationError, match=r"none of its 5 frames is one of 0x181, 0x281"):
         read(written(tmp_path, [other] * 5, ".log"))
 
 
-def test_two_machines_in_one_log_are_noticed(tmp_path: Path, frames: list[can.Message]) -> None:
+def test_can_log_warns_of_frames_from_two_channels(tmp_path: Path, frames: list[can.Message]) -> None:
     for frame in frames[1::2]:
         frame.channel = 1
     _, _, warnings = read(written(tmp_path, frames, ".blf"))
@@ -206,17 +202,17 @@ def test_two_machines_in_one_log_are_noticed(tmp_path: Path, frames: list[can.Me
 
 
 def check_any(path: Path) -> None:
-    """It is refused with its name, or read to its end with all that is bad in it counted."""
+    """Refused with its name, or read to its end."""
     try:
         rows, _, _ = read(path)
         assert all(np.isfinite(part.times).all() for part in rows)
     except ConfigurationError as error:
-        assert str(path) in str(error)  # noqa: PT017 - either is right
+        assert str(path) in str(error)  # noqa: PT017 - both are right
 
 
 @settings(max_examples=60, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(PACKED), st.binary(max_size=300))
-def test_garbage_is_refused_or_counted(tmp_path: Path, suffix: str, content: bytes) -> None:
+def test_can_log_of_random_bytes_is_refused_or_counted(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"garbage{suffix}"
     path.write_bytes(gzip.compress(content) if suffix.endswith(".gz") else content)
     check_any(path)
@@ -229,7 +225,7 @@ SHARE = st.floats(0.0, 1.0, exclude_max=True)
 
 @settings(max_examples=150, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(PACKED), st.lists(st.tuples(SHARE, st.integers(0, 255)), max_size=4), SHARE)
-def test_a_damaged_log_is_read_as_far_as_it_goes(
+def test_can_log_with_changed_bytes_is_refused_or_read(
     tmp_path: Path, frames: list[can.Message], suffix: str, changes: list[tuple[float, int]], end: float
 ) -> None:
     content = bytearray(written(tmp_path, frames[:30], suffix).read_bytes())
@@ -241,9 +237,7 @@ def test_a_damaged_log_is_read_as_far_as_it_goes(
 
 
 @pytest.mark.parametrize("size", [0, 1, 15])
-def test_an_object_without_a_size_does_not_keep_the_reader_for_ever(
-    tmp_path: Path, frames: list[can.Message], size: int
-) -> None:
+def test_can_log_with_a_zero_size_blf_object_ends(tmp_path: Path, frames: list[can.Message], size: int) -> None:
     path = tmp_path / "loop.blf"
     with can.BLFWriter(path, compression_level=0) as writer:
         for frame in frames[:100]:

@@ -1,4 +1,4 @@
-"""A file in the place of a machine: at its pace or as fast as it is taken, counted to the last sample."""
+"""The replay driver: times, counts, repetition, and errors with their key."""
 
 import threading
 import time
@@ -12,7 +12,7 @@ from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import tables as table
-from otolith_drivers.replay.driver import Options, Replayer, Source, build
+from otolith_drivers.replay.driver import Options, ReplayDriver, Source, build
 from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import UNITS, frames_of, live, written
 from tests.waiting import wait_for, within
@@ -27,7 +27,7 @@ def setup(sources: dict[str, dict[str, Any]], folder: Path = EXAMPLES) -> Setup:
 
 
 def written_table(folder: Path, rows: int) -> Path:
-    """Rows that are not evenly spaced, with a cell blank, one wrong, and a row of another length."""
+    """Rows of irregular times, with a blank cell, a bad cell and a bad row."""
     random = np.random.default_rng(2)
     times = np.cumsum(random.uniform(0.005, 0.015, rows)).round(4)
     lines = [f"{time},{index},{-index}" for index, time in enumerate(times.tolist())]
@@ -38,13 +38,20 @@ def written_table(folder: Path, rows: int) -> Path:
     return path
 
 
-def driver_of(path: Path, sources: dict[str, dict[str, Any]] | None = None, **options: Any) -> Replayer:
+def driver_of(path: Path, sources: dict[str, dict[str, Any]] | None = None, **options: Any) -> ReplayDriver:
     named = sources if sources is not None else {"i": {}, "omega": {}}
     return build(Options.model_validate({"file": path, **options}), setup(named))
 
 
-def played(driver: Replayer) -> list[Sample]:
-    """Everything, up to the end of the file."""
+def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def played(driver: ReplayDriver) -> list[Sample]:
+    """All samples of the file."""
     got: list[Sample] = []
     driver.open(got.extend)
     wait_for(lambda: not driver.link().up)
@@ -55,14 +62,14 @@ def played(driver: Replayer) -> list[Sample]:
 
 @pytest.mark.timed
 @pytest.mark.parametrize("pace", ["real time", FAST])
-def test_the_spacing_is_the_datas_and_every_cell_is_counted(tmp_path: Path, pace: str) -> None:
+def test_replay_keeps_spacing_and_counts_every_cell(tmp_path: Path, pace: str) -> None:
     path = written_table(tmp_path, 60)
     driver = driver_of(path, pace=pace)
     assert (driver.link().up, driver.link().reason) == (False, "not opened yet")
     begun = time.monotonic()
     got = played(driver)
-    with table.Table(path, {"i": "A", "omega": "rad/s"}) as opened:
-        (rows,) = opened.stretches()
+    with table.TableReader(path, {"i": "A", "omega": "rad/s"}) as opened:
+        (rows,) = opened.chunks()
     for name, values in rows.columns.items():
         there = np.isfinite(values)
         assert [sample.value for sample in got if sample.signal == name] == values[there].tolist()
@@ -74,8 +81,7 @@ def test_the_spacing_is_the_datas_and_every_cell_is_counted(tmp_path: Path, pace
     assert any("bad cells: 1, bad rows: 1" in line for line in driver.link().warnings)
 
 
-@pytest.mark.timed
-def test_in_real_time_no_sample_comes_before_its_time(tmp_path: Path) -> None:
+def test_replay_in_real_time_delivers_no_sample_early(tmp_path: Path) -> None:
     late: list[float] = []
     driver = driver_of(written_table(tmp_path, 100))
     driver.open(lambda samples: late.extend(time.monotonic() - sample.time for sample in samples))
@@ -85,8 +91,8 @@ def test_in_real_time_no_sample_comes_before_its_time(tmp_path: Path) -> None:
     assert float(np.median(late)) < within(0.02)
 
 
-def test_who_takes_slowly_holds_the_replay_up(tmp_path: Path) -> None:
-    """Nothing piles up in between, and nothing is lost."""
+def test_replay_waits_for_a_slow_receiver(tmp_path: Path) -> None:
+    """Memory stays bounded, and no sample is lost."""
     path = tmp_path / "long.csv"
     path.write_text("t,i,omega\n" + "".join(f"{0.01 * k:.2f},1,2\n" for k in range(300_000)), encoding="utf-8")
     gate, got = threading.Event(), list[int]()
@@ -106,7 +112,7 @@ def test_who_takes_slowly_holds_the_replay_up(tmp_path: Path) -> None:
     assert sum(got) == driver.counters().received == 600_000
 
 
-def test_over_and_over_time_goes_on(tmp_path: Path) -> None:
+def test_replay_repeats_with_increasing_time(tmp_path: Path) -> None:
     driver, got = driver_of(written_table(tmp_path, 60), pace=FAST, repeat=True), list[Sample]()
     driver.open(got.extend)
     wait_for(lambda: len(got) > 3 * 118)
@@ -122,26 +128,26 @@ def test_over_and_over_time_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".trc.gz"])
-def test_a_log_of_a_bus_says_what_the_bus_said(tmp_path: Path, scenario: MotorScenario, suffix: str) -> None:
+def test_replay_of_can_log_equals_live_samples(tmp_path: Path, scenario: MotorScenario, suffix: str) -> None:
     frames = frames_of(scenario, 300)
     path = written(tmp_path, frames, suffix)
     sources = {name: {"signal": SIGNALS[name]} for name in UNITS}
     driver = driver_of(path, sources, pace=FAST, can={"type": "can", "dbc": "dc-motor.dbc", "channel": "can0"})
-    heard = live(frames)
+    from_bus = live(frames)
     got = played(driver)
-    assert [(sample.signal, sample.value) for sample in got] == [(sample.signal, sample.value) for sample in heard]
-    assert driver.counters().received == len(heard)
+    assert [(sample.signal, sample.value) for sample in got] == [(sample.signal, sample.value) for sample in from_bus]
+    assert driver.counters().received == len(from_bus)
     assert all(any(name in line for line in driver.describe()) for name in UNITS)
 
 
-def test_what_the_file_does_not_have_is_said_with_its_key(tmp_path: Path, scenario: MotorScenario) -> None:
+def test_replay_names_the_key_of_what_is_missing(tmp_path: Path, scenario: MotorScenario) -> None:
     path = written_table(tmp_path, 10)
     log = written(tmp_path, frames_of(scenario, 10), ".log")
     named: list[tuple[dict[str, Any], dict[str, dict[str, Any]], str, tuple[str, ...]]] = [
         ({"file": "none.csv"}, {"i": {}}, "No such file", ("driver", "file")),
         ({"file": path}, {"i": {"column": "I"}}, "no column 'I'", ("driver", "file")),
         ({"file": path}, {"i": {"signal": "x"}}, "unknown key 'signal'", ("signals", "i", "signal")),
-        ({"file": log}, {"i": {"signal": "x"}}, "what is in the frames", ("driver", "can")),
+        ({"file": log}, {"i": {"signal": "x"}}, "the description of the frames", ("driver", "can")),
         ({"file": log, "can": {"dcb": 1}}, {"i": {}}, "did you mean 'dbc'", ("driver", "can", "dcb")),
         ({"file": log, "can": {"dbc": "none.dbc"}}, {"i": {"signal": "x"}}, "No such file", ("driver", "can", "dbc")),
         (
@@ -157,7 +163,7 @@ def test_what_the_file_does_not_have_is_said_with_its_key(tmp_path: Path, scenar
         assert caught.value.key == key
 
 
-def test_a_file_that_is_gone_is_a_device_error(tmp_path: Path) -> None:
+def test_replay_of_a_deleted_file_is_a_device_error(tmp_path: Path) -> None:
     path = written_table(tmp_path, 10)
     driver = driver_of(path)
     path.unlink()
@@ -165,7 +171,7 @@ def test_a_file_that_is_gone_is_a_device_error(tmp_path: Path) -> None:
         driver.open(lambda _: None)
 
 
-def test_a_file_that_ends_in_garbage_brings_the_link_down_with_its_reason(tmp_path: Path) -> None:
+def test_replay_without_usable_rows_brings_the_link_down(tmp_path: Path) -> None:
     path = tmp_path / "drive.csv"
     path.write_text("t,i,omega\nx,y,z\n", encoding="utf-8")
     driver = driver_of(path)

@@ -1,4 +1,4 @@
-"""A new twin is one TOML file: a thermal model of a winding, dropped in, estimates at once."""
+"""Structural identifiability, and a new twin from one TOML file: a thermal model of a winding."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import Status
 from otolith.machine import load_machine, load_twin
-from otolith.twin.identifiability import structure_of
+from otolith.twin.identifiability import structural_identifiability
 from otolith.twin.kernel import Excitation, kernel_of
 
 PAGE = """
@@ -62,9 +62,9 @@ def machine_file(tmp_path: Path) -> Path:
     return path
 
 
-def test_it_estimates_what_its_roles_say(machine_file: Path) -> None:
+def test_new_twin_estimates_parameters_by_role(machine_file: Path) -> None:
     plan = load_machine(machine_file)
-    assert [entry.name for entry in plan.problem.free] == ["C", "R_th"]
+    assert [parameter.name for parameter in plan.problem.free] == ["C", "R_th"]
     random = np.random.default_rng(4)
     current = np.repeat(random.uniform(2.0, 15.0, 30), 10)
     drive = Excitation(current[:, None], 1.0)
@@ -74,19 +74,19 @@ def test_it_estimates_what_its_roles_say(machine_file: Path) -> None:
     window = Window.whole(0, 0.0, 1.0, ("i", "theta"), values)
     _, report = adapt(initial_state("spindle", "site", plan.problem), window)
     for name, value in (("C", 95.0), ("R_th", 1.1)):
-        found = report.document.parameters[name]
-        assert found.status is Status.ESTIMATED
-        assert found.value == pytest.approx(value, rel=0.01)
-        assert found.low is not None
-        assert found.high is not None
-        assert found.low - 2e-3 * value < value < found.high + 2e-3 * value
+        result = report.document.parameters[name]
+        assert result.status is Status.ESTIMATED
+        assert result.value == pytest.approx(value, rel=0.01)
+        assert result.low is not None
+        assert result.high is not None
+        assert result.low - 2e-3 * value < value < result.high + 2e-3 * value
 
 
-def verdicts(tmp_path: Path, page: str) -> dict[str, str]:
-    """Of each parameter: why it could not be estimated, or nothing."""
+def reasons(tmp_path: Path, page: str) -> dict[str, str]:
+    """Why each parameter could not be estimated; empty if it could."""
     path = tmp_path / "twin.toml"
     path.write_text(page, encoding="utf-8")
-    return {entry.name: entry.reason for entry in structure_of(load_twin(path))}
+    return {row.name: row.reason for row in structural_identifiability(load_twin(path))}
 
 
 KNOWN_HEAT = PAGE.replace(
@@ -102,32 +102,31 @@ def with_second(page: str, line: str) -> str:
     return page.replace("\n[constants]", f"{line}\n\n[constants]")
 
 
-def test_what_only_acts_together_is_named(tmp_path: Path) -> None:
-    """Only R/C and R_th*C act: whoever wants one of the three must be given another."""
-    found = verdicts(tmp_path, PAGE)
-    assert all(reason.startswith("only together with") for reason in found.values())
-    assert verdicts(tmp_path, KNOWN_HEAT) == {"C": "", "R_th": ""}
+def test_parameters_that_act_together_are_named(tmp_path: Path) -> None:
+    """Only R/C and R_th*C act: one of the three can be estimated if another is given."""
+    assert all(reason.startswith("only together with") for reason in reasons(tmp_path, PAGE).values())
+    assert reasons(tmp_path, KNOWN_HEAT) == {"C": "", "R_th": ""}
 
 
-def test_two_resistances_in_series_are_one(tmp_path: Path) -> None:
+def test_resistances_in_series_are_one(tmp_path: Path) -> None:
     second = 'R_2 = { unit = "K/W", nominal = 0.4, bounds = [0.1, 2], meaning = "second resistance" }'
-    found = verdicts(tmp_path, with_second(KNOWN_HEAT, second).replace("theta/R_th", "theta/(R_th + R_2)"))
-    assert found == {"C": "", "R_th": "only together with R_2", "R_2": "only together with R_th"}
+    result = reasons(tmp_path, with_second(KNOWN_HEAT, second).replace("theta/R_th", "theta/(R_th + R_2)"))
+    assert result == {"C": "", "R_th": "only together with R_2", "R_2": "only together with R_th"}
 
 
-def test_a_parameter_that_no_output_feels_is_named(tmp_path: Path) -> None:
+def test_parameter_without_effect_is_named(tmp_path: Path) -> None:
     second = 'R_2 = { unit = "1", nominal = 0.4, bounds = [0.1, 2], meaning = "nothing" }'
-    found = verdicts(tmp_path, with_second(KNOWN_HEAT, second).replace('/ C"', '/ C + 0*R_2*theta/R_th/C"'))
-    assert found == {"C": "", "R_th": "", "R_2": "no output depends on it"}
+    result = reasons(tmp_path, with_second(KNOWN_HEAT, second).replace('/ C"', '/ C + 0*R_2*theta/R_th/C"'))
+    assert result == {"C": "", "R_th": "", "R_2": "no output depends on it"}
 
 
-def test_a_threshold_is_not_called_dead(tmp_path: Path) -> None:
+def test_threshold_is_not_called_dead(tmp_path: Path) -> None:
     second = 'i_0 = { unit = "A", nominal = 5, bounds = [1, 9], meaning = "current from which it heats" }'
-    found = verdicts(tmp_path, with_second(KNOWN_HEAT, second).replace("R*i^2", "where(i > i_0, R*i^2, 0)"))
-    assert found["i_0"].startswith("it acts as a threshold only")
+    result = reasons(tmp_path, with_second(KNOWN_HEAT, second).replace("R*i^2", "where(i > i_0, R*i^2, 0)"))
+    assert result["i_0"].startswith("it acts as a threshold only")
 
 
-def test_a_fast_circuit_is_judged_by_its_equations_and_not_by_the_integrator(tmp_path: Path) -> None:
+def test_fast_circuit_is_judged_by_its_equations(tmp_path: Path) -> None:
     """A time constant of a microsecond: only the product of resistance and capacitance acts."""
     path = tmp_path / "rc.toml"
     path.write_text(
@@ -150,5 +149,5 @@ C = { unit = "nF", nominal = 100, bounds = [10, 1000], meaning = "capacitance" }
 """,
         encoding="utf-8",
     )
-    found = {entry.name: entry.reason for entry in structure_of(load_twin(path))}
-    assert found == {"R": "only together with C", "C": "only together with R"}
+    result = {row.name: row.reason for row in structural_identifiability(load_twin(path))}
+    assert result == {"R": "only together with C", "C": "only together with R"}

@@ -1,0 +1,89 @@
+"""The decision after a window, and which update of the posterior it leads to."""
+
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+
+from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
+from otolith.discovery.sequential_test import SequentialTest
+
+MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
+STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
+COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # the same for a component
+SENSOR_PROBABILITY = 0.95  # of a faulty sensor while another type of hypothesis explains the windows as well
+SENSOR_PROBABILITY_ALONE = 0.5  # the same while no other type does
+MAX_OPEN_WINDOWS = 8  # windows after which a component is adopted although another one explains everything as well
+
+
+class WindowDecision(StrEnum):
+    """What a window led to."""
+
+    LEARNED = "learned"
+    SUSPECTED = "it contradicts the prediction: a sudden change or a wrong window; further windows decide"
+    STEPPED = "two windows agree on a sudden change"
+    DISCOVERED = "several windows agree on a new component"
+    FADED = "a component is no longer there"
+    SENSOR = "a sensor is wrong: the window does not update the estimates"
+    BAD = "the window is not good enough: it does not update the estimates"
+    REFUSED = "nothing explains the window, neither parameters nor components: it does not update the estimates"
+
+
+class PosteriorUpdate(Enum):
+    """How a window changes the posterior."""
+
+    NONE = "the posterior of the window before stays"
+    FILTER = "the filter is updated with the window"
+    HYPOTHESIS = "the posterior of the accepted hypothesis replaces the filter's"
+
+
+UPDATES = {
+    WindowDecision.LEARNED: PosteriorUpdate.FILTER,
+    WindowDecision.STEPPED: PosteriorUpdate.HYPOTHESIS,
+    WindowDecision.DISCOVERED: PosteriorUpdate.HYPOTHESIS,
+    WindowDecision.FADED: PosteriorUpdate.HYPOTHESIS,
+    WindowDecision.SUSPECTED: PosteriorUpdate.NONE,
+    WindowDecision.SENSOR: PosteriorUpdate.NONE,
+    WindowDecision.BAD: PosteriorUpdate.NONE,
+    WindowDecision.REFUSED: PosteriorUpdate.NONE,
+}
+ACCEPTED = frozenset(decision for decision, update in UPDATES.items() if update is not PosteriorUpdate.NONE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowOutcome:
+    """A decision with the hypothesis that it rests on."""
+
+    decision: WindowDecision
+    hypothesis: TrackedHypothesis
+
+    @property
+    def update(self) -> PosteriorUpdate:
+        """How the window changes the posterior."""
+        return UPDATES[self.decision]
+
+
+def decide(test: SequentialTest) -> WindowOutcome:
+    """Return the decision that the evidence so far allows."""
+    best = test.best
+    if best.type is FaultType.NOTHING:
+        return WindowOutcome(WindowDecision.LEARNED, best)
+    if best.cost > MAX_COST:
+        return WindowOutcome(WindowDecision.REFUSED, best)
+    own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
+    agreed = test.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
+    if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
+        return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
+    if test.probability(FaultType.SENSOR) >= (SENSOR_PROBABILITY if test.is_open else SENSOR_PROBABILITY_ALONE):
+        faulty = next(item for item in test.hypotheses if item.type is FaultType.SENSOR)
+        return WindowOutcome(WindowDecision.SENSOR, faulty)
+    leads = best.type is FaultType.COMPONENT and test.leading >= COMPONENT_WINDOWS
+    probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY
+    alone = test.windows >= MAX_OPEN_WINDOWS or not test.alternatives(best)
+    if leads and probable and alone:
+        return WindowOutcome(WindowDecision.DISCOVERED, best)
+    return WindowOutcome(WindowDecision.SUSPECTED, best)
+
+
+def some_component_is_certain(test: SequentialTest) -> bool:
+    """Whether a component has appeared, although it is open which."""
+    windows, probability = test.windows, test.probability(FaultType.COMPONENT)
+    return windows >= COMPONENT_WINDOWS and probability >= COMPONENT_PROBABILITY

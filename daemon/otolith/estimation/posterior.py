@@ -1,0 +1,227 @@
+"""What is known across windows: the filter's posterior of a problem's free parameters, and the phases of components.
+
+The phase of a periodic component counts from the first record of a window. Between windows it advances by frequency
+times time, or by order times shaft angle. A tracked component therefore stays coherent, and its frequency becomes ever
+more certain. Where the advance is not known, the phase is reset to unknown.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Window
+from otolith.estimation import imm_filter
+from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
+from otolith.estimation.augmented import base_model, indices, source_of, without
+from otolith.estimation.imm_filter import FIRST_LEVEL, ImmPosterior
+from otolith.estimation.problem import Problem
+
+START_TOLERANCE = 0.5  # sampling periods by which a window may start early or late and still follow its predecessor
+MAX_KNOWN_PHASE_SD = 1.0  # rad: a phase less certain than this counts as unknown
+UNKNOWN_PHASE_SD = np.pi / np.sqrt(3.0)  # rad: standard deviation of the uniform distribution over a turn
+PHASE_STARTS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad: starts of a fit where a phase is unknown
+MAX_AGE = 600.0  # s for which a component over time that is not periodic is kept: later it is a trend of a parameter
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseAdvance:
+    """How far the sources of the components moved from the first record of a window to that of the next."""
+
+    start: float
+    """Unix seconds of the window's first record."""
+    next_start: float
+    """Unix seconds of the next window's first record, if no window is missing between."""
+    by: tuple[float, ...]
+    """Of each slot, in the unit of its source."""
+
+
+def phase_advance(problem: Problem, window: Window, last_state: Array) -> PhaseAdvance:
+    """Return the advance over ``window``; ``last_state`` (states,) is the state at its last record."""
+    names = [state.name for state in problem.twin.states]
+    advance = []
+    for component in problem.components:
+        symbol = source_of(base_model(problem), component.source).symbol
+        if component.source == "t":
+            advance.append(window.records * window.sample_period)
+        elif component.periodic and symbol.startswith("_"):
+            speed = last_state[names.index(symbol.removeprefix("_angle_"))]
+            advance.append(float(last_state[names.index(symbol)] + speed * window.sample_period))
+        else:
+            advance.append(0.0)
+    return PhaseAdvance(window.start, window.end, tuple(advance))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """What is known of the free parameters of ``problem``. Plain: it pickles."""
+
+    problem: Problem
+    belief: ImmPosterior
+    """Relative to the sizes of the parameters."""
+    phase: PhaseAdvance | None = None
+    """None before the first window."""
+
+    @classmethod
+    def initial(cls, problem: Problem) -> "Posterior":
+        """Return what is known before the first window."""
+        prior, size = initial_prior(problem), _size(problem)
+        return cls(problem, imm_filter.initial_modes(prior.mean / size, prior.covariance / np.outer(size, size)))
+
+    def predict(self, window: Window) -> "Posterior":
+        """Return the prediction: phases at the first record of ``window``, parameters at its end."""
+        belief = self._propagate_phases(window.start, window.sample_period)
+        return replace(self, belief=imm_filter.predict(belief, window.end))
+
+    def propagate_phases(self, advance: PhaseAdvance, window: Window) -> "Posterior":
+        """Return the same with phases at the first record of ``window``, which ``advance`` leads to."""
+        return replace(self, belief=replace(self, phase=advance)._propagate_phases(window.start, window.sample_period))
+
+    def prior(self) -> Prior:
+        """Return all modes as one normal distribution, in the units of the parameters."""
+        size = _size(self.problem)
+        mean, covariance = imm_filter.moment_match(self.belief)
+        return Prior(mean * size, covariance * np.outer(size, size))
+
+    def start(self) -> Array:
+        """Return the parameters (free,) at which a fit starts: the mean, within the bounds."""
+        return np.clip(self.prior().mean[: len(self.problem.free)], *self.problem.bounds)
+
+    def starts(self) -> list[Array]:
+        """Return the starts of a fit: one, or four with different phases where a phase is unknown."""
+        unknown, starts = self.unknown_phases(), []
+        for turn in PHASE_STARTS if unknown else (0.0,):
+            start = self.start()
+            start[unknown] += turn
+            starts.append(start)
+        return starts
+
+    def unknown_phases(self) -> list[int]:
+        """Return where phases that are unknown stand among the free parameters."""
+        problem = self.problem
+        phases = [indices(problem, slot)[-1] for slot, item in enumerate(problem.components) if item.periodic]
+        sd = np.sqrt(self.belief.covariance[0].diagonal()[: len(problem.free)]) * problem.scale
+        return [phase for phase in phases if sd[phase] > MAX_KNOWN_PHASE_SD]
+
+    def nis(self, evidence: Evidence) -> float:
+        """Return the normalised innovation squared of a window, of which this is the prediction."""
+        return imm_filter.nis(self.belief, self._relative(evidence))
+
+    def expects(self, evidence: Evidence) -> bool:
+        """Whether the normalised innovation squared of a window is within what healthy windows reach."""
+        return self.nis(evidence) <= imm_filter.nis_limit(2.0 * len(self.problem.free))
+
+    def update(self, evidence: Evidence, phase: PhaseAdvance) -> "Posterior":
+        """Return the posterior after a window, of which this is the prediction."""
+        return replace(self, belief=imm_filter.update(self.belief, self._relative(evidence)), phase=phase)
+
+    def inflate_variance(self, nis_per_degree: float) -> "Posterior":
+        """Return the same after a window that contradicted both those before and those after it."""
+        return replace(self, belief=imm_filter.inflate_variance(self.belief, nis_per_degree))
+
+    def set_prior(self, prior: Prior) -> "Posterior":
+        """Return the same modes, each with ``prior`` as its distribution."""
+        size = _size(self.problem)
+        belief = imm_filter.set_all_modes(self.belief, prior.mean / size, prior.covariance / np.outer(size, size))
+        return replace(self, belief=belief)
+
+    def reset_value(self, index: int, value: float, sd: float) -> "Posterior":
+        """Return the same with an independent ``value`` ± ``sd`` of one parameter, in its unit."""
+        scale = self.problem.scale[index]
+        return replace(self, belief=imm_filter.reset_marginal(self.belief, index, sd / scale, value / scale))
+
+    def forget_phase(self, index: int) -> "Posterior":
+        """Return the same with the phase at ``index`` unknown."""
+        return replace(self, belief=_forget_phase(self.belief, self.problem, index))
+
+    def remap_parameters(self, problem: Problem) -> "Posterior":
+        """Return what is known for another choice of free parameters; new ones have the initial prior."""
+        fresh = Posterior.initial(problem).belief
+        mean, covariance = imm_filter.moment_match(self.belief)
+        order = {free.label: index for index, free in enumerate(self.problem.free)}  # slots may have changed places
+        both = [(order[free.label], index) for index, free in enumerate(problem.free) if free.label in order]
+        old, new = (np.array(part, dtype=np.int64) for part in (zip(*both, strict=True) if both else ((), ())))
+        level = np.full(len(problem.free), FIRST_LEVEL)
+        level[new] = self.belief.level[0][old]
+        ratio = self.problem.scale[old] / problem.scale[new]
+        ratio = np.concatenate([ratio, ratio])
+        old, new = (
+            np.concatenate([part, part + count]) for part, count in ((old, len(order)), (new, len(problem.free)))
+        )
+        new_mean, new_covariance = imm_filter.moment_match(fresh)
+        new_mean[new] = mean[old] * ratio
+        new_covariance[new, :] = new_covariance[:, new] = 0.0
+        new_covariance[np.ix_(new, new)] = covariance[np.ix_(old, old)] * np.outer(ratio, ratio)
+        modes = imm_filter.equal_modes(level, new_mean, new_covariance, self.belief.end, self.belief.variance_ratio)
+        return replace(self, problem=problem, belief=modes)
+
+    def without_slot(self, slot: int) -> "Posterior":
+        """Return what is known without the component of a slot; the others keep their values."""
+        remapped = self.remap_parameters(without(self.problem, self.problem.components[slot]))
+        if self.phase is None:
+            return remapped
+        by = tuple(advance for index, advance in enumerate(self.phase.by) if index != slot)
+        return replace(remapped, phase=replace(self.phase, by=by))
+
+    def without_expired(self, start: float) -> "Posterior":
+        """Return what is known without components over time that are not periodic and too old at ``start`` (Unix s).
+
+        What lasts longer is a trend of a parameter. A component from the future means that the clock was set back; it
+        leaves as well.
+        """
+        posterior = self
+        for component in self.problem.components:
+            is_trend = component.source == "t" and not component.periodic
+            if is_trend and not 0.0 <= start - component.origin <= MAX_AGE:
+                posterior = posterior.without_slot(posterior.problem.components.index(component))
+        return posterior
+
+    def _relative(self, evidence: Evidence) -> Evidence:
+        size = _size(self.problem)
+        return Evidence(evidence.point / size, evidence.sqrt_information * size, evidence.residual)
+
+    def _propagate_phases(self, start: float, sample_period: float) -> ImmPosterior:
+        problem, belief, phase = self.problem, self.belief, self.phase
+        if phase is None:
+            return belief
+        follows = abs(start - phase.next_start) <= START_TOLERANCE * sample_period
+        for slot, (component, advance) in enumerate(zip(problem.components, phase.by, strict=True)):
+            if not component.periodic:
+                continue
+            elapsed = start - phase.start
+            if component.source == "t" and _stays_coherent(belief, problem, slot, elapsed):
+                belief = _advance_phase(belief, problem, slot, elapsed)
+            elif component.source == "t":
+                belief = _forget_phase(belief, problem, indices(problem, slot)[-1])
+            elif follows:
+                belief = _advance_phase(belief, problem, slot, advance)
+            elif source_of(base_model(problem), component.source).symbol.startswith("_"):
+                belief = _forget_phase(belief, problem, indices(problem, slot)[-1])
+        return belief
+
+
+def _size(problem: Problem) -> Array:
+    """Return the sizes (2 free,) of parameters and trends."""
+    return np.tile(problem.scale, 2)
+
+
+def _advance_phase(belief: ImmPosterior, problem: Problem, slot: int, by: float) -> ImmPosterior:
+    """Return the belief with the phase of a slot advanced by its inner parameter times ``by``."""
+    _, inner, phase = indices(problem, slot)
+    free = len(problem.free)
+    move = np.eye(2 * free)
+    move[phase, inner] = move[free + phase, free + inner] = by * problem.scale[inner] / problem.scale[phase]
+    mean = belief.mean @ move.T
+    turn = 2.0 * np.pi / problem.scale[phase]
+    mean[:, phase] -= turn * np.rint(mean[0, phase] / turn)
+    return replace(belief, mean=mean, covariance=move @ belief.covariance @ move.T)
+
+
+def _stays_coherent(belief: ImmPosterior, problem: Problem, slot: int, elapsed: float) -> bool:
+    """Whether the frequency is known well enough to predict the phase; never if the clock was set back."""
+    inner = indices(problem, slot)[1]
+    sd = float(np.sqrt(belief.covariance[:, inner, inner].max())) * problem.scale[inner]
+    return elapsed >= 0.0 and sd * elapsed < UNKNOWN_PHASE_SD
+
+
+def _forget_phase(belief: ImmPosterior, problem: Problem, phase: int) -> ImmPosterior:
+    return imm_filter.reset_marginal(belief, phase, UNKNOWN_PHASE_SD / problem.scale[phase])

@@ -1,0 +1,79 @@
+"""adapt: a pure function whose healthy path is short."""
+
+import sys
+from collections.abc import Callable
+from types import FrameType
+
+from otolith.acquisition.window import Window
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import AdaptationState, initial_state
+from otolith.discovery.decision import ACCEPTED, UPDATES, PosteriorUpdate, WindowDecision
+from otolith.estimation.objective import Objective
+from otolith.estimation.problem import Problem
+from otolith.machine import find_twin
+from otolith.twin.kernel import Kernel
+from otolith_drivers.plant.dc_motor import MotorScenario
+
+Cut = Callable[..., list[tuple[Window, float]]]
+PACKAGES = ("otolith.estimation.", "otolith.discovery.", "otolith.adaptation.")
+MAX_MODULES = 12
+DC_MOTOR = find_twin("dc_motor")
+
+
+def healthy(scenario: MotorScenario, windows: Cut) -> tuple[AdaptationState, Window]:
+    """A determined state, and the next window of the same healthy motor."""
+    free = (DC_MOTOR.parameter("R_a"),)
+    known = tuple((item.name, item.nominal) for item in DC_MOTOR.parameters if item.name != "R_a")
+    problem = Problem(DC_MOTOR, known, free, (0.005, 0.02), input_noise=(0.0, 0.0002))
+    state = initial_state("motor", "here", problem)
+    *first, (last, _) = windows(scenario.model_copy(update={"faults": ()}), 12)
+    for window, _ in first:
+        state, _ = adapt(state, window)
+    return state, last
+
+
+def test_a_healthy_window_passes_few_modules(scenario: MotorScenario, windows: Cut) -> None:
+    """Modules of the core in which some function receives the window."""
+    state, window = healthy(scenario, windows)
+    passed: set[str] = set()
+
+    def record(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and any(isinstance(value, Window) for value in frame.f_locals.values()):
+            passed.add(str(frame.f_globals.get("__name__")))
+
+    sys.setprofile(record)
+    try:
+        _, report = adapt(state, window)
+    finally:
+        sys.setprofile(None)
+    assert report.document.decision is WindowDecision.LEARNED
+    core = {name for name in passed if name.startswith(PACKAGES)}
+    assert len(core) <= MAX_MODULES, sorted(core)
+
+
+def test_a_healthy_window_has_one_objective_and_one_kalman_pass(scenario: MotorScenario, windows: Cut) -> None:
+    state, window = healthy(scenario, windows)
+    calls: list[str] = []
+
+    def record(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code in (Objective.__init__.__code__, Kernel.innovation_model.__code__):
+            calls.append(frame.f_code.co_qualname)
+
+    sys.setprofile(record)
+    try:
+        adapt(state, window)
+    finally:
+        sys.setprofile(None)
+    assert calls.count("Objective.__init__") == 1
+    assert calls.count("Kernel.innovation_model") <= 2  # again if the first pass asks for finer sub-steps
+
+
+def test_the_same_state_and_window_give_the_same_report(scenario: MotorScenario, windows: Cut) -> None:
+    state, window = healthy(scenario, windows)
+    first, second = (adapt(state, window)[1].document.to_json() for _ in range(2))
+    assert first == second
+
+
+def test_every_decision_has_an_update() -> None:
+    assert set(UPDATES) == set(WindowDecision)
+    assert {decision for decision, update in UPDATES.items() if update is not PosteriorUpdate.NONE} == ACCEPTED

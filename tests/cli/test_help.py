@@ -1,0 +1,54 @@
+"""Help of every command: at most 80 columns, with an example; docs/reference/commands.md has every option."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from otolith.cli.main import cli
+
+REFERENCE = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
+WIDTH = 80  # columns of a terminal
+
+
+def command_paths(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    yield path
+    if isinstance(command, click.Group):
+        for name, child in command.commands.items():
+            yield from command_paths(child, (*path, name))
+
+
+def command_at(path: tuple[str, ...]) -> click.Command:
+    command: click.Command = cli
+    for name in path:
+        assert isinstance(command, click.Group)
+        command = command.commands[name]
+    return command
+
+
+PATHS = list(command_paths(cli))
+
+
+@pytest.mark.parametrize("path", PATHS, ids=" ".join)
+def test_help_fits_80_columns_and_has_an_example(path: tuple[str, ...]) -> None:
+    text = CliRunner().invoke(cli, [*path, "--help"], env={"COLUMNS": "200"}).output
+    assert max(map(len, text.splitlines())) <= WIDTH
+    assert re.search(rf"(Examples?|Start here):\n\s+{' '.join(('otolith', *path))}\b", text)
+
+
+@pytest.mark.parametrize("path", PATHS, ids=" ".join)
+def test_the_reference_has_every_command_and_option(path: tuple[str, ...]) -> None:
+    text = REFERENCE.read_text(encoding="utf-8")
+    command = command_at(path)
+    if not isinstance(command, click.Group):
+        section = text.partition(f"## `{' '.join(('otolith', *path))}")[2].partition("\n## ")[0]
+        assert section
+        options = [option for option in command.params if isinstance(option, click.Option)]
+        assert {name for option in options for name in option.opts} <= set(re.findall(r"`(-{1,2}[\w-]+)", section))
+
+
+def test_the_reference_has_every_exit_code() -> None:
+    assert set(re.findall(r"^\| (\d+)", REFERENCE.read_text(encoding="utf-8"), re.MULTILINE)) == {"0", "1", "2", "130"}

@@ -1,0 +1,108 @@
+"""The particle swarm: its update rule, and its minima against pymoo's on the same objectives."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pymoo.algorithms.soo.nonconvex.pso import PSO
+from pymoo.core.problem import Problem as PymooProblem
+from pymoo.optimize import minimize
+
+from otolith.acquisition.window import Array, Window
+from otolith.estimation.objective import Objective
+from otolith.estimation.particle_swarm import SwarmRule, particle_swarm, search_parameters, spread_starts
+from otolith.estimation.problem import Problem, SwarmOptions
+from otolith.machine import find_twin
+from otolith.twin.kernel import Excitation, kernel_of
+
+TWIN = find_twin("dc_motor")
+NOMINAL = {parameter.name: parameter.nominal for parameter in TWIN.parameters}
+OPTIONS = SwarmOptions()
+SEEDS = range(10)
+NOISE = np.array([0.005, 0.02])  # A, rad/s
+
+
+def sphere(x: Array) -> Array:
+    return np.asarray(((x - 0.3) ** 2).sum(axis=-1))
+
+
+def valley(x: Array) -> Array:
+    """Rosenbrock's: narrow and curved."""
+    return np.asarray(100.0 * (x[..., 1] - x[..., 0] ** 2) ** 2 + (1.0 - x[..., 0]) ** 2)
+
+
+def many_minima(x: Array) -> Array:
+    """Rastrigin's: a minimum at every whole number, the lowest at zero."""
+    return np.asarray((x**2 - 10.0 * np.cos(2.0 * np.pi * x) + 10.0).sum(axis=-1))
+
+
+def ours(cost: Callable[[Array], Array], seed: int, generations: int) -> float:
+    random = np.random.default_rng(seed)
+    positions = random.uniform(-2.0, 2.0, (1, OPTIONS.size, 2))
+    rule = SwarmRule(OPTIONS, inertia_generations=60, max_generations=generations)
+    return float(particle_swarm(cost, positions, (np.full(2, -2.0), np.full(2, 2.0)), rule, random).costs[0, 0])
+
+
+def pymoos(cost: Callable[[Array], Array], seed: int, generations: int) -> float:
+    class Bounded(PymooProblem):  # type: ignore[misc]  # pymoo has no types
+        def __init__(self) -> None:
+            super().__init__(n_var=2, n_obj=1, xl=-2.0, xu=2.0)
+
+        def _evaluate(self, x: Array, out: dict[str, Array], *_: object, **__: object) -> None:
+            out["F"] = cost(x)
+
+    swarm = PSO(pop_size=OPTIONS.size, w=OPTIONS.inertia, c1=OPTIONS.cognitive, c2=OPTIONS.social, adaptive=True)
+    return float(minimize(Bounded(), swarm, ("n_gen", generations), seed=seed).F[0])
+
+
+@pytest.mark.parametrize("cost", [sphere, valley, many_minima])
+def test_minima_are_no_worse_than_pymoos(cost: Callable[[Array], Array]) -> None:
+    """Median over ten seeds, 120 generations each."""
+    medians = [np.median([swarm(cost, seed, 120) for seed in SEEDS]) for swarm in (ours, pymoos)]
+    assert medians[0] <= max(medians[1], 1e-3)
+
+
+def test_one_generation_is_equations_1_and_2_of_the_paper() -> None:
+    start = np.array([[[0.0], [1.0], [-1.0]]])
+    bounds = (np.array([-10.0]), np.array([10.0]))
+    rule = SwarmRule(OPTIONS, inertia_generations=10, max_generations=2)
+    result = particle_swarm(sphere, start, bounds, rule, np.random.default_rng(4))
+    random = np.random.default_rng(4)
+    own, common = random.random(start.shape), random.random(start.shape)
+    velocity = OPTIONS.cognitive * own * 0.0 + OPTIONS.social * common * (0.0 - start)
+    second = start + velocity
+    best = np.minimum(sphere(start), sphere(second))
+    assert result.costs[0] == pytest.approx(np.sort(best[0]))
+
+
+def test_swarms_side_by_side_share_nothing() -> None:
+    random = np.random.default_rng(1)
+    starts = random.uniform(-2.0, 2.0, (3, OPTIONS.size, 1))
+    low, high = np.array([[[-2.0]], [[-1.0]], [[0.5]]]), np.array([[[2.0]], [[0.0]], [[2.0]]])
+    rule = SwarmRule(OPTIONS, inertia_generations=12, max_generations=60)
+    best = particle_swarm(sphere, np.clip(starts, low, high), (low, high), rule, random).positions[:, 0, 0]
+    assert best == pytest.approx([0.3, 0.0, 0.5], abs=1e-2)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_cold_start_reaches_the_valley_of_the_truth(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    inputs = np.column_stack([np.repeat(random.uniform(5.0, 20.0, 20), 10), np.full(200, 0.03)])
+    outputs = kernel_of(TWIN).simulate(
+        np.array([list(NOMINAL.values())]), np.zeros((1, 2)), Excitation(inputs, 0.01, 8)
+    )
+    values = np.column_stack([inputs, outputs[0] + random.normal(size=(200, 2)) * NOISE])
+    window = Window.whole(0, 0.0, 0.01, TWIN.signals, values)
+    free = tuple(parameter for parameter in TWIN.parameters if parameter.name in ("R_a", "J"))
+    known = tuple(pair for pair in NOMINAL.items() if pair[0] not in ("R_a", "J"))
+    problem = Problem(TWIN, known, free, tuple(NOISE))
+    objective = Objective(problem, window, np.array([parameter.high for parameter in free]))
+    result = search_parameters(objective, OPTIONS, np.array([parameter.high for parameter in free]), seed)
+    assert result.converged
+    assert result.positions[0, 0] == pytest.approx([NOMINAL["R_a"], NOMINAL["J"]], rel=0.1)
+
+
+def test_starts_cover_the_bounds_by_order_of_magnitude() -> None:
+    starts = spread_starts(np.array([1e-6, -1.0]), np.array([1.0, 1.0]), 12, seed=1)
+    assert np.sort(np.floor(2.0 * np.log10(starts[:, 0]))).tolist() == list(range(-12, 0))
+    assert np.sort(np.floor(6.0 * (starts[:, 1] + 1.0))).tolist() == list(range(12))

@@ -1,0 +1,61 @@
+"""Reports in words: values with interval and unit, and the line of the daemon's log."""
+
+import pytest
+
+from otolith.acquisition.window import Verdict
+from otolith.discovery.decision import WindowDecision
+from otolith.health.schema import (
+    DriverDocument,
+    FindingDocument,
+    ParameterDocument,
+    QualityDocument,
+    ReportDocument,
+    Severity,
+    Status,
+    WindowDocument,
+)
+from otolith.health.text import finding_text, summary, value_cells, value_text
+
+ESTIMATED = ParameterDocument(value=5.98561, sd=0.00382, unit="ohm", nominal=6.5, status=Status.ESTIMATED)
+UNKNOWN = ParameterDocument(unit="ohm", nominal=6.5, status=Status.UNESTIMATED, reason="no current")
+LEAK = FindingDocument(
+    id="s/f", severity=Severity.FAULT, condition="leak", text="a leak", since=0.0, advice="Close it."
+)
+
+
+def test_a_value_has_its_unit_and_95_percent_interval() -> None:
+    assert value_text(ESTIMATED) == "5.9856 ohm ± 0.0075"
+    assert value_cells(ESTIMATED) == ("5.9856", "0.0075", "ohm", "-7.91%")
+
+
+def test_an_unknown_value_has_no_number() -> None:
+    assert value_text(UNKNOWN) == "unknown"
+    assert value_cells(UNKNOWN) == ("unknown", "", "ohm", "")
+
+
+@pytest.mark.parametrize("value", [6.5001, 6.4999])
+def test_a_change_of_zero_has_no_sign(value: float) -> None:
+    assert value_cells(ESTIMATED.model_copy(update={"value": value}))[3] == "0.00%"
+
+
+def test_a_finding_has_severity_text_and_advice() -> None:
+    assert finding_text(LEAK) == "fault: a leak Close it."
+    assert finding_text(LEAK.model_copy(update={"advice": ""})) == "fault: a leak"
+
+
+def test_the_summary_is_one_line_with_reasons_and_warnings() -> None:
+    quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
+    report = ReportDocument(
+        machine="m",
+        site="s",
+        twin="dc_motor",
+        window=WindowDocument(index=3, start=1.0, end=3.0, records=200, quality=quality),
+        decision=WindowDecision.LEARNED,
+        parameters={"R_a": ESTIMATED, "L_a": UNKNOWN},
+        findings=(LEAK,),
+        driver=DriverDocument(up=False, reason="unplugged", warnings=("slow", "late", "odd")),
+    )
+    assert summary(report) == (
+        "window 3 good, R_a 5.9856 ohm ± 0.0075, L_a unknown (unestimated: no current), fault: a leak Close it., "
+        "no connection: unplugged, slow, and 2 more warnings"
+    )
