@@ -155,7 +155,7 @@ def test_a_scan_lists_the_devices_that_answer() -> None:
             "device 2",
             "device 5 (that register is refused: illegal data address)",
         ]
-        nothing = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "3..4", "--timeout", "0.05")
+        nothing = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "3..4", "--timeout", "0.2")
         assert nothing.return_value == 1
 
 

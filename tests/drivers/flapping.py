@@ -35,10 +35,12 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
         opened[:] = [bus]
         return bus
 
-    vars(can_receiver).update(open_bus=remembered, BACKOFF_FIRST=SHORT)
-    options = can_receiver.Options(**place.model_dump(), dbc=Path("dc-motor.dbc"))
+    vars(can_receiver).update(open_bus=open_and_remember, BACKOFF_FIRST=SHORT)
     signals = (Signal("i", "A", CanSource(signal="ArmatureCurrent")),)
-    sender, stop = open_bus(place), threading.Event()
+    driver = can_receiver.build(
+        can_receiver.Options(**options.model_dump(), dbc=Path("dc-motor.dbc")), Setup(signals, EXAMPLES, PERIOD)
+    )
+    sender, stop = open_bus(options), threading.Event()
 
     def send() -> None:
         counter = 0

@@ -24,15 +24,8 @@ def source(**keys: object) -> Source:
 
 def poller(port: int, sources: Sequence[Source], period: float = PERIOD, **options: object) -> ModbusPoller:
     signals = tuple(Signal(f"s{index}", "V", source) for index, source in enumerate(sources))
-    parsed = Options.model_validate({"host": "127.0.0.1", "port": port, "timeout": "0.1 s", **options})
+    parsed = Options.model_validate({"host": "127.0.0.1", "port": port, "timeout": f"{TIMEOUT} s", **options})
     return build(parsed, Setup(signals, Path(), period))
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {seconds:g} s"
-        time.sleep(0.005)
 
 
 class Listener:

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from otolith.health.schema import ReportDocument
+from otolith.health.schema import ReportDocument, Status
 from otolith.publishing.zenoh_session import Listener
 from tests.conftest import OwnMachine
 from tests.waiting import PATIENCE, wait_for
@@ -32,7 +32,6 @@ class Running:
         wait_for(lambda: "reports on" in self.log.read_text() or self.daemon.poll() is not None)
         plays = [*machine.plays, "--truth", str(self.truth), "--summary", str(self.summary)]
         self.plant = self._start("plant", "plant", *plays) if machine.plays else None
-        self.daemon = self._start("daemon", "run", str(machine.machine), "--recording", str(self.recording))
         self._received: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._listener = Listener([machine.endpoint], "otolith/**/report", self._received.put)
         self.reports: list[ReportDocument] = []
@@ -41,7 +40,9 @@ class Running:
         with (self.folder / f"{name}.log").open("wb") as log:
             return subprocess.Popen([*OTOLITH, *arguments], stdout=log, stderr=subprocess.STDOUT)
 
-    def wait_for(self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 60.0) -> list[ReportDocument]:
+    def wait_for(
+        self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 3 * PATIENCE
+    ) -> list[ReportDocument]:
         """Return all reports once ``enough`` accepts them; fail with the daemon's log after ``seconds``."""
         deadline = time.monotonic() + seconds
         while not enough(self.reports):
@@ -73,6 +74,11 @@ class Running:
             if process is not None and process.poll() is None:
                 process.terminate()
                 process.wait(timeout=PATIENCE)
+
+
+def is_estimated(report: ReportDocument) -> bool:
+    """Whether the window of the report gave an estimate of the armature resistance."""
+    return report.parameters["R_a"].status is Status.ESTIMATED
 
 
 @pytest.fixture

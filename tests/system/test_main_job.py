@@ -18,13 +18,12 @@ from rerun.chunk import RrdReader
 
 from otolith.acquisition.window import Array, Verdict
 from otolith.cli.demo import compare
-from otolith.health.schema import ReportDocument, Status
 from tests.conftest import OwnMachine
-from tests.system.conftest import Running
-from tests.waiting import PATIENCE, within
+from tests.system.conftest import Running, is_estimated
+from tests.waiting import EXACT, PATIENCE, within
 
 CAN_LISTENER = """
-import can, cantools, sys, json, time
+import can, cantools, json, sys
 database = cantools.database.load_file(sys.argv[1])
 bus = can.Bus(interface="udp_multicast", channel=sys.argv[2], port=int(sys.argv[3]), hop_limit=0, fd=False)
 seen = []
@@ -48,7 +47,9 @@ config.insert_json5("scouting/multicast/enabled", "false")
 received, alive = [], []
 with zenoh.open(config) as session:
     session.declare_subscriber("otolith/**", lambda s: received.append((str(s.key_expr), s.payload.to_string())))
-    time.sleep(5)
+    end = time.monotonic() + 60.0
+    while sum(key.endswith("/report") for key, _ in received) < 2 and time.monotonic() < end:
+        time.sleep(0.1)
     latest = [reply.ok.payload.to_string() for reply in session.get("otolith/demo/dc-motor/report") if reply.ok]
     alive = [str(reply.ok.key_expr) for reply in session.liveliness().get("otolith/*/*/alive") if reply.ok]
 print(json.dumps({"received": received, "latest": latest, "alive": alive}))
@@ -73,12 +74,14 @@ def series(path: Path, entity: str) -> tuple[Array, Array]:
     return np.concatenate(times)[order], np.concatenate(values)[order]
 
 
+@pytest.mark.timed
 def test_frames_reports_and_recording_are_complete(running: Running) -> None:
     running.wait_for(lambda reports: len(reports) >= 2)
     machine = running.machine
     frames = independent(CAN_LISTENER, machine.dbc, machine.group, machine.port)
-    assert {"MotorElectrical", "MotorMechanical"} == set(frames)
-    counters = [frame["ElectricalAliveCounter"] for frame in frames["MotorElectrical"]]
+    assert {"MotorElectrical", "MotorMechanical"} == {name for name, _, _ in frames}
+    electrical = [(stamp, values) for name, stamp, values in frames if name == "MotorElectrical"]
+    counters = [values["ElectricalAliveCounter"] for _, values in electrical]
     assert set(np.diff(counters) % 256) == {1}
     seconds = electrical[-1][0] - electrical[0][0]
     assert seconds == pytest.approx(0.01 * (len(electrical) - 1), abs=within(0.1))
@@ -111,20 +114,18 @@ def test_frames_reports_and_recording_are_complete(running: Running) -> None:
     assert resistance[: len(known), 2].tolist() == known
 
 
-def is_estimated(report: ReportDocument) -> bool:
-    return report.parameters["R_a"].status is Status.ESTIMATED
-
-
 def check_accuracy(running: Running) -> None:
     with running.truth.open(encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if None not in row.values()]
     truth = {name: [float(row[name]) for row in rows] for name in rows[0]}
-    compared = compare(running.reports, truth)
+    # Values that are held, as they are in bad windows of a busy computer, may lag behind.
+    compared = compare(running.reports if EXACT else list(filter(is_estimated, running.reports)), truth)
     assert len(compared) >= 5
     assert max(row.error for row in compared) <= 0.005
     assert max(report.cost.latency_s for report in running.reports[1:]) < within(1.0)
 
 
+@pytest.mark.timed
 def test_a_killed_worker_is_restarted(running: Running) -> None:
     running.wait_for(lambda reports: len(reports) >= 2)
     running.child("worker").kill()
@@ -137,11 +138,11 @@ def test_a_killed_worker_is_restarted(running: Running) -> None:
     assert (last.lost, last.bad) == (0, 0)
     for before, after in pairwise(reports):
         if after.window.index == before.window.index + 1:
-            assert after.window.start == pytest.approx(before.window.end, abs=0.005)  # half a period
+            assert after.window.start == pytest.approx(before.window.end, abs=within(0.005))  # half a period
 
 
 def test_a_killed_recorder_changes_nothing_else(running: Running) -> None:
-    running.wait_for(lambda reports: len(reports) >= 2)
+    before = running.wait_for(lambda reports: len(reports) >= 2)[-1].counters
     running.child("recorder").kill()
     reports = running.wait_for(lambda reports: len(reports) >= 5)
     last = reports[-1].counters
@@ -166,8 +167,8 @@ def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine,
     begun = time.monotonic()
     for process in [psutil.Process(daemon.pid), *children]:
         process.send_signal(signal.SIGINT)
-    _, errors = daemon.communicate(timeout=10)
-    assert time.monotonic() - begun < 3.0
+    _, errors = daemon.communicate(timeout=PATIENCE)
+    assert time.monotonic() - begun < within(3.0)
     # In the first hundredths of a second the interpreter has not reached our code, and may print its own traceback.
     assert "otolith" not in errors.partition("Traceback")[2]
     assert daemon.returncode in (130, -signal.SIGINT) or (daemon.returncode == 1 and "Traceback" in errors)
@@ -178,7 +179,7 @@ def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine,
 
 
 def test_demo_estimates_what_was_injected(tmp_path: Path, own_machine: OwnMachine) -> None:
-    command = [sys.executable, "-m", "otolith", "demo", "--duration", "10", "--json"]
+    command = [sys.executable, "-m", "otolith", "demo", "--duration", "20", "--json"]
     command += ["--machine", str(own_machine.machine), "--scenario", str(own_machine.scenario)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=3 * PATIENCE, check=False)
     assert done.returncode == 0, done.stderr

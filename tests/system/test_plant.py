@@ -23,7 +23,7 @@ def test_a_second_plant_on_the_same_bus_is_refused(own_machine: OwnMachine) -> N
     assert first.stderr is not None
     assert "frames of dc-motor.dbc" in first.stderr.readline()
     with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus:
-        assert bus.recv(10.0) is not None  # the plant sends after it has listened for other nodes
+        assert bus.recv(PATIENCE) is not None  # the plant sends after it has listened for other nodes
     second = subprocess.run(
         [*PLANT, str(own_machine.scenario)], capture_output=True, text=True, timeout=PATIENCE, check=False
     )
@@ -79,7 +79,7 @@ def test_every_withheld_frame_is_counted(own_machine: OwnMachine, tmp_path: Path
         node = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         while (frame := bus.recv(0.2)) is not None or node.poll() is None:
             received += [frame] if frame is not None else []
-    assert node.wait(timeout=5) == 0
+    assert node.wait(timeout=PATIENCE) == 0
     done = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     dropouts, gone, garbage = done["faults"]
     assert len(received) == done["frames"] + garbage["ticks"]
@@ -128,11 +128,11 @@ def test_the_lift_sends_in_the_units_of_its_database(own_machine: OwnMachine, tm
     values: dict[str, float] = {}
     with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus_:
         while len(values) < 6:
-            frame = bus_.recv(10.0)
+            frame = bus_.recv(PATIENCE)
             assert frame is not None
             values |= database.decode_message(frame.arbitration_id, frame.data)  # type: ignore[arg-type]
     node.terminate()
-    assert node.wait(timeout=5) == 0
+    assert node.wait(timeout=PATIENCE) == 0
     assert values["ValveArea"] == pytest.approx(63.28, abs=5.0)  # mm², in balance at first
     assert values["LoadForce"] == pytest.approx(9806.65)
     assert values["SystemPressure"] == pytest.approx(49945.0, abs=50.0)

@@ -51,7 +51,7 @@ def test_two_processes_compile_a_kernel_once(cache: Path) -> None:
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize("keep", [0, 0.5])
 def test_truncated_cache_file_is_compiled_again(cache: Path, ending: str, keep: float) -> None:
-    start().communicate(timeout=60)
+    start().communicate(timeout=5 * PATIENCE)
     (half,) = cache.glob(f"*/__pycache__/*.{ending}")
     content = half.read_bytes()
     half.write_bytes(content[: int(keep * len(content))])

@@ -20,7 +20,7 @@ from tests.waiting import wait_for
 
 def late(reply: bytes) -> bytes:
     """A reply with another value after the timeout, which must not be taken for the answer to the next request."""
-    time.sleep(0.15)
+    time.sleep(1.5 * TIMEOUT)
     return reply[:-4] + struct.pack(">f", 99.0)
 
 

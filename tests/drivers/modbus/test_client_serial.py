@@ -86,7 +86,7 @@ def test_late_reply_is_not_taken_for_the_next_one(device: Device) -> None:
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
-        wait_for(lambda: device.requests > 100, 30.0)
+        wait_for(lambda: device.requests > 100)
     finally:
         driver.close()
     assert driver.counters().lost > 0
@@ -100,7 +100,7 @@ def test_echo_of_the_request_is_no_answer(device: Device) -> None:
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
-        wait_for(lambda: device.requests > 100, 30.0)
+        wait_for(lambda: device.requests > 100)
     finally:
         driver.close()
     assert len(samples) > 50
@@ -116,7 +116,7 @@ def test_silent_line_is_reopened(device: Device) -> None:
         device.delay = lambda number: None
         wait_for(lambda: not driver.link().up)
         device.delay = lambda number: 0.0
-        wait_for(lambda: driver.link().up, 20.0)
+        wait_for(lambda: driver.link().up)
     finally:
         driver.close()
     assert driver.counters().reconnects == 1
@@ -136,6 +136,7 @@ def test_wall_clock_set_back_does_not_block_the_line(device: Device, monkeypatch
         driver.close()
 
 
+@pytest.mark.timed
 def test_slow_device_does_not_delay_close(device: Device) -> None:
     device.delay = lambda number: None
     driver = poller(device, 10.0)

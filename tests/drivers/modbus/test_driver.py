@@ -109,6 +109,7 @@ def test_sample_time_is_the_middle_of_the_round_trip() -> None:
     assert behind[len(behind) // 2] == pytest.approx(0.0, abs=0.004)
 
 
+@pytest.mark.timed
 def test_slow_line_reports_its_achieved_rate() -> None:
     """And polls evenly on a coarser grid."""
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
@@ -124,9 +125,15 @@ def test_slow_line_reports_its_achieved_rate() -> None:
         assert link.period is not None
         assert 0.02 < link.period < within(0.05)
         assert "100 Hz asked" in link.plan
-        achieved = re.search(r"([\d.]+) achieved", link.plan)
-        assert achieved is not None
-        assert float(achieved[1]) == pytest.approx(1 / link.period, rel=0.1)  # a busy computer keeps it only roughly
+        listener.wait(keeps_its_period)
+
+
+def keeps_its_period(link: Link) -> bool:
+    """Whether the driver polls at the rate of its period; a busy computer keeps it only now and then."""
+    achieved = re.search(r"([\d.]+) achieved", link.plan)
+    if achieved is None or link.period is None:
+        return False
+    return float(achieved[1]) == pytest.approx(1 / link.period, rel=0.1)
 
 
 def test_line_that_breaks_each_round_still_delivers() -> None:
@@ -143,6 +150,7 @@ def test_line_that_breaks_each_round_still_delivers() -> None:
         wait_for(lambda: len(listener.of("s0")) > 25)
 
 
+@pytest.mark.timed
 def test_unresponsive_host_does_not_delay_close() -> None:
     with socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as stack:
         for _ in range(4):  # beyond its backlog, connections are not answered

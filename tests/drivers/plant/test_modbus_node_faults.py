@@ -31,7 +31,7 @@ def test_dropouts_are_all_counted(drive: Callable[..., Drive]) -> None:
 
 
 def test_gone_tcp_drive_closes_its_port_and_returns(drive: Callable[..., Drive]) -> None:
-    node = drive('[[faults]]\nkind = "gone"\nstart = "1 s"\nuntil = "2 s"\n')
+    node = drive('[[faults]]\nkind = "gone"\nstart = "3 s"\nuntil = "4 s"\n')
     with node.client() as client:
         wait_for(client, past(0))
         with socket.create_connection(("127.0.0.1", node.port)) as idle:
@@ -84,7 +84,7 @@ def test_exception_for_some_registers(drive: Callable[..., Drive]) -> None:
 
 @pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
 def test_garbage_is_sent_on_the_line(drive: Callable[..., Drive], transport: str) -> None:
-    node = drive('[[faults]]\nkind = "garbage"\nshare = 1.0\nstart = "0.5 s"\nuntil = "1 s"\n', transport)
+    node = drive('[[faults]]\nkind = "garbage"\nshare = 1.0\nstart = "0.5 s"\nuntil = "3 s"\n', transport)
     if transport == "modbus-tcp":
         with socket.create_connection(("127.0.0.1", node.port)) as connection:
             line_says(connection.fileno(), 100)

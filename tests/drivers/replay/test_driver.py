@@ -43,13 +43,6 @@ def driver_of(path: Path, sources: dict[str, dict[str, Any]] | None = None, **op
     return build(Options.model_validate({"file": path, **options}), setup(named))
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
 def played(driver: ReplayDriver) -> list[Sample]:
     """All samples of the file."""
     got: list[Sample] = []
@@ -81,6 +74,7 @@ def test_replay_keeps_spacing_and_counts_every_cell(tmp_path: Path, pace: str) -
     assert any("bad cells: 1, bad rows: 1" in line for line in driver.link().warnings)
 
 
+@pytest.mark.timed
 def test_replay_in_real_time_delivers_no_sample_early(tmp_path: Path) -> None:
     late: list[float] = []
     driver = driver_of(written_table(tmp_path, 100))
