@@ -11,7 +11,7 @@ from benchmarks.discovery.truth import same
 from otolith.discovery.hypotheses import FaultType, FittedHypothesis
 from otolith.estimation.augmented import indices
 
-DECISIVE = 2.0 * math.log(150.0)  # in -2 log evidence: decides between two hypotheses
+BAYES_FACTOR_150 = 2.0 * math.log(150.0)  # in -2 log evidence: decides between two hypotheses
 QUANTILE_95 = 1.96  # standard deviations on either side of which 95 % lie
 
 
@@ -111,8 +111,8 @@ def judge(case: Case, ranked: RankedHypotheses) -> CaseResult:
         best=label(best),
         best_family=_family(best, case),
         first=first,
-        decided=min(others, default=math.inf) > DECISIVE,
-        named=behind <= DECISIVE,
+        decided=min(others, default=math.inf) > BAYES_FACTOR_150,
+        named=behind <= BAYES_FACTOR_150,
         behind=behind,
         tried=true_hypothesis is not None,
         noticed=ranked.screening.gain > 0.0,
