@@ -8,6 +8,7 @@ import numpy as np
 from benchmarks.discovery.draw import Case, draw
 from benchmarks.discovery.setting import RankedHypotheses, problem, search_and_rank
 from benchmarks.discovery.truth import same
+from otolith.discovery.candidates import DECISIVE
 from otolith.discovery.hypotheses import FaultType, FittedHypothesis
 from otolith.estimation.augmented import indices
 
