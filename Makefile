@@ -8,11 +8,13 @@ DEV := .venv/.dev-$(HERE)
 BENCH := .venv/.bench-$(HERE)
 PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: help demo test system-test check bench paper clean
+.PHONY: help demo test test-full system-test check bench paper clean
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
-	@echo "make test    run all tests"
+	@echo "make test    run the tests, long ones shortened: six minutes on two cores"
+	@echo "make test-full"
+	@echo "             the long tests, and those that time something, one at a time: fifteen minutes"
 	@echo "make system-test"
 	@echo "             as root on Debian: drivers against can-utils, systemd and libmodbus, in a guest that is booted"
 	@echo "make check   ruff, mypy --strict, import rules"
@@ -23,15 +25,16 @@ help:
 demo: $(RUNTIME)
 	$(BIN)/python -m otolith demo
 
-# What only computes runs beside what lives in real time and gives way; what is timed comes last, alone.
-GIVING_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
+# Two processes a core: half of the tests wait for real time. A file's tests stay together and share what they compute.
+WORKERS ?= $(shell echo $$((2 * $$(nproc))))
+SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
 test: $(DEV)
-	@$(GIVING_WAY) $(BIN)/python -m pytest -m computed > .venv/computed.txt 2>&1 & computed=$$!; \
-	trap 'kill $$computed 2>/dev/null; exit 130' INT TERM; \
-	$(BIN)/python -m pytest -m "not computed and not alone"; lived=$$?; \
-	echo "the tests that only compute:"; \
-	wait $$computed; passed=$$?; cat .venv/computed.txt; \
-	$(BIN)/python -m pytest -m alone; timed=$$?; exit $$((lived | passed | timed))
+	$(SHARED) -m "not full"
+
+# What is timed runs last, one test at a time, and must keep its limits exactly.
+test-full: $(DEV)
+	@$(SHARED) -m "full and not timed"; shared=$$?; \
+	OTOLITH_TIMING=exact $(BIN)/python -m pytest -m timed; timed=$$?; exit $$((shared | timed))
 
 system-test: $(DEV)
 	@PYTHON=$(BIN)/python tests/vm/all.sh

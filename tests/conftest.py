@@ -1,8 +1,10 @@
 """What many tests share: a simulated plant's windows without any clock, and a machine of one's own on free ports."""
 
 import socket
-from collections.abc import Callable
-from itertools import islice
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache
+from itertools import cycle, islice
 from pathlib import Path
 
 import numpy as np
@@ -13,44 +15,41 @@ from otolith.acquisition.window import Window
 from otolith.cli.common import examples_directory
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import load_scenario, simulate
+from tests.progress import Progress
+from tests.waiting import EXACT
 
 EXAMPLES = examples_directory()
 TESTS = Path(__file__).parent
+# Ports for tests: below those that the kernel gives to whoever asks for any port, so that nobody else takes one first.
+FIRST_PORT, LAST_PORT, PORTS = 10_000, 32_000, 400  # PORTS for each process
+CLAIMS: list[socket.socket] = []
 settings.register_profile("otolith", deadline=None)  # how long an example takes depends on who else computes
 settings.load_profile("otolith")
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 
 
-# What only computes: no bus, no port, no clock, so that it may run slowly beside what lives in real time.
-COMPUTED = frozenset({
-    "adaptation",
-    "commissioning",
-    "discovery",
-    "estimation",
-    "health",
-    "twin",
-    "cli/test_noise.py",
-    "cli/test_replay.py",
-    "cli/test_replay_tables.py",
-    "docs/test_describe_your_machine.py",
+# Whole files that take longest, so that workers start with them; a mix of files that compute and files that wait.
+SLOWEST = (
+    "adaptation/test_measured_axis.py",
+    "system/test_faults.py",
     "benchmarks/test_paper.py",
+    "system/test_main_job.py",
     "benchmarks/test_paper_discovery.py",
-})  # fmt: skip
+    "system/test_transports.py",
+    "adaptation/test_coverage.py",
+)
 
 
-# What says how soon things happen, or how exactly: nothing may run beside it.
-ALONE = frozenset({"test_faults.py", "test_transports.py"})
+def pytest_configure(config: pytest.Config) -> None:
+    """Show what runs, if several processes share the tests; this is the process that gives them out."""
+    if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Progress(config))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what only computes, and what wants to be alone."""
-    for item in items:
-        if item.path.is_relative_to(TESTS):
-            path = item.path.relative_to(TESTS)
-            if path.parts[0] in COMPUTED or path.as_posix() in COMPUTED:
-                item.add_marker("computed")
-        if item.path.name in ALONE:
-            item.add_marker("alone")
+    """Put the slowest files first."""
+    ranks = {TESTS / name: rank for rank, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: ranks.get(item.path, len(SLOWEST)))
 
 
 @pytest.fixture(autouse=True)
@@ -86,11 +85,28 @@ def windows() -> Callable[..., list[tuple[Window, float]]]:
     return cut
 
 
+@cache
+def _own_ports() -> Iterator[int]:
+    """Ports of a block that no other process of any test run uses; the block is claimed until this process ends."""
+    for first in range(FIRST_PORT, LAST_PORT, PORTS):
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            claim.bind(f"\0otolith-tests-ports-{first}")
+        except OSError:
+            claim.close()
+            continue
+        CLAIMS.append(claim)
+        return cycle(range(first, first + PORTS))
+    raise RuntimeError(f"all ports from {FIRST_PORT} to {LAST_PORT} are claimed by processes of tests")
+
+
 def free_port(kind: socket.SocketKind) -> int:
-    """A port of this computer that nobody uses now."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A port of this computer that nobody uses now, and that no other process of the tests will be given."""
+    for port in islice(_own_ports(), PORTS):
+        with socket.socket(socket.AF_INET, kind) as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise RuntimeError("every port of this process's block is in use")
 
 
 @pytest.fixture
@@ -99,6 +115,8 @@ def own_machine(tmp_path: Path) -> "OwnMachine":
     return OwnMachine(tmp_path)
 
 
+# A busy computer polls late: such windows are estimated from all the same. The defaults are tested one by one.
+BUSY = '\n[window]\nmissing_limit = "20 %"\ngap_limit = "250 ms"\n'
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu", "in-process")
 
 
@@ -141,6 +159,7 @@ class OwnMachine:
     def _machine_file(self) -> str:
         text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
         text += f'\n[zenoh]\nlisten = ["{self.endpoint}"]\n'
+        text += "" if EXACT else BUSY
         can = 'type = "can"\ndbc = "dc-motor.dbc"\n'
         if self.transport == "can":
             return text.replace(can, f'type = "can"\ndbc = "{self.dbc}"\n{self._bus()}')

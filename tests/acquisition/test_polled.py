@@ -14,6 +14,7 @@ from otolith_drivers.base import Sampling, Setup, Signal
 from otolith_drivers.modbus.driver import Options, Source, build
 from tests.conftest import free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
+from tests.waiting import PATIENCE
 
 PERIOD, RECORDS = 0.02, 100
 FREQUENCY = 2.0 * math.pi  # rad/s
@@ -44,7 +45,7 @@ def read_window(sampling: Sampling) -> float:
     driver = build(Options(host="127.0.0.1", port=port), Setup(signals, Path(), PERIOD))
     with odd_server(Behaviour(SineRegisters(), corrupt=slow), port):
         driver.open(rings.deliver)
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + PATIENCE
         while not (windower.begin(rings, time.monotonic(), 0.0) and windower.due(rings, time.monotonic())):
             assert time.monotonic() < deadline
             time.sleep(0.01)

@@ -37,6 +37,9 @@ PERIOD, RECORDS = 1e-3, 2000
 MASS = 95.1089  # kg
 DIRECTIONAL = {"F_v_up": 166.71, "F_c_up": 20.144, "F_v_down": 240.42, "F_c_down": 20.628}  # N*s/m and N
 TURN = 5e-4  # m/s: width of the authors' sign(v); the likelihood of the record increases down to this width
+WHOLE = 12  # windows of the record
+COUNTS = pytest.mark.parametrize("count", [4, pytest.param(WHOLE, marks=pytest.mark.full)])
+"""How many windows are adapted to: nearly each one is searched for components that the twin lacks, which takes long."""
 ONE_WAY = 1e-3  # of the path: largest share in the other direction of a one-way window
 
 
@@ -62,9 +65,9 @@ def identified(twin: str) -> IdentifiedNoise:
 
 
 @lru_cache
-def reports(twin: str) -> tuple[ReportDocument, ...]:
+def reports(twin: str, count: int) -> tuple[ReportDocument, ...]:
     state, documents = initial_state("axis", "lab", identified(twin).applied(problem(twin))), []
-    for window in windows():
+    for window in windows()[:count]:
         state, report = adapt(state, window)
         documents.append(report.document)
     return tuple(documents)
@@ -85,31 +88,38 @@ def test_noise_levels_of_encoder_and_slow_model_error() -> None:
     assert noise.consistency.before > 10.0  # what white noise alone would have claimed
 
 
-def test_mass_is_right_once_the_axis_has_moved_both_ways() -> None:
+def test_the_record_has_twelve_windows() -> None:
+    assert len(windows()) == WHOLE
+
+
+@COUNTS
+def test_mass_is_right_once_the_axis_has_moved_both_ways(count: int) -> None:
     both = next(index for index, window in enumerate(windows()) if shares(window).min() > ONE_WAY)
-    values = [report.parameters["M"].value for report in reports("servo_axis")[both:]]
-    assert len(values) >= 10
+    values = [report.parameters["M"].value for report in reports("servo_axis", count)[both:]]
+    assert len(values) >= count - 2
     assert values == pytest.approx([MASS] * len(values), rel=0.015)
 
 
-def test_friction_by_direction_agrees_with_the_authors() -> None:
-    last = reports("servo_axis_directional")[-1].parameters
+@COUNTS
+def test_friction_by_direction_agrees_with_the_authors(count: int) -> None:
+    last = reports("servo_axis_directional", count)[-1].parameters
     friction = {name: last[name].value for name in DIRECTIONAL}
     assert friction == pytest.approx(DIRECTIONAL, rel=0.05)
     assert last["M"].value == pytest.approx(95.154, rel=0.015)
 
 
-def test_no_published_value_jumps_with_symmetric_friction() -> None:
+@COUNTS
+def test_no_published_value_jumps_with_symmetric_friction(count: int) -> None:
     """An estimated value stays within its own interval and the previous one; held and invalid values do not count."""
     published = 0
     for name in ("M", "F_v", "F_c", "offset"):
-        history = [report.parameters[name] for report in reports("servo_axis")]
+        history = [report.parameters[name] for report in reports("servo_axis", count)]
         for before, now in pairwise(history):
             if now.status is Status.ESTIMATED and now.value is not None and before.value is not None:
                 published += 1
                 assert abs(now.value - before.value) <= reach(now) + reach(before), (name, now, before)
             assert now.status is Status.ESTIMATED or now.reason
-    assert published > 20
+    assert published > {4: 2, WHOLE: 20}[count]
 
 
 def test_noise_identification_doubts_symmetric_friction() -> None:
@@ -135,11 +145,12 @@ def test_windows_not_used_for_identification_are_consistent() -> None:
         assert 0.5 <= test.reduced <= 2.0
 
 
-def test_reported_estimates_of_single_windows_are_consistent() -> None:
+@COUNTS
+def test_reported_estimates_of_single_windows_are_consistent(count: int) -> None:
     """Chi-square of ``raw`` with ``raw_sd``, per parameter."""
     squares, degrees = 0.0, 0
     for name in ("M", *DIRECTIONAL):
-        parameters = [report.parameters[name] for report in reports("servo_axis_directional")]
+        parameters = [report.parameters[name] for report in reports("servo_axis_directional", count)]
         estimates = [
             (parameter.raw, parameter.raw_sd)
             for parameter in parameters
@@ -149,13 +160,14 @@ def test_reported_estimates_of_single_windows_are_consistent() -> None:
         mean = np.average(values, weights=sd**-2.0)
         squares += float((((values - mean) / sd) ** 2).sum())
         degrees += len(values) - 1
-    assert degrees > 30
+    assert degrees > {4: 6, WHOLE: 30}[count]
     assert 0.5 <= squares / degrees <= 2.0
 
 
-def test_one_way_windows_trade_friction_with_offset() -> None:
+@COUNTS
+def test_one_way_windows_trade_friction_with_offset(count: int) -> None:
     seen = 0
-    for window, report in zip(windows(), reports("servo_axis"), strict=True):
+    for window, report in zip(windows()[:count], reports("servo_axis", count), strict=True):
         if shares(window).min() > ONE_WAY:
             continue
         seen += 1
@@ -163,10 +175,11 @@ def test_one_way_windows_trade_friction_with_offset() -> None:
             parameter = report.parameters[name]
             assert parameter.identifiability is Identifiability.TRADED
             assert f"traded with {other}" in parameter.reason
-    assert seen == 5
+    assert seen == {4: 2, WHOLE: 5}[count]
 
 
-def test_missing_dry_friction_is_discovered() -> None:
+@COUNTS
+def test_missing_dry_friction_is_discovered(count: int) -> None:
     """The twin has viscous friction by direction, but no dry friction, 20.4 N in the mean of both directions."""
     full = find_twin("servo_axis_directional")
     bare = replace(
@@ -185,10 +198,11 @@ def test_missing_dry_friction_is_discovered() -> None:
         "axis", "lab", Problem(bare, (), bare.parameters, (noise.outputs[0].value,), process_noise=process)
     )
     documents = []
-    for window in windows():
+    for window in windows()[:count]:
         state, report = adapt(state, window)
         documents.append(report.document)
     (component,) = documents[-1].components
-    assert (component.family, component.input, component.site) == ("Coulomb", "v", "carriage")
+    assert (component.input, component.site) == ("v", "carriage")
+    assert component.family == "Coulomb" or count < WHOLE  # after four windows a flat power law explains as much
     assert component.values["amplitude"].value == pytest.approx(-20.4, rel=0.1)
     assert documents[-1].parameters["M"].value == pytest.approx(MASS, rel=0.01)

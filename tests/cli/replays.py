@@ -18,9 +18,9 @@ HEADING = ("t", *SIGNALS)
 Lines = list[list[str]]
 
 
-def recorded(scenario: MotorScenario) -> Lines:
-    """Cells of five windows of the simulated motor."""
-    ticks = islice(simulate(scenario), 5 * RECORDS)
+def recorded(scenario: MotorScenario, windows: int = 5) -> Lines:
+    """Cells of ``windows`` windows of the simulated motor."""
+    ticks = islice(simulate(scenario), windows * RECORDS)
     return [
         [f"{index * PERIOD:.3f}", *(repr(float(tick.measured[name])) for name in SIGNALS.values())]
         for index, tick in enumerate(ticks)

@@ -29,6 +29,7 @@ from tests.conftest import OwnMachine, free_port
 from tests.drivers.modbus_servers import Behaviour, Words, library_server, odd_server
 from tests.drivers.registers import registers
 from tests.drivers.serial_devices import serial_device
+from tests.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[2]
 MOVING: list[tuple[int, TypeName, Order, Callable[[float, float], float]]] = [
@@ -148,13 +149,13 @@ def test_a_scan_lists_the_devices_that_answer() -> None:
     port = free_port(socket.SOCK_STREAM)
     behaviour = Behaviour({}, silent=lambda device: device not in (2, 5), refuse=lambda device, *_: {5: 2}.get(device))
     with odd_server(behaviour, port):
-        result = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "1..6", "--timeout", "0.05")
+        result = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "1..6", "--timeout", "0.2")
         assert result.stdout.splitlines() == [
             f"Modbus TCP 127.0.0.1:{port}: 2 of 6 devices answer",
             "device 2",
             "device 5 (that register is refused: illegal data address)",
         ]
-        nothing = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "3..4", "--timeout", "0.05")
+        nothing = probe("modbus", f"127.0.0.1:{port}", "--scan", "--device", "3..4", "--timeout", "0.2")
         assert nothing.return_value == 1
 
 
@@ -164,14 +165,14 @@ def refuse(*_: object) -> None:
 
 def test_a_serial_line_is_scanned_and_read(monkeypatch: pytest.MonkeyPatch) -> None:
     with serial_device({3: 1234}, 5) as port:
-        scanned = probe("modbus", port, "--scan", "--device", "3..6", "--timeout", "0.1", "--parity", "N")
+        scanned = probe("modbus", port, "--scan", "--device", "3..6", "--timeout", "0.2", "--parity", "N")
         assert scanned.stdout.splitlines()[1:] == ["device 5"]
         text = probe("modbus", port, "--device", "5", "--registers", "0..9", "--seconds", 0.2, "--parity", "N").stdout
         assert re.search(r"^3 +04D2 +1234 ", text, re.MULTILINE)
         driver = tomllib.loads(text[text.index("[driver]") : text.index("[signals]")])["driver"]
         assert (driver["serial"], driver["baudrate"], driver["parity"], driver["device"]) == (port, 19200, "N", 5)
-        with pytest.raises(DeviceError, match=r"device 4: no answer within 0\.1 s; are baud rate, parity"):
-            probe("modbus", port, "--device", "4", "--timeout", "0.1", "--parity", "N")
+        with pytest.raises(DeviceError, match=r"device 4: no answer within 0\.2 s; are baud rate, parity"):
+            probe("modbus", port, "--device", "4", "--timeout", "0.2", "--parity", "N")
         monkeypatch.setattr("termios.tcsetattr", refuse)
         with pytest.raises(DeviceError, match=r"the port refuses these settings: .*--parity"):
             probe("modbus", port, "--parity", "E")
@@ -182,7 +183,7 @@ def plant(own_machine: OwnMachine) -> Iterator[OwnMachine]:
     """The simulated motor in a process of its own, sending frames."""
     command = [sys.executable, "-m", "otolith", "plant", str(own_machine.scenario)]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + PATIENCE
         while probe("can", *bus_of(own_machine), "--seconds", 0.3).return_value and time.monotonic() < deadline:
             assert process.poll() is None
         yield own_machine
@@ -246,11 +247,11 @@ def interrupted(arguments: Sequence[str], ready: Callable[[], bool]) -> "subproc
     """The command, ended by Ctrl-C when it listens to signals and the rest is ``ready``."""
     command = [sys.executable, "-m", "otolith", "probe", *arguments, "--seconds", "60"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + PATIENCE
         while not (_takes_signals(process.pid) and ready()) and time.monotonic() < deadline:
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        output, errors = process.communicate(timeout=30.0)
+        output, errors = process.communicate(timeout=PATIENCE)
     return subprocess.CompletedProcess(command, process.returncode, output, errors)
 
 

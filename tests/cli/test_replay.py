@@ -43,6 +43,7 @@ from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import frames_of, live
 from tests.drivers.logs import written as written_log
 from tests.machine.test_machine_file import GOLDEN as MACHINE_FILES
+from tests.waiting import PATIENCE
 
 CASES = sorted(path.parent for path in GOLDEN.glob("*/data.*"))
 
@@ -228,7 +229,7 @@ def test_real_time_waits_for_the_end_of_each_window(
         printed.append(capsys.readouterr().out)
     assert printed[0] == printed[1]
     assert len(printed[0].splitlines()) == 4
-    assert 2.0 <= time.monotonic() - begun < 20.0  # the gap in the middle is skipped
+    assert 2.0 <= time.monotonic() - begun < PATIENCE  # the gap in the middle is skipped
 
 
 def test_columns_are_mapped_by_the_machine_file(

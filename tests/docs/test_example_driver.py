@@ -14,7 +14,7 @@ MODULE = "otolith_udp_json.py"
 
 def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, *command], capture_output=True, text=True, timeout=120, check=False,
+        [sys.executable, *command], capture_output=True, text=True, timeout=600, check=False,
         cwd=FOLDER, env={**os.environ, **environment},
     )  # fmt: skip
 

@@ -1,11 +1,10 @@
-"""Drivers on a real bus that can be broken at will, with their pauses shortened; for a process of its own."""
+"""Drivers on a real bus that is broken on demand, with their pauses shortened; for a process of its own."""
 
 import contextlib
 import os
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -19,6 +18,7 @@ from otolith_drivers.canbus.signals import CanSource
 from otolith_drivers.modbus import driver as modbus_poller
 from tests.conftest import EXAMPLES, free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
+from tests.waiting import wait_for
 
 SHORT = 0.001  # s
 PERIOD = 0.002  # s
@@ -26,60 +26,69 @@ PERIOD = 0.002  # s
 
 @contextmanager
 def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
-    """A bus whose socket stops to be one."""
-    place = BusOptions(interface="udp_multicast", channel="239.74.163.8", port=free_port(socket.SOCK_DGRAM))
-    opened: list[can.BusABC] = []
+    """The CAN driver, and a function that makes the socket of its bus invalid."""
+    options = BusOptions(interface="udp_multicast", channel="239.74.163.8", port=free_port(socket.SOCK_DGRAM))
+    opened: list[can.BusABC] = []  # at most one: the latest that has not been broken yet
 
-    def remembered(*arguments: object, **options: object) -> can.BusABC:
-        opened[:] = [open_bus(*arguments, **options)]  # type: ignore[arg-type]
-        return opened[0]
+    def open_and_remember(*arguments: object, **more: object) -> can.BusABC:
+        bus = open_bus(*arguments, **more)  # type: ignore[arg-type]
+        opened[:] = [bus]
+        return bus
 
-    vars(can_receiver).update(open_bus=remembered, BACKOFF_FIRST=SHORT)
-    options = can_receiver.Options(**place.model_dump(), dbc=Path("dc-motor.dbc"))
+    vars(can_receiver).update(open_bus=open_and_remember, BACKOFF_FIRST=SHORT)
     signals = (Signal("i", "A", CanSource(signal="ArmatureCurrent")),)
-    sender, stop = open_bus(place), threading.Event()
+    driver = can_receiver.build(
+        can_receiver.Options(**options.model_dump(), dbc=Path("dc-motor.dbc")), Setup(signals, EXAMPLES, PERIOD)
+    )
+    sender, stop = open_bus(options), threading.Event()
 
-    def speak() -> None:
+    def send() -> None:
         counter = 0
         while not stop.wait(PERIOD):
             data = bytes(7) + bytes([counter % 256])
             sender.send(can.Message(arbitration_id=385, data=data, is_extended_id=False))
             counter += 1
 
-    speaker = threading.Thread(target=speak)
-    speaker.start()
-    nowhere = os.open(os.devnull, os.O_RDONLY)
+    thread = threading.Thread(target=send)
+    thread.start()
+    no_socket = os.open(os.devnull, os.O_RDONLY)
 
     def flap() -> None:
-        os.dup2(nowhere, opened[0].fileno())  # the kernel says from now on that this is no socket
+        """Break a bus once. While the driver is reopening it, there is no descriptor to break: wait for the next."""
+        wait_for(lambda: bool(opened))
+        os.dup2(no_socket, opened.pop().fileno())  # the kernel reports from now on that this is no socket
 
     try:
-        yield can_receiver.build(options, Setup(signals, EXAMPLES, PERIOD)), flap
+        yield driver, flap
     finally:
         stop.set()
-        speaker.join()
+        thread.join()
         sender.shutdown()
-        os.close(nowhere)
+        os.close(no_socket)
 
 
 @contextmanager
 def modbus_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
-    """A server that cuts its connections."""
+    """The Modbus driver, and a function that cuts its connection."""
     modbus_poller.BACKOFF_FIRST = SHORT
     port = free_port(socket.SOCK_STREAM)
-    words = dict(enumerate(struct.unpack(">2H", struct.pack(">f", 24.0))))
-    options = modbus_poller.Options(host="127.0.0.1", port=port)
+    registers = dict(enumerate(struct.unpack(">2H", struct.pack(">f", 24.0))))
     source = modbus_poller.Source.model_validate({"register": 0, "type": "float32", "unit": "V"})
-    with odd_server(Behaviour(words), port) as server:
+    setup = Setup((Signal("u", "V", source),), Path(), PERIOD)
+    with odd_server(Behaviour(registers), port) as server:
+        driver = modbus_poller.build(modbus_poller.Options(host="127.0.0.1", port=port), setup)
+        cut: set[socket.socket] = set()
 
         def flap() -> None:
-            while not server.connections:
-                time.sleep(SHORT)
-            for connection in list(server.connections):
-                with contextlib.suppress(OSError):  # cut by the driver itself meanwhile
+            """Cut a connection once. One that was cut may still be listed until the server's thread has noticed."""
+            wait_for(lambda: bool(server.connections - cut))
+            cut.intersection_update(server.connections)
+            for connection in server.connections - cut:
+                cut.add(connection)
+                with contextlib.suppress(OSError):  # the driver itself has closed it meanwhile
                     connection.shutdown(socket.SHUT_RDWR)
 
-        yield modbus_poller.build(options, Setup((Signal("u", "V", source),), Path(), PERIOD)), flap
+        yield driver, flap
 
 
 RIGS: dict[str, Callable[[], AbstractContextManager[tuple[Driver, Callable[[], None]]]]] = {

@@ -1,15 +1,16 @@
 """Modbus drivers for tests, and a context manager that keeps what they deliver."""
 
 import struct
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
 from otolith_drivers.base import Link, Sample, Setup, Signal
 from otolith_drivers.modbus.driver import ModbusPoller, Options, Source, build
+from tests.waiting import wait_for
 
 PERIOD = 0.01
+TIMEOUT = 0.2  # s; on a busy computer as well, a server that answers at all does so within this
 
 
 def floats(*values: float) -> dict[int, int]:
@@ -23,15 +24,8 @@ def source(**keys: object) -> Source:
 
 def poller(port: int, sources: Sequence[Source], period: float = PERIOD, **options: object) -> ModbusPoller:
     signals = tuple(Signal(f"s{index}", "V", source) for index, source in enumerate(sources))
-    parsed = Options.model_validate({"host": "127.0.0.1", "port": port, "timeout": "0.1 s", **options})
+    parsed = Options.model_validate({"host": "127.0.0.1", "port": port, "timeout": f"{TIMEOUT} s", **options})
     return build(parsed, Setup(signals, Path(), period))
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {seconds:g} s"
-        time.sleep(0.005)
 
 
 class Listener:

@@ -1,7 +1,7 @@
-"""A day of a bus that comes and goes once a minute: memory stays flat, no thread and no descriptor is left behind.
+"""A bus that fails once a minute for a day: memory stays flat, and no thread and no descriptor is left behind.
 
-The day is simulated in that the pauses of the drivers are shortened; the flaps are real: connections that are cut,
-sockets that are closed under the driver.
+The day is simulated in that the pauses of the drivers are shortened; the failures are real: connections that are cut,
+sockets that become invalid under the driver.
 """
 
 import json
@@ -11,48 +11,59 @@ from typing import Any
 
 import pytest
 
-FLAPS = 24 * 60
+HOUR, DAY = 60, 24 * 60  # failures
 
 PROGRAM = """
-import gc, json, os, sys, threading, time, warnings
+import gc, json, sys, time
 import psutil
 from tests.drivers.flapping import RIGS
+from tests.waiting import wait_for
 
 flaps, process = int(sys.argv[2]), psutil.Process()
-seen = []
+measured = []
+
+def resources():
+    # Threads and sockets of the other end live on for a moment after a failure: the least of some moments is ours.
+    gc.collect()
+    threads, descriptors = [], []
+    for _ in range(30):
+        threads.append(process.num_threads())
+        descriptors.append(process.num_fds())
+        time.sleep(0.01)
+    return process.memory_info().rss, min(threads), min(descriptors)
+
 with RIGS[sys.argv[1]]() as (driver, flap):
     delivered = [0]
     def deliver(samples):
         delivered[0] += len(samples)
     driver.open(deliver)
     for index in range(flaps + 1):
-        before, deadline = delivered[0], time.monotonic() + 20.0
-        while delivered[0] == before:
-            assert time.monotonic() < deadline, f"flap {index}: {driver.link()} {driver.counters()}"
-            time.sleep(0.0005)
+        before = delivered[0]
+        wait_for(lambda: delivered[0] > before)
         if index % (flaps // 10) == 0:
-            gc.collect()
-            seen.append((process.memory_info().rss, process.num_threads(), process.num_fds()))
+            measured.append(resources())
         flap()
+    wait_for(lambda: driver.counters().reconnects >= 0.95 * flaps)
     counters = driver.counters()
     driver.close()
-print(json.dumps({"seen": seen, "reconnects": counters.reconnects, "lost": counters.lost}))
+print(json.dumps({"measured": measured, "reconnects": counters.reconnects, "lost": counters.lost}))
 """
 
 
-def day(name: str, flaps: int) -> Any:
+def flap(name: str, flaps: int) -> Any:
     command = [sys.executable, "-c", PROGRAM, name, str(flaps)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
+@pytest.mark.parametrize("flaps", [HOUR, pytest.param(DAY, marks=pytest.mark.full)])
 @pytest.mark.parametrize("name", ["can", "modbus"])
-def test_a_day_of_flapping_leaves_nothing_behind(name: str) -> None:
-    found = day(name, FLAPS)
-    first, *_, last = found["seen"][1:]  # the first tenth of the day fills what is kept
+def test_flapping_leaves_nothing_behind(name: str, flaps: int) -> None:
+    result = flap(name, flaps)
+    first, *_, last = result["measured"][1:]  # caches fill in the first tenth
     assert last[0] <= 1.05 * first[0]
     assert last[1:] == first[1:]
-    assert found["reconnects"] >= 0.95 * FLAPS  # a cut while it connects is none
+    assert result["reconnects"] >= 0.95 * flaps  # a connection that is cut while it connects is not reconnected
     if name == "modbus":
-        assert found["lost"] > 0
+        assert result["lost"] > 0

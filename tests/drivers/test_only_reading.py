@@ -13,7 +13,7 @@ from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
 from tests.conftest import EXAMPLES, OwnMachine
-from tests.drivers.modbus_readers import wait_for
+from tests.waiting import PATIENCE, wait_for
 
 DRIVERS = Path(can_driver.__file__).parents[1]
 WRITING_METHODS = {
@@ -45,7 +45,7 @@ def test_can_driver_sends_no_frame(source: can_driver.Source, own_machine: OwnMa
         for length in range(9):
             machine.send(can.Message(arbitration_id=identifier, data=bytes(length), is_extended_id=False))
             sent += 1
-    wait_for(lambda: bool(samples) and len(on_the_bus) >= sent, 5.0)
+    wait_for(lambda: bool(samples) and len(on_the_bus) >= sent)
     driver.close()
     time.sleep(0.1)  # long enough for one more frame to arrive
     done.set()
@@ -64,13 +64,13 @@ def test_can_adapter_is_set_to_listen_only(own_machine: OwnMachine) -> None:
     opened = threading.Thread(target=driver.open, args=(lambda _: None,))
     opened.start()
     os.set_blocking(adapter, False)
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline and b"L\r" not in written:
         try:
             written += os.read(adapter, 100)
         except BlockingIOError:
             time.sleep(0.01)
-    opened.join(timeout=10.0)
+    opened.join(timeout=PATIENCE)
     os.write(adapter, b"t18180000000000000000\r")
     driver.close()
     os.close(adapter)

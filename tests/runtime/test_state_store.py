@@ -13,11 +13,11 @@ from otolith.discovery.adopted import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import find_twin
 from otolith.runtime.state_store import StateStore, WriterThread
-from tests.runtime.conftest import wait_for
+from tests.waiting import PATIENCE, wait_for, within
 
 FRICTION = Component("shaft", "Coulomb", "omega", -0.004)
 SAVED = (ComponentRecord(AdoptedComponent(FRICTION, 5.0), (-0.004,), (1e-5,)),)
-IMMEDIATELY = 0.1  # s: far less than a disk that does not answer
+IMMEDIATELY = within(0.1)  # s: far less than a disk that does not answer
 
 
 def is_being_read(pipe: Path, descriptors: list[int]) -> bool:
@@ -43,7 +43,7 @@ def writer(store: StateStore) -> Iterator[WriterThread]:
 def test_the_latest_components_are_on_disk_after_stop(store: StateStore, writer: WriterThread) -> None:
     for amplitude in (-0.001, -0.002, -0.003, -0.004):
         writer.save((ComponentRecord(AdoptedComponent(FRICTION, 5.0), (amplitude,), (1e-5,)),))
-    writer.stop(5.0)
+    writer.stop(PATIENCE)
     assert store.components() == SAVED
 
 
@@ -70,10 +70,11 @@ def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> Non
     writer.start()
     writer.save(SAVED)
     wait_for(store.components_path.exists)
-    writer.stop(5.0)
+    writer.stop(PATIENCE)
     assert writer.new_decisions() is None
 
 
+@pytest.mark.timed
 def test_callers_do_not_wait_for_a_disk_that_hangs(store: StateStore, writer: WriterThread) -> None:
     """A named pipe without a writer stands in for the decisions file: reading it blocks."""
     store.decisions_path.parent.mkdir(parents=True)
@@ -100,6 +101,6 @@ def test_a_failed_write_is_tried_again_and_logged_once(
     writer.save(SAVED)
     wait_for(lambda: "components are not saved" in caplog.text)
     folder.unlink()
-    writer.stop(5.0)
+    writer.stop(PATIENCE)
     assert store.components() == SAVED
     assert caplog.text.count("components are not saved") == 1

@@ -13,7 +13,7 @@ from otolith.health.schema import Report
 from otolith.runtime.worker import MAX_WAITING_WINDOWS, NOT_READY, WINDOW_TIMEOUT, Supervisor, perform
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.estimation.test_window_fit import Cut, state_for
-from tests.runtime.conftest import wait_for
+from tests.waiting import PATIENCE, wait_for
 
 LENGTH = 2.0  # s of a window
 
@@ -39,7 +39,7 @@ def poll_for_report(supervisor: Supervisor) -> Report:
         reports.extend(report for report, _ in supervisor.poll(time.monotonic()))
         return bool(reports)
 
-    wait_for(has_report, 40.0)
+    wait_for(has_report, 3 * PATIENCE)
     assert len(reports) == 1
     return reports[0]
 
@@ -49,7 +49,7 @@ def poll_until_missed(supervisor: Supervisor, count: int) -> None:
         supervisor.poll(time.monotonic())
         return supervisor.missed == count
 
-    wait_for(is_missed, 40.0)
+    wait_for(is_missed, 3 * PATIENCE)
 
 
 def test_a_window_whose_worker_died_is_tried_again(supervisor: Supervisor, batch: list[Window]) -> None:

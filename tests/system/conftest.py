@@ -12,9 +12,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from otolith.health.schema import ReportDocument
+from otolith.health.schema import ReportDocument, Status
 from otolith.publishing.zenoh_session import Listener
 from tests.conftest import OwnMachine
+from tests.waiting import PATIENCE, wait_for
 
 OTOLITH = [sys.executable, "-m", "otolith"]
 
@@ -26,9 +27,11 @@ class Running:
         self.machine, self.folder = machine, folder
         self.recording, self.truth, self.log = folder / "run.rrd", folder / "truth.csv", folder / "daemon.log"
         self.summary = folder / "summary.json"
+        self.daemon = self._start("daemon", "run", str(machine.machine), "--recording", str(self.recording))
+        # The clock of the plant starts when the daemon listens, however long a busy computer takes until then.
+        wait_for(lambda: "reports on" in self.log.read_text() or self.daemon.poll() is not None)
         plays = [*machine.plays, "--truth", str(self.truth), "--summary", str(self.summary)]
         self.plant = self._start("plant", "plant", *plays) if machine.plays else None
-        self.daemon = self._start("daemon", "run", str(machine.machine), "--recording", str(self.recording))
         self._received: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._listener = Listener([machine.endpoint], "otolith/**/report", self._received.put)
         self.reports: list[ReportDocument] = []
@@ -37,7 +40,9 @@ class Running:
         with (self.folder / f"{name}.log").open("wb") as log:
             return subprocess.Popen([*OTOLITH, *arguments], stdout=log, stderr=subprocess.STDOUT)
 
-    def wait_for(self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 60.0) -> list[ReportDocument]:
+    def wait_for(
+        self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 3 * PATIENCE
+    ) -> list[ReportDocument]:
         """Return all reports once ``enough`` accepts them; fail with the daemon's log after ``seconds``."""
         deadline = time.monotonic() + seconds
         while not enough(self.reports):
@@ -60,7 +65,7 @@ class Running:
         """Stop the daemon; return its exit code and the seconds until it ended."""
         begun = time.monotonic()
         self.daemon.send_signal(number)
-        return self.daemon.wait(timeout=10), time.monotonic() - begun
+        return self.daemon.wait(timeout=PATIENCE), time.monotonic() - begun
 
     def close(self) -> None:
         """End all processes."""
@@ -68,7 +73,12 @@ class Running:
         for process in (self.daemon, self.plant):
             if process is not None and process.poll() is None:
                 process.terminate()
-                process.wait(timeout=10)
+                process.wait(timeout=PATIENCE)
+
+
+def is_estimated(report: ReportDocument) -> bool:
+    """Whether the window of the report gave an estimate of the armature resistance."""
+    return report.parameters["R_a"].status is Status.ESTIMATED
 
 
 @pytest.fixture

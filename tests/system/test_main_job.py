@@ -18,21 +18,25 @@ from rerun.chunk import RrdReader
 
 from otolith.acquisition.window import Array, Verdict
 from otolith.cli.demo import compare
-from otolith.health.schema import Status
 from tests.conftest import OwnMachine
-from tests.system.conftest import Running
+from tests.system.conftest import Running, is_estimated
+from tests.waiting import EXACT, PATIENCE, within
 
 CAN_LISTENER = """
-import can, cantools, sys, json, time
+import can, cantools, json, sys
 database = cantools.database.load_file(sys.argv[1])
 bus = can.Bus(interface="udp_multicast", channel=sys.argv[2], port=int(sys.argv[3]), hop_limit=0, fd=False)
-seen, end = {}, time.monotonic() + 2.0
-while time.monotonic() < end:
-    frame = bus.recv(0.2)
-    if frame is not None:
-        seen.setdefault(frame.arbitration_id, []).append(database.decode_message(frame.arbitration_id, frame.data))
+seen = []
+while len(seen) < 400:
+    frame = bus.recv(60.0)
+    assert frame is not None
+    seen.append(frame)
 bus.shutdown()
-print(json.dumps({database.get_message_by_frame_id(key).name: frames for key, frames in seen.items()}))
+print(json.dumps([
+    (database.get_message_by_frame_id(frame.arbitration_id).name, frame.timestamp,
+     database.decode_message(frame.arbitration_id, frame.data))
+    for frame in seen
+]))
 """
 
 ZENOH_LISTENER = """
@@ -43,7 +47,9 @@ config.insert_json5("scouting/multicast/enabled", "false")
 received, alive = [], []
 with zenoh.open(config) as session:
     session.declare_subscriber("otolith/**", lambda s: received.append((str(s.key_expr), s.payload.to_string())))
-    time.sleep(5)
+    end = time.monotonic() + 60.0
+    while sum(key.endswith("/report") for key, _ in received) < 2 and time.monotonic() < end:
+        time.sleep(0.1)
     latest = [reply.ok.payload.to_string() for reply in session.get("otolith/demo/dc-motor/report") if reply.ok]
     alive = [str(reply.ok.key_expr) for reply in session.liveliness().get("otolith/*/*/alive") if reply.ok]
 print(json.dumps({"received": received, "latest": latest, "alive": alive}))
@@ -52,7 +58,7 @@ print(json.dumps({"received": received, "latest": latest, "alive": alive}))
 
 def independent(program: str, *arguments: object) -> Any:
     command = [sys.executable, "-c", program, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=3 * PATIENCE, check=True)
     return json.loads(done.stdout)
 
 
@@ -68,14 +74,17 @@ def series(path: Path, entity: str) -> tuple[Array, Array]:
     return np.concatenate(times)[order], np.concatenate(values)[order]
 
 
+@pytest.mark.timed
 def test_frames_reports_and_recording_are_complete(running: Running) -> None:
     running.wait_for(lambda reports: len(reports) >= 2)
     machine = running.machine
     frames = independent(CAN_LISTENER, machine.dbc, machine.group, machine.port)
-    assert {"MotorElectrical", "MotorMechanical"} == set(frames)
-    counters = [frame["ElectricalAliveCounter"] for frame in frames["MotorElectrical"]]
+    assert {"MotorElectrical", "MotorMechanical"} == {name for name, _, _ in frames}
+    electrical = [(stamp, values) for name, stamp, values in frames if name == "MotorElectrical"]
+    counters = [values["ElectricalAliveCounter"] for _, values in electrical]
     assert set(np.diff(counters) % 256) == {1}
-    assert len(counters) == pytest.approx(200, abs=10)
+    seconds = electrical[-1][0] - electrical[0][0]
+    assert seconds == pytest.approx(0.01 * (len(electrical) - 1), abs=within(0.1))
 
     published = independent(ZENOH_LISTENER, machine.endpoint)
     documents = [json.loads(text) for key, text in published["received"] if key.endswith("/report")]
@@ -85,7 +94,7 @@ def test_frames_reports_and_recording_are_complete(running: Running) -> None:
     assert json.loads(published["latest"][0])["machine"] == "dc-motor"
     assert published["alive"] == ["otolith/demo/dc-motor/alive"]
 
-    reports = list(running.wait_for(lambda reports: len(reports) >= 7))
+    reports = list(running.wait_for(lambda reports: len(reports) >= 7 and sum(map(is_estimated, reports)) >= 6))
     code, _ = running.stop()
     assert code == 0
     check_accuracy(running)
@@ -109,41 +118,44 @@ def check_accuracy(running: Running) -> None:
     with running.truth.open(encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if None not in row.values()]
     truth = {name: [float(row[name]) for row in rows] for name in rows[0]}
-    compared = compare(running.reports, truth)
+    # Values that are held, as they are in bad windows of a busy computer, may lag behind.
+    compared = compare(running.reports if EXACT else list(filter(is_estimated, running.reports)), truth)
     assert len(compared) >= 5
     assert max(row.error for row in compared) <= 0.005
-    assert max(report.cost.latency_s for report in running.reports[1:]) < 1.0
+    assert max(report.cost.latency_s for report in running.reports[1:]) < within(1.0)
 
 
+@pytest.mark.timed
 def test_a_killed_worker_is_restarted(running: Running) -> None:
     running.wait_for(lambda reports: len(reports) >= 2)
     running.child("worker").kill()
-    reports = running.wait_for(lambda reports: len(reports) >= 6)
+    reports = running.wait_for(lambda reports: len(reports) >= 6 and is_estimated(reports[-1]))
     last = reports[-1].counters
     assert last is not None
     assert last.worker_restarts == 1
-    assert last.windows_missed <= 2
+    assert last.windows_missed <= within(2)
     assert last.windows_missed == reports[-1].window.index + 1 - len(reports)
     assert (last.lost, last.bad) == (0, 0)
     for before, after in pairwise(reports):
         if after.window.index == before.window.index + 1:
-            assert after.window.start == pytest.approx(before.window.end, abs=0.005)  # half a period
-    assert reports[-1].parameters["R_a"].status is Status.ESTIMATED
+            assert after.window.start == pytest.approx(before.window.end, abs=within(0.005))  # half a period
 
 
 def test_a_killed_recorder_changes_nothing_else(running: Running) -> None:
-    running.wait_for(lambda reports: len(reports) >= 2)
+    before = running.wait_for(lambda reports: len(reports) >= 2)[-1].counters
     running.child("recorder").kill()
     reports = running.wait_for(lambda reports: len(reports) >= 5)
     last = reports[-1].counters
+    assert before is not None
     assert last is not None
-    assert (last.windows_missed, last.worker_restarts, last.lost) == (0, 0, 0)
+    assert (last.windows_missed, last.worker_restarts, last.lost) == (before.windows_missed, 0, 0)
     running.stop()
     second = list((running.folder / "state").rglob("*.rrd"))
     assert len(second) == 1
     assert running.recording.stat().st_size > 0
 
 
+@pytest.mark.timed
 @pytest.mark.parametrize("moment", [0.02, 0.2, 0.5, 1.0, 1.5, 3.5])
 def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine, tmp_path: Path, moment: float) -> None:
     """The whole process group gets the signal, as from a terminal."""
@@ -155,21 +167,21 @@ def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine,
     begun = time.monotonic()
     for process in [psutil.Process(daemon.pid), *children]:
         process.send_signal(signal.SIGINT)
-    _, errors = daemon.communicate(timeout=10)
-    assert time.monotonic() - begun < 3.0
+    _, errors = daemon.communicate(timeout=PATIENCE)
+    assert time.monotonic() - begun < within(3.0)
     # In the first hundredths of a second the interpreter has not reached our code, and may print its own traceback.
     assert "otolith" not in errors.partition("Traceback")[2]
     assert daemon.returncode in (130, -signal.SIGINT) or (daemon.returncode == 1 and "Traceback" in errors)
-    _, left = psutil.wait_procs(children, timeout=1.0)
+    _, left = psutil.wait_procs(children, timeout=within(1.0))
     # Where the first process of a container reaps nobody, an ended orphan stays listed as a zombie.
     assert [process for process in left if process.status() != psutil.STATUS_ZOMBIE] == []
     assert set(Path("/dev/shm").iterdir()) <= shared  # noqa: S108
 
 
 def test_demo_estimates_what_was_injected(tmp_path: Path, own_machine: OwnMachine) -> None:
-    command = [sys.executable, "-m", "otolith", "demo", "--duration", "10", "--json"]
+    command = [sys.executable, "-m", "otolith", "demo", "--duration", "20", "--json"]
     command += ["--machine", str(own_machine.machine), "--scenario", str(own_machine.scenario)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=3 * PATIENCE, check=False)
     assert done.returncode == 0, done.stderr
     assert "the twin is compiled" in done.stderr
     verdict = json.loads(done.stdout)
@@ -183,6 +195,6 @@ def test_demo_is_exit_code_one_for_a_wrong_estimate(own_machine: OwnMachine) -> 
     own_machine.machine.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "otolith", "demo", "--duration", "10", "--json"]
     command += ["--machine", str(own_machine.machine), "--scenario", str(own_machine.scenario)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=3 * PATIENCE, check=False)
     assert done.returncode == 1, done.stderr
     assert not json.loads(done.stdout)["right"]

@@ -13,6 +13,7 @@ import pytest
 from otolith_drivers.canbus.bus import BusOptions, open_bus
 from otolith_drivers.canbus.database import load_dbc
 from tests.conftest import EXAMPLES, OwnMachine
+from tests.waiting import PATIENCE
 
 PLANT = [sys.executable, "-m", "otolith", "plant"]
 
@@ -22,12 +23,12 @@ def test_a_second_plant_on_the_same_bus_is_refused(own_machine: OwnMachine) -> N
     assert first.stderr is not None
     assert "frames of dc-motor.dbc" in first.stderr.readline()
     with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus:
-        assert bus.recv(10.0) is not None  # the plant sends after it has listened for other nodes
+        assert bus.recv(PATIENCE) is not None  # the plant sends after it has listened for other nodes
     second = subprocess.run(
-        [*PLANT, str(own_machine.scenario)], capture_output=True, text=True, timeout=20, check=False
+        [*PLANT, str(own_machine.scenario)], capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     first.terminate()
-    assert first.wait(timeout=5) == 0
+    assert first.wait(timeout=PATIENCE) == 0
     first.stderr.close()
     assert second.returncode == 2
     assert "another node already sends frame" in second.stderr
@@ -35,7 +36,7 @@ def test_a_second_plant_on_the_same_bus_is_refused(own_machine: OwnMachine) -> N
 
 def test_the_plant_keeps_its_rate_and_ends_after_duration(own_machine: OwnMachine) -> None:
     command = [*PLANT, str(own_machine.scenario), "--duration", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 0
     assert "200 frames in 1.0 s of simulated time, 0 stalls" in done.stderr
 
@@ -45,7 +46,7 @@ def test_ctrl_c_ends_the_plant_with_code_130(own_machine: OwnMachine) -> None:
     assert process.stderr is not None
     process.stderr.readline()
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=5)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
     assert "Traceback" not in errors
 
@@ -78,7 +79,7 @@ def test_every_withheld_frame_is_counted(own_machine: OwnMachine, tmp_path: Path
         node = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         while (frame := bus.recv(0.2)) is not None or node.poll() is None:
             received += [frame] if frame is not None else []
-    assert node.wait(timeout=5) == 0
+    assert node.wait(timeout=PATIENCE) == 0
     done = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     dropouts, gone, garbage = done["faults"]
     assert len(received) == done["frames"] + garbage["ticks"]
@@ -106,7 +107,7 @@ def test_a_port_in_use_gives_a_one_line_error(own_machine: OwnMachine) -> None:
     host, port = own_machine.endpoint.removeprefix("tcp/").split(":")
     with socket.create_server((host, int(port))):
         command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 2
     assert own_machine.endpoint in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -127,11 +128,11 @@ def test_the_lift_sends_in_the_units_of_its_database(own_machine: OwnMachine, tm
     values: dict[str, float] = {}
     with open_bus(BusOptions(interface="udp_multicast", channel=own_machine.group, port=own_machine.port)) as bus_:
         while len(values) < 6:
-            frame = bus_.recv(10.0)
+            frame = bus_.recv(PATIENCE)
             assert frame is not None
             values |= database.decode_message(frame.arbitration_id, frame.data)  # type: ignore[arg-type]
     node.terminate()
-    assert node.wait(timeout=5) == 0
+    assert node.wait(timeout=PATIENCE) == 0
     assert values["ValveArea"] == pytest.approx(63.28, abs=5.0)  # mm², in balance at first
     assert values["LoadForce"] == pytest.approx(9806.65)
     assert values["SystemPressure"] == pytest.approx(49945.0, abs=50.0)

@@ -14,6 +14,7 @@ from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.cli.replays import MACHINE, PERIOD, recorded, written
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
+from tests.waiting import PATIENCE
 
 DRIVER = """
 [driver]
@@ -34,13 +35,19 @@ enabled = false
 def replayed(*arguments: object) -> list[ReportDocument]:
     """Return the reports of ``otolith replay``."""
     command = [sys.executable, "-m", "otolith", "replay", *map(str, arguments), "--json"]
-    printed = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    printed = subprocess.run(command, capture_output=True, text=True, timeout=3 * PATIENCE, check=True).stdout
     return [ReportDocument.from_json(line) for line in printed.splitlines()]
 
 
-def test_the_daemons_recording_replays_to_the_same_reports(running: Running) -> None:
-    reports = list(running.wait_for(lambda reports: len(reports) >= 7))
-    assert running.stop()[0] == 0
+@pytest.mark.parametrize("transport", ["in-process", pytest.param("can", marks=(pytest.mark.full, pytest.mark.timed))])
+def test_the_daemons_recording_replays_to_the_same_reports(transport: str, tmp_path: Path) -> None:
+    """On a busy computer only the plant in the daemon's process has no jitter, which would move the windows."""
+    running = Running(OwnMachine(tmp_path / "machine", transport), tmp_path)
+    try:
+        reports = list(running.wait_for(lambda reports: len(reports) >= 7))
+        assert running.stop()[0] == 0
+    finally:
+        running.close()
     again = replayed(running.machine.machine, running.recording)
     compared = 0
     for report in reports:
@@ -58,7 +65,7 @@ def test_the_daemons_recording_replays_to_the_same_reports(running: Running) -> 
 def test_a_real_time_replay_estimates_as_the_fast_one(
     tmp_path: Path, scenario: MotorScenario, own_machine: OwnMachine
 ) -> None:
-    data = written(tmp_path, recorded(scenario))
+    data = written(tmp_path, recorded(scenario, 20))  # more than a busy computer misses while it starts
     machine = tmp_path / "replayed.toml"
     text = MACHINE.read_text(encoding="utf-8") + DRIVER + f'\n[zenoh]\nlisten = ["{own_machine.endpoint}"]\n'
     machine.write_text(text, encoding="utf-8")
@@ -71,12 +78,12 @@ def test_a_real_time_replay_estimates_as_the_fast_one(
         ) as daemon,
         Listener([own_machine.endpoint], "otolith/**/report", received.put),
     ):
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + 2 * PATIENCE
         while len(reports) < 4:
             assert time.monotonic() < deadline, reports
-            reports.append(ReportDocument.from_json(received.get(timeout=60.0)))
+            reports.append(ReportDocument.from_json(received.get(timeout=2 * PATIENCE)))
         daemon.terminate()
-        assert daemon.wait(timeout=10) == 0
+        assert daemon.wait(timeout=PATIENCE) == 0
     good = [report for report in reports if report.window.quality.verdict == "good"]
     assert len(good) >= 2
     for report in good:

@@ -1,6 +1,7 @@
 """The service with systemd, its recorder and its disk."""
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -23,6 +24,7 @@ from otolith.runtime.state_store import StateStore
 from otolith.runtime.worker import COMPILE_TIMEOUT
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
+from tests.waiting import PATIENCE, within
 
 # Friction near standstill: a turning shaft gives no evidence against it, so it is not removed during the test.
 FRICTION = Component("shaft", "Stribeck", "omega", -0.004, inner=0.01, low=0.005, high=0.02)
@@ -46,21 +48,21 @@ def test_systemd_gets_readiness_progress_and_stop(own_machine: OwnMachine, tmp_p
     )
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
-        manager.settimeout(30.0)
+        manager.settimeout(2 * PATIENCE)
         environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "4000000"}
         command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
         daemon = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
         messages: list[str] = []
         while sum("WATCHDOG=1" in text for text in messages) < 4 or not any(
-            "window 1 good" in text for text in messages
+            re.search(r"window \d+ good", text) for text in messages
         ):
             messages.append(manager.recv(4096).decode())
         daemon.send_signal(signal.SIGTERM)
-        assert daemon.wait(timeout=10) == 0
+        assert daemon.wait(timeout=PATIENCE) == 0
         while not any("STOPPING=1" in text for text in messages):
             messages.append(manager.recv(4096).decode())
     plant.terminate()
-    plant.wait(timeout=10)
+    plant.wait(timeout=PATIENCE)
     assert messages[0].startswith("READY=1\nSTATUS=listening: CAN bus udp_multicast")
     assert f"MAINPID={daemon.pid}" in messages[0]
 
@@ -103,8 +105,9 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
         service._notifier.close()
 
 
+@pytest.mark.timed
 def test_windows_without_a_recorder_are_counted_as_dropped(running: Running) -> None:
-    running.wait_for(lambda reports: len(reports) >= 2)
+    before = running.wait_for(lambda reports: len(reports) >= 2)[-1].counters
     os.kill(running.child("recorder").pid, signal.SIGKILL)
     shutil.rmtree(running.folder / "state", ignore_errors=True)
     (running.folder / "state").write_text("no folder any more", encoding="utf-8")
@@ -112,13 +115,15 @@ def test_windows_without_a_recorder_are_counted_as_dropped(running: Running) -> 
         lambda reports: bool(reports and reports[-1].counters and reports[-1].counters.recordings_dropped >= 2)
     )
     last = reports[-1].counters
+    assert before is not None
     assert last is not None
-    assert (last.windows_missed, last.lost) == (0, 0)
+    assert (last.windows_missed, last.lost) == (before.windows_missed, 0)
     code, seconds = running.stop()
     assert code == 0
-    assert seconds < 3.0
+    assert seconds < within(3.0)
 
 
+@pytest.mark.timed
 def test_components_are_saved_and_decisions_apply_at_run_time(
     running_with_component: tuple[Running, StateStore],
 ) -> None:
@@ -130,7 +135,7 @@ def test_components_are_saved_and_decisions_apply_at_run_time(
     store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
     running.wait_for(lambda reports: reports[-1].components[0].approval is Approval.APPROVED)
     code, seconds = running.stop()
-    assert (code, seconds < 3.0) == (0, True)
+    assert (code, seconds < within(3.0)) == (0, True)
     assert [record.adopted.component.key for record in store.components()] == [FRICTION.key]  # saved again at the end
 
 
@@ -159,5 +164,5 @@ def test_sighup_is_ignored_under_nohup(own_machine: OwnMachine) -> None:
     time.sleep(0.5)  # long enough for it to have ended
     assert daemon.poll() is None
     daemon.terminate()
-    assert daemon.wait(timeout=5) == 0
+    assert daemon.wait(timeout=PATIENCE) == 0
     daemon.stderr.close()

@@ -12,6 +12,7 @@ from otolith import kernel_cache
 from otolith.machine import find_twin
 from otolith.twin.kernel import identity_of
 from otolith_drivers.errors import ServiceError
+from tests.waiting import PATIENCE
 
 PROGRAM = """
 import sys, time
@@ -37,12 +38,12 @@ def start() -> "subprocess.Popen[str]":
 
 def test_two_processes_compile_a_kernel_once(cache: Path) -> None:
     together = [start(), start()]
-    outputs = [process.communicate(timeout=60)[0] for process in together]
+    outputs = [process.communicate(timeout=5 * PATIENCE)[0] for process in together]
     assert [output.splitlines()[0] for output in outputs] == ["0.0", "0.0"]
     compiled = list(cache.glob("*/__pycache__/*.nbc"))
     assert len(compiled) == 1
     before = compiled[0].stat().st_mtime_ns
-    third = start().communicate(timeout=60)[0].splitlines()
+    third = start().communicate(timeout=5 * PATIENCE)[0].splitlines()
     assert third == ["0.0", "False"]  # a cached kernel needs no SymPy
     assert compiled[0].stat().st_mtime_ns == before
 
@@ -50,11 +51,11 @@ def test_two_processes_compile_a_kernel_once(cache: Path) -> None:
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize("keep", [0, 0.5])
 def test_truncated_cache_file_is_compiled_again(cache: Path, ending: str, keep: float) -> None:
-    start().communicate(timeout=60)
+    start().communicate(timeout=5 * PATIENCE)
     (half,) = cache.glob(f"*/__pycache__/*.{ending}")
     content = half.read_bytes()
     half.write_bytes(content[: int(keep * len(content))])
-    assert start().communicate(timeout=60)[0].splitlines()[0] == "0.0"
+    assert start().communicate(timeout=5 * PATIENCE)[0].splitlines()[0] == "0.0"
     assert half.stat().st_size == pytest.approx(len(content), rel=0.01)
 
 

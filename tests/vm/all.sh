@@ -1,5 +1,5 @@
 #!/bin/bash
-# What 'make system-test' runs: our drivers against foreign parts. README.md beside this file says more.
+# What 'make system-test' runs: our drivers against software that others wrote. README.md beside this file says more.
 set -euo pipefail
 cd "$(dirname "$(realpath "$0")")/../.."
 python=${PYTHON:-.venv/bin/python}

@@ -1,4 +1,4 @@
-"""The kernel's CAN, and plant and daemon as processes on it: what the tests inside the guest share."""
+"""Shared by the tests in the guest: a CAN bus of the kernel, and plant and daemon as processes on it."""
 
 import os
 import queue
@@ -50,40 +50,40 @@ def run(*command: str, seconds: float = 60.0) -> str:
 
 
 def transmitted() -> int:
-    """Frames that anybody has put on the bus since it was made."""
+    """Number of frames that anybody has sent since the bus was made."""
     return int((STATISTICS / "tx_packets").read_text(encoding="ascii"))
 
 
 def resistance(reports: Reports) -> ParameterDocument:
-    """What the newest report says of R_a."""
+    """R_a in the newest report."""
     return reports[-1].parameters["R_a"]
 
 
 def counters(reports: Reports) -> CountersDocument:
-    """The newest."""
+    """Counters of the newest report."""
     found = reports[-1].counters
     assert found is not None
     return found
 
 
 def good(reports: Reports) -> Reports:
-    """Those of windows that could be estimated from."""
+    """Reports of good windows."""
     return [report for report in reports if report.window.quality.verdict is Verdict.GOOD]
 
 
 @dataclass
 class Program:
-    """A process and what it has said."""
+    """A process and its output."""
 
     process: "subprocess.Popen[bytes]"
     log: Path
 
     def text(self) -> str:
-        """All that it has said."""
+        """Its output so far."""
         return self.log.read_text(encoding="utf-8", errors="replace")
 
-    def says(self, words: str, seconds: float = 60.0) -> None:
-        """Wait until it has said so."""
+    def wait_for_output(self, words: str, seconds: float = 60.0) -> None:
+        """Wait until its output contains ``words``."""
         deadline = time.monotonic() + seconds
         while words not in self.text():
             assert self.process.poll() is None, self.text()
@@ -97,11 +97,11 @@ class Program:
         return self.process.wait(timeout=20)
 
 
-class Ears:
-    """Hears the reports of a daemon over Zenoh."""
+class ReportListener:
+    """Receives the reports of a daemon over Zenoh."""
 
     def __init__(self, endpoint: str, alive: Callable[[], str]) -> None:
-        """``alive`` says why a daemon that should run does not; nothing if it does."""
+        """``alive`` returns why the daemon ended; empty while it runs."""
         self.reports: Reports = []
         self._alive = alive
         self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -126,7 +126,7 @@ class Ears:
         return self.wait_for(lambda reports: len(good(reports)) >= before + count)
 
     def close(self) -> None:
-        """Listen no more."""
+        """End the session."""
         self._listener.__exit__(None, None, None)
 
 
@@ -143,7 +143,7 @@ class Machine:
         self.file.write_text(f'{text}\n{WINDOW}[zenoh]\nlisten = ["{self.endpoint}"]\n', encoding="utf-8")
         self.scenario.write_text(SCENARIO, encoding="utf-8")
         self._programs: list[Program] = []
-        self._ears: list[Ears] = []
+        self._listeners: list[ReportListener] = []
 
     def start(self, *command: str) -> Program:
         """A program in the background."""
@@ -157,33 +157,33 @@ class Machine:
     def plant(self) -> Program:
         """The simulated machine, once it is on the bus."""
         program = self.start(*OTOLITH, "plant", str(self.scenario))
-        program.says("Ctrl-C ends it")
+        program.wait_for_output("Ctrl-C ends it")
         return program
 
-    def daemon(self, seconds: float = 60.0) -> tuple[Program, Ears]:
-        """The daemon, once it has said that the bus is silent, and what it says."""
+    def daemon(self, seconds: float = 60.0) -> tuple[Program, ReportListener]:
+        """The daemon, once it has published its first report, and a listener to its reports."""
         program = self.start(*OTOLITH, "run", str(self.file))
-        program.says("reports on")
-        ears = self.ears(lambda: "" if program.process.poll() is None else program.text())
-        ears.wait_for(lambda reports: len(reports) >= 1, seconds)
-        return program, ears
+        program.wait_for_output("reports on")
+        listener = self.listener(lambda: "" if program.process.poll() is None else program.text())
+        listener.wait_for(lambda reports: len(reports) >= 1, seconds)
+        return program, listener
 
-    def ears(self, alive: Callable[[], str]) -> Ears:
-        """What the daemon of this machine says."""
-        self._ears.append(Ears(self.endpoint, alive))
-        return self._ears[-1]
+    def listener(self, alive: Callable[[], str]) -> ReportListener:
+        """A listener to the reports of this machine's daemon."""
+        self._listeners.append(ReportListener(self.endpoint, alive))
+        return self._listeners[-1]
 
     def close(self) -> None:
         """End what still runs."""
-        for ears in self._ears:
-            ears.close()
+        for listener in self._listeners:
+            listener.close()
         for program in reversed(self._programs):
             program.stop()
 
 
 @contextmanager
 def machine_on_a_bus(folder: Path) -> Iterator[Machine]:
-    """A bus of the kernel, with its counters at zero, and nobody on it yet."""
+    """A CAN bus of the kernel with its counters at zero and no node on it."""
     run("ip", "link", "add", CHANNEL, "type", "vcan")
     machine = Machine(folder)
     try:

@@ -1,4 +1,4 @@
-"""Our daemon on a bus of the Linux kernel, with can-utils as the others on it. Runs in the guest, as root."""
+"""Our daemon on a bus of the Linux kernel, with can-utils as the other nodes. Runs in the guest, as root."""
 
 import re
 import time
@@ -13,9 +13,9 @@ from otolith.health.schema import CountersDocument, ParameterDocument, ReportDoc
 from tests.vm.conftest import (
     CHANNEL,
     RESISTANCE,
-    Ears,
     Machine,
     Program,
+    ReportListener,
     Reports,
     counters,
     good,
@@ -31,7 +31,7 @@ OURS = ("181", "281")
 
 @dataclass(frozen=True)
 class Live:
-    """What a daemon found out while candump wrote down what was on the bus."""
+    """Reports of a daemon, and what candump recorded on the bus meanwhile."""
 
     silent: ReportDocument
     transmitted_before: int
@@ -46,11 +46,11 @@ class Live:
 @pytest.fixture(scope="module")
 def live(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Live:
     with machine_on_a_bus(tmp_path_factory.mktemp("live")) as machine:
-        _, ears = machine.daemon()
+        _, listener = machine.daemon()
         before = transmitted()
         dump = machine.start("candump", "-L", CHANNEL)
         plant = machine.plant()
-        reports = ears.wait_for_good(10)
+        reports = listener.wait_for_good(10)
         plant.stop()
         frames = int(re.findall(r"(\d+) frames in", plant.text())[0])
         deadline = time.monotonic() + 10.0
@@ -65,12 +65,12 @@ class Watched:
 
     machine: Machine
     daemon: Program
-    ears: Ears
+    listener: ReportListener
 
     def now(self) -> CountersDocument:
         """What has been counted up to the end of a window that ends after this call."""
         moment = time.time()
-        return counters(self.ears.wait_for(lambda reports: reports[-1].window.end >= moment))
+        return counters(self.listener.wait_for(lambda reports: reports[-1].window.end >= moment))
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def watched(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 @pytest.fixture
 def plant(watched: Watched) -> Iterator[Program]:
     plant = watched.machine.plant()
-    watched.ears.wait_for_good(2)
+    watched.listener.wait_for_good(2)
     yield plant
     plant.stop()
 
@@ -116,9 +116,9 @@ def test_a_replayed_dump_says_what_the_live_bus_said(
     compiled: None, live: Live, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     with machine_on_a_bus(tmp_path_factory.mktemp("replayed")) as machine:
-        _, ears = machine.daemon()
+        _, listener = machine.daemon()
         player = machine.start("canplayer", "-I", str(live.dump))
-        reports = ears.wait_for_good(7)
+        reports = listener.wait_for_good(7)
         assert player.process.wait(timeout=30) == 0
         assert transmitted() == live.frames
     found, then = resistance(reports), resistance(live.reports)
@@ -131,7 +131,7 @@ def test_a_replayed_dump_says_what_the_live_bus_said(
 
 def test_a_flood_of_other_frames_changes_nothing(watched: Watched, plant: Program) -> None:
     """Extended, FD and remote frames, also with our identifiers, and error frames."""
-    machine, ears = watched.machine, watched.ears
+    machine, listener = watched.machine, watched.listener
     before, sent = watched.now(), transmitted()
     kinds = [
         ["-e", "-I", "r"],
@@ -145,7 +145,7 @@ def test_a_flood_of_other_frames_changes_nothing(watched: Watched, plant: Progra
     flood = [machine.start("cangen", CHANNEL, "-g", "5", "-i", *kind) for kind in kinds]
     for error_class in ("20000004", "20000040", "20000080"):
         run("cansend", CHANNEL, f"{error_class}#0000000000000000")
-    reports = ears.wait_for_good(6)
+    reports = listener.wait_for_good(6)
     seconds = time.monotonic() - begun
     others = transmitted() - sent - FRAMES * seconds
     assert [generator.process.poll() for generator in flood] == [None] * len(flood)
@@ -169,18 +169,18 @@ def test_short_frames_of_our_own_identifiers_are_counted(watched: Watched, plant
         run("cansend", CHANNEL, frame)
     last = watched.now()
     assert last.bad == before.bad + len(short)
-    check(resistance(watched.ears.wait_for_good(2)))
+    check(resistance(watched.listener.wait_for_good(2)))
 
 
 @pytest.mark.parametrize("how", ["down", "gone"])
 def test_it_lives_through_an_outage_of_the_bus(live: Live, watched: Watched, plant: Program, how: str) -> None:
     """The interface is set down, as for a new bit rate, or taken away, as an adapter is unplugged."""
-    ears, before = watched.ears, watched.now()
+    listener, before = watched.listener, watched.now()
     run(*("ip", "link", "set", CHANNEL, "down") if how == "down" else ("ip", "link", "delete", CHANNEL))
     assert plant.process.wait(timeout=20) == 2
     assert "sending on the bus failed" in plant.text()
-    count = len(ears.reports)
-    reports = ears.wait_for(lambda reports: len(reports) >= count + 5)
+    count = len(listener.reports)
+    reports = listener.wait_for(lambda reports: len(reports) >= count + 5)
     quality = reports[-1].window.quality
     assert quality.verdict is Verdict.BAD
     assert any("no samples of" in reason for reason in quality.reasons)
@@ -196,7 +196,7 @@ def test_it_lives_through_an_outage_of_the_bus(live: Live, watched: Watched, pla
     run("ip", "link", "set", CHANNEL, "up")
     player = watched.machine.start("canplayer", "-I", str(live.dump))
     begun, seen = time.time(), len(good(reports))
-    reports = ears.wait_for_good(2)
+    reports = listener.wait_for_good(2)
     first = good(reports)[seen]
     print(f"{how}: the first good window begins {first.window.start - begun:.2f} s after the bus came back")
     check(resistance(reports))

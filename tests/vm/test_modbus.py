@@ -1,4 +1,4 @@
-"""Our Modbus driver against a server of another house: libmodbus in C, over TCP and over a serial line.
+"""Our Modbus driver against a server made with libmodbus, in C, over TCP and over a serial line.
 
 Runs on the host; the server's own record says which function codes were sent.
 """
@@ -22,7 +22,8 @@ import pytest
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.modbus.driver import Options, Source, build
 from tests.conftest import free_port
-from tests.drivers.modbus_readers import Listener, wait_for
+from tests.drivers.modbus_readers import Listener
+from tests.waiting import wait_for
 
 SERVER = Path(__file__).with_name("modbus_server.c")
 FLAGS = ("-std=c11", "-D_DEFAULT_SOURCE", "-O1", "-Wall", "-Wextra", "-Werror")

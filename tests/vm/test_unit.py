@@ -46,8 +46,8 @@ def test_the_shipped_unit_serves_and_comes_back(installed: Machine) -> None:
     run("systemctl", "enable", "--now", UNIT)  # returns when the daemon has said that it is ready
     print(f"ready after {time.monotonic() - begun:.1f} s")
     assert (shown("ActiveState"), shown("SubState"), shown("Type")) == ("active", "running", "notify")
-    ears = installed.ears(failure)
-    reports = ears.wait_for_good(3)
+    listener = installed.listener(failure)
+    reports = listener.wait_for_good(3)
     assert resistance(reports).status is Status.ESTIMATED
     assert "R_a" in shown("StatusText")
     first = shown("MainPID")
@@ -62,8 +62,8 @@ def test_the_shipped_unit_serves_and_comes_back(installed: Machine) -> None:
         assert time.monotonic() < begun + 30.0, failure()
         time.sleep(0.1)
     index = reports[-1].window.index
-    reports = ears.wait_for(lambda reports: reports[-1].window.index < index)
-    ears.wait_for_good(2)
+    reports = listener.wait_for(lambda reports: reports[-1].window.index < index)
+    listener.wait_for_good(2)
     print(f"good again {time.monotonic() - begun:.1f} s after it was killed")
     assert shown("NRestarts") == "1"
 

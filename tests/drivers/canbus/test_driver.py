@@ -23,6 +23,7 @@ from otolith_drivers.canbus.bus import BusOptions, enlarge_buffer, frames_droppe
 from otolith_drivers.canbus.driver import CanOptions, CanReceiver, build
 from tests.conftest import OwnMachine, free_port
 from tests.drivers.can_frames import frame, signals
+from tests.waiting import PATIENCE
 
 RAW = {"V_a": ("V", {"id": "0x181", "start": 0, "length": 16, "signed": True, "scale": 0.01, "unit": "V"})}
 COUNTED: dict[str, Any] = {"0x181": {"counter": {"start": 56, "length": 8}, "period": "10 ms"}}
@@ -38,7 +39,7 @@ bus.shutdown()
 """
 
 
-def until(condition: Callable[[], bool], within: float = 8.0) -> bool:
+def until(condition: Callable[[], bool], within: float = PATIENCE) -> bool:
     deadline = time.monotonic() + within
     while not condition() and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -70,7 +71,7 @@ def test_frames_of_another_process_arrive_complete(bus_options: dict[str, Any], 
     driver, got = receiver(wishes, **options), list[Sample]()
     driver.open(got.extend)
     arguments = ["udp_multicast", bus_options["channel"], str(bus_options["port"]), "500", kind]
-    subprocess.run([sys.executable, "-c", SENDER, *arguments], check=True, timeout=30)
+    subprocess.run([sys.executable, "-c", SENDER, *arguments], check=True, timeout=PATIENCE)
     assert until(lambda: len(got) == 500)
     driver.close()
     assert [round(sample.value * 100) for sample in got] == [index % 1000 for index in range(500)]
@@ -203,7 +204,7 @@ def test_a_silent_server_is_connected_anew() -> None:
         driver.open(got.extend)
         assert until(lambda: len(got) > 50)
         server.silent.set()
-        assert until(lambda: driver.counters().reconnects == 1, within=15.0)
+        assert until(lambda: driver.counters().reconnects == 1)
         before = len(got)
         assert until(lambda: len(got) > before + 50)
         assert driver.link().up

@@ -15,8 +15,8 @@ from otolith_drivers.canbus.driver import CanReceiver, Options, build, monotonic
 from otolith_drivers.conformance import Rig
 from otolith_drivers.errors import DeviceError
 from tests.conftest import OwnMachine
-from tests.drivers.modbus_readers import wait_for
 from tests.drivers.rigs import SETUP, can_rig
+from tests.waiting import wait_for
 
 
 def emit_until(rig: Rig, condition: Callable[[], bool]) -> None:
@@ -26,7 +26,7 @@ def emit_until(rig: Rig, condition: Callable[[], bool]) -> None:
         rig.emit()
         return condition()
 
-    wait_for(emitted_and_checked, 5.0)
+    wait_for(emitted_and_checked)
 
 
 def opened(rig: Rig) -> list[Sample]:
@@ -85,7 +85,7 @@ def test_unreadable_frames_do_not_close_the_bus(own_machine: OwnMachine) -> None
             sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
             for _ in range(5):
                 sender.sendto(b"\xc1 no frame", (own_machine.group, own_machine.port))
-        wait_for(lambda: rig.driver.counters().bad >= 5, 5.0)
+        wait_for(lambda: rig.driver.counters().bad >= 5)
         assert rig.driver.counters().bad == 5
         assert rig.driver.counters().reconnects == 0
         assert rig.driver.link().up
@@ -105,7 +105,7 @@ def test_broken_bus_is_reopened(own_machine: OwnMachine, monkeypatch: pytest.Mon
             return original(self, timeout)
 
         monkeypatch.setattr(can.BusABC, "recv", recv)
-        wait_for(lambda: rig.driver.counters().reconnects > 0, 5.0)
+        wait_for(lambda: rig.driver.counters().reconnects > 0)
         received = rig.driver.counters().received
         emit_until(rig, lambda: rig.driver.counters().received > received)
         assert rig.driver.counters().reconnects == 1

@@ -13,13 +13,14 @@ from otolith_drivers.modbus.client import ReadOnlyClient
 from otolith_drivers.modbus.driver import Options
 from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
 from tests.conftest import free_port
-from tests.drivers.modbus_readers import TWO, Listener, floats, poller, source, wait_for
+from tests.drivers.modbus_readers import TIMEOUT, TWO, Listener, floats, poller, source
 from tests.drivers.modbus_servers import Behaviour, odd_server
+from tests.waiting import wait_for
 
 
 def late(reply: bytes) -> bytes:
     """A reply with another value after the timeout, which must not be taken for the answer to the next request."""
-    time.sleep(0.15)
+    time.sleep(1.5 * TIMEOUT)
     return reply[:-4] + struct.pack(">f", 99.0)
 
 
@@ -50,7 +51,7 @@ def test_corrupted_reply_is_no_reading(corrupt: Callable[[bytes], bytes]) -> Non
         wait_for(lambda: listener.driver.counters().lost > lost + 2)
         behaviour.corrupt = lambda reply: reply
         count = len(listener.samples)
-        wait_for(lambda: len(listener.samples) > count, 15.0)
+        wait_for(lambda: len(listener.samples) > count)
     assert {sample.value for sample in listener.samples} == {24.0, 1.5}
 
 

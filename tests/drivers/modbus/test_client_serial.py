@@ -15,7 +15,7 @@ from pymodbus.framer.rtu import FramerRTU
 
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.modbus.driver import ModbusPoller, Options, Source, build
-from tests.drivers.modbus_readers import wait_for
+from tests.waiting import wait_for, within
 
 REGISTERS = {"a": 1000, "b": 2000}
 TIMEOUT = 0.2  # s
@@ -86,7 +86,7 @@ def test_late_reply_is_not_taken_for_the_next_one(device: Device) -> None:
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
-        wait_for(lambda: device.requests > 100, 30.0)
+        wait_for(lambda: device.requests > 100)
     finally:
         driver.close()
     assert driver.counters().lost > 0
@@ -100,7 +100,7 @@ def test_echo_of_the_request_is_no_answer(device: Device) -> None:
     driver, samples = poller(device), list[Sample]()
     driver.open(samples.extend)
     try:
-        wait_for(lambda: device.requests > 100, 30.0)
+        wait_for(lambda: device.requests > 100)
     finally:
         driver.close()
     assert len(samples) > 50
@@ -116,7 +116,7 @@ def test_silent_line_is_reopened(device: Device) -> None:
         device.delay = lambda number: None
         wait_for(lambda: not driver.link().up)
         device.delay = lambda number: 0.0
-        wait_for(lambda: driver.link().up, 20.0)
+        wait_for(lambda: driver.link().up)
     finally:
         driver.close()
     assert driver.counters().reconnects == 1
@@ -131,11 +131,12 @@ def test_wall_clock_set_back_does_not_block_the_line(device: Device, monkeypatch
         requests = device.requests
         wait_for(lambda: device.requests > requests)
         monkeypatch.setattr(time, "time", lambda: wall() - 3600.0)
-        wait_for(lambda: not driver.link().up, 20.0)
+        wait_for(lambda: not driver.link().up)
     finally:
         driver.close()
 
 
+@pytest.mark.timed
 def test_slow_device_does_not_delay_close(device: Device) -> None:
     device.delay = lambda number: None
     driver = poller(device, 10.0)
@@ -143,7 +144,7 @@ def test_slow_device_does_not_delay_close(device: Device) -> None:
     wait_for(lambda: device.requests > 0)
     begun = time.monotonic()
     driver.close()
-    assert time.monotonic() - begun < 1.0
+    assert time.monotonic() - begun < within(1.0)
     assert not [thread for thread in threading.enumerate() if thread.name == "modbus-poll"]
 
 

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 
 import pytest
 
-from otolith_drivers.base import Sample
+from otolith_drivers.base import Link, Sample
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import free_port
-from tests.drivers.modbus_readers import PERIOD, TWO, Listener, floats, poller, source, wait_for
+from tests.drivers.modbus_readers import PERIOD, TWO, Listener, floats, poller, source
 from tests.drivers.modbus_servers import Behaviour, odd_server
+from tests.waiting import wait_for, within
 
 
 def test_only_function_codes_3_and_4_are_sent() -> None:
@@ -64,7 +65,7 @@ def test_refused_register_affects_no_other() -> None:
         assert {sample.value for sample in listener.of("s2")} == {7.0}
         assert not listener.of("s1")
         behaviour.refuse = lambda *_: None
-        wait_for(lambda: bool(listener.of("s1")), 15.0)
+        wait_for(lambda: bool(listener.of("s1")))
         listener.wait(lambda link: not link.warnings)
 
 
@@ -87,26 +88,28 @@ def test_dead_device_does_not_stop_another() -> None:
         count = len(listener.of("s0"))
         wait_for(lambda: len(listener.of("s0")) > count + 50)
         behaviour.silent = lambda _: False
-        wait_for(lambda: bool(listener.of("s1")), 15.0)
+        wait_for(lambda: bool(listener.of("s1")))
         listener.wait(lambda link: not link.warnings)
 
 
 def test_sample_time_is_the_middle_of_the_round_trip() -> None:
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
-    replied: list[float] = []
+    middles: list[float] = []
 
     def slow(reply: bytes) -> bytes:
+        begun = time.monotonic()
         time.sleep(0.02)
-        replied.append(time.monotonic())
+        middles.append(0.5 * (begun + time.monotonic()))  # a busy computer may sleep longer
         return reply
 
     behaviour.corrupt = slow
     with odd_server(behaviour, port), Listener(poller(port, TWO, 0.1)) as listener:
         wait_for(lambda: len(listener.of("s0")) >= 25)
-    behind = sorted(reply - sample.time for reply, sample in zip(replied, listener.of("s0"), strict=False))
-    assert behind[len(behind) // 2] == pytest.approx(0.01, abs=0.004)
+    behind = sorted(middle - sample.time for middle, sample in zip(middles, listener.of("s0"), strict=False))
+    assert behind[len(behind) // 2] == pytest.approx(0.0, abs=0.004)
 
 
+@pytest.mark.timed
 def test_slow_line_reports_its_achieved_rate() -> None:
     """And polls evenly on a coarser grid."""
     behaviour, port = Behaviour(floats(24.0, 1.5)), free_port(socket.SOCK_STREAM)
@@ -120,11 +123,17 @@ def test_slow_line_reports_its_achieved_rate() -> None:
         listener.wait(lambda link: link.period is not None and "not known" not in link.plan)
         link = listener.driver.link()
         assert link.period is not None
-        assert 0.02 < link.period < 0.05
+        assert 0.02 < link.period < within(0.05)
         assert "100 Hz asked" in link.plan
-        achieved = re.search(r"([\d.]+) achieved", link.plan)
-        assert achieved is not None
-        assert float(achieved[1]) == pytest.approx(1 / link.period, rel=0.1)  # a busy computer keeps it only roughly
+        listener.wait(keeps_its_period)
+
+
+def keeps_its_period(link: Link) -> bool:
+    """Whether the driver polls at the rate of its period; a busy computer keeps it only now and then."""
+    achieved = re.search(r"([\d.]+) achieved", link.plan)
+    if achieved is None or link.period is None:
+        return False
+    return float(achieved[1]) == pytest.approx(1 / link.period, rel=0.1)
 
 
 def test_line_that_breaks_each_round_still_delivers() -> None:
@@ -138,9 +147,10 @@ def test_line_that_breaks_each_round_still_delivers() -> None:
 
     behaviour.corrupt = close_connection
     with odd_server(behaviour, port), Listener(poller(port, [source(register=0), source(register=50)])) as listener:
-        wait_for(lambda: len(listener.of("s0")) > 25, 30.0)
+        wait_for(lambda: len(listener.of("s0")) > 25)
 
 
+@pytest.mark.timed
 def test_unresponsive_host_does_not_delay_close() -> None:
     with socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as stack:
         for _ in range(4):  # beyond its backlog, connections are not answered
@@ -152,7 +162,7 @@ def test_unresponsive_host_does_not_delay_close() -> None:
         time.sleep(0.2)  # long enough to begin to connect
         begun = time.monotonic()
         driver.close()
-        assert time.monotonic() - begun < 0.5
+        assert time.monotonic() - begun < within(0.5)
     assert not [thread for thread in threading.enumerate() if thread.name == "modbus-poll"]
 
 

@@ -14,6 +14,7 @@ from otolith_drivers.plant.driver import Options, Source, build
 from otolith_drivers.plant.faults import FaultInjector
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES
+from tests.waiting import PATIENCE
 
 SIGNALS = (
     Signal("i", "mA", Source(signal="ArmatureCurrent")),
@@ -49,7 +50,7 @@ def receive(driver: Driver, enough: Callable[[list[Sample]], bool]) -> list[Samp
         news.set()
 
     driver.open(take)
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + PATIENCE
     while not enough(got):
         news.clear()
         assert news.wait(deadline - time.monotonic())
@@ -91,7 +92,7 @@ def test_plant_driver_reports_gone_and_reconnects(scenario: Callable[[str], Path
     got: list[Sample] = []
     reasons: list[str] = []
     driver.open(got.extend)
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + PATIENCE
     while len(got) < 80:
         assert time.monotonic() < deadline
         reasons.append(driver.link().reason)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from pymodbus import ModbusException
 
-from tests.drivers.drives import COUNTER, PATIENCE, REGISTERS, Drive, floats, line_says, past, wait_for
+from tests.drivers.drives import COUNTER, REGISTERS, Drive, floats, line_says, past, wait_for
+from tests.waiting import PATIENCE
 
 
 def test_dropouts_are_all_counted(drive: Callable[..., Drive]) -> None:
@@ -30,7 +31,7 @@ def test_dropouts_are_all_counted(drive: Callable[..., Drive]) -> None:
 
 
 def test_gone_tcp_drive_closes_its_port_and_returns(drive: Callable[..., Drive]) -> None:
-    node = drive('[[faults]]\nkind = "gone"\nstart = "1 s"\nuntil = "2 s"\n')
+    node = drive('[[faults]]\nkind = "gone"\nstart = "3 s"\nuntil = "4 s"\n')
     with node.client() as client:
         wait_for(client, past(0))
         with socket.create_connection(("127.0.0.1", node.port)) as idle:
@@ -39,7 +40,7 @@ def test_gone_tcp_drive_closes_its_port_and_returns(drive: Callable[..., Drive])
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection(("127.0.0.1", node.port))
         back = wait_for(client, past(0)).registers
-    assert back[COUNTER] >= 200
+    assert back[COUNTER] >= 400
     assert np.array_equal(floats(back), np.array(node.ticks(back[COUNTER] + 1)[-1], np.float32))
     assert node.end()[1]["faults"][0]["ticks"] == 100
 
@@ -83,7 +84,7 @@ def test_exception_for_some_registers(drive: Callable[..., Drive]) -> None:
 
 @pytest.mark.parametrize("transport", ["modbus-tcp", "modbus-rtu"])
 def test_garbage_is_sent_on_the_line(drive: Callable[..., Drive], transport: str) -> None:
-    node = drive('[[faults]]\nkind = "garbage"\nshare = 1.0\nstart = "0.5 s"\nuntil = "1 s"\n', transport)
+    node = drive('[[faults]]\nkind = "garbage"\nshare = 1.0\nstart = "0.5 s"\nuntil = "3 s"\n', transport)
     if transport == "modbus-tcp":
         with socket.create_connection(("127.0.0.1", node.port)) as connection:
             line_says(connection.fileno(), 100)
@@ -92,5 +93,5 @@ def test_garbage_is_sent_on_the_line(drive: Callable[..., Drive], transport: str
         line_says(line, 100)
         os.close(line)
     with node.client() as client:
-        wait_for(client, past(100))
-    assert node.end()[1]["faults"][0]["ticks"] == 50
+        wait_for(client, past(300))
+    assert node.end()[1]["faults"][0]["ticks"] == 250

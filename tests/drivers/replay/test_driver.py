@@ -2,7 +2,6 @@
 
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from otolith_drivers.replay import tables as table
 from otolith_drivers.replay.driver import Options, ReplayDriver, Source, build
 from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import UNITS, frames_of, live, written
+from tests.waiting import wait_for, within
 
 FAST = "as fast as possible"
 ENDED = "the recording has ended"
@@ -43,13 +43,6 @@ def driver_of(path: Path, sources: dict[str, dict[str, Any]] | None = None, **op
     return build(Options.model_validate({"file": path, **options}), setup(named))
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
 def played(driver: ReplayDriver) -> list[Sample]:
     """All samples of the file."""
     got: list[Sample] = []
@@ -60,6 +53,7 @@ def played(driver: ReplayDriver) -> list[Sample]:
     return got
 
 
+@pytest.mark.timed
 @pytest.mark.parametrize("pace", ["real time", FAST])
 def test_replay_keeps_spacing_and_counts_every_cell(tmp_path: Path, pace: str) -> None:
     path = written_table(tmp_path, 60)
@@ -74,12 +68,13 @@ def test_replay_keeps_spacing_and_counts_every_cell(tmp_path: Path, pace: str) -
         assert [sample.value for sample in got if sample.signal == name] == values[there].tolist()
         times = np.array([sample.time for sample in got if sample.signal == name])
         assert times - got[0].time == pytest.approx(rows.times[there] - rows.times[0], abs=1e-6)
-    assert begun <= got[0].time <= begun + 1.0
+    assert begun <= got[0].time <= begun + within(1.0)
     counters = driver.counters()
     assert (counters.received, counters.bad, counters.lost) == (len(got), 2, 0) == (118, 2, 0)
     assert any("bad cells: 1, bad rows: 1" in line for line in driver.link().warnings)
 
 
+@pytest.mark.timed
 def test_replay_in_real_time_delivers_no_sample_early(tmp_path: Path) -> None:
     late: list[float] = []
     driver = driver_of(written_table(tmp_path, 100))
@@ -87,7 +82,7 @@ def test_replay_in_real_time_delivers_no_sample_early(tmp_path: Path) -> None:
     wait_for(lambda: not driver.link().up)
     assert len(late) == 198
     assert min(late) >= 0.0
-    assert float(np.median(late)) < 0.02
+    assert float(np.median(late)) < within(0.02)
 
 
 def test_replay_waits_for_a_slow_receiver(tmp_path: Path) -> None:
@@ -107,7 +102,7 @@ def test_replay_waits_for_a_slow_receiver(tmp_path: Path) -> None:
     assert driver._reader.progress < 1.0
     assert driver.counters().received <= 1000
     gate.set()
-    wait_for(lambda: not driver.link().up, 60.0)
+    wait_for(lambda: not driver.link().up)
     assert sum(got) == driver.counters().received == 600_000
 
 
