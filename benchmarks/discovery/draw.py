@@ -2,8 +2,9 @@
 
 The detection limit is the amplitude whose gain in -2 log evidence, expected from the linear picture of a healthy
 window of the same operation, equals what the search asks for: amplitude² * information = numbers * log(values) +
-2 log(3 rivals) + DECISIVE. The information is the part of the unit response that parameters, trends and initial
-state do not explain, given the prior; rivals are the candidates of the machine (not of its sensors) in that window.
+2 log(3 alternatives) + DECISIVE. The information is the part of the unit response that parameters, trends and initial
+state do not explain, given the prior; alternatives are the candidates of the machine in that window,
+not those of its sensors.
 """
 
 import math
@@ -150,8 +151,8 @@ def detection_limit(structure: CandidateForm, inner: float, phase: float, landsc
     """Amplitude in the unit of the site; infinite if parameters explain the component."""
     numbers = len(structure.model.phases) + (structure.model.inner is not None)
     own = len(base_model(problem()).sites)
-    rivals = sum(1 for candidate in candidate_library(base_model(problem()), landscape.x) if candidate.site < own)
-    required = numbers * math.log(landscape.objective.count) + 2.0 * math.log(3.0 * rivals) + DECISIVE
+    alternatives = sum(1 for candidate in candidate_library(base_model(problem()), landscape.x) if candidate.site < own)
+    required = numbers * math.log(landscape.objective.count) + 2.0 * math.log(3.0 * alternatives) + DECISIVE
     return math.sqrt(required / max(_information(structure, inner, phase, landscape), 1e-300))
 
 

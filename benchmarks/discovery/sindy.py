@@ -34,7 +34,7 @@ MODELS = 10
 
 def answers(case: Typical, record: Recorded, seed: int) -> dict[str, Answer]:
     """One answer per variant and setting; the name is the variant, a space, the setting."""
-    sindy = importlib.import_module("pysindy")  # it has no types, and not everybody has it
+    sindy = importlib.import_module("pysindy")  # optional, and without types
     answers = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about thresholds that remove all terms

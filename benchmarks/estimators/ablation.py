@@ -61,16 +61,16 @@ def attempts(problem: Problem, window: Window, start: Array) -> tuple[Attempt, .
     objective = Objective(problem, window, start)
     made = time.perf_counter() - begin
 
-    def polished(values: Array) -> Attempt:
+    def refined(values: Array) -> Attempt:
         begin = time.perf_counter()
         values = gauss_newton(objective, objective.guess(values)).guess[: objective.free]
         return Attempt(values, time.perf_counter() - begin + made)
 
-    alone = polished(start)
+    alone = refined(start)
     begin = time.perf_counter()
     values = search_parameters(objective, problem.swarm, start, problem.seed + window.index).positions[0, 0]
     swarm = Attempt(values, time.perf_counter() - begin + made)
-    after = polished(values)
+    after = refined(values)
     begin = time.perf_counter()
     whole = np.array(
         [

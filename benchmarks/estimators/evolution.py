@@ -9,11 +9,11 @@ from benchmarks.estimators.data import NOISE, full, inputs_of, outputs_of
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.problem import Problem
 
-INITIAL_STATE_REACH = 5.0  # standard deviations around the first record in which the initial state is sought
+INITIAL_STATE_REACH = 5.0  # standard deviations around the first record within which the initial state is estimated
 
 
 def methods(_: Budget) -> tuple[Method, ...]:
-    """SciPy's defaults: 15 members per unknown, up to 1000 generations, polished by L-BFGS-B."""
+    """SciPy's defaults: 15 members per unknown, up to 1000 generations, refined by L-BFGS-B."""
     return (Method(("differential_evolution",), Evolution),)
 
 

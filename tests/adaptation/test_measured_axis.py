@@ -39,7 +39,7 @@ DIRECTIONAL = {"F_v_up": 166.71, "F_c_up": 20.144, "F_v_down": 240.42, "F_c_down
 TURN = 5e-4  # m/s: width of the authors' sign(v); the likelihood of the record increases down to this width
 WHOLE = 12  # windows of the record
 COUNTS = pytest.mark.parametrize("count", [4, pytest.param(WHOLE, marks=pytest.mark.full)])
-"""Windows that the state is adapted to. Nearly every window is searched for missing components, which is slow."""
+"""How many windows are adapted to: nearly each one is searched for components that the twin lacks, which takes long."""
 ONE_WAY = 1e-3  # of the path: largest share in the other direction of a one-way window
 
 
@@ -88,7 +88,7 @@ def test_noise_levels_of_encoder_and_slow_model_error() -> None:
     assert noise.consistency.before > 10.0  # what white noise alone would have claimed
 
 
-def test_record_has_twelve_windows() -> None:
+def test_the_record_has_twelve_windows() -> None:
     assert len(windows()) == WHOLE
 
 
@@ -203,6 +203,6 @@ def test_missing_dry_friction_is_discovered(count: int) -> None:
         documents.append(report.document)
     (component,) = documents[-1].components
     assert (component.input, component.site) == ("v", "carriage")
-    assert component.family == "Coulomb" or count < WHOLE  # four windows fit a flat power law as well
+    assert component.family == "Coulomb" or count < WHOLE  # after four windows a flat power law explains as much
     assert component.values["amplitude"].value == pytest.approx(-20.4, rel=0.1)
     assert documents[-1].parameters["M"].value == pytest.approx(MASS, rel=0.01)

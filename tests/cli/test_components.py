@@ -128,7 +128,7 @@ def test_an_invalid_state_file_is_refused_by_name() -> None:
     files = store()
     files.components_path.parent.mkdir(parents=True, exist_ok=True)
     files.components_path.write_text('{"version": 1, "twin": "dc_motor", "components": [{}]}', encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=r"components.0.adopted.*move it away"):
+    with pytest.raises(ConfigurationError, match=r"components.0.adopted.*move the file away"):
         files.components()
     files.decisions_path.write_text("half a fi", encoding="utf-8")
     with pytest.raises(ConfigurationError, match=files.decisions_path.name):

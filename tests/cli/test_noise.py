@@ -35,7 +35,7 @@ def test_printed_lines_are_valid_in_a_machine_file(tmp_path: Path, data: Path) -
     assert problem.input_noise == pytest.approx((0.0, 0.0002))
     assert problem.process_noise == pytest.approx((0.0, 0.0), abs=0.05)
     assert set(tomllib.loads(result.stdout)) == {"noise", "process_noise"}
-    assert "# learned from 5 windows of 2 s" in result.stdout
+    assert "# identified from 5 windows of 2 s" in result.stdout
     assert "chi-square between windows" in result.stdout
     assert "T_load" in result.stdout
 

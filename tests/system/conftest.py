@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from otolith.health.schema import ReportDocument
+from otolith.health.schema import ReportDocument, Status
 from otolith.publishing.zenoh_session import Listener
 from tests.conftest import OwnMachine
 from tests.waiting import PATIENCE, wait_for
@@ -41,7 +41,7 @@ class Running:
             return subprocess.Popen([*OTOLITH, *arguments], stdout=log, stderr=subprocess.STDOUT)
 
     def wait_for(
-        self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 2 * PATIENCE
+        self, enough: Callable[[list[ReportDocument]], bool], seconds: float = 3 * PATIENCE
     ) -> list[ReportDocument]:
         """Return all reports once ``enough`` accepts them; fail with the daemon's log after ``seconds``."""
         deadline = time.monotonic() + seconds
@@ -74,6 +74,11 @@ class Running:
             if process is not None and process.poll() is None:
                 process.terminate()
                 process.wait(timeout=PATIENCE)
+
+
+def is_estimated(report: ReportDocument) -> bool:
+    """Whether the window of the report gave an estimate of the armature resistance."""
+    return report.parameters["R_a"].status is Status.ESTIMATED
 
 
 @pytest.fixture

@@ -18,10 +18,9 @@ from rerun.chunk import RrdReader
 
 from otolith.acquisition.window import Array, Verdict
 from otolith.cli.demo import compare
-from otolith.health.schema import ReportDocument, Status
 from tests.conftest import OwnMachine
-from tests.system.conftest import Running
-from tests.waiting import PATIENCE, within
+from tests.system.conftest import Running, is_estimated
+from tests.waiting import EXACT, PATIENCE, within
 
 CAN_LISTENER = """
 import can, cantools, json, sys
@@ -49,7 +48,7 @@ received, alive = [], []
 with zenoh.open(config) as session:
     session.declare_subscriber("otolith/**", lambda s: received.append((str(s.key_expr), s.payload.to_string())))
     end = time.monotonic() + 60.0
-    while sum(key.endswith("/report") for key, _ in received) < 3 and time.monotonic() < end:
+    while sum(key.endswith("/report") for key, _ in received) < 2 and time.monotonic() < end:
         time.sleep(0.1)
     latest = [reply.ok.payload.to_string() for reply in session.get("otolith/demo/dc-motor/report") if reply.ok]
     alive = [str(reply.ok.key_expr) for reply in session.liveliness().get("otolith/*/*/alive") if reply.ok]
@@ -115,15 +114,12 @@ def test_frames_reports_and_recording_are_complete(running: Running) -> None:
     assert resistance[: len(known), 2].tolist() == known
 
 
-def is_estimated(report: ReportDocument) -> bool:
-    return report.parameters["R_a"].status is Status.ESTIMATED
-
-
 def check_accuracy(running: Running) -> None:
     with running.truth.open(encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if None not in row.values()]
     truth = {name: [float(row[name]) for row in rows] for name in rows[0]}
-    compared = compare(running.reports, truth)
+    # Values that are held, as they are in bad windows of a busy computer, may lag behind.
+    compared = compare(running.reports if EXACT else list(filter(is_estimated, running.reports)), truth)
     assert len(compared) >= 5
     assert max(row.error for row in compared) <= 0.005
     assert max(report.cost.latency_s for report in running.reports[1:]) < within(1.0)
@@ -142,7 +138,7 @@ def test_a_killed_worker_is_restarted(running: Running) -> None:
     assert (last.lost, last.bad) == (0, 0)
     for before, after in pairwise(reports):
         if after.window.index == before.window.index + 1:
-            assert after.window.start == pytest.approx(before.window.end, abs=0.005)  # half a period
+            assert after.window.start == pytest.approx(before.window.end, abs=within(0.005))  # half a period
 
 
 def test_a_killed_recorder_changes_nothing_else(running: Running) -> None:

@@ -48,7 +48,7 @@ def test_systemd_gets_readiness_progress_and_stop(own_machine: OwnMachine, tmp_p
     )
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
-        manager.settimeout(PATIENCE)
+        manager.settimeout(2 * PATIENCE)
         environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "4000000"}
         command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
         daemon = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)

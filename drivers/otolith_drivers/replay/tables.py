@@ -283,13 +283,12 @@ class _TableChunk:
         counts, columns = self._counts, self._header.columns
         before = counts.bad
         cells = self._split(quoted=quoted)
-        has_text = _has_text(cells)
-        kept = np.flatnonzero(self._right_width(cells, has_text))
-        cells = cells.take(pa.array(kept))
+        kept = np.flatnonzero(self._right_width(cells))
+        cells = cells if len(kept) == len(cells) else cells.take(pa.array(kept))
         texts = {name: pc.list_element(cells, column.place) for name, column in columns.items()}
         counts.decimal = counts.decimal or _decimal_sign(list(texts.values()))
         times = _numbers(texts[TIME], columns[TIME], counts.decimal)
-        timed = self._timed(times, texts.pop(TIME), kept, has_text[kept])
+        timed = self._timed(times, texts.pop(TIME), cells, kept)
         kept = kept[timed]
         if not len(kept):
             return None
@@ -308,30 +307,33 @@ class _TableChunk:
             return pc.split_pattern(self._lines, separator)
         return pa.array([_split_quoted(line, separator) for line in self._lines.to_pylist()], pa.list_(pa.string()))
 
-    def _right_width(self, cells: pa.ListArray, has_text: Mask) -> Mask:
+    def _right_width(self, cells: pa.ListArray) -> Mask:
         """Which lines are rows: a cell for each column, and no text in cells beyond them. Comments are no rows."""
         least, most = self._header.widths
         widths = pc.list_value_length(cells).to_numpy()
         comment = pc.starts_with(pc.utf8_ltrim_whitespace(self._lines), "#").to_numpy(zero_copy_only=False)
         fits: Mask = (widths >= least) & ~comment
         wide = np.flatnonzero(fits & (widths > most))
-        fits[wide] = ~_has_text(pc.list_slice(cells.take(pa.array(wide)), most))
-        wrong = np.flatnonzero(~fits & ~comment & has_text)
+        if len(wide):
+            fits[wide] = ~_has_text(pc.list_slice(cells.take(pa.array(wide)), most))
+        wrong = np.flatnonzero(~fits & ~comment)
+        wrong = wrong[_has_text(cells.take(pa.array(wrong)))]
         if len(wrong):
             hint = " (a decimal comma needs ';' or a tab between cells)" if self._header.separator == "," else ""
             self._count_rows(wrong, f"{widths[wrong[0]]} cells, but {most} columns{hint}")
         return fits
 
-    def _timed(self, times: Array, texts: pa.StringArray, kept: Integers, has_text: Mask) -> Mask:
-        """Which of the rows ``kept`` have a time. A row without any text is blank, not bad."""
+    def _timed(self, times: Array, texts: pa.StringArray, cells: pa.ListArray, lines: Integers) -> Mask:
+        """Which of the rows have a time; ``lines`` are their lines. A row without any text is blank, not bad."""
         timed: Mask = np.abs(times) <= MAX_TIME
-        wrong = np.flatnonzero(~timed & has_text)
+        wrong = np.flatnonzero(~timed)
+        wrong = wrong[_has_text(cells.take(pa.array(wrong)))]
         if len(wrong):
             first, cause = wrong[0], "a row without t"
             if not np.isnan(times[first]):
                 cell = texts[int(first)].as_py()
                 cause = f"t is {cell!r}: write seconds, relative or Unix, or name the unit like 't [ms]'"
-            self._count_rows(kept[wrong], cause)
+            self._count_rows(lines[wrong], cause)
         return timed
 
     def _count_rows(self, lines: Integers, cause: str) -> None:

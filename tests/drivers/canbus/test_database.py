@@ -69,6 +69,18 @@ def test_broken_databases_are_refused_in_one_line(tmp_path: Path, content: str) 
 
 @pytest.mark.timed
 @pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (dbc('BO_ 1 A: 32769 X\n SG_ S : 0|8@1+ (1,0) [0|0] "" X'), "a length or a start beyond 4096 bytes"),
+        (dbc(MOTOR, after="SG_MUL_VAL_ 1 S M 0-65537;"), "a multiplexer of more than 65536 values"),
+    ],
+)
+def test_excessive_numbers_are_refused_before_parsing(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(ConfigurationError, match=sentence):
+        loaded(tmp_path / "excessive.dbc", text)
+
+
+@pytest.mark.parametrize(
     ("name", "text"),
     [
         ("bomb.kcd", '<!DOCTYPE x [<!ENTITY a "aaaa">]><NetworkDefinition>&a;</NetworkDefinition>'),

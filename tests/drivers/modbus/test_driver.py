@@ -125,14 +125,14 @@ def test_slow_line_reports_its_achieved_rate() -> None:
         assert link.period is not None
         assert 0.02 < link.period < within(0.05)
         assert "100 Hz asked" in link.plan
-        listener.wait(reports_its_period)
+        listener.wait(keeps_its_period)
 
 
-def reports_its_period(link: Link) -> bool:
-    """Whether the achieved rate agrees with the period; on a busy computer, only after a while."""
+def keeps_its_period(link: Link) -> bool:
+    """Whether the driver polls at the rate of its period; a busy computer keeps it only now and then."""
     achieved = re.search(r"([\d.]+) achieved", link.plan)
-    assert achieved is not None
-    assert link.period is not None
+    if achieved is None or link.period is None:
+        return False
     return float(achieved[1]) == pytest.approx(1 / link.period, rel=0.1)
 
 

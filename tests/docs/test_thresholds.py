@@ -1,0 +1,77 @@
+"""The pages of thresholds name constants that exist, with their values, and tests that exist."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DRIVERS, DAEMON = ROOT / "drivers" / "otolith_drivers", ROOT / "daemon" / "otolith"
+SOURCES = {
+    "acquisition": [DAEMON / "acquisition"],
+    "canbus": [DRIVERS / "canbus"],
+    "cli": [DAEMON / "cli", DAEMON / "health"],
+    "commissioning": [DAEMON / "commissioning"],
+    "discovery": [DAEMON / "discovery"],
+    "drivers": [DRIVERS],
+    "estimation": [DAEMON / "estimation"],
+    "health": [DAEMON / "health", DAEMON / "adaptation"],
+    "modbus": [DRIVERS / "modbus"],
+    "plant": [DRIVERS / "plant"],
+    "replay": [DRIVERS / "replay"],
+    "runtime": [DAEMON / "runtime", DAEMON / "publishing", DAEMON],
+    "twin": [DAEMON / "twin"],
+}
+PAGES = sorted((ROOT / "docs" / "reference").glob("thresholds-*.md"))
+CODE = re.compile(r"`([^`]+)`")
+
+
+def rows(page: Path) -> list[list[str]]:
+    """The cells of every row, without headers."""
+    lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+
+
+def constants(folders: list[Path]) -> set[str]:
+    """Names that are assigned in modules and classes."""
+    names: set[str] = set()
+    for path in (path for folder in folders for path in folder.glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            targets = node.targets if isinstance(node, ast.Assign) else []
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else targets
+            names |= {item.id for target in targets for item in ast.walk(target) if isinstance(item, ast.Name)}
+    return names
+
+
+def test_every_package_has_a_page_of_thresholds() -> None:
+    assert {page.stem.removeprefix("thresholds-") for page in PAGES} == set(SOURCES)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_threshold_exists(page: Path) -> None:
+    known = constants(SOURCES[page.stem.removeprefix("thresholds-")])
+    named = {name.rpartition(".")[2] for row in rows(page) for name in CODE.findall(row[0])}
+    assert named
+    assert {name for name in named if name.isupper() or "_" in name} <= known
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_row_has_value_unit_origin_and_guard(page: Path) -> None:
+    for row in rows(page):
+        assert len(row) == 6, row
+        assert all(row), row
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_guarding_test_exists(page: Path) -> None:
+    files = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("*.py")}
+    functions = set(
+        re.findall(r"^def (test_\w+)", "\n".join((ROOT / name).read_text() for name in files), re.MULTILINE)
+    )
+    for row in rows(page):
+        for name in CODE.findall(row[5]):
+            if name.endswith(".py"):
+                assert any(path.endswith(f"/{name.removeprefix('tests/')}") for path in files), name
+            elif name.startswith("test_"):
+                assert name.partition("[")[0] in functions, name
