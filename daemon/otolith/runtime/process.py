@@ -34,7 +34,8 @@ def _run_main(connection: Any, main: str, arguments: Sequence[Any]) -> None:
 
 
 def _send_queued(outbox: queue.Queue[Any], connection: Any) -> None:
-    with contextlib.suppress(OSError, ValueError):
+    # The main thread may close the connection during a write, whose descriptor is then None: a TypeError.
+    with contextlib.suppress(OSError, ValueError, TypeError):
         while True:
             message = outbox.get()
             connection.send(message)
