@@ -61,7 +61,7 @@ class LiveTable:
             histories = {name: tuple(values) for name, values in self._histories.items()}
         if document is None:
             return Text(self._state(), style="dim")
-        parts: list[RenderableType] = [*_heading(document), _parameters(document.parameters, histories, width)]
+        parts: list[RenderableType] = [*_title_lines(document), _parameters(document.parameters, histories, width)]
         parts += [_components(document)] if document.components else []
         parts += [*_messages(document), *_counters(document)]
         if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
@@ -86,7 +86,7 @@ def parameter_table(*columns: str) -> Table:
     return table
 
 
-def _heading(document: ReportDocument) -> list[Text]:
+def _title_lines(document: ReportDocument) -> list[Text]:
     window, quality = document.window, document.window.quality
     line = Text(f"window {window.index} ")
     line.append(quality.verdict, style="green" if quality.verdict is Verdict.GOOD else "red")

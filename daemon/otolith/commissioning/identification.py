@@ -231,14 +231,14 @@ def _state_levels(
 ) -> Iterator[NoiseLevel]:
     """The uncertainty of an inflated level includes that of the factor, from a chi-square of so many ``degrees``."""
     columns = (column[len(twin.outputs) :].tolist() for column in (guess.variances.free, levels, best.levels, best.sd))
-    for state, observable, free, value, likeliest, sd in zip(twin.states, guess.process, *columns, strict=True):
+    for state, observable, free, value, most_probable, sd in zip(twin.states, guess.process, *columns, strict=True):
         if not free:
             yield NoiseLevel(state.name, 0.0, None, NOT_OBSERVABLE if np.isnan(observable) else AT_REST)
         elif not value:
             yield NoiseLevel(state.name, 0.0, sd, NOT_SIGNIFICANT.format(sd, state.unit))
         else:
-            own = sd / likeliest if likeliest else 0.0
-            of_factor = 0.0 if value == likeliest else 1.0 / np.sqrt(2.0 * degrees)
+            own = sd / most_probable if most_probable else 0.0
+            of_factor = 0.0 if value == most_probable else 1.0 / np.sqrt(2.0 * degrees)
             yield NoiseLevel(state.name, value, value * float(np.hypot(own, of_factor)), "")
 
 

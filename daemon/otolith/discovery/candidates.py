@@ -179,9 +179,9 @@ def search_inner_parameters(response: LinearResponse, starts: list[tuple[Candida
     low, high = np.array([form.bounds for form in forms]).T[:, :, None, None]
     steps = np.array([_grid_step(form, response.x) for form in forms])[:, None]
     first = np.array([np.resize(values, PARTICLES) for _, values in starts])
-    scatter = START_SPREAD * steps * random.uniform(-1.0, 1.0, first.shape)
-    scatter[:, 0] = 0.0
-    positions = np.clip((first + scatter)[..., None], low, high)
+    offsets = START_SPREAD * steps * random.uniform(-1.0, 1.0, first.shape)
+    offsets[:, 0] = 0.0
+    positions = np.clip((first + offsets)[..., None], low, high)
 
     def cost(inner: Array) -> Array:
         guesses = [(form, float(value)) for form, row in zip(forms, inner[..., 0], strict=True) for value in row]
