@@ -1,6 +1,6 @@
 """``adapt(state, window) -> (state, report)``: the one entry to the core, a pure function.
 
-    check data → predict → fit → test against the prediction → (search → compare hypotheses) → update → report
+    predict → check data → fit → test against the prediction → (search → compare hypotheses) → update → report
 
 Time arrives with the window and randomness with the seed. Every run is therefore reproducible bit for bit, and the work
 can move between processes.
