@@ -1,7 +1,7 @@
-# Each target sets up what it needs in .venv. PYTHON=python3.12 make ... takes another Python (3.11 or newer).
+# Each target installs its dependencies into .venv. PYTHON=python3.12 make ... selects another Python (3.11 or newer).
 PYTHON ?= python3
 BIN := .venv/bin
-# An editable install knows where it lies: a folder that was moved gets a new one.
+# An editable install contains the path of the checkout: reinstall if the checkout was moved.
 HERE := $(shell pwd | cksum | cut -d' ' -f1)
 RUNTIME := .venv/.runtime-$(HERE)
 DEV := .venv/.dev-$(HERE)
@@ -25,13 +25,13 @@ help:
 demo: $(RUNTIME)
 	$(BIN)/python -m otolith demo
 
-# Two processes a core: half of the tests wait for real time. A file's tests stay together and share what they compute.
+# Two processes per core: half of the tests wait for real time. One worker runs all tests of a file, which share results.
 WORKERS ?= $(shell echo $$((2 * $$(nproc))))
 SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
 test: $(DEV)
 	$(SHARED) -m "not full"
 
-# What is timed runs last, one test at a time, and must keep its limits exactly.
+# Timed tests run last and one at a time, with exact limits.
 test-full: $(DEV)
 	@$(SHARED) -m "full and not timed"; shared=$$?; \
 	OTOLITH_TIMING=exact $(BIN)/python -m pytest -m timed; timed=$$?; exit $$((shared | timed))

@@ -1,4 +1,4 @@
-"""What many tests share: a simulated plant's windows without any clock, and a machine of one's own on free ports."""
+"""Shared fixtures: windows of a simulated plant without real time, and a machine file with free ports."""
 
 import socket
 from collections.abc import Callable, Iterator
@@ -20,15 +20,15 @@ from tests.waiting import EXACT
 
 EXAMPLES = examples_directory()
 TESTS = Path(__file__).parent
-# Ports for tests: below those that the kernel gives to whoever asks for any port, so that nobody else takes one first.
-FIRST_PORT, LAST_PORT, PORTS = 10_000, 32_000, 400  # PORTS for each process
+# Ports for tests. They are below the ephemeral range, so that the kernel never assigns them to another process.
+FIRST_PORT, LAST_PORT, PORTS = 10_000, 32_000, 400  # PORTS: ports of each process
 CLAIMS: list[socket.socket] = []
-settings.register_profile("otolith", deadline=None)  # how long an example takes depends on who else computes
+settings.register_profile("otolith", deadline=None)  # the time of an example depends on the load of the computer
 settings.load_profile("otolith")
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 
 
-# Whole files that take longest, so that workers start with them; a mix of files that compute and files that wait.
+# The slowest files. Workers start with them; files that compute alternate with files that wait for real time.
 SLOWEST = (
     "adaptation/test_measured_axis.py",
     "system/test_faults.py",
@@ -41,7 +41,7 @@ SLOWEST = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Show what runs, if several processes share the tests; this is the process that gives them out."""
+    """Register the progress display in the process that distributes the tests, if there are several."""
     if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
         config.pluginmanager.register(Progress(config))
 
@@ -54,7 +54,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def private_directories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test reads or writes the state of the user who runs it; compiled kernels are shared by all tests."""
+    """Redirect the state directory of the user to ``tmp_path``. All tests share the compiled kernels."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in ("STATE_DIRECTORY", "CACHE_DIRECTORY", "NOTIFY_SOCKET", "WATCHDOG_USEC"):
         monkeypatch.delenv(name, raising=False)
@@ -62,7 +62,7 @@ def private_directories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.fixture
 def scenario() -> MotorScenario:
-    """The demo's."""
+    """The scenario of the demo."""
     found = load_scenario(EXAMPLES / "scenarios" / "demo.toml")
     assert isinstance(found, MotorScenario)
     return found
@@ -70,7 +70,7 @@ def scenario() -> MotorScenario:
 
 @pytest.fixture
 def windows() -> Callable[..., list[tuple[Window, float]]]:
-    """Windows of a scenario as the daemon would cut them, each with the mean armature resistance in it."""
+    """Function that cuts windows of a scenario like the daemon; each has its mean armature resistance (ohm)."""
 
     def cut(scenario: MotorScenario, count: int, records: int = 200) -> list[tuple[Window, float]]:
         ticks = list(islice(simulate(scenario), count * records))
@@ -87,7 +87,7 @@ def windows() -> Callable[..., list[tuple[Window, float]]]:
 
 @cache
 def _own_ports() -> Iterator[int]:
-    """Ports of a block that no other process of any test run uses; the block is claimed until this process ends."""
+    """Endless iterator over a block of ports that this process reserves until it ends; RuntimeError if none is left."""
     for first in range(FIRST_PORT, LAST_PORT, PORTS):
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
@@ -101,7 +101,7 @@ def _own_ports() -> Iterator[int]:
 
 
 def free_port(kind: socket.SocketKind) -> int:
-    """A port of this computer that nobody uses now, and that no other process of the tests will be given."""
+    """A free port of this computer that no other test process receives; RuntimeError if the block is in use."""
     for port in islice(_own_ports(), PORTS):
         with socket.socket(socket.AF_INET, kind) as probe, suppress(OSError):
             probe.bind(("127.0.0.1", port))
@@ -115,16 +115,16 @@ def own_machine(tmp_path: Path) -> "OwnMachine":
     return OwnMachine(tmp_path)
 
 
-# A busy computer polls late: such windows are estimated from all the same. The defaults are tested one by one.
+# On a busy computer polls are late. These limits accept such windows; other tests check the default limits.
 BUSY = '\n[window]\nmissing_limit = "20 %"\ngap_limit = "250 ms"\n'
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu", "in-process")
 
 
 class OwnMachine:
-    """Writes the example files with a bus and an endpoint of their own; the machine is heard over ``transport``."""
+    """Writes the example files with a separate bus and endpoint; the daemon reads the machine over ``transport``."""
 
     def __init__(self, folder: Path, transport: str = "can", scenario: str = "demo", faults: str | None = None) -> None:
-        """``faults`` stand in for those of the scenario."""
+        """``faults`` (TOML) replace those of the scenario."""
         folder.mkdir(exist_ok=True)
         self.transport = transport
         self.group, self.port = "239.74.163.9", free_port(socket.SOCK_DGRAM)
@@ -150,7 +150,7 @@ class OwnMachine:
 
     @property
     def plays(self) -> list[str]:
-        """The arguments of ``otolith plant``; none where the daemon plays the plant itself."""
+        """Arguments of ``otolith plant``; empty if the daemon simulates the plant itself."""
         return [] if self.transport == "in-process" else [str(self.scenario), "--as", self.transport]
 
     def _bus(self) -> str:

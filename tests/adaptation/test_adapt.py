@@ -1,4 +1,4 @@
-"""adapt: a pure function whose healthy path is short."""
+"""adapt: a pure function with few calls for a healthy window."""
 
 import sys
 from collections.abc import Callable
@@ -21,9 +21,9 @@ DC_MOTOR = find_twin("dc_motor")
 
 
 def healthy(scenario: MotorScenario, windows: Cut) -> tuple[AdaptationState, Window]:
-    """A determined state, and the next window of the same healthy motor."""
+    """State after eleven windows of a healthy motor, and the next window."""
     free = (DC_MOTOR.parameter("R_a"),)
-    known = tuple((item.name, item.nominal) for item in DC_MOTOR.parameters if item.name != "R_a")
+    known = tuple((parameter.name, parameter.nominal) for parameter in DC_MOTOR.parameters if parameter.name != "R_a")
     problem = Problem(DC_MOTOR, known, free, (0.005, 0.02), input_noise=(0.0, 0.0002))
     state = initial_state("motor", "here", problem)
     *first, (last, _) = windows(scenario.model_copy(update={"faults": ()}), 12)
@@ -32,8 +32,8 @@ def healthy(scenario: MotorScenario, windows: Cut) -> tuple[AdaptationState, Win
     return state, last
 
 
-def test_a_healthy_window_passes_few_modules(scenario: MotorScenario, windows: Cut) -> None:
-    """Modules of the core in which some function receives the window."""
+def test_healthy_window_passes_at_most_twelve_modules(scenario: MotorScenario, windows: Cut) -> None:
+    """Counts the core modules in which a function receives the window."""
     state, window = healthy(scenario, windows)
     passed: set[str] = set()
 
@@ -51,7 +51,7 @@ def test_a_healthy_window_passes_few_modules(scenario: MotorScenario, windows: C
     assert len(core) <= MAX_MODULES, sorted(core)
 
 
-def test_a_healthy_window_has_one_objective_and_one_kalman_pass(scenario: MotorScenario, windows: Cut) -> None:
+def test_healthy_window_has_one_objective_and_kalman_pass(scenario: MotorScenario, windows: Cut) -> None:
     state, window = healthy(scenario, windows)
     calls: list[str] = []
 
@@ -65,10 +65,10 @@ def test_a_healthy_window_has_one_objective_and_one_kalman_pass(scenario: MotorS
     finally:
         sys.setprofile(None)
     assert calls.count("Objective.__init__") == 1
-    assert calls.count("Kernel.innovation_model") <= 2  # again if the first pass asks for finer sub-steps
+    assert calls.count("Kernel.innovation_model") <= 2  # a second time if the first pass needs finer sub-steps
 
 
-def test_the_same_state_and_window_give_the_same_report(scenario: MotorScenario, windows: Cut) -> None:
+def test_adapt_is_deterministic(scenario: MotorScenario, windows: Cut) -> None:
     state, window = healthy(scenario, windows)
     first, second = (adapt(state, window)[1].document.to_json() for _ in range(2))
     assert first == second

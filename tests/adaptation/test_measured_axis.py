@@ -37,9 +37,9 @@ PERIOD, RECORDS = 1e-3, 2000
 MASS = 95.1089  # kg
 DIRECTIONAL = {"F_v_up": 166.71, "F_c_up": 20.144, "F_v_down": 240.42, "F_c_down": 20.628}  # N*s/m and N
 TURN = 5e-4  # m/s: width of the authors' sign(v); the likelihood of the record increases down to this width
-WHOLE = 12  # windows of the record
-COUNTS = pytest.mark.parametrize("count", [4, pytest.param(WHOLE, marks=pytest.mark.full)])
-"""How many windows are adapted to: nearly each one is searched for components that the twin lacks, which takes long."""
+ALL_WINDOWS = 12  # windows of the record
+COUNTS = pytest.mark.parametrize("count", [4, pytest.param(ALL_WINDOWS, marks=pytest.mark.full)])
+"""Number of windows. Nearly every window starts a search for missing components, which takes long."""
 ONE_WAY = 1e-3  # of the path: largest share in the other direction of a one-way window
 
 
@@ -60,7 +60,7 @@ def problem(twin: str) -> Problem:
 
 @lru_cache
 def identified(twin: str) -> IdentifiedNoise:
-    """From every other window."""
+    """Noise levels identified from every other window."""
     return identify_noise(problem(twin), windows()[::2])
 
 
@@ -74,7 +74,7 @@ def reports(twin: str, count: int) -> tuple[ReportDocument, ...]:
 
 
 def shares(window: Window) -> Array:
-    """Shares of the path forwards and backwards."""
+    """Shares of the path forwards and backwards (1)."""
     steps = np.diff(window.column("x"))
     paths = np.array([np.maximum(steps, 0.0).sum(), np.maximum(-steps, 0.0).sum()])
     return np.asarray(paths / paths.sum())
@@ -85,15 +85,15 @@ def test_noise_levels_of_encoder_and_slow_model_error() -> None:
     assert noise.outputs[0].value < 5e-8  # m: the encoder's step
     assert 2e-3 < noise.states[1].value < 1e-2  # m/s/s^0.5
     assert noise.consistency.before is not None
-    assert noise.consistency.before > 10.0  # what white noise alone would have claimed
+    assert noise.consistency.before > 10.0  # reduced chi-square with white noise only
 
 
 def test_the_record_has_twelve_windows() -> None:
-    assert len(windows()) == WHOLE
+    assert len(windows()) == ALL_WINDOWS
 
 
 @COUNTS
-def test_mass_is_right_once_the_axis_has_moved_both_ways(count: int) -> None:
+def test_mass_is_right_after_motion_in_both_directions(count: int) -> None:
     both = next(index for index, window in enumerate(windows()) if shares(window).min() > ONE_WAY)
     values = [report.parameters["M"].value for report in reports("servo_axis", count)[both:]]
     assert len(values) >= count - 2
@@ -110,25 +110,25 @@ def test_friction_by_direction_agrees_with_the_authors(count: int) -> None:
 
 @COUNTS
 def test_no_published_value_jumps_with_symmetric_friction(count: int) -> None:
-    """An estimated value stays within its own interval and the previous one; held and invalid values do not count."""
+    """Consecutive estimates differ by less than the sum of their half intervals. Held and invalid ones do not count."""
     published = 0
     for name in ("M", "F_v", "F_c", "offset"):
         history = [report.parameters[name] for report in reports("servo_axis", count)]
         for before, now in pairwise(history):
             if now.status is Status.ESTIMATED and now.value is not None and before.value is not None:
                 published += 1
-                assert abs(now.value - before.value) <= reach(now) + reach(before), (name, now, before)
+                assert abs(now.value - before.value) <= half_interval(now) + half_interval(before), (name, now, before)
             assert now.status is Status.ESTIMATED or now.reason
-    assert published > {4: 2, WHOLE: 20}[count]
+    assert published > {4: 2, ALL_WINDOWS: 20}[count]
 
 
-def test_noise_identification_doubts_symmetric_friction() -> None:
+def test_noise_identification_flags_symmetric_friction() -> None:
     assert DOUBTFUL in identified("servo_axis").consistency.remark
     assert DOUBTFUL not in identified("servo_axis_directional").consistency.remark
 
 
-def reach(parameter: ParameterDocument) -> float:
-    """Half the 95 % interval."""
+def half_interval(parameter: ParameterDocument) -> float:
+    """Half the width of the 95 % interval."""
     assert parameter.low is not None
     assert parameter.high is not None
     return 0.5 * (parameter.high - parameter.low)
@@ -147,7 +147,7 @@ def test_windows_not_used_for_identification_are_consistent() -> None:
 
 @COUNTS
 def test_reported_estimates_of_single_windows_are_consistent(count: int) -> None:
-    """Chi-square of ``raw`` with ``raw_sd``, per parameter."""
+    """Reduced chi-square of ``raw`` with ``raw_sd``, per parameter and summed."""
     squares, degrees = 0.0, 0
     for name in ("M", *DIRECTIONAL):
         parameters = [report.parameters[name] for report in reports("servo_axis_directional", count)]
@@ -160,22 +160,22 @@ def test_reported_estimates_of_single_windows_are_consistent(count: int) -> None
         mean = np.average(values, weights=sd**-2.0)
         squares += float((((values - mean) / sd) ** 2).sum())
         degrees += len(values) - 1
-    assert degrees > {4: 6, WHOLE: 30}[count]
+    assert degrees > {4: 6, ALL_WINDOWS: 30}[count]
     assert 0.5 <= squares / degrees <= 2.0
 
 
 @COUNTS
 def test_one_way_windows_trade_friction_with_offset(count: int) -> None:
-    seen = 0
+    one_way = 0
     for window, report in zip(windows()[:count], reports("servo_axis", count), strict=True):
         if shares(window).min() > ONE_WAY:
             continue
-        seen += 1
+        one_way += 1
         for name, other in (("F_c", "offset"), ("offset", "F_c")):
             parameter = report.parameters[name]
             assert parameter.identifiability is Identifiability.TRADED
             assert f"traded with {other}" in parameter.reason
-    assert seen == {4: 2, WHOLE: 5}[count]
+    assert one_way == {4: 2, ALL_WINDOWS: 5}[count]
 
 
 @COUNTS
@@ -203,6 +203,6 @@ def test_missing_dry_friction_is_discovered(count: int) -> None:
         documents.append(report.document)
     (component,) = documents[-1].components
     assert (component.input, component.site) == ("v", "carriage")
-    assert component.family == "Coulomb" or count < WHOLE  # after four windows a flat power law explains as much
+    assert component.family == "Coulomb" or count < ALL_WINDOWS  # after four windows a flat power law explains as much
     assert component.values["amplitude"].value == pytest.approx(-20.4, rel=0.1)
     assert documents[-1].parameters["M"].value == pytest.approx(MASS, rel=0.01)

@@ -1,4 +1,4 @@
-"""Every benchmark runs, with a small budget."""
+"""Each benchmark runs with a small budget."""
 
 import importlib.util
 import json
@@ -30,7 +30,7 @@ COMPARED = {
 
 
 def run(module: str, *arguments: str) -> str:
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", f"benchmarks.{module}", *arguments],
         cwd=ROOT,
         capture_output=True,
@@ -38,12 +38,12 @@ def run(module: str, *arguments: str) -> str:
         timeout=600,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
-    return done.stdout
+    assert process.returncode == 0, process.stderr
+    assert process.stdout
+    return process.stdout
 
 
-def needs(library: str) -> None:
+def skip_without(library: str) -> None:
     if library and importlib.util.find_spec(library) is None:
         pytest.skip(f"{library} is installed by 'make bench' only")
 
@@ -73,16 +73,16 @@ def test_every_benchmark_of_make_bench_is_tested() -> None:
 
 @pytest.mark.parametrize("name", TIMINGS)
 def test_a_timing_benchmark_runs(name: str) -> None:
-    needs(TIMINGS[name])
+    skip_without(TIMINGS[name])
     run(name)
 
 
 @pytest.mark.parametrize("name", COMPARED)
 def test_an_estimator_is_compared(name: str, compared: dict[str, Any]) -> None:
-    needs(COMPARED[name])
+    skip_without(COMPARED[name])
     (row,) = (row for row in compared["rows"] if row["name"] == name)
     assert row["seconds"] > 0.0
-    if not name.startswith("paper"):  # its swarm is cut short here
+    if not name.startswith("paper"):  # --quick shortens its swarm
         assert all(error < 1.0 for error in row["error"].values()), row  # per cent
         assert len(row["error"]) == 3
 

@@ -54,14 +54,14 @@ def studied(name: str) -> Study:
     """A scenario with ideal sensors, in two lengths of windows."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(studies, "LENGTHS", LENGTHS)
-        made = study(Job(row_of(name), Kind.IDEAL, BEYOND_ONSET), quiet)
-    assert isinstance(made, Study)
-    return made
+        result = study(Job(row_of(name), Kind.IDEAL, BEYOND_ONSET), quiet)
+    assert isinstance(result, Study)
+    return result
 
 
 @pytest.mark.parametrize("name", DRIFTING)
 def test_errors_are_within_the_targets(name: str) -> None:
-    """A short run is mostly the onset of the drift, which misses the target for 99 % of the windows."""
+    """A short run is mostly the onset of the drift, for which the target of the 99th percentile is not met."""
     score, target = studied(name).score, row_of(name).target
     assert score.published.maximum is not None
     assert score.published.median is not None
@@ -77,7 +77,7 @@ def test_errors_are_within_the_targets(name: str) -> None:
 
 @pytest.mark.parametrize("name", DRIFTING)
 def test_long_windows_lag_unless_published(name: str) -> None:
-    """The paper's trade-off: the estimate of a window lags by half its length."""
+    """The estimate of one window lags by half its length, the trade-off of the paper."""
     short, long = studied(name).scores
     assert short.raw.p99 is not None
     assert long.raw.p99 is not None
@@ -93,7 +93,7 @@ def test_the_outputs_are_predicted_within_their_noise(name: str) -> None:
         assert studied(name).score.rmse[output.name] < noise
 
 
-def test_plots_are_pictures_that_open(tmp_path: Path) -> None:
+def test_plots_are_readable_images(tmp_path: Path) -> None:
     written = draw([studied(PLOTTED)], [], tmp_path / "new")
     assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(written)
     kinds = [path.stem.removeprefix(f"{PLOTTED}-") for path in written]
@@ -101,7 +101,7 @@ def test_plots_are_pictures_that_open(tmp_path: Path) -> None:
     for path in written:
         picture = imread(path)
         assert min(picture.shape[:2]) > 500
-        assert np.ptp(picture[..., :3]) == 1.0  # something is drawn
+        assert np.ptp(picture[..., :3]) == 1.0  # the image is not blank
 
 
 def test_a_plot_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_plot_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         draw([studied(PLOTTED)], [], tmp_path / "file" / "folder")
 
 
-def test_every_row_estimates_what_drifts_in_its_scenario() -> None:
+def test_every_row_estimates_its_drifting_parameter() -> None:
     for row in ROWS:
         scenario = load_scenario(examples_directory() / "scenarios" / f"{row.name}.toml")
         assert [getattr(fault, "parameter", None) for fault in scenario.faults] == [row.parameter]
@@ -131,7 +131,7 @@ def test_a_target_bounds_the_99th_percentile_and_the_largest(spread: Spread, *, 
     assert spread.meets(2.0) is met
 
 
-def test_noisy_sensors_are_rounded_and_estimates_stay_good() -> None:
+def test_noisy_sensors_are_quantised_and_estimates_accurate() -> None:
     row = row_of("armature-resistance")
     sensors, machine = SENSORS[row.machine], machine_of(row)
     record = simulate_row(row, machine, SHORT, sensors, lambda: None)
@@ -140,10 +140,10 @@ def test_noisy_sensors_are_rounded_and_estimates_stay_good() -> None:
         column = record.signals.index(sensor.signal)
         steps = (record.values[:, column] - sensor.low) / sensor.adc_step
         assert np.abs(steps - np.rint(steps)).max() < 1e-6
-    still = slice(0, 900)  # the motor stands, so ideal sensors show zero
+    at_rest = slice(0, 900)  # the motor is at rest, so that ideal sensors measure zero
     speed = record.signals.index("omega")
-    assert not ideal.values[still, speed].any()
-    assert np.std(record.values[still, speed]) == pytest.approx(sensors[1].deviation, rel=0.15)
+    assert not ideal.values[at_rest, speed].any()
+    assert np.std(record.values[at_rest, speed]) == pytest.approx(sensors[1].deviation, rel=0.15)
     noisy = study(Job(row, Kind.NOISY, SHORT), quiet)
     assert isinstance(noisy, Study)
     assert noisy.score.first == 5
@@ -157,7 +157,7 @@ def test_limiting_noise_of_damping() -> None:
     assert limit.alone.kept is not None
     assert limit.alone.lost is not None
     assert limit.together.lost is not None
-    assert 3.0 < limit.alone.kept < limit.alone.lost < 10.0  # damping is 7 Pa, seen in 200 records
+    assert 3.0 < limit.alone.kept < limit.alone.lost < 10.0  # damping contributes 7 Pa, measured over 200 records
     assert limit.alone.lost < 1.05 * limit.alone.kept
     assert limit.together.lost > limit.alone.lost
     assert limit.unaided.lost is not None
@@ -189,7 +189,7 @@ def test_processes_report_progress_and_errors() -> None:
     assert len(steps) > 3
 
 
-def test_a_process_that_dies_is_an_error() -> None:
+def test_killed_process_is_an_error() -> None:
     def kill(_: Progress) -> None:
         for child in multiprocessing.active_children():
             if child.name.startswith("otolith-paper-"):
@@ -236,14 +236,14 @@ def test_plots_and_no_plots_exclude_each_other(tmp_path: Path) -> None:
 
 
 def test_tables_without_any_estimate(capsys: pytest.CaptureFixture[str]) -> None:
-    """A motor that never turns: nothing is excited, nothing is estimated."""
-    still = study(Job(row_of("bearing-wear"), Kind.IDEAL, 10.0), quiet)
-    assert isinstance(still, Study)
-    assert still.score.first is None
-    assert still.score.published == Spread(None, None, None, 0)
-    for page in pages([still]):
+    """The motor is at rest: no parameter is excited or estimated."""
+    at_rest = study(Job(row_of("bearing-wear"), Kind.IDEAL, 10.0), quiet)
+    assert isinstance(at_rest, Study)
+    assert at_rest.score.first is None
+    assert at_rest.score.published == Spread(None, None, None, 0)
+    for page in pages([at_rest]):
         Console(width=110).print(page)
     printed = capsys.readouterr().out
     assert "never" in printed
     assert "not met" in printed
-    assert "first_excited" not in json.loads(document([still], []))["scenarios"][0]
+    assert "first_excited" not in json.loads(document([at_rest], []))["scenarios"][0]

@@ -30,7 +30,7 @@ def quiet(_steps: int, _activity: str) -> None:
 
 @cache
 def discovered(name: str, kind: Kind, seconds: float) -> Discovery:
-    """A scenario with an unknown component."""
+    """Discovery in a scenario with an unknown component."""
     return discover(Search(unknown_row_of(name), kind, seconds), quiet)
 
 
@@ -39,7 +39,7 @@ def numbers_of(discovery: Discovery) -> dict[str, Course]:
 
 
 def test_an_unbalanced_shaft_is_discovered() -> None:
-    """The paper: 0.5 and 0.02 rad/s, 1.6 %, 0.22 %."""
+    """The paper has residuals of 0.5 and 0.02 rad/s, and errors of 1.6 % and 0.22 %."""
     discovery = discovered("unbalance", Kind.IDEAL, 40.0)
     amplitude, frequency, phase = (numbers_of(discovery)[name] for name in ("amplitude", "frequency", "phase"))
     assert discovery.met
@@ -69,7 +69,7 @@ def test_a_leak_is_discovered() -> None:
 
 
 def test_a_leak_is_discovered_in_noise() -> None:
-    """Noise of 0.5 % of the signals' standard deviation: other families fit as well until the lift has moved on."""
+    """Noise is 0.5 % of the signals' standard deviation: other families fit as well until the lift moves further."""
     discovery = discovered("hydraulic-leak", Kind.NOISY, 260.0)
     (factor,) = discovery.courses
     assert discovery.met
@@ -96,7 +96,7 @@ def test_a_lost_or_additional_component_misses_the_target() -> None:
     assert not replace(discovery, others=("shaft/linear/omega",)).met
 
 
-def test_before_and_after_are_drawn(tmp_path: Path) -> None:
+def test_discovery_plots_show_before_and_after(tmp_path: Path) -> None:
     written = draw([], [discovered("hydraulic-leak", Kind.IDEAL, 190.0)], tmp_path)
     kinds = [path.stem.removeprefix("hydraulic-leak-") for path in written]
     assert kinds == ["before-fig-19-20", "after-fig-21-22", "numbers"]

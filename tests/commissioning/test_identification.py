@@ -1,4 +1,4 @@
-"""Identification of simulated noise levels, and remarks where the windows do not show them."""
+"""Noise identification: simulated levels are identified, and remarks name levels that are not observable."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ PROBLEM = Problem(
     TWIN,
     known=tuple((name, value) for name, value in TRUTH.items() if name not in FREE),
     free=tuple(parameter for parameter in TWIN.parameters if parameter.name in FREE),
-    noise=(0.05, 0.01),  # what the machine file says is wrong both ways
+    noise=(0.05, 0.01),  # A, rad/s: wrong levels, one too large and one too small
 )
 
 
@@ -45,12 +45,12 @@ def window(
     parameters = np.array([list((TRUTH | changed).values())])
     state = np.array([1.0, 10.0]) if volts.any() else np.zeros(2)
     outputs = np.zeros((RECORDS, 2))
-    driven = np.column_stack([volts, load + slow])
+    inputs = np.column_stack([volts, load + slow])
     for record in range(RECORDS):
         outputs[record] = state
-        piece = Excitation(driven[record : record + 2], PERIOD, 4)
+        excitation = Excitation(inputs[record : record + 2], PERIOD, 4)
         if record + 1 < RECORDS:
-            state = kernel_of(TWIN).simulate(parameters, state[None], piece)[0, 1]
+            state = kernel_of(TWIN).simulate(parameters, state[None], excitation)[0, 1]
             state = state + np.array(process) * np.sqrt(PERIOD) * random.normal(size=2)
     values = np.column_stack([volts, load, outputs + random.normal(size=outputs.shape) * SENSORS])
     return Window.whole(index, 2.0 * index, PERIOD, TWIN.signals, values)
@@ -147,7 +147,7 @@ def test_a_constant_output_is_not_identified() -> None:
 
 
 def test_inconsistent_windows_inflate_process_noise() -> None:
-    """A slow unmeasured load beside fast process noise: the likelihood shows the fast part only."""
+    """A slow unmeasured load beside fast process noise: the likelihood identifies the fast part only."""
     noise = identified(11, 16, process=(0.0, 0.3), hidden=0.002)
     consistency = noise.consistency
     assert consistency.remark == text.INFLATED
@@ -191,8 +191,8 @@ def test_observable_states_are_measured_or_driven() -> None:
         for level, is_observable in zip(two_mass.states, observable_states(two_mass), strict=True)
         if is_observable
     ]
-    assert names == ["omega_m", "omega_l"]  # and not the twist between them
+    assert names == ["omega_m", "omega_l"]  # the twist is neither measured nor driven
 
 
-def test_the_same_windows_give_the_same_bits() -> None:
+def test_noise_identification_is_deterministic() -> None:
     assert identified(14, 4) == identified(14, 4)

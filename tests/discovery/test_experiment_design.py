@@ -1,4 +1,4 @@
-"""What would help: a move that pins a parameter down really does, and windows are as long as drift and noise ask."""
+"""Experiment design: the advised step determines its parameter, and the window length follows drift and noise."""
 
 from dataclasses import replace
 
@@ -15,11 +15,11 @@ from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
 
 TWIN = find_twin("dc_motor")
-FREE = tuple(entry for entry in TWIN.parameters if entry.name in ("R_a", "J", "D"))
-KNOWN = tuple((entry.name, entry.nominal) for entry in TWIN.parameters if entry not in FREE)
+FREE = tuple(parameter for parameter in TWIN.parameters if parameter.name in ("R_a", "J", "D"))
+KNOWN = tuple((parameter.name, parameter.nominal) for parameter in TWIN.parameters if parameter not in FREE)
 PROBLEM = Problem(TWIN, KNOWN, FREE, (0.005, 0.02))
 RECORDS, PERIOD = 200, 0.01
-PARAMETERS = np.array([[entry.nominal for entry in TWIN.parameters]])
+PARAMETERS = np.array([[parameter.nominal for parameter in TWIN.parameters]])
 SPEED = 10.0  # rad/s
 CURRENT = (0.00143 + 0.006) * SPEED / 0.038
 STEADY = np.array([6.5 * CURRENT + 0.038 * SPEED, 0.06])
@@ -33,64 +33,64 @@ def window(index: int, inputs: Array, initial: Array) -> Window:
 
 
 def steady(count: int) -> tuple[AdaptationState, ReportDocument]:
-    """After windows at constant speed."""
+    """State and last report after ``count`` windows at constant speed."""
     state = initial_state("motor", "here", PROBLEM)
     for index in range(count):
         state, report = adapt(state, window(index, np.tile(STEADY, (RECORDS, 1)), np.array([CURRENT, SPEED])))
     return state, report.document
 
 
-def test_constant_speed_says_nothing_of_the_inertia_and_asks_for_a_move() -> None:
+def test_inertia_at_constant_speed_is_unestimated_with_advice() -> None:
     _, document = steady(5)
-    entry = document.parameters["J"]
-    assert (entry.status, entry.value) == (Status.UNESTIMATED, None)
-    assert entry.reason
-    assert entry.advice is not None
-    assert "V_a" in entry.advice
+    inertia = document.parameters["J"]
+    assert (inertia.status, inertia.value) == (Status.UNESTIMATED, None)
+    assert inertia.reason
+    assert inertia.advice is not None
+    assert "V_a" in inertia.advice
     assert document.parameters["R_a"].status is Status.ESTIMATED
 
 
-def test_the_move_that_is_advised_pins_it_down_as_foretold() -> None:
+def test_advised_step_estimates_inertia_as_predicted() -> None:
     state, document = steady(5)
     advice = document.parameters["J"].advice or ""
     assert advice.startswith("a step of V_a from")
     target = float(advice.split(" to ")[1].split()[0])
-    foretold = float(advice.split("±")[1].split()[0])
+    predicted = float(advice.split("±")[1].split()[0])
     inputs = np.tile(STEADY, (RECORDS, 1))
     inputs[RECORDS // 4 :, 0] = target
     _, report = adapt(state, window(9, inputs, np.array([CURRENT, SPEED])))
-    found = report.document.parameters["J"]
-    assert found.status is Status.ESTIMATED
-    assert found.sd is not None
-    assert 0.5 < 1.96 * found.sd / foretold < 2.0
-    assert found.value == pytest.approx(0.001171, abs=3.0 * found.sd)
+    inertia = report.document.parameters["J"]
+    assert inertia.status is Status.ESTIMATED
+    assert inertia.sd is not None
+    assert 0.5 < 1.96 * inertia.sd / predicted < 2.0
+    assert inertia.value == pytest.approx(0.001171, abs=3.0 * inertia.sd)
 
 
-def test_windows_grow_while_nothing_drifts_and_shrink_with_the_drift() -> None:
+def test_window_length_shrinks_as_the_trend_grows() -> None:
     options = WindowOptions(200, 50, 1000)
 
     def settled(trend: float) -> int:
         records = 200
         for _ in range(30):
-            sd = 0.002 * np.sqrt(200 / records)  # of a window of this length, alone
-            need = WindowExcitation(np.array([sd]), np.array([trend]), explained=True)
-            records = next_records(options, records, PERIOD, need)
+            sd = 0.002 * np.sqrt(200 / records)  # of one window of this length
+            excitation = WindowExcitation(np.array([sd]), np.array([trend]), explained=True)
+            records = next_records(options, records, PERIOD, excitation)
         return records
 
     lengths = [settled(trend) for trend in (1e-6, 3e-4, 1e-3, 3e-3, 1e-1)]
     assert lengths == sorted(lengths, reverse=True)
     assert (lengths[0], lengths[-1]) == (1000, 50)
-    best = np.cbrt(2.0 * 0.002**2 * 2.0 / 1e-3**2) / PERIOD  # where squared bias and variance add up to least
+    best = np.cbrt(2.0 * 0.002**2 * 2.0 / 1e-3**2) / PERIOD  # minimises squared bias plus variance
     assert lengths[2] == pytest.approx(best, rel=0.25)
 
 
-def test_without_a_choice_the_length_stays() -> None:
-    need = WindowExcitation(np.array([0.1]), np.array([10.0]), explained=False)
-    assert next_records(WindowOptions(200, 200, 200), 200, PERIOD, need) == 200
+def test_window_length_stays_if_its_bounds_are_equal() -> None:
+    excitation = WindowExcitation(np.array([0.1]), np.array([10.0]), explained=False)
+    assert next_records(WindowOptions(200, 200, 200), 200, PERIOD, excitation) == 200
 
 
 @pytest.mark.parametrize("records", [50_000, pytest.param(1_000_000, marks=pytest.mark.full)])
-def test_a_long_window_is_answered(records: int) -> None:
+def test_long_window_is_estimated(records: int) -> None:
     inputs = np.tile(STEADY, (records, 1))
     inputs[:, 0] += np.repeat(np.random.default_rng(1).uniform(-2.0, 2.0, records // 1000), 1000)
     state, _ = steady(1)

@@ -14,15 +14,17 @@ from otolith.machine import find_twin
 
 TWIN = find_twin("dc_motor")
 R_A, J = TWIN.parameter("R_a"), TWIN.parameter("J")
-KNOWN = tuple((entry.name, entry.nominal) for entry in TWIN.parameters if entry is not R_A)
+KNOWN = tuple((parameter.name, parameter.nominal) for parameter in TWIN.parameters if parameter is not R_A)
 BARE = Problem(TWIN, KNOWN, (R_A,), (0.005, 0.02))
-SHAKING = Component("shaft", "periodic", "t", 0.004, 10.0, 1.0, 20.0)
-RUBBING = Component("shaft", "Coulomb", "omega", -0.003)
+PERIODIC = Component("shaft", "periodic", "t", 0.004, 10.0, 1.0, 20.0)
+COULOMB = Component("shaft", "Coulomb", "omega", -0.003)
 
 
 def hypothesis(kind: FaultType, problem: Problem, **certain: tuple[float, float]) -> TrackedHypothesis:
-    """Of which some values are certain: (value, standard deviation) by name."""
-    values = [certain.get(entry.name, (entry.nominal, 1e-3 * abs(entry.nominal))) for entry in problem.free]
+    """A hypothesis with the given (value, standard deviation) of the ``certain`` parameters."""
+    values = [
+        certain.get(parameter.name, (parameter.nominal, 1e-3 * abs(parameter.nominal))) for parameter in problem.free
+    ]
     mean = np.array([value for value, _ in values] + [0.0] * len(values))
     deviations = np.array([sd for _, sd in values] + [1e-9] * len(values))
     posterior = Posterior.initial(problem).set_prior(Prior(mean, np.diag(deviations**2)))
@@ -31,23 +33,23 @@ def hypothesis(kind: FaultType, problem: Problem, **certain: tuple[float, float]
 
 
 def test_hypotheses_equal_to_the_null_hypothesis_are_pruned() -> None:
-    calm = hypothesis(FaultType.NOTHING, BARE)
-    shaken = augment(BARE, [SHAKING])
-    amplitude = shaken.free[1].name
-    idle = hypothesis(FaultType.COMPONENT, shaken, **{amplitude: (1e-6, 1e-5)})
-    there = hypothesis(FaultType.COMPONENT, shaken, **{amplitude: (4e-3, 1e-5)})
+    null = hypothesis(FaultType.NOTHING, BARE)
+    augmented = augment(BARE, [PERIODIC])
+    amplitude = augmented.free[1].name
+    insignificant = hypothesis(FaultType.COMPONENT, augmented, **{amplitude: (1e-6, 1e-5)})
+    significant = hypothesis(FaultType.COMPONENT, augmented, **{amplitude: (4e-3, 1e-5)})
     wider = replace(BARE, free=(R_A, J), known=tuple(pair for pair in KNOWN if pair[0] != "J"))
-    still = hypothesis(FaultType.PARAMETER, wider)
-    moved = hypothesis(FaultType.PARAMETER, wider, J=(1.1 * J.nominal, 0.01 * J.nominal))
-    neutral = [0.0] * 5
-    assert prune([calm, idle, there, still, moved], neutral) == [calm, there, moved]
-    assert prune([calm, idle], [30.0, 0.0]) == [calm, idle]  # it explained the window, little as is known of it
+    unchanged = hypothesis(FaultType.PARAMETER, wider)
+    changed = hypothesis(FaultType.PARAMETER, wider, J=(1.1 * J.nominal, 0.01 * J.nominal))
+    no_evidence = [0.0] * 5
+    assert prune([null, insignificant, significant, unchanged, changed], no_evidence) == [null, significant, changed]
+    assert prune([null, insignificant], [30.0, 0.0]) == [null, insignificant]  # its evidence prevents pruning
 
 
-def test_a_component_that_is_gone_is_not_pruned() -> None:
-    both, one = augment(BARE, [SHAKING, RUBBING]), augment(BARE, [RUBBING])
-    calm, gone = hypothesis(FaultType.NOTHING, both), hypothesis(FaultType.PARAMETER, one)
-    assert prune([calm, gone], [0.0, 0.0]) == [calm, gone]
+def test_hypothesis_of_a_removed_component_is_not_pruned() -> None:
+    both, one = augment(BARE, [PERIODIC, COULOMB]), augment(BARE, [COULOMB])
+    null, removed = hypothesis(FaultType.NOTHING, both), hypothesis(FaultType.PARAMETER, one)
+    assert prune([null, removed], [0.0, 0.0]) == [null, removed]
 
 
 @pytest.mark.parametrize("sharpness", [1e20, float("inf"), float("nan")])
@@ -56,6 +58,6 @@ def test_evidence_of_a_diverging_twin_is_not_used(sharpness: float) -> None:
         return Evidence(np.array([6.5, 0.0]), np.full((2, 2), size), np.zeros(2))
 
     predicted = Posterior.initial(BARE)
-    moved = FaultHypothesis(FaultType.PARAMETER, "R_a")
-    assert is_usable(moved, predicted, evidence(1.0))
-    assert not is_usable(moved, predicted, evidence(sharpness))
+    changed = FaultHypothesis(FaultType.PARAMETER, "R_a")
+    assert is_usable(changed, predicted, evidence(1.0))
+    assert not is_usable(changed, predicted, evidence(sharpness))

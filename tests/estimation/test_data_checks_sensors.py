@@ -1,4 +1,4 @@
-"""What lies must not teach, and what is true must not be called a lie."""
+"""Sensor checks: faulty data are rejected before estimating, and healthy data are accepted."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,17 +25,17 @@ HEALTHY, SICK = 14, 4  # windows
 
 
 def problem(*names: str) -> Problem:
-    free = tuple(entry for entry in TWIN.parameters if entry.name in names)
-    known = tuple((entry.name, entry.nominal) for entry in TWIN.parameters if entry.name not in names)
+    free = tuple(parameter for parameter in TWIN.parameters if parameter.name in names)
+    known = tuple((parameter.name, parameter.nominal) for parameter in TWIN.parameters if parameter.name not in names)
     return Problem(TWIN, known, free, (0.005, 0.02), input_noise=(0.0, 0.0002))
 
 
 def run(state: AdaptationState, windows: list[Window]) -> tuple[AdaptationState, list[ReportDocument]]:
-    found = []
+    documents = []
     for window in windows:
         state, report = adapt(state, window)
-        found.append(report.document)
-    return state, found
+        documents.append(report.document)
+    return state, documents
 
 
 def changed(window: Window, signal: str, change: Change) -> Window:
@@ -50,12 +50,12 @@ def quiet(scenario: MotorScenario) -> MotorScenario:
     return scenario.model_copy(update={"faults": ()})
 
 
-def held(documents: list[ReportDocument], word: str) -> None:
-    """Every parameter stays what it was, and the reason names the channel."""
+def assert_held(documents: list[ReportDocument], text: str) -> None:
+    """Check that every parameter is held or invalid, and that its reason contains ``text``."""
     for document in documents:
-        for entry in document.parameters.values():
-            assert entry.status in (Status.HELD, Status.INVALID)
-            assert word in entry.reason
+        for parameter in document.parameters.values():
+            assert parameter.status in (Status.HELD, Status.INVALID)
+            assert text in parameter.reason
 
 
 FAULTS: dict[str, tuple[str, str, Change]] = {
@@ -70,18 +70,20 @@ FAULTS: dict[str, tuple[str, str, Change]] = {
 
 @pytest.mark.parametrize("names", [("R_a",), ("R_a", "D")], ids="-".join)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_lying_sensor_teaches_nothing(quiet: MotorScenario, windows: Cut, fault: str, names: tuple[str, ...]) -> None:
-    signal, word, change = FAULTS[fault]
+def test_faulty_sensor_does_not_update_the_posterior(
+    quiet: MotorScenario, windows: Cut, fault: str, names: tuple[str, ...]
+) -> None:
+    signal, text, change = FAULTS[fault]
     record = [window for window, _ in windows(quiet, 14)]
     state, _ = run(initial_state("motor", "here", problem(*names)), record[:10])
-    sick = changed(record[10], signal, change)  # the set-point has just doubled: everything moves
-    after, documents = run(state, [sick])
-    held(documents, word)
+    faulty = changed(record[10], signal, change)  # the set-point has just doubled, so that all states change
+    after, documents = run(state, [faulty])
+    assert_held(documents, text)
     assert documents[0].decision is WindowDecision.SENSOR
     assert after.posterior is state.posterior
 
 
-LIES: dict[str, tuple[str, Change]] = {
+LASTING_FAULTS: dict[str, tuple[str, Change]] = {
     "gain of the current": ("i", lambda values: 1.05 * values),
     "offset of the current": ("i", lambda values: values + 0.05),
     "gain of the speed": ("omega", lambda values: 1.05 * values),
@@ -89,44 +91,46 @@ LIES: dict[str, tuple[str, Change]] = {
 
 
 @pytest.mark.parametrize(
-    ("lie", "names"), [*((lie, ("R_a",)) for lie in LIES), ("gain of the current", ("R_a", "D"))], ids=str
+    ("fault", "names"),
+    [*((fault, ("R_a",)) for fault in LASTING_FAULTS), ("gain of the current", ("R_a", "D"))],
+    ids=str,
 )
-def test_a_sensor_that_keeps_lying_never_becomes_a_step(
-    quiet: MotorScenario, windows: Cut, lie: str, names: tuple[str, ...]
+def test_lasting_sensor_fault_is_never_a_parameter_step(
+    quiet: MotorScenario, windows: Cut, fault: str, names: tuple[str, ...]
 ) -> None:
-    """Through set-points up and down and a minute and a half; the sensor that lies is named all the while."""
-    signal, change = LIES[lie]
+    """The set-point rises and falls for 90 s. Every report names the faulty sensor."""
+    signal, change = LASTING_FAULTS[fault]
     record = [window for window, _ in windows(quiet, 55)]
     state, _ = run(initial_state("motor", "here", problem(*names)), record[:10])
     _, documents = run(state, [changed(window, signal, change) for window in record[10:]])
     assert {document.decision for document in documents} == {WindowDecision.SENSOR}
     assert all(f"{signal} reads" in document.parameters["R_a"].reason for document in documents)
-    found = documents[-1].parameters["R_a"]
-    assert found.status is Status.HELD
-    assert found.value == pytest.approx(6.5, rel=0.02)
+    resistance = documents[-1].parameters["R_a"]
+    assert resistance.status is Status.HELD
+    assert resistance.value == pytest.approx(6.5, rel=0.02)
 
 
 @pytest.mark.parametrize("names", [("R_a",), ("R_a", "D"), ("R_a", "D", "J")], ids="-".join)
 @pytest.mark.parametrize("moment", [30.0, 30.9, 41.1])
-def test_a_step_of_the_resistance_is_followed_within_three_windows(
+def test_resistance_step_is_tracked_within_three_windows(
     quiet: MotorScenario, windows: Cut, names: tuple[str, ...], moment: float
 ) -> None:
     fault = Step.model_validate({"kind": "step", "parameter": "R_a", "start": f"{moment} s", "amount": "-0.65 ohm"})
     record = windows(quiet.model_copy(update={"faults": (fault,)}), 24)
     _, documents = run(initial_state("motor", "here", problem(*names)), [window for window, _ in record])
-    first = int(moment / 2.0)  # the window in which it happens
+    first = int(moment / 2.0)  # the window that contains the step
     for document in documents[10:first]:
         assert document.decision is WindowDecision.LEARNED
-    followed = documents[first + 2].parameters["R_a"]
-    assert followed.status is Status.ESTIMATED
-    assert followed.low is not None
-    assert followed.high is not None
-    assert followed.value == pytest.approx(5.85, rel=0.005)
+    tracked = documents[first + 2].parameters["R_a"]
+    assert tracked.status is Status.ESTIMATED
+    assert tracked.low is not None
+    assert tracked.high is not None
+    assert tracked.value == pytest.approx(5.85, rel=0.005)
     for document in documents[first + 3 :]:
         assert document.parameters["R_a"].value == pytest.approx(5.85, rel=0.005)
 
 
-def test_spikes_are_left_out_and_the_rest_is_used(quiet: MotorScenario, windows: Cut) -> None:
+def test_spikes_are_excluded_and_other_records_are_used(quiet: MotorScenario, windows: Cut) -> None:
     record = [window for window, _ in windows(quiet, 11)]
     state, _ = run(initial_state("motor", "here", problem("R_a")), record[:10])
 
@@ -135,13 +139,13 @@ def test_spikes_are_left_out_and_the_rest_is_used(quiet: MotorScenario, windows:
         return values
 
     _, (document,) = run(state, [changed(record[10], "i", spike)])
-    found = document.parameters["R_a"]
-    assert found.status is Status.ESTIMATED
-    assert "2 spikes" in found.reason
-    assert found.value == pytest.approx(6.5, rel=0.005)
+    resistance = document.parameters["R_a"]
+    assert resistance.status is Status.ESTIMATED
+    assert "2 spikes" in resistance.reason
+    assert resistance.value == pytest.approx(6.5, rel=0.005)
 
 
-def test_noise_steps_and_kinks_are_no_spikes() -> None:
+def test_noise_steps_and_kinks_are_not_spikes() -> None:
     random = np.random.default_rng(8)
     time = 0.01 * np.arange(400)
     curves = [
@@ -156,8 +160,8 @@ def test_noise_steps_and_kinks_are_no_spikes() -> None:
         assert not spike_records(curve, 0.01).any()
 
 
-def test_a_healthy_machine_has_honest_sensors(quiet: MotorScenario, windows: Cut) -> None:
-    """Set-points up and down, rest and motion, for ten minutes."""
+def test_healthy_machine_has_no_sensor_fault(quiet: MotorScenario, windows: Cut) -> None:
+    """Ten minutes of rest and motion with rising and falling set-points."""
     state, documents = run(
         initial_state("motor", "here", problem("R_a", "D")), [window for window, _ in windows(quiet, 300)]
     )

@@ -1,4 +1,4 @@
-"""The particle swarm: its update rule, and its minima against pymoo's on the same objectives."""
+"""The particle swarm: its update rule, and its minima compared with those of pymoo on the same objectives."""
 
 from collections.abc import Callable
 
@@ -26,24 +26,24 @@ def sphere(x: Array) -> Array:
     return np.asarray(((x - 0.3) ** 2).sum(axis=-1))
 
 
-def valley(x: Array) -> Array:
-    """Rosenbrock's: narrow and curved."""
+def rosenbrock(x: Array) -> Array:
+    """Rosenbrock's function: a narrow, curved valley."""
     return np.asarray(100.0 * (x[..., 1] - x[..., 0] ** 2) ** 2 + (1.0 - x[..., 0]) ** 2)
 
 
-def many_minima(x: Array) -> Array:
-    """Rastrigin's: a minimum at every whole number, the lowest at zero."""
+def rastrigin(x: Array) -> Array:
+    """Rastrigin's function: a local minimum at every integer, the global one at zero."""
     return np.asarray((x**2 - 10.0 * np.cos(2.0 * np.pi * x) + 10.0).sum(axis=-1))
 
 
-def ours(cost: Callable[[Array], Array], seed: int, generations: int) -> float:
+def otolith_minimum(cost: Callable[[Array], Array], seed: int, generations: int) -> float:
     random = np.random.default_rng(seed)
     positions = random.uniform(-2.0, 2.0, (1, OPTIONS.size, 2))
     rule = SwarmRule(OPTIONS, inertia_generations=60, max_generations=generations)
     return float(particle_swarm(cost, positions, (np.full(2, -2.0), np.full(2, 2.0)), rule, random).costs[0, 0])
 
 
-def pymoos(cost: Callable[[Array], Array], seed: int, generations: int) -> float:
+def pymoo_minimum(cost: Callable[[Array], Array], seed: int, generations: int) -> float:
     class Bounded(PymooProblem):  # type: ignore[misc]  # pymoo has no types
         def __init__(self) -> None:
             super().__init__(n_var=2, n_obj=1, xl=-2.0, xu=2.0)
@@ -55,14 +55,14 @@ def pymoos(cost: Callable[[Array], Array], seed: int, generations: int) -> float
     return float(minimize(Bounded(), swarm, ("n_gen", generations), seed=seed).F[0])
 
 
-@pytest.mark.parametrize("cost", [sphere, valley, many_minima])
-def test_minima_are_no_worse_than_pymoos(cost: Callable[[Array], Array]) -> None:
-    """Median over ten seeds, 120 generations each."""
-    medians = [np.median([swarm(cost, seed, 120) for seed in SEEDS]) for swarm in (ours, pymoos)]
+@pytest.mark.parametrize("cost", [sphere, rosenbrock, rastrigin])
+def test_particle_swarm_is_no_worse_than_pymoo(cost: Callable[[Array], Array]) -> None:
+    """Medians over ten seeds, with 120 generations each."""
+    medians = [np.median([swarm(cost, seed, 120) for seed in SEEDS]) for swarm in (otolith_minimum, pymoo_minimum)]
     assert medians[0] <= max(medians[1], 1e-3)
 
 
-def test_one_generation_is_equations_1_and_2_of_the_paper() -> None:
+def test_particle_swarm_follows_equations_1_and_2() -> None:
     start = np.array([[[0.0], [1.0], [-1.0]]])
     bounds = (np.array([-10.0]), np.array([10.0]))
     rule = SwarmRule(OPTIONS, inertia_generations=10, max_generations=2)
@@ -75,7 +75,7 @@ def test_one_generation_is_equations_1_and_2_of_the_paper() -> None:
     assert result.costs[0] == pytest.approx(np.sort(best[0]))
 
 
-def test_swarms_side_by_side_share_nothing() -> None:
+def test_parallel_swarms_are_independent() -> None:
     random = np.random.default_rng(1)
     starts = random.uniform(-2.0, 2.0, (3, OPTIONS.size, 1))
     low, high = np.array([[[-2.0]], [[-1.0]], [[0.5]]]), np.array([[[2.0]], [[0.0]], [[2.0]]])
@@ -85,7 +85,7 @@ def test_swarms_side_by_side_share_nothing() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_cold_start_reaches_the_valley_of_the_truth(seed: int) -> None:
+def test_cold_start_converges_near_the_true_parameters(seed: int) -> None:
     random = np.random.default_rng(seed)
     inputs = np.column_stack([np.repeat(random.uniform(5.0, 20.0, 20), 10), np.full(200, 0.03)])
     outputs = kernel_of(TWIN).simulate(
@@ -102,7 +102,7 @@ def test_a_cold_start_reaches_the_valley_of_the_truth(seed: int) -> None:
     assert result.positions[0, 0] == pytest.approx([NOMINAL["R_a"], NOMINAL["J"]], rel=0.1)
 
 
-def test_starts_cover_the_bounds_by_order_of_magnitude() -> None:
+def test_spread_starts_cover_each_order_of_magnitude() -> None:
     starts = spread_starts(np.array([1e-6, -1.0]), np.array([1.0, 1.0]), 12, seed=1)
     assert np.sort(np.floor(2.0 * np.log10(starts[:, 0]))).tolist() == list(range(-12, 0))
     assert np.sort(np.floor(6.0 * (starts[:, 1] + 1.0))).tolist() == list(range(12))

@@ -1,4 +1,4 @@
-"""Estimation on windows of the simulated motor: known parameters come back, and ignorance is said."""
+"""Estimation on windows of the simulated motor: accuracy, identifiability, coverage and rejected windows."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,8 +26,10 @@ DC_MOTOR = find_twin("dc_motor")
 
 
 def problem_for(*names: str) -> Problem:
-    free = tuple(entry for entry in DC_MOTOR.parameters if entry.name in names)
-    known = tuple((entry.name, entry.nominal) for entry in DC_MOTOR.parameters if entry.name not in names)
+    free = tuple(parameter for parameter in DC_MOTOR.parameters if parameter.name in names)
+    known = tuple(
+        (parameter.name, parameter.nominal) for parameter in DC_MOTOR.parameters if parameter.name not in names
+    )
     return Problem(DC_MOTOR, known, free, (0.005, 0.02), swarm=SwarmOptions(generations=400))
 
 
@@ -39,24 +41,24 @@ def state_for(*names: str) -> AdaptationState:
     return initial_state("motor", "here", problem_for(*names))
 
 
-def test_resistance_comes_back_within_half_a_percent_in_every_window(scenario: MotorScenario, windows: Cut) -> None:
+def test_resistance_is_within_half_a_percent_in_every_window(scenario: MotorScenario, windows: Cut) -> None:
     state = state_for("R_a")
     drifting = scenario.model_copy(update={"faults": scenario.faults[:1]})
     for window, injected in windows(drifting, 45):
         state, report = adapt(state, window)
-        found = report.document.parameters["R_a"]
-        assert found.status is Status.ESTIMATED
-        assert found.value == pytest.approx(injected, rel=0.005)
+        resistance = report.document.parameters["R_a"]
+        assert resistance.status is Status.ESTIMATED
+        assert resistance.value == pytest.approx(injected, rel=0.005)
 
 
 @pytest.mark.parametrize("names", [("D",), ("R_a", "D"), ("R_a", "L_a", "J")])
-def test_any_subset_can_be_estimated(scenario: MotorScenario, windows: Cut, names: tuple[str, ...]) -> None:
+def test_any_subset_of_parameters_is_estimated(scenario: MotorScenario, windows: Cut, names: tuple[str, ...]) -> None:
     quiet = scenario.model_copy(update={"faults": ()})
-    window, _ = windows(quiet, 11)[-1]  # the set-point has just doubled: everything moves
-    found = estimated(problem_for(*names), window, [DC_MOTOR.parameter(name).nominal for name in names])
-    for entry in found.parameters:
-        assert entry.identifiability is Identifiability.DETERMINED
-        assert entry.value == pytest.approx(DC_MOTOR.parameter(entry.name).nominal, rel=0.02)
+    window, _ = windows(quiet, 11)[-1]  # the set-point has just doubled, so that all states change
+    result = estimated(problem_for(*names), window, [DC_MOTOR.parameter(name).nominal for name in names])
+    for parameter in result.parameters:
+        assert parameter.identifiability is Identifiability.DETERMINED
+        assert parameter.value == pytest.approx(DC_MOTOR.parameter(parameter.name).nominal, rel=0.02)
 
 
 def test_the_same_seed_gives_the_same_report(scenario: MotorScenario, windows: Cut) -> None:
@@ -65,80 +67,80 @@ def test_the_same_seed_gives_the_same_report(scenario: MotorScenario, windows: C
     assert first.to_json() == second.to_json()
 
 
-def test_a_motor_at_rest_says_nothing_about_its_resistance() -> None:
+def test_resistance_is_unestimated_at_rest() -> None:
     values = np.zeros((200, 4))
     window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     _, report = adapt(state_for("R_a"), window)
-    found = report.document.parameters["R_a"]
-    assert (found.status, found.value) == (Status.UNESTIMATED, None)
-    assert found.identifiability in (Identifiability.FLAT, Identifiability.WEAK)
-    assert found.reason
+    resistance = report.document.parameters["R_a"]
+    assert (resistance.status, resistance.value) == (Status.UNESTIMATED, None)
+    assert resistance.identifiability in (Identifiability.FLAT, Identifiability.WEAK)
+    assert resistance.reason
 
 
-def test_parameters_that_only_act_together_are_named_as_traded(scenario: MotorScenario, windows: Cut) -> None:
+def test_confounded_parameters_are_reported_as_traded(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 4)[-1]
-    found = estimated(problem_for("J", "K_t", "D"), window, [0.001171, 0.038, 0.00143])
-    traded = {entry.name: entry.reason for entry in found.parameters}
-    assert Identifiability.TRADED in {entry.identifiability for entry in found.parameters}
-    assert any("can be traded with" in reason for reason in traded.values())
+    result = estimated(problem_for("J", "K_t", "D"), window, [0.001171, 0.038, 0.00143])
+    reasons = {parameter.name: parameter.reason for parameter in result.parameters}
+    assert Identifiability.TRADED in {parameter.identifiability for parameter in result.parameters}
+    assert any("can be traded with" in reason for reason in reasons.values())
 
 
-def test_a_bad_window_teaches_nothing(scenario: MotorScenario, windows: Cut) -> None:
-    (good, _), (next_one, _) = windows(scenario, 2)
+def test_bad_window_does_not_update_the_posterior(scenario: MotorScenario, windows: Cut) -> None:
+    (good, _), (following, _) = windows(scenario, 2)
     state, _ = adapt(state_for("R_a"), good)
-    bad = replace(next_one, quality=Quality(Verdict.BAD, 1.0, 2.0, 0.0, 0.0, ("no samples of i",)))
+    bad = replace(following, quality=Quality(Verdict.BAD, 1.0, 2.0, 0.0, 0.0, ("no samples of i",)))
     after, report = adapt(state, bad)
-    found = report.document.parameters["R_a"]
+    resistance = report.document.parameters["R_a"]
     assert after.posterior is state.posterior
-    assert found.status is Status.HELD
-    assert "no samples of i" in found.reason
+    assert resistance.status is Status.HELD
+    assert "no samples of i" in resistance.reason
     assert report.document.fit is None
     assert report.document.decision is WindowDecision.BAD
 
 
-def test_the_truth_outside_the_bounds_is_reported_as_invalid(scenario: MotorScenario, windows: Cut) -> None:
+def test_truth_outside_the_bounds_is_reported_as_invalid(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 5)[-1]
     problem = problem_for("R_a")
     narrow = replace(problem, free=(replace(problem.free[0], nominal=8.0, low=7.0, high=9.0),))
     _, report = adapt(initial_state("motor", "here", narrow), window)
-    found = report.document.parameters["R_a"]
-    assert found.status is Status.INVALID
-    assert "bound" in found.reason
+    resistance = report.document.parameters["R_a"]
+    assert resistance.status is Status.INVALID
+    assert "bound" in resistance.reason
 
 
-def test_a_window_that_contradicts_the_twin_teaches_nothing(scenario: MotorScenario, windows: Cut) -> None:
+def test_unexplained_window_does_not_update_the_posterior(scenario: MotorScenario, windows: Cut) -> None:
     (first, _), (second, _) = windows(scenario, 6)[-2:]
     state, _ = adapt(state_for("R_a"), first)
     values = second.values.copy()
     values[80, 0] = 65.5  # one corrupt voltage
     wrong = replace(second, values=values)
     after, report = adapt(state, wrong)
-    found = report.document.parameters["R_a"]
+    resistance = report.document.parameters["R_a"]
     assert report.document.fit is not None
     assert not report.document.fit.explained
-    assert found.status is Status.HELD
-    assert "nothing explains" in found.reason
+    assert resistance.status is Status.HELD
+    assert "nothing explains" in resistance.reason
     assert after.posterior is state.posterior
-    again = adapt(after, replace(wrong, start=wrong.end))[1].document.parameters["R_a"]
-    assert again.status is Status.INVALID
+    repeated = adapt(after, replace(wrong, start=wrong.end))[1].document.parameters["R_a"]
+    assert repeated.status is Status.INVALID
 
 
 @pytest.mark.parametrize("lost", [1, 2, 5])
-def test_lost_first_records_do_not_bias(scenario: MotorScenario, windows: Cut, lost: int) -> None:
+def test_missing_first_records_do_not_bias_the_estimate(scenario: MotorScenario, windows: Cut, lost: int) -> None:
     quiet = scenario.model_copy(update={"faults": ()})
     window, _ = windows(quiet, 11)[-1]  # the set-point has just been doubled
     missing, values = window.missing.copy(), window.values.copy()
     missing[:lost], values[:lost] = True, values[lost]
-    told = replace(problem_for("R_a"), input_noise=(0.0, 0.0002))
-    entry = estimated(told, replace(window, values=values, missing=missing), [6.5]).parameters[0]
-    assert entry.sd < 0.005
-    assert entry.value == pytest.approx(6.5, abs=4.0 * entry.sd)
+    problem = replace(problem_for("R_a"), input_noise=(0.0, 0.0002))
+    resistance = estimated(problem, replace(window, values=values, missing=missing), [6.5]).parameters[0]
+    assert resistance.sd < 0.005
+    assert resistance.value == pytest.approx(6.5, abs=4.0 * resistance.sd)
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-300, 1.0, 1e6, 1e11, 1e15, 1e29, 1e100, np.inf, np.nan])
 @pytest.mark.parametrize("records", [1, 2, 5, 200])
 @pytest.mark.parametrize("names", [("R_a",), ("R_a", "K_e"), ("R_a", "L_a", "J", "K_e", "K_t", "D")])
-def test_constant_windows_are_answered_honestly(value: float, records: int, names: tuple[str, ...]) -> None:
+def test_constant_windows_give_finite_reports_with_reasons(value: float, records: int, names: tuple[str, ...]) -> None:
     values = np.full((records, 4), value)
     window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     problem = replace(problem_for(*names), swarm=SwarmOptions(generations=3))
@@ -146,24 +148,24 @@ def test_constant_windows_are_answered_honestly(value: float, records: int, name
     text = report.document.to_json()
     assert "NaN" not in text
     assert "Infinity" not in text
-    for entry in report.document.parameters.values():
-        assert entry.status is not Status.ESTIMATED or entry.sd is not None
-        assert entry.status is Status.ESTIMATED or entry.reason
+    for parameter in report.document.parameters.values():
+        assert parameter.status is not Status.ESTIMATED or parameter.sd is not None
+        assert parameter.status is Status.ESTIMATED or parameter.reason
 
 
-def test_a_constant_equilibrium_cannot_tell_resistance_from_the_electromotive_force() -> None:
-    """Nominal equilibrium to the last digit: only V_a - R_a i - K_e omega is seen, so neither alone is known."""
+def test_resistance_and_k_e_are_traded_at_equilibrium() -> None:
+    """At an exact equilibrium only V_a - R_a i - K_e omega is measured, so that R_a and K_e are confounded."""
     i, omega = (0.00143 + 0.006) * 10.0 / 0.038, 10.0
     row = [6.5 * i + 0.038 * omega, 0.06, i, omega]
     values = np.tile(row, (200, 1))
     window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
-    found = estimated(problem_for("R_a", "K_e"), window, [6.5, 0.038])
-    assert {entry.identifiability for entry in found.parameters} == {Identifiability.TRADED}
+    result = estimated(problem_for("R_a", "K_e"), window, [6.5, 0.038])
+    assert {parameter.identifiability for parameter in result.parameters} == {Identifiability.TRADED}
 
 
-def test_a_fast_motor_is_integrated_finely_enough() -> None:
-    """An inductance of 10 mH: the time constant is a sixth of the sample period."""
-    truth = {**{entry.name: entry.nominal for entry in DC_MOTOR.parameters}, "L_a": 0.01}
+def test_fast_electrical_dynamics_are_integrated_accurately() -> None:
+    """An inductance of 10 mH makes the electrical time constant a sixth of the sample period."""
+    truth = {**{parameter.name: parameter.nominal for parameter in DC_MOTOR.parameters}, "L_a": 0.01}
     parameters = np.array([list(truth.values())])
     random = np.random.default_rng(3)
     inputs = np.column_stack([np.repeat(random.uniform(5.0, 20.0, 20), 10), np.full(200, 0.03)])
@@ -171,51 +173,51 @@ def test_a_fast_motor_is_integrated_finely_enough() -> None:
     values = np.column_stack([inputs, outputs + random.normal(size=(200, 2)) * [0.005, 0.02]])
     window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     known = tuple((name, value) for name, value in truth.items() if name != "R_a")
-    entry = estimated(replace(problem_for("R_a"), known=known), window, [6.0]).parameters[0]
-    assert entry.value == pytest.approx(6.5, abs=4.0 * entry.sd)
-    assert entry.sd < 0.01
+    parameter = estimated(replace(problem_for("R_a"), known=known), window, [6.0]).parameters[0]
+    assert parameter.value == pytest.approx(6.5, abs=4.0 * parameter.sd)
+    assert parameter.sd < 0.01
 
 
-def test_noise_of_a_measured_input_widens_the_interval(scenario: MotorScenario, windows: Cut) -> None:
-    """The load torque is as noisy as its sensor; the interval that knows it covers the truth, the other does not."""
-    told = replace(problem_for("R_a"), input_noise=(0.0, 0.0002))
+def test_input_noise_widens_the_interval(scenario: MotorScenario, windows: Cut) -> None:
+    """The load torque is noisy. Only the interval that includes its noise covers the truth."""
+    noisy_input = replace(problem_for("R_a"), input_noise=(0.0, 0.0002))
     inside = {True: 0, False: 0}
     count = 60
     for seed in range(count):
         changed = scenario.model_copy(update={"seed": seed, "faults": ()})
         window, _ = windows(changed, 5)[-1]
-        for knows, problem in ((True, told), (False, problem_for("R_a"))):
-            entry = estimated(problem, window, [6.5], Search.IF_UNEXPLAINED).parameters[0]
-            inside[knows] += abs(entry.value - 6.5) <= 1.96 * entry.sd
-    assert inside[True] >= 0.87 * count  # the binomial's 0.5 % quantile for 95 %
+        for modelled, problem in ((True, noisy_input), (False, problem_for("R_a"))):
+            resistance = estimated(problem, window, [6.5], Search.IF_UNEXPLAINED).parameters[0]
+            inside[modelled] += abs(resistance.value - 6.5) <= 1.96 * resistance.sd
+    assert inside[True] >= 0.87 * count  # 0.5 % quantile of the binomial distribution for 95 %
     assert inside[False] < 0.75 * count
 
 
-def test_a_residual_beyond_the_noise_widens_the_interval(scenario: MotorScenario, windows: Cut) -> None:
+def test_residuals_above_noise_widen_the_interval(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 5)[-1]
-    told = estimated(problem_for("R_a"), window, [6.5]).parameters[0]
-    optimist = replace(problem_for("R_a"), noise=(0.005 / 3.0, 0.02 / 3.0))
-    doubted = estimated(optimist, window, [6.5]).parameters[0]
-    assert doubted.sd == pytest.approx(told.sd, rel=0.15)
+    reference = estimated(problem_for("R_a"), window, [6.5]).parameters[0]
+    underestimated = replace(problem_for("R_a"), noise=(0.005 / 3.0, 0.02 / 3.0))
+    inflated = estimated(underestimated, window, [6.5]).parameters[0]
+    assert inflated.sd == pytest.approx(reference.sd, rel=0.15)
 
 
-def test_only_a_residual_that_lasts_widens_the_interval_beyond_its_size() -> None:
+def test_only_correlated_residuals_are_inflated_further() -> None:
     random = np.random.default_rng(1)
     white = random.standard_normal((200, 2))
-    lasting = np.cumsum(random.standard_normal((200, 2)), axis=0)
-    for residuals, low, high in ((white, 0.95, 1.1), (lasting, 3.0, 20.0)):
+    correlated = np.cumsum(random.standard_normal((200, 2)), axis=0)
+    for residuals, low, high in ((white, 0.95, 1.1), (correlated, 3.0, 20.0)):
         cost = float(np.sqrt(np.mean(residuals**2)))
         assert low <= inflation_of(3.0 / cost * residuals, 3.0) / 3.0 <= high
 
 
-def test_a_guess_that_diverges_never_wins(scenario: MotorScenario, windows: Cut) -> None:
+def test_diverging_guess_costs_the_penalty(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 1)[-1]
     objective = Objective(problem_for("J"), window, np.array([0.001171]))
     cost = objective.cost(np.vstack([objective.guess(np.array([1e-300])), objective.guess(np.array([np.nan]))]))
     assert cost.tolist() == [PENALTY, PENALTY]
 
 
-def test_missing_records_do_not_count(scenario: MotorScenario, windows: Cut) -> None:
+def test_missing_records_are_not_used(scenario: MotorScenario, windows: Cut) -> None:
     window, injected = windows(scenario, 5)[-1]
     missing = window.missing.copy()
     values = window.values.copy()
@@ -224,14 +226,14 @@ def test_missing_records_do_not_count(scenario: MotorScenario, windows: Cut) -> 
     assert report.document.parameters["R_a"].value == pytest.approx(injected, rel=0.005)
 
 
-def test_spread_over_seeds_is_what_the_report_claims(scenario: MotorScenario, windows: Cut) -> None:
-    """Sensor noise alone, as the standard deviation assumes; the load torque is known exactly."""
+def test_spread_over_seeds_matches_the_reported_sd(scenario: MotorScenario, windows: Cut) -> None:
+    """The load torque is exact: the standard deviation assumes sensor noise only."""
     problem, pulls = problem_for("R_a"), []
     quiet = scenario.noise.model_copy(update={"load_torque": 0.0})
     for seed in range(40):
         changed = scenario.model_copy(update={"seed": seed, "noise": quiet, "faults": ()})
         window, _ = windows(changed, 3)[-1]
-        entry = estimated(problem, window, [6.5]).parameters[0]
-        pulls.append((entry.value - 6.5) / entry.sd)
+        resistance = estimated(problem, window, [6.5]).parameters[0]
+        pulls.append((resistance.value - 6.5) / resistance.sd)
     assert np.std(pulls) == pytest.approx(1.0, abs=0.35)
     assert abs(np.mean(pulls)) < 0.6

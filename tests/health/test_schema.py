@@ -1,4 +1,4 @@
-"""The report: what is published can be read back, and no number in it is anything but finite."""
+"""The report: a published document can be read back, and all its numbers are finite."""
 
 import json
 import math
@@ -39,15 +39,15 @@ ALLOWED = 0.65  # ohm
     st.integers(0, 5),
     st.builds(PreviousStatus, st.booleans(), st.sampled_from(Status)),
 )
-def test_nothing_but_finite_numbers_is_published(
-    fused: MarginalPosterior,
+def test_report_contains_only_finite_numbers(
+    marginal: MarginalPosterior,
     estimate: ParameterEstimate | None,
     decision: WindowDecision,
     contradictions: int,
     before: PreviousStatus,
 ) -> None:
-    heard = WindowEvidence(estimate, decision, contradictions, 1.0, "why")
-    after, document = publish(RESISTANCE, ALLOWED, fused, heard, before)
+    evidence = WindowEvidence(estimate, decision, contradictions, 1.0, "why")
+    after, document = publish(RESISTANCE, ALLOWED, marginal, evidence, before)
     text = report(R_a=document).to_json()
     assert ReportDocument.from_json(text).parameters["R_a"] == document
     assert not any(word in text for word in ("NaN", "Infinity"))
@@ -56,68 +56,73 @@ def test_nothing_but_finite_numbers_is_published(
     assert 0.0 <= document.progress <= 1.0
 
 
-def test_absent_is_absent_and_schema_is_named() -> None:
-    heard = WindowEvidence(reason="window not estimated from: no samples of i")
-    _, document = publish(RESISTANCE, ALLOWED, MarginalPosterior(6.5, 3.0, 0.0, 1.0), heard, PreviousStatus())
-    found = json.loads(report(R_a=document).to_json())
-    assert found["schema"] == "otolith.report/1"
-    assert "value" not in found["parameters"]["R_a"]
-    assert found["parameters"]["R_a"]["status"] == "unestimated"
-    assert found["decision"] == WindowDecision.BAD
-    assert "fit" not in found
+def test_report_omits_absent_fields_and_names_its_schema() -> None:
+    evidence = WindowEvidence(reason="window not estimated from: no samples of i")
+    _, document = publish(RESISTANCE, ALLOWED, MarginalPosterior(6.5, 3.0, 0.0, 1.0), evidence, PreviousStatus())
+    published = json.loads(report(R_a=document).to_json())
+    assert published["schema"] == "otolith.report/1"
+    assert "value" not in published["parameters"]["R_a"]
+    assert published["parameters"]["R_a"]["status"] == "unestimated"
+    assert published["decision"] == WindowDecision.BAD
+    assert "fit" not in published
 
 
-def said(
+def publish_after(
     sd: float,
     kept: float = 1.0,
     decision: WindowDecision = WindowDecision.LEARNED,
     contradictions: int = 0,
     before: PreviousStatus | None = None,
 ) -> tuple[PreviousStatus, ParameterDocument]:
-    """Of a parameter that is known to 0.1 ohm, after a window that alone knows it to ``sd``."""
+    """Publish after a window with standard deviation ``sd`` (ohm); that of the posterior is 0.1 ohm."""
     estimate = ParameterEstimate("R_a", 6.0, sd, Identifiability.DETERMINED, "")
-    fused = MarginalPosterior(6.0, 0.1, 1e-4, 1e-5, kept)
+    marginal = MarginalPosterior(6.0, 0.1, 1e-4, 1e-5, kept)
     return publish(
-        RESISTANCE, ALLOWED, fused, WindowEvidence(estimate, decision, contradictions), before or PreviousStatus()
+        RESISTANCE, ALLOWED, marginal, WindowEvidence(estimate, decision, contradictions), before or PreviousStatus()
     )
 
 
-def test_the_interval_is_two_sided_95_percent() -> None:
-    _, document = said(0.1)
+def test_report_interval_is_two_sided_95_percent() -> None:
+    _, document = publish_after(0.1)
     assert document.status is Status.ESTIMATED
     assert [document.low, document.high] == pytest.approx([5.804, 6.196], abs=1e-4)
     assert document.trend_per_hour == pytest.approx(0.36)
 
 
-def test_the_status_does_not_flicker_at_its_limit() -> None:
-    """An interval a little too wide begins nothing, but what has begun goes on."""
+def test_status_has_hysteresis_at_its_limit() -> None:
+    """A slightly too wide interval keeps an estimated parameter estimated, but does not make a held one estimated."""
     a_little_wide = 1.3 * ALLOWED / 1.96
     estimated, held = PreviousStatus(True, Status.ESTIMATED), PreviousStatus(True, Status.HELD)
-    assert said(a_little_wide, before=estimated)[1].status is Status.ESTIMATED
-    assert said(a_little_wide, before=held)[1].status is Status.HELD
-    assert said(3.0, before=estimated)[1].status is Status.HELD
-    assert said(3.0, kept=0.5, before=held)[1].status is Status.ESTIMATED
+    assert publish_after(a_little_wide, before=estimated)[1].status is Status.ESTIMATED
+    assert publish_after(a_little_wide, before=held)[1].status is Status.HELD
+    assert publish_after(3.0, before=estimated)[1].status is Status.HELD
+    assert publish_after(3.0, kept=0.5, before=held)[1].status is Status.ESTIMATED
 
 
-def test_one_contradiction_holds_and_two_make_invalid() -> None:
+def test_status_is_held_then_invalid_after_contradictions() -> None:
     before = PreviousStatus(True, Status.ESTIMATED)
-    assert said(0.1, decision=WindowDecision.SUSPECTED, contradictions=1, before=before)[1].status is Status.HELD
-    assert said(0.1, decision=WindowDecision.SUSPECTED, contradictions=2, before=before)[1].status is Status.INVALID
+    assert (
+        publish_after(0.1, decision=WindowDecision.SUSPECTED, contradictions=1, before=before)[1].status is Status.HELD
+    )
+    assert (
+        publish_after(0.1, decision=WindowDecision.SUSPECTED, contradictions=2, before=before)[1].status
+        is Status.INVALID
+    )
 
 
 def test_progress_grows_as_the_interval_shrinks() -> None:
-    found = [
+    progress = [
         publish(RESISTANCE, ALLOWED, MarginalPosterior(6.0, sd, 0.0, 0.0), WindowEvidence(), PreviousStatus())[
             1
         ].progress
         for sd in (3.0, 2.0, 1.0, 0.5, 0.3)
     ]
-    assert found[0] == 0.0
-    assert found == sorted(found)
-    assert found[-1] == 1.0
+    assert progress[0] == 0.0
+    assert progress == sorted(progress)
+    assert progress[-1] == 1.0
 
 
-def test_a_document_with_an_unknown_field_is_refused() -> None:
+def test_report_with_an_unknown_field_is_refused() -> None:
     text = report().to_json().replace('"machine"', '"machin"')
     with pytest.raises(ValidationError):
         ReportDocument.from_json(text)

@@ -1,4 +1,4 @@
-"""Reports in words: values with interval and unit, and the line of the daemon's log."""
+"""Report texts: values with interval and unit, findings, and the summary line of the daemon's log."""
 
 import pytest
 
@@ -23,27 +23,27 @@ LEAK = FindingDocument(
 )
 
 
-def test_a_value_has_its_unit_and_95_percent_interval() -> None:
+def test_value_text_has_unit_and_95_percent_interval() -> None:
     assert value_text(ESTIMATED) == "5.9856 ohm ± 0.0075"
     assert value_cells(ESTIMATED) == ("5.9856", "0.0075", "ohm", "-7.91%")
 
 
-def test_an_unknown_value_has_no_number() -> None:
+def test_unknown_value_text_has_no_number() -> None:
     assert value_text(UNKNOWN) == "unknown"
     assert value_cells(UNKNOWN) == ("unknown", "", "ohm", "")
 
 
 @pytest.mark.parametrize("value", [6.5001, 6.4999])
-def test_a_change_of_zero_has_no_sign(value: float) -> None:
+def test_zero_change_text_has_no_sign(value: float) -> None:
     assert value_cells(ESTIMATED.model_copy(update={"value": value}))[3] == "0.00%"
 
 
-def test_a_finding_has_severity_text_and_advice() -> None:
+def test_finding_text_has_severity_and_advice() -> None:
     assert finding_text(LEAK) == "fault: a leak Close it."
     assert finding_text(LEAK.model_copy(update={"advice": ""})) == "fault: a leak"
 
 
-def test_the_summary_is_one_line_with_reasons_and_warnings() -> None:
+def test_summary_is_one_line_with_reasons_and_warnings() -> None:
     quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
     report = ReportDocument(
         machine="m",
