@@ -23,7 +23,8 @@ TESTS = Path(__file__).parent
 # Ports for tests. They are below the ephemeral range, so that the kernel never assigns them to another process.
 FIRST_PORT, LAST_PORT, PORTS = 10_000, 32_000, 400  # PORTS: ports of each process
 CLAIMS: list[socket.socket] = []
-settings.register_profile("otolith", deadline=None)  # the time of an example depends on the load of the computer
+# The time of an example depends on the load of the computer; the same examples in every run.
+settings.register_profile("otolith", deadline=None, derandomize=True)
 settings.load_profile("otolith")
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 

@@ -146,11 +146,12 @@ def test_the_error_names_a_signal_that_was_not_recorded(tmp_path: Path, rows: Li
         assert np.concatenate([part.columns["i"] for part in milli.chunks()]) == pytest.approx(1e3 * ampere)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)), max_size=3), st.floats(0.0, 1.0))
-def test_a_damaged_recording_is_refused_or_read(
-    tmp_path: Path, scenario: MotorScenario, changes: list[tuple[float, int]], end: float
-) -> None:
+DAMAGE = st.lists(st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)), max_size=3)
+SHORT = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+LONG = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def check_damaged(tmp_path: Path, scenario: MotorScenario, changes: list[tuple[float, int]], end: float) -> None:
     whole = tmp_path / "whole.rrd"
     if not whole.exists():
         record(tmp_path, recorded(scenario)[: 2 * RECORDS], whole.name)
@@ -164,3 +165,20 @@ def test_a_damaged_recording_is_refused_or_read(
             assert all(len(part.times) for part in damaged.chunks())
     except ConfigurationError as error:
         assert str(path) in str(error)  # noqa: PT017 - either is right
+
+
+@SHORT
+@given(DAMAGE, st.floats(0.0, 1.0))
+def test_a_damaged_recording_is_refused_or_read(
+    tmp_path: Path, scenario: MotorScenario, changes: list[tuple[float, int]], end: float
+) -> None:
+    check_damaged(tmp_path, scenario, changes, end)
+
+
+@pytest.mark.full
+@LONG
+@given(DAMAGE, st.floats(0.0, 1.0))
+def test_many_damaged_recordings_are_refused_or_read(
+    tmp_path: Path, scenario: MotorScenario, changes: list[tuple[float, int]], end: float
+) -> None:
+    check_damaged(tmp_path, scenario, changes, end)

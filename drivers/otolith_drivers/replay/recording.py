@@ -5,6 +5,8 @@ sample; a window may have been bad because of when its samples came. So the reco
 """
 
 import re
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +30,7 @@ MAX_NS, MIN_NS = np.iinfo(np.int64).max, np.iinfo(np.int64).min
 APPLICATION, TIMELINE = "otolith", "time"
 VALUES, NAMES = "Scalars:scalars", "SeriesLines:names"
 FOLDER, WINDOWS = "/signals/", "/windows"
+READ_ALL = "import sys; from rerun.chunk import RrdReader; [None for _ in RrdReader(sys.argv[1]).stream()]"
 NAME = re.compile(r".* measured \[(.*)\]")  # of a series; the group is the unit
 
 
@@ -60,6 +63,7 @@ class RecordingReader(Reader):
         self._records = 0
         if not path.is_file():
             raise ConfigurationError(f"{path}: cannot be read: {'is no file' if path.exists() else 'No such file'}")
+        self._check_in_a_child()
         with warnings.catch_warnings(record=True) as raised:
             warnings.simplefilter("always", RerunWarning)
             self._file = self._guarded(RrdReader, path)
@@ -69,14 +73,28 @@ class RecordingReader(Reader):
         written = self._scan()
         self._scales = {name: self._scale(name, unit, written) for name, unit in units.items()}
 
+    def _check_in_a_child(self) -> None:
+        """Read the file once in a child process: the library's native code aborts on some damaged files.
+
+        Raises:
+            ConfigurationError: the child was killed by a signal.
+        """
+        command = [sys.executable, "-c", READ_ALL, str(self.path)]
+        child = subprocess.run(command, capture_output=True, check=False)  # noqa: S603 - our own interpreter
+        if child.returncode < 0:
+            raise ConfigurationError(f"{self.path}: damaged, or no recording (its reader aborts); {self._repair}")
+
+    @property
+    def _repair(self) -> str:
+        return f"'rerun rrd optimize --continue-on-error {self.path} -o whole.rrd' saves what is whole"
+
     def _guarded(self, step: Any, *arguments: Any) -> Any:
         """The result of a call of Rerun, which raises several types for a damaged file."""
         try:
             return step(*arguments)
         except (RuntimeError, ValueError, OSError) as error:
             cause = str(error).rpartition(": ")[2] or str(error)
-            repair = f"'rerun rrd optimize --continue-on-error {self.path} -o whole.rrd' saves what is whole"
-            raise ConfigurationError(f"{self.path}: damaged, or no recording ({cause}); {repair}") from error
+            raise ConfigurationError(f"{self.path}: damaged, or no recording ({cause}); {self._repair}") from error
 
     def _stream(self) -> Iterator[Any]:
         chunks = iter(self._guarded(self._file.stream))

@@ -210,7 +210,7 @@ def check_any(path: Path) -> None:
         assert str(path) in str(error)  # noqa: PT017 - both are right
 
 
-@settings(max_examples=60, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(PACKED), st.binary(max_size=300))
 def test_can_log_of_random_bytes_is_refused_or_counted(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"garbage{suffix}"
@@ -223,7 +223,7 @@ def test_can_log_of_random_bytes_is_refused_or_counted(tmp_path: Path, suffix: s
 SHARE = st.floats(0.0, 1.0, exclude_max=True)
 
 
-@settings(max_examples=150, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(PACKED), st.lists(st.tuples(SHARE, st.integers(0, 255)), max_size=4), SHARE)
 def test_can_log_with_changed_bytes_is_refused_or_read(
     tmp_path: Path, frames: list[can.Message], suffix: str, changes: list[tuple[float, int]], end: float
