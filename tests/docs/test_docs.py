@@ -99,3 +99,10 @@ def test_no_path_of_a_developers_machine_is_in_the_tree() -> None:
     for name in files:
         text = (ROOT / name).read_text(encoding="utf-8", errors="replace")
         assert not re.search(r"/(?:root|work|home/\w+)/", text), name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_of_a_page_leads_to_a_file(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if not link.startswith("http")]
+    assert [link for link in links if not (ROOT / page).parent.joinpath(link).exists()] == []

@@ -317,7 +317,7 @@ def _findings(
         others = "".join(f"; or {other.text} ({other.probability:.0%})" for other in explanations[1:3])
         findings.append(
             FindingDocument(
-                id="case",
+                id="undecided",
                 severity=Severity.FAULT if best.reason is FaultType.SENSOR else Severity.WARNING,
                 condition=OPEN_CONDITION,
                 text=f"{best.reason}: {best.text} ({best.probability:.0%}){others}",
