@@ -1,5 +1,6 @@
 """Shared fixtures: windows of a simulated plant without real time, and a machine file with free ports."""
 
+import atexit
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -22,7 +23,6 @@ EXAMPLES = examples_directory()
 TESTS = Path(__file__).parent
 # Ports for tests. They are below the ephemeral range, so that the kernel never assigns them to another process.
 FIRST_PORT, LAST_PORT, PORTS = 10_000, 32_000, 400  # PORTS: ports of each process
-CLAIMS: list[socket.socket] = []
 # The time of an example depends on the load of the computer; the same examples in every run.
 settings.register_profile("otolith", deadline=None, derandomize=True)
 settings.load_profile("otolith")
@@ -36,7 +36,14 @@ SLOWEST = (
     "benchmarks/test_paper.py",
     "system/test_main_job.py",
     "benchmarks/test_paper_discovery.py",
+    "discovery/test_search.py",
     "system/test_transports.py",
+    "discovery/test_experiment_design.py",
+    "system/test_service.py",
+    "estimation/test_data_checks_sensors.py",
+    "system/test_replayed.py",
+    "cli/test_replay.py",
+    "drivers/plant/test_modbus_node.py",
     "adaptation/test_coverage.py",
 )
 
@@ -96,7 +103,7 @@ def _own_ports() -> Iterator[int]:
         except OSError:
             claim.close()
             continue
-        CLAIMS.append(claim)
+        atexit.register(claim.close)
         return cycle(range(first, first + PORTS))
     raise RuntimeError(f"all ports from {FIRST_PORT} to {LAST_PORT} are claimed by processes of tests")
 

@@ -11,6 +11,7 @@ import termios
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -52,13 +53,14 @@ def lines_of(text: str, start: str) -> list[str]:
 
 @pytest.fixture
 def drive() -> Iterator[int]:
-    """A drive with numbers of all types in one order; the port."""
-    random, begun = np.random.default_rng(3), time.monotonic()
+    """A drive with numbers of all types in one order; the port. Its time passes by requests, however fast they come."""
+    random, moments = np.random.default_rng(3), count(0.0, 0.01)
 
     def moving() -> Words:
         words: Words = {}
+        moment = next(moments)
         for address, kind, order, number in MOVING:
-            value = number(time.monotonic() - begun, random.standard_normal())
+            value = number(moment, random.standard_normal())
             words |= {address + at: word for at, word in enumerate(registers(value, kind, order))}
         return words
 
@@ -67,7 +69,7 @@ def drive() -> Iterator[int]:
 
 
 def test_inferred_registers_become_lines_that_the_driver_reads(drive: int) -> None:
-    result = probe("modbus", f"127.0.0.1:{drive}", "--registers", "0..110", "--seconds", 2)
+    result = probe("modbus", f"127.0.0.1:{drive}", "--registers", "0..110", "--seconds", 3)
     text = result.stdout
     assert result.return_value == 0
     assert "registers 0 to 12 and 100 to 101 can be read" in text
@@ -88,7 +90,7 @@ def test_inferred_registers_become_lines_that_the_driver_reads(drive: int) -> No
 
 
 def test_a_single_register_is_shown_in_every_type_and_order(drive: int) -> None:
-    text = probe("modbus", f"127.0.0.1:{drive}", "--registers", "5", "--seconds", 1).stdout
+    text = probe("modbus", f"127.0.0.1:{drive}", "--registers", "5", "--seconds", 2).stdout
     assert len(lines_of(text, "float64")) == len(lines_of(text, "int32")) == 4
     (right,) = [line for line in lines_of(text, "float64") if "*" in line]
     assert right.split()[1] == "CDAB"
@@ -96,7 +98,7 @@ def test_a_single_register_is_shown_in_every_type_and_order(drive: int) -> None:
 
 
 def test_json_of_a_device(drive: int) -> None:
-    arguments = ("--registers", "1..14", "--first-address", "1", "--seconds", "1.5", "--json")
+    arguments = ("--registers", "1..14", "--first-address", "1", "--seconds", "3", "--json")
     document = json.loads(probe("modbus", f"127.0.0.1:{drive}", *arguments).stdout)
     assert document["readable"] == [[1, 13]]
     assert document["refused"] == {"14": "illegal data address"}
