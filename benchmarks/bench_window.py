@@ -46,7 +46,7 @@ def main() -> int:
         free = with_free(problem, names)
         start = np.array([parameter.nominal for parameter in free.free])
         prior = initial_prior(free)
-        cold = median_seconds(partial(estimate, free, record[-1], prior, start, Search.ALWAYS), 5)
+        cold = median_seconds(partial(estimate, free, record[-1], prior, start, Search.FROM_BOUNDS), 5)
         warm = median_seconds(partial(estimate, free, record[-1], prior, start, Search.IF_UNEXPLAINED), 50)
         objective = Objective(free, record[-1], start)
         guess = objective.guess(start)

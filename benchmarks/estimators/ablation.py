@@ -75,7 +75,7 @@ def attempts(problem: Problem, window: Window, start: Array) -> tuple[Attempt, .
     whole = np.array(
         [
             parameter.value
-            for parameter in estimate(problem, window, initial_prior(problem), start, Search.ALWAYS).parameters
+            for parameter in estimate(problem, window, initial_prior(problem), start, Search.FROM_BOUNDS).parameters
         ]
     )
     both = Attempt(whole, time.perf_counter() - begin)

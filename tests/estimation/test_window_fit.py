@@ -33,7 +33,9 @@ def problem_for(*names: str) -> Problem:
     return Problem(DC_MOTOR, known, free, (0.005, 0.02), swarm=SwarmOptions(generations=400))
 
 
-def estimated(problem: Problem, window: Window, start: list[float], search: Search = Search.ALWAYS) -> WindowEstimate:
+def estimated(
+    problem: Problem, window: Window, start: list[float], search: Search = Search.FROM_BOUNDS
+) -> WindowEstimate:
     return estimate(problem, window, initial_prior(problem), np.array(start), search)
 
 

@@ -1,6 +1,6 @@
 """``adapt(state, window) -> (state, report)``: the one entry to the core, a pure function.
 
-    predict → check data → fit → test against the prediction → (search → compare hypotheses) → update → report
+    predict → check data → fit → test against the prediction, screen → (search → compare hypotheses) → update → report
 
 Time arrives with the window and randomness with the seed. Every run is therefore reproducible bit for bit, and the work
 can move between processes.
@@ -44,7 +44,7 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     predicted = posterior.predict(window)
     checked = check_window(window, predicted)
     if checked.is_usable:
-        search = Search.NEVER if state.is_determined else Search.ALWAYS
+        search = Search.NEVER if state.is_determined else Search.FROM_BOUNDS
         estimated = estimate_window(predicted, checked.window, search)
         result = _decide(state, predicted, estimated)
     else:
@@ -62,7 +62,11 @@ def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow
 
 
 def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
-    """Test the estimate against the prediction, compare hypotheses if it fails, and update as the decision says."""
+    """Test the estimate against the prediction, and screen the window for what the twin lacks.
+
+    An expected window without such a sign updates the filter. Otherwise, or while a test is open, hypotheses are
+    compared, and the update follows the decision.
+    """
     screening = screen_window(predicted, estimated, determined=state.is_determined)
     if state.test is None and _is_expected(predicted, estimated) and not screening.is_positive:
         return _update_filter(state, predicted, estimated)
@@ -73,20 +77,20 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     elif outcome.update is PosteriorUpdate.FILTER and estimated.cost <= MAX_COST:
         result = _update_filter(state, predicted, estimated)
     else:
-        result = _leave_undecided(state, predicted, estimated, test, outcome)
+        result = _keep_posterior(state, predicted, estimated, test, outcome)
     return replace(result, searched=True)
 
 
 def _is_expected(predicted: Posterior, estimated: WindowEstimate) -> bool:
-    """Whether the twin explains the window, and the prediction its parameters."""
+    """Whether the residual counts as noise, and the normalised innovation squared is within its limit."""
     return estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
 
 
 def _update_filter(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
-    """Return the result of a window that the prediction explains: the filter is updated."""
+    """Return the result of a window that updates the filter; a faded component that it does not need is removed."""
     before = predicted.prior()
     if state.test is not None:  # the windows before were wrong for an unknown reason
-        predicted = predicted.inflate_variance(state.test.surprise)
+        predicted = predicted.inflate_variance(state.test.null_reduced_chi_square)
     posterior = predicted.update(estimated.evidence, estimated.advance)
     adopted = count_fading(state.adopted, posterior)
     result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), adopted, estimate=estimated)
@@ -96,7 +100,7 @@ def _update_filter(state: AdaptationState, predicted: Posterior, estimated: Wind
         return result
     fewer = _replace_posterior(WindowDecision.FADED, posterior.without_slot(slot), estimated, adopted)
     is_needed = fewer.estimate is None or fewer.estimate.cost > max(EXPLAINED, estimated.cost)
-    return result if is_needed else fewer  # a component may be needed, however little is known of it
+    return result if is_needed else fewer  # an insignificant component stays if the window is not explained without it
 
 
 def _adopt_hypothesis(
@@ -123,20 +127,23 @@ def _replace_posterior(
     return WindowResult(decision, posterior, prior, prior, keep_present(adopted, problem.components), estimate=again)
 
 
-def _leave_undecided(
+def _keep_posterior(
     state: AdaptationState,
     predicted: Posterior,
     estimated: WindowEstimate,
     test: SequentialTest,
     outcome: WindowOutcome,
 ) -> WindowResult:
-    """Return the result of a window that does not update the posterior yet, with the competing hypotheses."""
-    if outcome.decision is WindowDecision.LEARNED:  # the change ended within the window: nothing explains all of it
+    """Return the result of a window that does not update the posterior.
+
+    The test stays open unless the null hypothesis leads.
+    """
+    if outcome.decision is WindowDecision.LEARNED:  # the null hypothesis leads, but does not explain the whole window
         return WindowResult.unchanged(state, predicted, WindowDecision.REFUSED, estimate=estimated)
     result = WindowResult.unchanged(state, predicted, outcome.decision, estimate=estimated, test=test)
     best = outcome.hypothesis
     if best.type is FaultType.COMPONENT and some_component_is_certain(test):
-        # Which component it is may be open; each leaves the parameters where the best one has them.
+        # That there is a component is certain, though not which: the best one gives the parameters to report.
         prior = best.posterior.remap_parameters(state.problem).prior()
         result = replace(result, before=prior, after=prior)
     return result

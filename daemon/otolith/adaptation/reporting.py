@@ -42,9 +42,9 @@ from otolith.twin.component_families import SourceKind
 MAX_VARIANCE_RATIO = 3.0  # ratio of variances above which windows disagree with each other
 DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
-NEVER_EXPLAINED = "are the signals and [noise] what the machine file says, in unit and size?"
+NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
 UNDECIDED = frozenset({WindowDecision.SUSPECTED, WindowDecision.SENSOR, WindowDecision.REFUSED})
-OPEN_CONDITION = "something has happened that is not decided yet"
+OPEN_CONDITION = "the data do not yet decide between the hypotheses"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,14 +55,14 @@ class WindowResult:
     posterior: Posterior
     """For the next window."""
     before: Prior
-    """What was known at the end of the window, without the window."""
+    """Prior at the end of the window, without the window; equal to ``after`` where another posterior replaced it."""
     after: Prior
     """What is known there with the window."""
     adopted: tuple[AdoptedComponent, ...]
     estimate: WindowEstimate | None = None
     """None for a window that was not estimated from."""
     test: SequentialTest | None = None
-    """The competing hypotheses, if the window raises the question."""
+    """The sequential test that is open, or that this window decided."""
     reason: str = ""
     """Why the window was not estimated from."""
     notes: tuple[str, ...] = ()

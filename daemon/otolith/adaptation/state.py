@@ -31,7 +31,7 @@ class AdaptationState:
     test: SequentialTest | None = None
     """The competing hypotheses, while they are undecided."""
     contradictions: int = 0
-    """Consecutive windows that did not update the posterior because they contradict it."""
+    """Consecutive windows that did not update the posterior; windows with bad data are not counted."""
     restricted: frozenset[str] = frozenset()
     """Keys of components that the machine file excludes."""
     approved: frozenset[str] = frozenset()

@@ -184,7 +184,8 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
     click.echo("\n".join(noise_lines(machine, identified)))
     if state.adopted:
         click.echo("# this process noise contains the components below: keep that of the file if you approve them")
-    click.echo("# put these tables into the machine file in place of its own", err=True)
+    else:
+        click.echo("# put these tables into the machine file in place of its own", err=True)
     _review(machine, store, state, approve_all=yes)
 
 
@@ -225,7 +226,9 @@ def _review(machine: "LoadedMachine", store: "StateStore", state: "AdaptationSta
 
 def _is_healthy() -> bool:
     try:
-        return click.confirm("does it belong to the healthy machine?", err=True)
+        return click.confirm(
+            "does it belong to the healthy machine? (n rejects it: it is not searched for again)", err=True
+        )
     except click.Abort:
         click.echo("\nno answer: nothing is kept; answer y or n, or give --yes", err=True)
         raise

@@ -92,8 +92,12 @@ def open_viewer(path: Path | None) -> int:
     """
     if path is None:
         path = next(iter(_recordings()), None)
-    if path is None or not path.is_file():
-        raise ConfigurationError(f"{path or state_directory()}: no recording; 'otolith view --list' lists them")
+    if path is None:
+        raise ConfigurationError(
+            f"{state_directory()}: no recording; 'otolith run' makes one, or 'otolith replay --recording FILE.rrd'"
+        )
+    if not path.is_file():
+        raise ConfigurationError(f"{path}: no such file; 'otolith view --list' lists the recordings")
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise ConfigurationError(f"{path}: not a Rerun recording")

@@ -119,11 +119,11 @@ class Screening:
     def of(cls, response: LinearResponse, guesses: list[Guess], alternatives: Alternatives) -> "Screening":
         """Score ``guesses`` by the linear response."""
         statistics = response.score(guesses)
-        records = response.objective.count
+        count = response.objective.count
         parameters = np.array([_parameter_count(form) for form, _ in guesses], dtype=np.float64)
         competing = np.array([alternatives.of(form) for form, _ in guesses])
-        variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / records, 1.0)
-        scores = statistics.gain / variance_factor - parameters * np.log(records) - 2.0 * np.log(3.0 * competing)
+        variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)
+        scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * competing)
         return cls(guesses, statistics.amplitudes, np.asarray(scores))
 
     def __getitem__(self, index: int) -> ScoredGuess:

@@ -29,7 +29,7 @@ MIN_DISTANCE = 2.0 * DECISIVE  # χ² between two predictions that decides with 
 SUBSTEPS = 4
 REGULARISATION = 1e-12
 OTHER_INPUTS = " if the other inputs stay as they are"
-NO_EXPERIMENT = "no move of one input tells them apart: look at the sensors and the machine itself"
+NO_EXPERIMENT = "no change of one input distinguishes them: inspect the sensors and the machine"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

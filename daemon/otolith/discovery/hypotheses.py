@@ -46,8 +46,8 @@ class FaultHypothesis:
     """Number of hypotheses of the same type."""
 
     @property
-    def log_prior(self) -> float:
-        """-2 log of the prior probability: types are equally probable, and so are the hypotheses of a type."""
+    def prior_deviance(self) -> float:
+        """-2 log of the prior weight: 1 for the null hypothesis, 1/3 for each other type, shared by its hypotheses."""
         return 0.0 if self.type is FaultType.NOTHING else float(2.0 * np.log(3.0 * self.alternatives))
 
 
@@ -90,10 +90,13 @@ class FittedHypothesis:
         """χ² of window and prior."""
         return self.fit.chi_square
 
-    def deviance(self, records: float, variance_factor: float) -> float:
-        """Return -2 log evidence, where the best hypothesis leaves ``variance_factor`` times the noise variance."""
+    def deviance(self, count: float, variance_factor: float) -> float:
+        """Return -2 log evidence of ``count`` measured values.
+
+        ``variance_factor``: the best hypothesis leaves this many times the noise variance.
+        """
         stated = self.hypothesis
-        return float(self.chi_square / variance_factor + stated.added * np.log(records) + stated.log_prior)
+        return float(self.chi_square / variance_factor + stated.added * np.log(count) + stated.prior_deviance)
 
 
 def nothing_happened(problem: Problem, prior: Prior) -> Proposal:
@@ -130,9 +133,9 @@ def _names(problem: Problem) -> str:
     return " and ".join(component.key for component in problem.components)
 
 
-def residual_variance_factor(chi_squares: Iterable[float], records: float) -> float:
+def residual_variance_factor(chi_squares: Iterable[float], count: float) -> float:
     """Return how many times the noise variance even the best hypothesis leaves; at least one."""
-    return max(min(chi_squares) / records, 1.0)
+    return max(min(chi_squares) / count, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +164,7 @@ class TrackedHypothesis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HypothesisStep:
-    """One tracked hypothesis on its way through one window."""
+    """Prediction, fit and evidence of one tracked hypothesis for one window."""
 
     tracked: TrackedHypothesis
     predicted: Posterior
@@ -205,7 +208,7 @@ def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float) -> Tr
 
 
 def complexity_penalty(predicted: Posterior, evidence: Evidence) -> float:
-    """Return, as -2 log evidence, how little the prediction said of what the window then said."""
+    """Return log det(I + R P Rᵀ): the term of -2 log evidence that penalises an uncertain prediction."""
     information = evidence.sqrt_information @ predicted.prior().covariance @ evidence.sqrt_information.T
     return float(np.linalg.slogdet(np.eye(len(information)) + information)[1])
 

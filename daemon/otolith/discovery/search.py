@@ -60,10 +60,10 @@ class ScreeningResult:
     gain: float
     """Largest gain in -2 log evidence over parameters only, minus what is decisive; positive if worth a search."""
     fitted: Fit
-    """Of the window, from what is known of it."""
+    """Its start is the linearisation point."""
     response: LinearResponse
     always_lacking: bool = False
-    """Whether the gain holds only if the twin has lacked something since the first window."""
+    """Whether only a component with a threshold, fitted under the initial prior, gains enough."""
 
     @property
     def is_positive(self) -> bool:
@@ -85,7 +85,9 @@ def linearised(problem: Problem, window: Window, prior: Prior, start: Array) -> 
 
 
 def screen_window(predicted: Posterior, estimated: WindowEstimate, *, determined: bool) -> ScreeningResult:
-    """Screen the window of an estimate, around the prediction, or around the estimate while that is unknown.
+    """Screen the window of an estimate, around the prediction.
+
+    While no parameter is determined or a phase is unknown, it is screened around the estimate instead.
 
     Of a very long window the last records are screened, so that a search ends before the next window.
     """
@@ -168,12 +170,12 @@ def _chi_square(fitted: FittedHypothesis) -> float:
 
 def _is_convincing(fitted: list[FittedHypothesis]) -> bool:
     """Whether one hypothesis with at most one component explains the window, decisively better than nothing."""
-    null, records = fitted[0], fitted[0].fit.count
-    variance_factor = residual_variance_factor(map(_chi_square, fitted), records)
-    best = min(fitted, key=lambda item: item.deviance(records, variance_factor))
-    gain = null.deviance(records, variance_factor) - best.deviance(records, variance_factor)
+    null, count = fitted[0], fitted[0].fit.count
+    variance_factor = residual_variance_factor(map(_chi_square, fitted), count)
+    best = min(fitted, key=lambda item: item.deviance(count, variance_factor))
+    gain = null.deviance(count, variance_factor) - best.deviance(count, variance_factor)
     added = len(best.problem.components) - len(null.problem.components)
-    return gain > DECISIVE and added <= 1 and best.chi_square <= EXPLAINED**2 * records
+    return gain > DECISIVE and added <= 1 and best.chi_square <= EXPLAINED**2 * count
 
 
 def _one_parameter_moved(problem: Problem, prior: Prior, response: LinearResponse) -> list[Proposal]:
@@ -215,9 +217,9 @@ def _with_another_component(best: FittedHypothesis) -> FittedHypothesis | None:
     further = min(fit_hypotheses(proposals, window), key=_chi_square, default=None)
     if further is None:
         return None
-    records = best.fit.count
-    gain = best.deviance(records, 1.0) - further.deviance(records, 1.0)
-    return further if gain / residual_variance_factor([further.chi_square], records) > DECISIVE else None
+    count = best.fit.count
+    gain = best.deviance(count, 1.0) - further.deviance(count, 1.0)
+    return further if gain / residual_variance_factor([further.chi_square], count) > DECISIVE else None
 
 
 def _always_lacking(null: FittedHypothesis) -> list[FittedHypothesis]:
@@ -270,7 +272,7 @@ def find_onset(predicted: Posterior, window: Window) -> int:
 
 
 def _first_far_off(fitted: FittedHypothesis, window: Window, record: int) -> int:
-    """Return the first record from ``record`` on that is far off the continued simulation of the fit."""
+    """Return the first record from ``record`` on that is far from the one-step prediction of the fit."""
     guess, free = fitted.fit.result.guess, len(fitted.problem.free)
     objective = Objective(fitted.problem, window, guess[:free])
     constant = np.concatenate([guess[:free], guess[2 * free :]])

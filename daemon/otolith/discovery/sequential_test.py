@@ -41,7 +41,7 @@ MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is
 MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
 MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
 MAX_TOTAL_DEVIANCE = 60.0  # in -2 log evidence: a hypothesis can return when things change
-PRUNED_AFTER = 3  # windows after which a hypothesis must differ from the null hypothesis
+PRUNED_AFTER = 3  # windows of a test after which a hypothesis must differ from the null hypothesis
 DIVERGED = 1e12  # χ² of a twin that explains nothing
 
 
@@ -52,7 +52,8 @@ class FitSummary:
     chi_square: float = 0.0
     penalty: float = 0.0
     """Of its complexity, in -2 log evidence."""
-    records: float = 1.0
+    count: float = 1.0
+    """Measured values of all outputs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,13 +67,13 @@ class SequentialTest:
     onset: float
     """Unix seconds."""
     windows: int = 1
-    """Windows over which these hypotheses have been tracked."""
+    """Windows since the test was opened; hypotheses that a later search added are younger."""
     leading: int = 1
     """Consecutive windows in which the best hypothesis was the best."""
     last: FitSummary = FitSummary()
     """Of the last window."""
-    surprise: float = 1.0
-    """χ² per record of the first window under the null hypothesis."""
+    null_reduced_chi_square: float = 1.0
+    """χ² per measured value of the first window under the null hypothesis; at least one."""
 
     @property
     def best(self) -> TrackedHypothesis:
@@ -103,7 +104,7 @@ class SequentialTest:
 
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not tell decisively from ``to``, with their probabilities."""
-        data = [item.deviance - item.hypothesis.log_prior for item in self.hypotheses]
+        data = [item.deviance - item.hypothesis.prior_deviance for item in self.hypotheses]
         own = data[self.hypotheses.index(to)]
         pairs = zip(self.hypotheses, self.probabilities, strict=True)
         return [
@@ -130,9 +131,9 @@ def continue_test(test: SequentialTest | None, predicted: Posterior, screening: 
 def open_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> SequentialTest:
     """Return a test of the ``fitted`` hypotheses; the first one is the null hypothesis."""
     fitted = [*fitted[:1], *(item for item in fitted[1:] if item.chi_square < DIVERGED)]
-    records = fitted[0].fit.count
-    variance_factor = residual_variance_factor([item.chi_square for item in fitted], records)
-    deviances = [item.deviance(records, variance_factor) for item in fitted]
+    count = fitted[0].fit.count
+    variance_factor = residual_variance_factor([item.chi_square for item in fitted], count)
+    deviances = [item.deviance(count, variance_factor) for item in fitted]
     order = np.argsort(deviances, kind="stable").tolist()
     least = deviances[order[0]]
     kept = [at for at in order if deviances[at] <= least + MAX_DEVIANCE][:MAX_HYPOTHESES]
@@ -140,11 +141,12 @@ def open_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Seque
     kept += [at for at in order if fitted[at].type in always and at not in kept]
     tracked = [track(fitted[at], predicted, min(deviances[at] - least, MAX_FIRST_EVIDENCE)) for at in kept]
     best = fitted[order[0]]
-    last = FitSummary(best.chi_square, least - best.chi_square / variance_factor, records)
-    surprise = fitted[0].chi_square / max(records, 1.0)
+    last = FitSummary(best.chi_square, least - best.chi_square / variance_factor, count)
+    reduced_chi_square = max(fitted[0].chi_square / max(count, 1.0), 1.0)
     usable = [item for item in tracked if item is not None]
+    onset = best.fit.window.start
     return SequentialTest(
-        predicted.problem, _sorted(usable), best.fit.window.start, last=last, surprise=max(surprise, 1.0)
+        predicted.problem, _sorted(usable), onset, last=last, null_reduced_chi_square=reduced_chi_square
     )
 
 
@@ -179,8 +181,8 @@ def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
 
 def _with_deviances(steps: list[HypothesisStep]) -> tuple[list[HypothesisStep], FitSummary]:
     """Return the steps with their deviances, and a summary of the best."""
-    records = steps[0].fitted.fit.count
-    variance_factor = residual_variance_factor([step.fitted.chi_square for step in steps], records)
+    count = steps[0].fitted.fit.count
+    variance_factor = residual_variance_factor([step.fitted.chi_square for step in steps], count)
     steps = [
         replace(
             step,
@@ -190,7 +192,7 @@ def _with_deviances(steps: list[HypothesisStep]) -> tuple[list[HypothesisStep], 
     ]
     best = min(steps, key=lambda step: step.deviance)
     chi_square = best.fitted.chi_square
-    return steps, FitSummary(chi_square, best.deviance - chi_square / variance_factor, records)
+    return steps, FitSummary(chi_square, best.deviance - chi_square / variance_factor, count)
 
 
 def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[HypothesisStep]) -> tuple[TrackedHypothesis, ...]:
@@ -209,7 +211,7 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     """Return the test with the hypotheses of a new search in its last window, if that explains it decisively better."""
     old, new = test.last, fresh.last
     gain = (
-        (old.chi_square - new.chi_square) / residual_variance_factor([new.chi_square], old.records)
+        (old.chi_square - new.chi_square) / residual_variance_factor([new.chi_square], old.count)
         + old.penalty
         - new.penalty
     )

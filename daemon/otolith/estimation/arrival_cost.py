@@ -36,7 +36,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What a window says of parameters and trends, the initial state eliminated.
+    """The information of one window about parameters and trends, with the initial state eliminated.
 
     Square-root information form (G. J. Bierman, Factorization Methods for Discrete Sequential Estimation, chapter V):
     ``residual + sqrt_information @ (z - point)`` has unit variance for the true ``z``.

@@ -81,7 +81,7 @@ def drop_spikes(window: Window, twin: Definition, noise: tuple[float, ...]) -> t
     ``noise`` holds the standard deviations of the outputs. Commands (``zoh`` inputs) may jump.
     """
     levels = {output.name: level for output, level in zip(twin.outputs, noise, strict=True)}
-    levels |= {command.name: 0.0 for command in twin.inputs if command.hold == "foh"}
+    levels |= {source.name: 0.0 for source in twin.inputs if source.hold == "foh"}
     values, missing = window.values.copy(), window.missing.copy()
     notes, faulty = [], []
     for name, level in levels.items():

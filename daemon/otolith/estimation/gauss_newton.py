@@ -12,7 +12,7 @@ from otolith.acquisition.window import Array
 
 MAX_STEPS = 40
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-7, 1e-12, 1e12
-MIN_IMPROVEMENT = 1e-6  # of χ²; also relative, times 1e-6
+MIN_IMPROVEMENT = 1e-6  # least decrease of χ²; above χ² = 1e6, the share 1e-12 of χ²
 
 
 class LeastSquares(Protocol):

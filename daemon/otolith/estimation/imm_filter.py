@@ -3,9 +3,10 @@
 The prediction of the filter is the prior of the next window (see :mod:`otolith.estimation.arrival_cost`). How fast a
 parameter may change is not known beforehand. So a bank of modes runs side by side, each with its own process noise of
 every trend, weighted by how well it predicted the windows (H. A. P. Blom, Y. Bar-Shalom, IEEE Transactions on Automatic
-Control 33, 1988). The bank is centred on its most probable mode; its neighbours have one parameter whose trend is
-calmer, livelier, or liveliest (moving model set: X. R. Li, Y. Bar-Shalom, IEEE Transactions on Automatic Control 41,
-1996). ``docs/explanation/filter.md`` has the equations.
+Control 33, 1988). The bank is centred on its most probable mode. In each neighbour the trend noise of one parameter is
+one level lower, one level higher, or at the highest level; all others are raised to at most one level below the highest
+of the mode (moving model set: X. R. Li, Y. Bar-Shalom, IEEE Transactions on Automatic Control 41, 1996).
+``docs/explanation/filter.md`` has the equations.
 
 All numbers are relative to the sizes of the parameters; :mod:`otolith.estimation.posterior` converts.
 """
@@ -20,8 +21,8 @@ from otolith.estimation.arrival_cost import Evidence
 
 TREND_NOISE = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: process noise of a trend, relative to the parameter
 FIRST_LEVEL = 2  # index into TREND_NOISE before the first window
-LIVELIEST = len(TREND_NOISE) - 1
-MAX_LEVELS_BELOW = 1  # levels that any parameter may be below the liveliest: what drifts may be its partner
+HIGHEST_LEVEL = len(TREND_NOISE) - 1
+MAX_LEVELS_BELOW = 1  # levels of a parameter below the highest of its mode: either of two correlated ones may drift
 STAY_PROBABILITY = 0.97  # that the same mode holds in the next window
 CALMER_FACTOR = 1.5  # how much more probable a calmer mode must be to become the centre
 NEW_MODE_WEIGHT = 0.02  # probability of a mode that enters the bank
@@ -30,7 +31,7 @@ TREND_MEMORY = 300.0  # s: time constant with which an unconfirmed trend decays
 MAX_GAP = 1e7  # s between windows: the modes are stationary by then
 VARIANCE_RATIO_GAIN = 0.1  # share of the newest window in the variance ratio
 MAX_VARIANCE_RATIO = 1e4
-MAX_NIS_PER_DEGREE = 9.0  # largest contribution of one window to the variance ratio
+MAX_NIS_PER_DEGREE = 9.0  # above it a window raises the variance ratio no further; also the unit of inflate_variance
 NIS_DEVIATE = 6.0  # of the standard normal distribution: exceeded by one healthy window in a thousand million
 MAX_INFLATION = 25.0  # largest factor by which one contradictory window raises the variance ratio
 
@@ -50,9 +51,9 @@ class ImmPosterior:
     weight: Array
     """(modes,) probabilities."""
     end: float
-    """Unix seconds of the last record; minus infinity before the first window."""
+    """Unix seconds at which the last window ends; minus infinity before the first window."""
     variance_ratio: float = 1.0
-    """How much more windows differ from each other than they claim (ratio of variances); one if they agree."""
+    """Variance between windows over the variance that they state; one if they agree."""
 
 
 def initial_modes(mean: Array, covariance: Array) -> ImmPosterior:
@@ -81,7 +82,7 @@ def _bank(centre: Levels) -> Levels:
     """Return the modes (modes, free) around ``centre`` (free,), which comes first, each once."""
     modes = [centre]
     for parameter, level in enumerate(centre):
-        for other in sorted({max(level - 1, 0), min(level + 1, LIVELIEST), LIVELIEST} - {level}):
+        for other in sorted({max(level - 1, 0), min(level + 1, HIGHEST_LEVEL), HIGHEST_LEVEL} - {level}):
             modes.append(centre.copy())
             modes[-1][parameter] = other
     raised = [np.maximum(mode, mode.max() - MAX_LEVELS_BELOW) for mode in modes]
@@ -143,9 +144,9 @@ def moment_match(posterior: ImmPosterior) -> tuple[Array, Array]:
 
 
 def nis(prediction: ImmPosterior, evidence: Evidence) -> float:
-    """Return the normalised innovation squared of a window under the mode that predicted it best.
+    """Return the smallest normalised innovation squared of a window over the modes.
 
-    It follows χ² with 2 free degrees of freedom if the machine changed as the modes allow.
+    Under the true mode it follows χ² with two degrees of freedom for each free parameter.
     """
     _, covariance, innovation = _innovation(prediction, evidence)
     return float(np.einsum("mi,mij,mj->m", innovation, np.linalg.inv(covariance), innovation).min())
@@ -161,15 +162,15 @@ def update(prediction: ImmPosterior, evidence: Evidence) -> ImmPosterior:
     root, innovation_covariance, innovation = _innovation(prediction, evidence)
     inverse = np.linalg.inv(innovation_covariance)
     gain = prediction.covariance @ root.T @ inverse
-    distance = np.einsum("mi,mij,mj->m", innovation, inverse, innovation)
+    nis_of_mode = np.einsum("mi,mij,mj->m", innovation, inverse, innovation)
     mean = prediction.mean - np.einsum("mij,mj->mi", gain, innovation)
     kept = np.eye(prediction.mean.shape[1]) - gain @ root  # Joseph form
     covariance = kept @ prediction.covariance @ kept.transpose(0, 2, 1) + gain @ gain.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    log_likelihood = -0.5 * (distance + np.linalg.slogdet(innovation_covariance)[1])
+    log_likelihood = -0.5 * (nis_of_mode + np.linalg.slogdet(innovation_covariance)[1])
     weight = prediction.weight * np.exp(log_likelihood - log_likelihood.max())
     weight = np.maximum(weight / weight.sum(), MIN_MODE_WEIGHT)
-    ratio = _updated_ratio(prediction.variance_ratio, float(distance.min()) / len(root))
+    ratio = _updated_ratio(prediction.variance_ratio, float(nis_of_mode.min()) / len(root))
     return _recentre(ImmPosterior(prediction.level, mean, covariance, weight / weight.sum(), prediction.end, ratio))
 
 
@@ -187,9 +188,9 @@ def _updated_ratio(variance_ratio: float, nis_per_degree: float) -> float:
     return float(np.clip(variance_ratio * change, 1.0, MAX_VARIANCE_RATIO))
 
 
-def inflate_variance(posterior: ImmPosterior, nis_per_degree: float) -> ImmPosterior:
-    """Return the posterior after a window that contradicted both those before and those after it."""
-    factor = float(np.clip(nis_per_degree / MAX_NIS_PER_DEGREE, 1.0, MAX_INFLATION))
+def inflate_variance(posterior: ImmPosterior, reduced_chi_square: float) -> ImmPosterior:
+    """Return the same with a larger variance ratio: a window fitted neither those before nor those after it."""
+    factor = float(np.clip(reduced_chi_square / MAX_NIS_PER_DEGREE, 1.0, MAX_INFLATION))
     return replace(posterior, variance_ratio=posterior.variance_ratio * factor)
 
 

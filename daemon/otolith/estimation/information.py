@@ -35,10 +35,10 @@ class Outcome(StrEnum):
     CONTINUED = "Gauss-Newton continued from the prediction"
     AGREED = "particle swarm and Gauss-Newton reached the same point"
     SWARM_WAS_BETTER = "the particle swarm found a better minimum than the prediction led to"
-    POLISH_WAS_BETTER = "the particle swarm found no better minimum than the prediction led to"
+    PREDICTION_WAS_BETTER = "the particle swarm found no better minimum than the prediction led to"
     AMBIGUOUS = "different parameters explain the window equally well"
-    NOTHING_TO_FIND = "the window says too little to search in"
-    UNFINISHED = "neither particle swarm nor Gauss-Newton converged: the result is the best so far"
+    NOTHING_TO_FIND = "the window has too little information for a search"
+    UNFINISHED = "the fit converged neither under the prior nor on the window alone: the result is the best so far"
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,10 @@ def classify(
     """Return the identifiability of parameter ``index``, and the reason as a sentence."""
     reach = QUANTILE * uncertainty.sd[index]
     if target.at_bound and reach <= PUSHED * target.half_width:
-        return Identifiability.AT_BOUND, "the best value lies at the bound: widen the bounds or doubt the twin"
+        return (
+            Identifiability.AT_BOUND,
+            "the best value lies at the bound: widen the bounds in [parameters], or check the equations of the twin",
+        )
     if reach <= target.half_width:
         return Identifiability.DETERMINED, ""
     correlations = np.abs(uncertainty.correlation[index]).copy()

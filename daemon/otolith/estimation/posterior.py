@@ -19,7 +19,7 @@ from otolith.estimation.problem import Problem
 START_TOLERANCE = 0.5  # sampling periods by which a window may start early or late and still follow its predecessor
 MAX_KNOWN_PHASE_SD = 1.0  # rad: a phase less certain than this counts as unknown
 UNKNOWN_PHASE_SD = np.pi / np.sqrt(3.0)  # rad: standard deviation of the uniform distribution over a turn
-PHASE_STARTS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad: starts of a fit where a phase is unknown
+PHASE_OFFSETS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad: added to unknown phases, one for each start of a fit
 MAX_AGE = 600.0  # s for which a component over time that is not periodic is kept: later it is a trend of a parameter
 
 
@@ -89,7 +89,7 @@ class Posterior:
     def starts(self) -> list[Array]:
         """Return the starts of a fit: one, or four with different phases where a phase is unknown."""
         unknown, starts = self.unknown_phases(), []
-        for turn in PHASE_STARTS if unknown else (0.0,):
+        for turn in PHASE_OFFSETS if unknown else (0.0,):
             start = self.start()
             start[unknown] += turn
             starts.append(start)
@@ -114,9 +114,9 @@ class Posterior:
         """Return the posterior after a window, of which this is the prediction."""
         return replace(self, belief=imm_filter.update(self.belief, self._relative(evidence)), phase=phase)
 
-    def inflate_variance(self, nis_per_degree: float) -> "Posterior":
-        """Return the same after a window that contradicted both those before and those after it."""
-        return replace(self, belief=imm_filter.inflate_variance(self.belief, nis_per_degree))
+    def inflate_variance(self, reduced_chi_square: float) -> "Posterior":
+        """Return the same with a larger variance ratio: a window fitted neither those before nor those after it."""
+        return replace(self, belief=imm_filter.inflate_variance(self.belief, reduced_chi_square))
 
     def set_prior(self, prior: Prior) -> "Posterior":
         """Return the same modes, each with ``prior`` as its distribution."""

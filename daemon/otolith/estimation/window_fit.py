@@ -29,8 +29,8 @@ from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
 from otolith.estimation.problem import Problem
 
 AT_BOUND = 1e-4  # share of the width of the bounds
-POLISHED_PARTICLES = 4  # best particles of the swarm that Gauss-Newton starts from
-POLISHED_STARTS = 12  # further starts of Gauss-Newton over all of the bounds
+REFINED_PARTICLES = 4  # best particles of the swarm that Gauss-Newton starts from
+REFINED_STARTS = 12  # further starts of Gauss-Newton over all of the bounds
 TRIAL_STEPS = 15  # of Gauss-Newton from each of these starts
 AFFORDABLE_STEPS = 20_000  # integrator steps of a prediction above which fewer starts are tried
 UNINFORMATIVE = 0.25  # share of the width of the bounds: standard deviation of a parameter that a window leaves open
@@ -78,7 +78,7 @@ class Fit:
         return self.result.guess[: len(self.problem.free)]
 
     def evidence(self) -> Evidence:
-        """Return what the window says, with standard deviations grown by what the fit leaves unexplained."""
+        """Return the evidence of the window; standard deviations are inflated by the unexplained residual."""
         residuals = self.map_objective.window_residuals(self.result).reshape(self.objective.measured.shape)
         return self.map_objective.evidence(self.result, inflation_of(residuals, self.cost))
 
@@ -109,7 +109,7 @@ def fit(problem: Problem, window: Window, prior: Prior, start: Array, max_steps:
 
 @dataclass(frozen=True, slots=True)
 class WindowEstimate:
-    """What one window says. Curves are (records, outputs) in the units of the twin."""
+    """The estimate from one window. Curves are (records, outputs) in the units of the twin."""
 
     fit: Fit
     parameters: tuple[ParameterEstimate, ...]
@@ -135,13 +135,16 @@ class WindowEstimate:
 class Search(Enum):
     """When the particle swarm searches."""
 
-    NEVER = "the start lies in the right valley"
-    IF_UNEXPLAINED = "the start lies in the right valley unless the fit does not explain the window"
-    ALWAYS = "nothing is known of the right valley"
+    NEVER = "Gauss-Newton starts at the prediction; no swarm"
+    IF_UNEXPLAINED = "a swarm searches if Gauss-Newton does not explain the window"
+    FROM_BOUNDS = "a swarm searches, unless the window is explained and determines no parameter"
 
 
 def estimate_window(predicted: Posterior, window: Window, search: Search = Search.NEVER) -> WindowEstimate:
-    """Estimate from ``window`` under its prediction. If a phase is unknown, the best of four starting phases counts."""
+    """Estimate from ``window`` under its prediction.
+
+    If no swarm may search and a phase is unknown, the fit of least cost from four starting phases is returned.
+    """
     problem, prior = predicted.problem, predicted.prior()
     starts = predicted.starts() if search is Search.NEVER else [predicted.start()]
     return min((estimate(problem, window, prior, start, search) for start in starts), key=lambda item: item.cost)
@@ -158,9 +161,9 @@ def estimate(
     both = _fit_alone(fitted, fitted.result.evaluations)
     outcome, generations = Outcome.CONTINUED, 0
     unexplained = both.cost > EXPLAINED and search is not Search.NEVER
-    if unexplained or (search is Search.ALWAYS and both.is_informative):
+    if unexplained or (search is Search.FROM_BOUNDS and both.is_informative):
         both, outcome, generations = _search(both)
-    elif search is Search.ALWAYS:
+    elif search is Search.FROM_BOUNDS:
         outcome = Outcome.NOTHING_TO_FIND
     if not both.fit.result.converged and not both.alone.converged:
         outcome = Outcome.UNFINISHED
@@ -207,33 +210,33 @@ def _search(both: _BothFits) -> tuple[_BothFits, Outcome, int]:
     fitted, objective, problem = both.fit, both.fit.objective, both.fit.problem
     free, seed = objective.free, problem.seed + both.fit.window.index
     swarm = search_parameters(objective, problem.swarm, fitted.parameters, seed)
-    best, evaluations = _polish(fitted, swarm, seed)
-    better = min(best, fitted.result, key=lambda result: result.chi_square)
-    objective.set_predictor(better.guess[:free], better.guess[2 * free :])  # made before around a start far off
-    best = gauss_newton(fitted.map_objective, best.guess)
-    previous = gauss_newton(fitted.map_objective, fitted.result.guess)
-    distinct = np.abs(best.guess - previous.guess)[:free] > DISTINCT * both.information.sd[:free]
-    chosen = min(previous, best, key=lambda result: result.chi_square)
-    evaluations += both.evaluations + swarm.evaluations + best.evaluations + previous.evaluations
+    from_swarm, evaluations = _refine(fitted, swarm, seed)
+    better = min(from_swarm, fitted.result, key=lambda result: result.chi_square)
+    objective.set_predictor(better.guess[:free], better.guess[2 * free :])  # the present one was made far from here
+    from_swarm = gauss_newton(fitted.map_objective, from_swarm.guess)
+    from_prediction = gauss_newton(fitted.map_objective, fitted.result.guess)
+    distinct = np.abs(from_swarm.guess - from_prediction.guess)[:free] > DISTINCT * both.information.sd[:free]
+    chosen = min(from_prediction, from_swarm, key=lambda result: result.chi_square)
+    evaluations += both.evaluations + swarm.evaluations + from_swarm.evaluations + from_prediction.evaluations
     after = _fit_alone(replace(fitted, result=chosen), evaluations)
     if not distinct.any():
         outcome = Outcome.AGREED
-    elif abs(best.chi_square - previous.chi_square) <= EQUALLY_GOOD * max(after.cost, 1.0) ** 2:
+    elif abs(from_swarm.chi_square - from_prediction.chi_square) <= EQUALLY_GOOD * max(after.cost, 1.0) ** 2:
         outcome = Outcome.AMBIGUOUS
     else:
-        outcome = Outcome.SWARM_WAS_BETTER if chosen is best else Outcome.POLISH_WAS_BETTER
+        outcome = Outcome.SWARM_WAS_BETTER if chosen is from_swarm else Outcome.PREDICTION_WAS_BETTER
     return after, outcome, swarm.generations
 
 
-def _polish(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[FitResult, int]:
+def _refine(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[FitResult, int]:
     """Return the best fit from the best particles and from starts over all of the bounds, and its evaluations.
 
-    The swarm searches parameters only, from the first record on. Where an initial state is not measured, or a valley is
-    narrow, the swarm stops on a slope that only Gauss-Newton descends.
+    The swarm searches parameters only, from the first record on. Where an initial state is not measured, or the minimum
+    lies along a narrow line, the swarm stops early, and only Gauss-Newton reaches the minimum.
     """
     objective, problem = fitted.objective, fitted.problem
-    count = min(POLISHED_STARTS, POLISHED_STARTS * AFFORDABLE_STEPS // max(objective.integrator_steps, 1))
-    starts = (*swarm.positions[0, : POLISHED_PARTICLES if count else 1], *spread_starts(*problem.bounds, count, seed))
+    count = min(REFINED_STARTS, REFINED_STARTS * AFFORDABLE_STEPS // max(objective.integrator_steps, 1))
+    starts = (*swarm.positions[0, : REFINED_PARTICLES if count else 1], *spread_starts(*problem.bounds, count, seed))
     results = [gauss_newton(objective, objective.guess(start), TRIAL_STEPS) for start in starts]
     best, free = min(results, key=lambda result: result.chi_square), objective.free
     final = gauss_newton(fitted.map_objective, fitted.map_objective.guess(best.guess[:free], best.guess[free:]))

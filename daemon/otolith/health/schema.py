@@ -164,7 +164,7 @@ class FitDocument(StrictModel):
     cost: float
     """RMSE of all outputs in units of their noise."""
     variance_ratio: float
-    """How much more windows differ from each other than they claim (ratio of variances); one if they agree."""
+    """Variance between windows over the variance that they state; one if they agree."""
     outcome: Outcome
     """How the search ended."""
 

@@ -46,15 +46,15 @@ class WindowEvidence:
     """None for a window that was not estimated from."""
     decision: WindowDecision = WindowDecision.BAD
     contradictions: int = 0
-    """Consecutive windows, this one included, that contradict twin or posterior."""
+    """Consecutive windows, this one included, that did not update the posterior; bad data are not counted."""
     variance_ratio: float = 1.0
-    """How much more windows differ from each other than they claim (ratio of variances)."""
+    """Variance between windows over the variance that they state."""
     reason: str = ""
     """About the window as a whole."""
 
     @property
     def at_bound(self) -> bool:
-        """Whether the window wants a value beyond the bounds."""
+        """Whether the best value of the window lies at a bound."""
         return self.estimate is not None and self.estimate.identifiability is Identifiability.AT_BOUND
 
     @property

@@ -200,7 +200,7 @@ class WriterThread:
         if self._thread.is_alive():
             self._thread.join(seconds)
             if self._thread.is_alive():
-                log.warning("components may not be saved: the disk has not answered within %.1f s", seconds)
+                log.warning("components may not be saved: writing took over %.1f s: check the disk", seconds)
 
     def _run(self) -> None:
         while True:

@@ -131,7 +131,7 @@ def opened(options: LineOptions, progress: ProgressCallback) -> Iterator[ReadOnl
 def _remedy(options: LineOptions, cause: str) -> str:
     if options.host is not None:
         if "refused" in cause:
-            return f"the host is there, but nobody listens on port {options.port}: write HOST:PORT for another one"
+            return f"the host answers, but port {options.port} is closed: write HOST:PORT for another port"
         return "are address and cable right, and does 'ping' reach it?"
     from serial.tools import list_ports  # noqa: PLC0415 - only needed for an error
 
