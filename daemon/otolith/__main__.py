@@ -2,10 +2,11 @@
 
 # First of all, and by the C module, which imports nothing itself: during start-up Ctrl-C ends the process at once,
 # without a traceback. The commands install their own handlers later.
-import _signal  # type: ignore[import-not-found]  # no stub: signal is its public interface
+import _signal  # type: ignore[import-not-found]  # mypy has no stub for the C module
 
 _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
+import errno  # noqa: E402
 import os  # noqa: E402
 import sys  # noqa: E402
 
@@ -34,7 +35,9 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt):
         code = INTERRUPTED
     except OSError as error:  # such as a full disk or a file that was removed: a traceback would explain nothing
-        click.echo(f"Error: {error}", err=True)
+        place = error.filename or "a file of this command, or its standard output"
+        remedy = ": free space on its disk, then repeat the command" if error.errno == errno.ENOSPC else ""
+        click.echo(f"Error: {place}: {error.strerror or error}{remedy}", err=True)
         code = 2
     sys.exit(code or 0)
 

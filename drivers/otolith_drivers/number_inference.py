@@ -332,7 +332,7 @@ def _judged(part: Part, rivals: Sequence[tuple[float, Part]]) -> Part:
         per_change = CERTAIN_MARGIN_PER_CHANGE if max(part.width, rival.width) > 2 else 0.0
         if rival.layout is None or cost >= max(CERTAIN_MARGIN, per_change * changes):
             continue
-        # An integer whose high half is still has the values of its low half, or cannot be told from it.
+        # If the high half is constant, the integer has the values of its low half, up to a constant.
         extends = rival.width > part.width and not rival.layout.is_float
         same = np.array_equal(rival.numbers, part.numbers) and (extends or rival.start == part.start)
         if not same and not (extends and np.abs(part.numbers).max() < LOW_HALF_SIZE):

@@ -1,6 +1,8 @@
 """Help of every command: at most 80 columns, with an example; docs/reference/commands.md has every option."""
 
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -52,3 +54,12 @@ def test_the_reference_has_every_command_and_option(path: tuple[str, ...]) -> No
 
 def test_the_reference_has_every_exit_code() -> None:
     assert set(re.findall(r"^\| (\d+)", REFERENCE.read_text(encoding="utf-8"), re.MULTILINE)) == {"0", "1", "2", "130"}
+
+
+def test_a_full_disk_gives_one_line_with_place_and_remedy() -> None:
+    command = [sys.executable, "-m", "otolith", "--help"]
+    with Path("/dev/full").open("w") as full:
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert result.returncode == 2
+    (line,) = result.stderr.splitlines()
+    assert "standard output: No space left on device: free space on its disk" in line

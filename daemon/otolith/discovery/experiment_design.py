@@ -1,8 +1,8 @@
-"""Experiments: which move of the machine would determine a parameter, or tell two hypotheses apart.
+"""Experiments: which move of the machine would determine a parameter, or distinguish two hypotheses.
 
 A parameter is determined best by the experiment whose Fisher information is largest (E. Walter, L. Pronzato,
-Identification of Parametric Models from Experimental Data, 1997, chapter 6). Two hypotheses are told apart best where
-their predictions differ most, after fitting the one to the other's prediction (A. C. Atkinson, V. V. Fedorov,
+Identification of Parametric Models from Experimental Data, 1997, chapter 6). Two hypotheses are distinguished best
+where their predictions differ most, after fitting the one to the other's prediction (A. C. Atkinson, V. V. Fedorov,
 Biometrika 62, 1975). The moves are steps and swings of one input at a time within its range, from the present state.
 """
 

@@ -20,7 +20,7 @@ from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit
 
 MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
-SIGNIFICANT = 4.0  # standard deviations: nearer to zero, neither component nor change is told from nothing
+SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero is not significant
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 
 

@@ -23,7 +23,9 @@ from otolith.twin.kernel import Excitation, Indices, LinearisedModel, kernel_of
 SENSOR_FAMILIES = frozenset({"constant", "linear"})  # the errors of a sensor: an offset and a gain
 PROBE_RECORDS = 6  # from which the size of the finite difference is found
 PROBE_EFFECT = 1e-4  # relative effect of the finite difference on a state
-MAX_DIFFERENCE = 10.0  # of χ²: a component that differs less from a parameter cannot be told from it in a window
+MAX_DIFFERENCE = (
+    10.0  # of χ²: a component that differs less from a parameter cannot be distinguished from it in a window
+)
 SAME_DIRECTION = 1.0 - 1e-5  # cosine between the effects of a component and of a parameter that are the same
 MIN_INPUT_VARIATION = 5.0  # times the noise of an input: less variation is noise
 MIN_REMAINDER = 1e-6  # share of a response that is left beside the effects of parameters; less is a parameter
@@ -49,7 +51,7 @@ Guess = tuple[CandidateForm, float]
 
 
 def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[CandidateForm]:
-    """Return all forms that can be told apart where the sources are ``x`` (sources, records).
+    """Return all forms that can be distinguished where the sources are ``x`` (sources, records).
 
     ``twin`` is the base model. Forms whose keys are ``taken`` are left out.
     """

@@ -93,7 +93,7 @@ class SequentialTest:
 
     @property
     def doubts_parameters(self) -> bool:
-        """Whether moved parameters are among the hypotheses that cannot be told from the best."""
+        """Whether moved parameters are among the hypotheses that the data do not distinguish from the best."""
         near = [self.best, *(item for item, _ in self.alternatives(self.best))]
         return any(item.type is FaultType.PARAMETER for item in near)
 
@@ -103,7 +103,7 @@ class SequentialTest:
         return any(item.type is not self.best.type for item, _ in self.alternatives(self.best))
 
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
-        """Return the others that the data do not tell decisively from ``to``, with their probabilities."""
+        """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
         data = [item.deviance - item.hypothesis.prior_deviance for item in self.hypotheses]
         own = data[self.hypotheses.index(to)]
         pairs = zip(self.hypotheses, self.probabilities, strict=True)

@@ -109,7 +109,7 @@ class Publisher:
 
     def close(self) -> None:
         """Close the session; subscribers see the liveliness token disappear."""
-        self._session.close()  # type: ignore[no-untyped-call]  # its stub says no return type
+        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
 
     def _answer(self, query: zenoh.Query) -> None:
         with query, self._lock:
@@ -138,4 +138,4 @@ class Listener:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._session.close()  # type: ignore[no-untyped-call]  # its stub says no return type
+        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type

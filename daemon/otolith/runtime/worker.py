@@ -60,7 +60,7 @@ def perform(state: AdaptationState, window: Window) -> WorkerResult:
     report, failure = None, ""
     try:
         state, report = adapt(state, window)
-    except Exception as error:
+    except Exception as error:  # any fault of the core: reported with the window, and the state stays as it was
         log.exception("window %d", window.index)
         failure = f"{type(error).__name__}: {error}"
     return WorkerResult(window.index, state, report, time.perf_counter() - begun, failure)

@@ -207,7 +207,7 @@ class Kernel:
         with kernel_cache.compiling(self._module):
             try:
                 result = function(*arguments)
-            except Exception:  # noqa: BLE001 - a truncated cache file raises anything; a real fault comes again
+            except Exception:  # noqa: BLE001 - a truncated cache file raises any type; a fault of the equations is raised again below
                 kernel_cache.discard(self._module)
                 result = function(*arguments)
         self._compiled.add(name)
@@ -241,6 +241,6 @@ def _source(definition: Definition) -> str:
 
     try:
         return kernel_source(definition)
-    except Exception as error:
+    except Exception as error:  # SymPy raises errors of many types: each becomes one that names the twin
         text = f"twin {definition.name!r}: its equations cannot be turned into code: {type(error).__name__}: {error}"
         raise ConfigurationError(text) from error

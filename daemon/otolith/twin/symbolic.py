@@ -39,7 +39,7 @@ class sign(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no t
         return sympy.Integer(0)
 
 
-class absolute(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as above
+class absolute(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no types; the class name is printed
     """The absolute value of a real quantity."""
 
     def fdiff(self, argindex: int = 1) -> sympy.Expr:
@@ -54,7 +54,7 @@ class absolute(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as above
         return str(printer._print(sympy.Abs(self.args[0])))  # type: ignore[attr-defined]  # as above
 
 
-class component(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as above
+class component(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no types; the class name is printed
     """``component(family, x, a, b, c)``: the kernel looks the formula up by the code of the family."""
 
     def fdiff(self, argindex: int = 1) -> sympy.Expr:
@@ -63,19 +63,19 @@ class component(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as above
         return slope
 
 
-class component_x(component):  # noqa: N801 - as above
+class component_x(component):  # noqa: N801 - sympy has no types; the class name is printed
     """Derivative of a component by its source."""
 
 
-class component_a(component):  # noqa: N801 - as above
+class component_a(component):  # noqa: N801 - sympy has no types; the class name is printed
     """Derivative of a component by its amplitude."""
 
 
-class component_b(component):  # noqa: N801 - as above
+class component_b(component):  # noqa: N801 - sympy has no types; the class name is printed
     """Derivative of a component by its inner parameter."""
 
 
-class component_c(component):  # noqa: N801 - as above
+class component_c(component):  # noqa: N801 - sympy has no types; the class name is printed
     """Derivative of a component by its phase."""
 
 

@@ -74,7 +74,7 @@ EMERGENCIES = {
 }
 """By the high byte of the error code: CiA 301 and CiA 402."""
 
-logging.getLogger("canopen").setLevel(logging.ERROR)  # its warnings concern objects that nobody requests
+logging.getLogger("canopen").setLevel(logging.ERROR)  # its warnings concern objects that are not used here
 Sections = dict[str, dict[str, str]]
 FrameHandler = Callable[[bytes | bytearray, float], None]
 

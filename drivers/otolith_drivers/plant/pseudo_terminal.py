@@ -47,7 +47,7 @@ class SerialLine:
             DeviceError: the path exists or cannot be created, or the kernel has no terminal left.
         """
         try:
-            # The client's end stays open here too: reading a terminal that nobody has open is an error.
+            # This process keeps the client's end open too: Linux returns EIO to a reader if no process has it open.
             self.device_end, self._client_end = pty.openpty()
         except OSError as error:
             raise DeviceError(
@@ -90,7 +90,7 @@ class LineTransport(asyncio.Transport):
     """The end of the drive, for a protocol of pymodbus.
 
     A silence ends a frame, as in Modbus RTU, so bytes that are no frame do not spoil the next frame. An answer that
-    nobody reads is lost if the terminal is full, as on a wire.
+    no client reads is lost if the terminal is full, as on a wire.
     """
 
     def __init__(self, end: int, receiver: FrameReceiver, baudrate: float) -> None:
