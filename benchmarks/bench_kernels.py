@@ -81,7 +81,7 @@ def in_casadi() -> tuple[casadi.Function, casadi.Function]:
 
 
 def main() -> int:
-    kernel, drive = kernel_of(TWIN), Excitation(INPUTS, PERIOD, SUBSTEPS)
+    kernel, drive = kernel_of(TWIN), Excitation.uniform(INPUTS, PERIOD, SUBSTEPS)
     run, both = in_casadi()
     one, start = PARAMETERS[None], INITIAL[None]
     assert np.allclose(kernel.simulate(one, start, drive)[0], in_numpy(), atol=1e-10)  # noqa: S101 - all solve the same problem

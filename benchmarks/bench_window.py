@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.motor import CONFIG, windows
+from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.estimation.arrival_cost import initial_prior
@@ -16,8 +17,13 @@ from otolith.estimation.objective import Objective
 from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Search, estimate
-from otolith.machine import load_machine
+from otolith.machine import find_twin, load_machine
+from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.plant.scenario import load_scenario
+
+AXIS_PERIOD = 1e-3  # s
+AXIS_RECORDS = (1000, 2000, 4000)
+AXIS_WINDOWS = 20
 
 
 def median_seconds(function: Callable[[], object], runs: int) -> float:
@@ -37,6 +43,29 @@ def with_free(problem: Problem, names: tuple[str, ...]) -> Problem:
     return replace(
         problem, known=known, free=tuple(parameter for parameter in twin.parameters if parameter.name in names)
     )
+
+
+def axis_seconds(records: int) -> float:
+    """Median time of ``adapt`` for a healthy window of a simulated servo axis; time of the processor."""
+    twin, random = find_twin("servo_axis"), np.random.default_rng(1)
+    time_of_record = AXIS_PERIOD * np.arange(AXIS_WINDOWS * records)
+    slow, fast = (np.sin(2.0 * np.pi * frequency * time_of_record) for frequency in (0.7, 2.3))
+    force = (60.0 * slow + 30.0 * fast)[:, None]
+    nominal = np.array([[parameter.nominal for parameter in twin.parameters]])
+    excitation = Excitation.uniform(force, AXIS_PERIOD, substeps=4)
+    position = kernel_of(twin).simulate(nominal, np.zeros((1, len(twin.states))), excitation)[0]
+    values = np.hstack([force, position + twin.outputs[0].noise * random.standard_normal(position.shape)])
+    names = tuple(parameter.name for parameter in twin.parameters if parameter.name != "v_s")
+    problem = with_free(Problem(twin, (), twin.parameters, (twin.outputs[0].noise,)), names)
+    state, times = initial_state("axis", "bench", problem), []
+    for index in range(AXIS_WINDOWS):
+        part = values[index * records : (index + 1) * records]
+        window = Window.whole(index, index * records * AXIS_PERIOD, AXIS_PERIOD, ("F", "x"), part)
+        start = time.process_time()
+        state, report = adapt(state, window)
+        if not report.document.cost.searched:
+            times.append(time.process_time() - start)
+    return float(np.median(times[AXIS_WINDOWS // 2 :]))
 
 
 def main() -> int:
@@ -60,6 +89,11 @@ def main() -> int:
         state, _ = adapt(state, window)
     whole = median_seconds(lambda: adapt(state, record[-1]), 50)
     print(f"the whole core, warm: {whole * 1e3:.2f} ms a window")
+    print("servo axis at 1 kHz, a healthy window")
+    times = {records: axis_seconds(records) for records in AXIS_RECORDS}
+    for records, seconds in times.items():
+        relative = (seconds / records) / (times[AXIS_RECORDS[0]] / AXIS_RECORDS[0])
+        print(f"  {records:5d} records {seconds * 1e3:7.1f} ms, a record {relative:.2f} x that of the shortest window")
     return 0
 
 

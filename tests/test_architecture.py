@@ -16,8 +16,9 @@ ROOT = Path(__file__).parents[1]
 LINTER = Path(sys.executable).with_name("lint-imports")
 SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root).rglob("*.py"))
 MAX_FILE_LINES = 600
-MAX_SOURCE_LINES = 20_000  # that are not blank, in daemon and drivers
-MAX_MODULES = 130  # in daemon and drivers
+# 20 000 lines and 130 modules before windows had records at their own times; new features are new files.
+MAX_SOURCE_LINES = 24_000  # that are not blank, in daemon and drivers
+MAX_MODULES = 150  # in daemon and drivers
 MAX_MODULES_IN_A_FOLDER = 12
 MAX_LAYERS = 12
 

@@ -16,11 +16,10 @@ from benchmarks.discovery.motor import Faults, simulate_motor, windows
 from benchmarks.discovery.setting import prior, problem, screen
 from benchmarks.discovery.truth import SHAFT, Truth, is_a_parameter
 from otolith.acquisition.window import Array, Window
-from otolith.discovery.candidates import DECISIVE
-from otolith.discovery.linear_response import BasisFunctions, CandidateForm, LinearResponse, candidate_library
-from otolith.discovery.search import ScreeningResult
+from otolith.discovery.candidate_forms import CandidateForm
+from otolith.discovery.linear_response import BasisFunctions, LinearResponse
+from otolith.discovery.screening import DECISIVE, ScreeningResult, candidate_library
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import base_model
 from otolith.twin.augmentation import sites, sources
 from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
 
@@ -102,7 +101,7 @@ def _chosen(
     model: ComponentFamily, kind: str, landscape: LinearResponse, random: np.random.Generator
 ) -> CandidateForm | None:
     """A candidate of the family that this operation excites and that is no parameter; all sites are equally likely."""
-    twin = base_model(problem())
+    twin = problem().base_model
     candidates: dict[int, list[CandidateForm]] = {}
     for candidate in candidate_library(twin, landscape.x):
         source = sources(twin)[candidate.source]
@@ -131,7 +130,7 @@ def _truth(
     structure: CandidateForm, times: float, landscape: LinearResponse, random: np.random.Generator
 ) -> Truth | None:
     """A component with ``times`` the amplitude of the detection limit, or None if its effect would be too large."""
-    twin, model = base_model(problem()), structure.model
+    twin, model = problem().base_model, structure.model
     two = len(model.phases) > 1
     inner, phase = _inner(structure, random), float(random.uniform(-np.pi, np.pi)) if two else 0.0
     limit = detection_limit(structure, inner, phase, landscape)
@@ -150,8 +149,8 @@ def _truth(
 def detection_limit(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:
     """Amplitude in the unit of the site; infinite if parameters explain the component."""
     numbers = len(structure.model.phases) + (structure.model.inner is not None)
-    own = len(base_model(problem()).sites)
-    alternatives = sum(1 for candidate in candidate_library(base_model(problem()), landscape.x) if candidate.site < own)
+    own = len(problem().base_model.sites)
+    alternatives = sum(1 for candidate in candidate_library(problem().base_model, landscape.x) if candidate.site < own)
     required = numbers * math.log(landscape.objective.count) + 2.0 * math.log(3.0 * alternatives) + DECISIVE
     return math.sqrt(required / max(_information(structure, inner, phase, landscape), 1e-300))
 
@@ -176,7 +175,7 @@ def _is_distinguishable(truth: Truth, structure: CandidateForm, window: Window, 
     if not np.isfinite(values).all() or float(np.abs(values).max()) > 100.0:
         return False
     x = screen(problem(), window, known).response.x
-    for candidate in candidate_library(base_model(problem()), x):
+    for candidate in candidate_library(problem().base_model, x):
         if (candidate.site, candidate.model, candidate.source) == (structure.site, structure.model, structure.source):
             low, high = candidate.bounds
             return structure.model.inner is None or low <= truth.inner <= high

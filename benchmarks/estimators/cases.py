@@ -113,7 +113,7 @@ def _window(case: Case, random: np.random.Generator, index: int) -> tuple[Array,
     initial = np.array([state.initial for state in twin.states])
     times: Array = np.multiply(case.period, np.arange(2 * RECORDS), dtype=np.float64)
     inputs = case.excite(random, twin, times)
-    drive, noise, kernel = Excitation(inputs, case.period), np.array(problem.noise), kernel_of(twin)
+    drive, noise, kernel = Excitation.uniform(inputs, case.period), np.array(problem.noise), kernel_of(twin)
     drive = replace(drive, substeps=kernel.substeps(parameters, initial, drive, EXACT * noise))
     outputs = kernel.simulate(parameters[None], initial[None], drive)[0]
     signals = np.column_stack([inputs, outputs + random.normal(size=outputs.shape) * noise])[RECORDS:]

@@ -83,7 +83,7 @@ def _simulate(truths: Array, state: Array, inputs: Array) -> Array:
     outputs = np.empty((len(inputs), len(TWIN.outputs)))
     for record in range(len(inputs)):
         outputs[record] = state  # the motor's outputs are its states
-        drive = Excitation(inputs[record : record + 2], PERIOD, SUBSTEPS)
+        drive = Excitation.uniform(inputs[record : record + 2], PERIOD, SUBSTEPS)
         state = kernel.simulate(parameters[record : record + 1], state[None], drive)[0, -1]
     return outputs
 

@@ -49,12 +49,12 @@ class Compiled:
     def __init__(self, problem: Problem, *, generations: int, adaptive: bool) -> None:
         self._bounds, self._generations, self._adaptive = problem.bounds, generations, adaptive
         self._kernel = kernel_of(TWIN)
-        still = Excitation(np.zeros((2, 2)), STEP)
+        still = Excitation.uniform(np.zeros((2, 2)), STEP)
         self._kernel.euler(full(problem.nominal[None]), np.zeros((1, 2)), still, STEP)  # compiles: not timed
 
     def fit(self, window: Window) -> tuple[Estimate, ...]:
         measured = outputs_of(window)
-        excitation = Excitation(inputs_of(window), window.sample_period)
+        excitation = Excitation.uniform(inputs_of(window), window.sample_period)
 
         def cost(particles: Array) -> Array:
             initial = np.repeat(measured[:1], len(particles), axis=0)

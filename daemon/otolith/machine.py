@@ -6,19 +6,28 @@ Errors name file, line and key.
 import contextlib
 import hashlib
 import json
+import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from otolith.acquisition.alignment import QualityLimits
+from otolith.acquisition.quality import QualityLimits
+from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
-from otolith.machine_file import DiscoveryTable, MachineFile, ParameterTable, RawQuantity, WindowTable
+from otolith.machine_file import (
+    DiscoveryTable,
+    MachineFile,
+    ParameterTable,
+    RawQuantity,
+    SignalTable,
+    WindowTable,
+)
 from otolith.twin.augmentation import sources
 from otolith.twin.component_families import FAMILY_NAMES
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import read_twin
-from otolith_drivers.base import Driver, DriverType, Setup, Signal
+from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal
 from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.registry import find
@@ -42,6 +51,8 @@ class LoadedMachine:
     file: MachineFile
     twin: Definition
     problem: Problem
+    signal_tables: Mapping[str, SignalTable]
+    """Of each signal of the twin."""
     built_driver: Driver | None
     """None if the file was loaded without its driver."""
 
@@ -70,7 +81,27 @@ class LoadedMachine:
     def limits(self) -> QualityLimits:
         """Bounds that a good window keeps."""
         window = self.file.window
-        return QualityLimits(window.missing_limit, window.gap_limit, window.jitter_limit)
+        return QualityLimits(
+            window.missing_limit, window.gap_limit, window.jitter_limit, window.surplus_limit, window.irregularity_limit
+        )
+
+    def plans(self, sampling: Sampling) -> tuple[SignalPlan, ...]:
+        """Return how each signal is sampled; ``sampling`` is the meaning of the times of the source."""
+        twin, problem = self.twin, self.problem
+        holds = {driven.name: driven.hold for driven in twin.inputs}
+        noise = dict(zip(holds, problem.input_noise, strict=True))
+        return tuple(
+            SignalPlan(
+                name=name,
+                hold=holds.get(name),
+                sampling=self.signal_tables[name].times or self.file.window.times or sampling,
+                delay=self.signal_tables[name].delay,
+                on_change=self.signal_tables[name].on_change,
+                noise=noise.get(name, 0.0),
+                checks=frozenset(self.signal_tables[name].checks),
+            )
+            for name in twin.signals
+        )
 
     @property
     def signal_fingerprint(self) -> str:
@@ -88,10 +119,11 @@ class LoadedMachine:
         return (state_directory() / "recordings" if folder is None else self.path.parent / folder).absolute()
 
 
-def load_machine(path: Path, *, with_driver: bool = True) -> LoadedMachine:
+def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = False) -> LoadedMachine:
     """Load the machine file at ``path`` with its twin, its estimation problem and its driver, which is not opened.
 
-    Without ``with_driver``, ``[driver]`` and ``[signals]`` are not checked and may be absent.
+    Without ``with_driver``, ``[driver]`` and ``[signals]`` are not checked and may be absent. With ``for_replay`` they
+    are checked unless both are absent.
 
     Raises:
         ConfigurationError: something in the file is wrong; one line per fault.
@@ -102,13 +134,28 @@ def load_machine(path: Path, *, with_driver: bool = True) -> LoadedMachine:
     file = validate(data, MachineFile, source)
     context = Context(source)
     twin = _twin(file, path, context)
-    problem = _problem(file, twin, context)
+    signals = {
+        name: validate(_common(table), SignalTable, source, under=("signals", name))
+        for name, table in file.signals.items()
+    }
+    tables = {name: signals.get(name, SignalTable()) for name in twin.signals}
+    problem = replace(_problem(file, twin, context), unchecked=_unchecked(tables))
     driver = None
-    if with_driver:
+    if with_driver and (file.driver or file.signals or not for_replay):
         config = driver_config(file, twin, source)
         with config.located_errors():
             driver = config.module.build(config.options, config.setup)
-    return LoadedMachine(path, file, twin, problem, driver)
+    return LoadedMachine(path, file, twin, problem, tables, driver)
+
+
+def _common(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a signal that every driver has."""
+    return {key: value for key, value in table.items() if key in SignalTable.model_fields}
+
+
+def _unchecked(tables: Mapping[str, SignalTable]) -> frozenset[tuple[str, Check]]:
+    """Return the checks that are turned off, each with its signal."""
+    return frozenset((name, check) for name, table in tables.items() for check in Check if check not in table.checks)
 
 
 def library_twins() -> list[str]:
@@ -191,10 +238,17 @@ def driver_config(file: MachineFile, twin: Definition, source: SourceFile) -> Dr
     written = {key: value for key, value in file.driver.items() if key != "type"}
     options = validate(written, module.Options, source, under=("driver",))
     signals = tuple(
-        Signal(name, twin.unit_of(name), validate(file.signals[name], module.Source, source, under=("signals", name)))
+        Signal(
+            name, twin.unit_of(name), validate(_own(file.signals[name]), module.Source, source, under=("signals", name))
+        )
         for name in needed
     )
     return DriverConfig(module, options, Setup(signals, source.path.parent, file.window.sample_period), source)
+
+
+def _own(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a signal by which its driver reads it."""
+    return {key: value for key, value in table.items() if key not in SignalTable.model_fields}
 
 
 def _problem(file: MachineFile, twin: Definition, context: Context) -> Problem:
@@ -284,15 +338,28 @@ def _window(table: WindowTable, context: Context) -> WindowOptions:
     records = {}
     for key, length in (("length", table.length), ("shortest", table.shortest), ("longest", table.longest)):
         seconds = table.length if length is None else length
-        count = records[key] = round(seconds / table.sample_period)
-        on_grid = abs(count * table.sample_period - seconds) <= MAX_GRID_ERROR * seconds
-        if not on_grid or not MIN_WINDOW_RECORDS <= count <= MAX_WINDOW_RECORDS:
-            bounds = f"{MIN_WINDOW_RECORDS} to {MAX_WINDOW_RECORDS} times it"
-            multiple = f"a multiple of the sample period {table.sample_period:g} s, {bounds}"
-            context.fail(("window", key), f"{seconds:g} s must be {multiple}")
+        records[key] = round(seconds / table.sample_period)
+        if problem := _length_problem(seconds, table.sample_period):
+            context.fail(("window", key), problem)
     if not records["shortest"] <= records["length"] <= records["longest"]:
         context.fail(("window", "length"), f"{table.length:g} s must lie between window.shortest and window.longest")
-    return WindowOptions(records["length"], records["shortest"], records["longest"])
+    return WindowOptions(records["length"], records["shortest"], records["longest"], table.sample_period)
+
+
+def _length_problem(seconds: float, period: float) -> str:
+    """Return why a window of ``seconds`` has no grid of ``period`` (s), with lengths that have one; empty if it has."""
+    count = round(seconds / period)
+    if seconds < MIN_WINDOW_RECORDS * period * (1.0 - MAX_GRID_ERROR):
+        least = f"write at least {MIN_WINDOW_RECORDS * period:.9g} s, or shorten sample_period"
+        return f"{seconds:.9g} s at {period:g} s give {count} records: a window needs {MIN_WINDOW_RECORDS}: {least}"
+    if count > MAX_WINDOW_RECORDS:
+        most = f"write at most {MAX_WINDOW_RECORDS * period:.9g} s, or lengthen sample_period"
+        return f"{seconds:.9g} s at {period:g} s give {count} records: more than {MAX_WINDOW_RECORDS}: {most}"
+    if abs(count * period - seconds) <= MAX_GRID_ERROR * seconds:
+        return ""
+    below = math.floor(seconds / period)
+    proposed = f"write {below * period:.9g} s or {(below + 1) * period:.9g} s"
+    return f"{seconds:.9g} s is no whole multiple of the sample period {period:g} s: {proposed}"
 
 
 def _excluded(table: DiscoveryTable, twin: Definition, context: Context) -> frozenset[str]:

@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
+from otolith.acquisition.samples import Check
+from otolith_drivers.base import Sampling
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.units import Quantity
 
@@ -68,6 +70,19 @@ class ParameterTable(StrictModel):
     high: RawQuantity = None
 
 
+class SignalTable(StrictModel):
+    """What the daemon needs to know of a signal, beside the keys by which the driver reads it."""
+
+    delay: Annotated[float, BeforeValidator(Quantity("s", 0.0, 60.0))] = 0.0
+    """Time by which the signal is late against the others; it is subtracted from the time of each sample."""
+    times: Sampling | None = None
+    """Meaning of the times of its samples; without it what the source gives."""
+    on_change: bool | None = None
+    """Of a command: whether it is recorded only when it changes; without it the record shows it."""
+    checks: tuple[Check, ...] = tuple(Check)
+    """The checks of its data; an empty list turns them off."""
+
+
 class WindowTable(StrictModel):
     """Length and grid of windows, and the quality that estimation needs."""
 
@@ -76,9 +91,13 @@ class WindowTable(StrictModel):
     longest: WindowLength | None = None
     """With ``shortest`` or ``longest`` the length adapts to drift and noise, starting at ``length``."""
     sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-4, 10.0))] = 0.01
-    missing_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.01
-    gap_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 60.0))] = 0.05
+    times: Sampling | None = None
+    """Meaning of the times of all samples; without it what the source gives."""
+    missing_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 1.0
+    gap_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 600.0))] = 600.0
     jitter_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 10.0))] = 0.005
+    surplus_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.02
+    irregularity_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 100.0))] = 0.3
 
 
 class EstimationTable(StrictModel):
@@ -131,7 +150,8 @@ class MachineFile(StrictModel):
     driver: Annotated[dict[str, Any], Field(default_factory=dict)]
     """``type`` and the options of that driver; a replay does not need it."""
     signals: Annotated[dict[str, dict[str, Any]], Field(default_factory=dict)]
-    """Where the driver finds each input and output of the twin; a replay does not need it."""
+    """Where the driver finds each input and output of the twin, and the keys of :class:`SignalTable`; a replay does not
+    need it."""
     twin: TwinTable
     parameters: Annotated[
         dict[str, Annotated[ParameterTable, BeforeValidator(_expand_value)]], Field(default_factory=dict)

@@ -34,12 +34,12 @@ class Signal:
 
 
 class Sampling(StrEnum):
-    """Meaning of the times of a driver's samples, which decides how samples are aligned to the grid of a window."""
+    """Meaning of the times of a driver's samples, which decides how samples become records of a window."""
 
     CYCLIC = "cyclic"
     """The source samples on its own grid; a time is an arrival time, which may be late but never early."""
-    POLLED = "polled"
-    """A time is the moment at which the value was true; samples are interpolated to the grid."""
+    TRUE = "true"
+    """A time is the moment at which the value was true, and is used as it is."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Registers read by successive requests are aligned to the same times of the grid."""
+"""Registers read by successive requests have records at the times at which they were read."""
 
 import math
 import socket
@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from otolith.acquisition.alignment import QualityLimits
+from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.ring import Rings
+from otolith.acquisition.samples import SignalPlan
 from otolith.acquisition.windower import Windower
 from otolith_drivers.base import Sampling, Setup, Signal
 from otolith_drivers.modbus.driver import Options, Source, build
@@ -38,13 +39,15 @@ def slow(reply: bytes) -> bytes:
 def read_window(sampling: Sampling) -> float:
     """Return the median difference of two registers of separate requests in a window, relative to the amplitude.
 
-    The median of a sine's magnitude is its RMS value, but requests that a busy computer delays do not enlarge it.
+    Values that were read at other times are compared with a line through the two nearest. The median of a sine's
+    magnitude is its RMS value, but requests that a busy computer delays do not enlarge it.
     """
     port = free_port(socket.SOCK_STREAM)
     sources = [{"register": address, "type": "int16", "unit": "V"} for address in (0, 500)]
     signals = tuple(Signal(name, "V", Source.model_validate(s)) for name, s in zip("ab", sources, strict=True))
     rings = Rings(("a", "b"), 4 * RECORDS)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, QualityLimits(missing=1.0, gap=10.0, jitter=1.0), sampling)
+    plans = [SignalPlan(name, sampling=sampling) for name in ("a", "b")]
+    windower = Windower(plans, RECORDS, PERIOD, QualityLimits(jitter=1.0))
     driver = build(Options(host="127.0.0.1", port=port), Setup(signals, Path(), PERIOD))
     with odd_server(Behaviour(SineRegisters(), corrupt=slow), port):
         driver.open(rings.deliver)
@@ -54,13 +57,14 @@ def read_window(sampling: Sampling) -> float:
             time.sleep(0.01)
         window = windower.cut(rings, 0.0)
         driver.close()
-    present = ~window.missing.any(axis=1)
-    assert present.sum() > RECORDS / 2
-    apart = (window.values[:, 0] - window.values[:, 1])[present]
-    return float(np.median(np.abs(apart)) / FULL_SCALE)
+    read = {name: ~window.missing_in(name) for name in ("a", "b")}
+    assert min(present.sum() for present in read.values()) > RECORDS / 2
+    times = {name: window.grid.offsets[present] for name, present in read.items()}
+    between = np.interp(times["a"], times["b"], window.column("b")[read["b"]])
+    return float(np.median(np.abs(window.column("a")[read["a"]] - between)) / FULL_SCALE)
 
 
 def test_the_skew_between_requests_is_corrected() -> None:
-    skewed, corrected = read_window(Sampling.CYCLIC), read_window(Sampling.POLLED)
+    skewed, corrected = read_window(Sampling.CYCLIC), read_window(Sampling.TRUE)
     assert skewed > 0.3 * FREQUENCY * REQUEST_TIME / 2  # what there is to correct
     assert corrected < 0.5 * skewed

@@ -7,14 +7,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.acquisition.alignment import QualityLimits
+from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.ring import Rings
+from otolith.acquisition.samples import SignalPlan
 from otolith.acquisition.window import Verdict, Window
 from otolith.acquisition.windower import GRACE_PERIOD, Windower
-from otolith_drivers.base import Sample
+from otolith_drivers.base import Sample, Sampling
+from tests.acquisition.series import ramp
 
 PERIOD, RECORDS = 0.01, 50
-LIMITS = QualityLimits(missing=0.05, gap=0.05, jitter=0.005)
+LIMITS = QualityLimits(missing=0.05, gap=0.05)
+
+
+def plans(*names: str, sampling: Sampling = Sampling.CYCLIC) -> tuple[SignalPlan, ...]:
+    return tuple(SignalPlan(name, sampling=sampling) for name in names)
+
+
+CYCLIC = plans("a", "b")
 
 
 def feed(rings: Rings, samples: list[tuple[float, float]]) -> None:
@@ -24,7 +33,7 @@ def feed(rings: Rings, samples: list[tuple[float, float]]) -> None:
 
 def cut_all(rings: Rings, samples: list[tuple[float, float]], *, until: float) -> list[Window]:
     """Feed samples at their times and cut whatever is due, as the service does."""
-    windower = Windower(("a", "b"), RECORDS, PERIOD, LIMITS)
+    windower = Windower(CYCLIC, RECORDS, PERIOD, LIMITS)
     windows, now, queue = [], 0.0, list(samples)
     while now < until:
         arrived = [sample for sample in queue if sample[0] <= now]
@@ -76,7 +85,7 @@ def test_a_late_first_sample_does_not_shift_the_first_window() -> None:
 
 def test_a_complete_window_is_due_at_once() -> None:
     rings = Rings(("a", "b"), 400)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, LIMITS)
+    windower = Windower(CYCLIC, RECORDS, PERIOD, LIMITS)
     feed(rings, [(index * PERIOD, 1.0) for index in range(RECORDS + 1)])
     assert windower.begin(rings, 0.5, 0.5)
     assert windower.due(rings, windower.next_end)
@@ -89,7 +98,9 @@ def test_windows_are_bad_during_an_outage_and_good_after() -> None:
     assert verdicts[:4] == [Verdict.GOOD] * 4
     assert verdicts[4:7] == [Verdict.BAD] * 3
     assert verdicts[7:11] == [Verdict.GOOD] * 4
-    assert windows[5].quality.reasons == ("no samples of a, b",)
+    assert windows[5].quality.reasons == (
+        "no samples of a, b from t = 1002.50 s for 0.5 s: is the source on, and is its signal right in [signals]?",
+    )
 
 
 def test_a_silent_machine_gives_bad_windows() -> None:
@@ -98,18 +109,22 @@ def test_a_silent_machine_gives_bad_windows() -> None:
     assert {window.quality.verdict for window in windows} == {Verdict.BAD}
 
 
-def test_the_reason_names_a_signal_that_never_comes() -> None:
-    rings = Rings(("a", "b", "c"), 400)
-    windower = Windower(("a", "b", "c"), RECORDS, PERIOD, LIMITS)
-    feed(rings, [(index * PERIOD, 1.0) for index in range(100)])
-    assert not windower.begin(rings, 0.4, 0.4)
-    assert windower.begin(rings, 1.0, 1.0)
-    assert windower.cut(rings, 0.0).quality.reasons == ("no samples of c",)
+def test_the_reason_names_an_input_that_never_comes() -> None:
+    """An output that never comes costs no window: the others are measured. An input that never comes is unknown."""
+    for hold, reason in ((None, ""), ("zoh", "no samples of c from t = 0.5 s for 0.5 s"), ("foh", "no samples of c")):
+        rings = Rings(("a", "b", "c"), 400)
+        windower = Windower((*CYCLIC, SignalPlan("c", hold, Sampling.CYCLIC)), RECORDS, PERIOD)
+        feed(rings, [(index * PERIOD, 1.0) for index in range(100)])
+        assert not windower.begin(rings, 0.4, 0.4)
+        assert windower.begin(rings, 1.0, 1.0)
+        quality = windower.cut(rings, 0.0).quality
+        assert quality.verdict is (Verdict.BAD if hold else Verdict.GOOD)
+        assert "; ".join(quality.reasons).startswith(reason)
 
 
 def test_an_incomplete_window_is_due_after_the_grace_period() -> None:
     rings = Rings(("a", "b"), 400)
-    windower = Windower(("a", "b"), RECORDS, PERIOD, LIMITS)
+    windower = Windower(CYCLIC, RECORDS, PERIOD, LIMITS)
     feed(rings, [(index * PERIOD, 1.0) for index in range(RECORDS - 3)])
     assert windower.begin(rings, 0.48, 0.48)
     assert not windower.due(rings, windower.next_end + 0.9 * GRACE_PERIOD)
@@ -117,12 +132,15 @@ def test_an_incomplete_window_is_due_after_the_grace_period() -> None:
 
 
 def test_the_gap_limit_returns_with_the_fine_grid() -> None:
-    windower, rings = Windower(("a", "b"), RECORDS, PERIOD, LIMITS), Rings(("a", "b"), 400)
+    windower, rings = Windower(CYCLIC, RECORDS, PERIOD, LIMITS), Rings(("a", "b"), 400)
     windower.regrid(RECORDS, 1.0)
     windower.regrid(RECORDS, PERIOD)
     feed(rings, [(index * PERIOD, 1.0) for index in range(2 * RECORDS) if not 20 <= index < 40])
     assert windower.begin(rings, 1.0, 1.0)
-    assert any("gap" in reason for reason in windower.cut(rings, unix_offset=0.0).quality.reasons)
+    reasons = windower.cut(rings, unix_offset=0.0).quality.reasons
+    assert "b has no sample for 0.2 s from t = 0.2 s, longer than gap_limit (0.05 s)" in reasons or (
+        "a has no sample for 0.2 s from t = 0.2 s, longer than gap_limit (0.05 s)" in reasons
+    )
 
 
 def test_a_sample_without_a_reading_is_not_counted() -> None:
@@ -139,7 +157,7 @@ def test_rings_are_bounded_and_count_overwritten_samples() -> None:
     rings.deliver([Sample("x", 0.0, 0.0)])
     counters = rings.counters()
     assert (counters.received, counters.overwritten, counters.unknown) == (130, 30, 1)
-    times, _ = rings.between(0.0, 1000.0)["a"]
+    times, _ = rings.around("a", 0.0, 1000.0, 1000.0)
     assert len(times) == 100
     rings.deliver([Sample("a", 200.0, 0.0)])
     assert rings.counters().overwritten == 30  # samples that were read are not lost
@@ -157,8 +175,63 @@ def test_deliver_columns_equals_deliver(parts: list[list[float]], capacity: int,
         columns = np.array(part), 2.0 * np.array(part)
         at_once.deliver_columns({"a": columns, "x": columns})
         for rings in (one_by_one, at_once):
-            rings.between(-10.0, reads[index % len(reads)] if reads else -10.0)
+            end = reads[index % len(reads)] if reads else -10.0
+            rings.around("a", -10.0, end, end)
         assert one_by_one.counters() == at_once.counters()
         assert one_by_one.last_times() == at_once.last_times()
-    old, new = one_by_one.between(-20.0, 20.0)["a"], at_once.between(-20.0, 20.0)["a"]
-    assert np.array_equal(old, new)
+    assert np.array_equal(one_by_one.around("a", -20.0, 20.0, 0.0), at_once.around("a", -20.0, 20.0, 0.0))
+
+
+def test_a_window_waits_for_a_delayed_signal() -> None:
+    """A signal that is late by more than the grace period is complete in every window."""
+    delay, rings = 0.35, Rings(("a", "b"), 400)
+    windower = Windower((CYCLIC[0], SignalPlan("b", sampling=Sampling.TRUE, delay=delay)), RECORDS, PERIOD)
+    windows = list[Window]()
+    for now in np.arange(0.0, 4.0, 0.005):
+        rings.deliver([Sample("a", now, now), Sample("b", now, now - delay)] if round(now / 0.005) % 2 == 0 else [])
+        while windower.begin(rings, now, now) and windower.due(rings, now):
+            windows.append(windower.cut(rings, unix_offset=0.0))
+    assert len(windows) >= 6
+    for window in windows:
+        assert not window.missing.any()
+        assert window.column("a") == pytest.approx(window.column("b"), abs=1e-9)
+
+
+def test_a_window_waits_for_its_last_true_samples() -> None:
+    """With 3.5 ms between samples, one that is 4 ms before the end does not complete a window of 10 ms records."""
+    times, rings = np.arange(0.0, 4.0, 0.0035), Rings(("a",), 2000)
+    windower, windows = Windower(plans("a", sampling=Sampling.TRUE), RECORDS, PERIOD), list[Window]()
+    for now in times:
+        rings.deliver([Sample("a", now, now)])
+        while windower.begin(rings, now, now) and windower.due(rings, now):
+            windows.append(windower.cut(rings, unix_offset=0.0))
+    values = np.concatenate([window.column("a")[~window.missing_in("a")] for window in windows])
+    assert values == pytest.approx(times[: len(values)])
+    assert len(windows) >= 6
+
+
+def test_samples_of_later_windows_that_are_overwritten_are_counted() -> None:
+    """A cut looks at samples after its window, to bridge inputs; that does not count as reading them."""
+    rings = Rings(("a",), 100)
+    windower = Windower(plans("a"), RECORDS, PERIOD)
+    rings.deliver([Sample("a", index * PERIOD, 0.0) for index in range(60)])
+    assert windower.begin(rings, 0.6, 0.6)
+    windower.cut(rings, unix_offset=0.0)
+    rings.deliver([Sample("a", index * PERIOD, 0.0) for index in range(60, 170)])
+    assert rings.counters().overwritten == 170 - 100 - RECORDS
+
+
+@pytest.mark.parametrize("interval", [0.02, 0.2, 3.0])
+def test_the_grace_period_covers_the_next_sample_of_a_slow_input(interval: float) -> None:
+    """At most a window's length: an input that comes less often is extrapolated."""
+    rings = Rings(("a", "v"), 4000)
+    windower = Windower((SignalPlan("a"), SignalPlan("v", "foh")), RECORDS, PERIOD)
+    grid = ramp(2000) * PERIOD
+    rings.deliver_columns(
+        {"a": (grid, grid), "v": (grid[:: round(interval / PERIOD)], grid[:: round(interval / PERIOD)])}
+    )
+    assert windower.begin(rings, 20.0, 20.0)
+    for _ in range(4):
+        windower.cut(rings, unix_offset=0.0)
+    expected = min(max(1.5 * interval, GRACE_PERIOD), RECORDS * PERIOD)
+    assert windower.grace == pytest.approx(expected if interval < 1.0 else GRACE_PERIOD)

@@ -35,7 +35,7 @@ def window(random: np.random.Generator, index: int) -> tuple[Window, Array]:
     inputs: Array = np.column_stack([voltage, load])
     initial: Array = random.uniform([0.5, 3.0], [2.0, 15.0])
     parameters = np.array([list(TRUTH.values())])
-    outputs = kernel_of(TWIN).simulate(parameters, initial[None], Excitation(inputs, PERIOD, 4))[0]
+    outputs = kernel_of(TWIN).simulate(parameters, initial[None], Excitation.uniform(inputs, PERIOD, 4))[0]
     measured = np.rint((outputs + random.normal(size=outputs.shape) * NOISE) / ADC_STEP) * ADC_STEP
     values = np.column_stack([inputs, measured])
     return Window.whole(index, 0.0, PERIOD, TWIN.signals, values), initial

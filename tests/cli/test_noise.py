@@ -5,7 +5,10 @@ import tomllib
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
+from benchmarks.sampling.measure import some_motor, write_machine
+from benchmarks.sampling.schedules import Schedule, Timing, record
 from click.testing import CliRunner, Result
 
 from otolith.cli.main import cli
@@ -50,16 +53,37 @@ def test_json_has_units_and_uncertainties(data: Path) -> None:
     assert document["consistency"]["degrees"] > 0
 
 
+def test_a_late_signal_is_printed_with_its_delay(tmp_path: Path) -> None:
+    """In a machine file without signals the lines are a table; otherwise they are comments for what is there."""
+    schedule, random = Schedule(rows=Timing(0.01)), np.random.default_rng(3)
+    recording = record(schedule, some_motor(random), 11.0, random).delayed({"omega": 0.01})
+    data = tmp_path / "recording.csv"
+    data.write_text(recording.table(), encoding="utf-8")
+    machine = write_machine(tmp_path, schedule)
+    printed = noise(machine, data).stdout
+    delay = tomllib.loads(printed)["signals"]["omega"]["delay"]
+    assert float(delay.removesuffix(" ms")) == pytest.approx(10.0, abs=0.3)
+    assert "# i: no delay is significant; up to about 0." in printed
+    text = machine.read_text(encoding="utf-8")
+    machine.write_text(text + printed[printed.index("[signals]") :], encoding="utf-8")
+    again = noise(machine, data).stdout
+    assert "# under [signals], add the key delay to what is there:\n# omega = { delay =" in again
+    document = json.loads(noise(machine, data, "--json").stdout)
+    delays = {signal["name"]: signal["value"] for signal in document["delays"]}
+    assert delays == {"i": 0.0, "omega": pytest.approx(0.01, abs=3e-4), "V_a": 0.0, "T_load": 0.0}
+
+
 def test_data_without_a_usable_window_is_refused(tmp_path: Path, scenario: MotorScenario) -> None:
     rows = recorded(scenario)
     short = written(tmp_path, rows[:100])
     with pytest.raises(ConfigurationError, match="no window of 2 s can be used: the data is too short"):
         noise(MACHINE, short)
-    holes = written(
-        tmp_path, [row if index % 200 < 150 else [row[0], "", "", "", ""] for index, row in enumerate(rows)]
-    )
-    with pytest.raises(ConfigurationError, match=r"no window of 2 s can be used: .*(missing|no samples|gap)"):
-        noise(MACHINE, holes)
+    nearly_empty = written(tmp_path, [row if index < 3 else [row[0], "", "", "", ""] for index, row in enumerate(rows)])
+    with pytest.raises(ConfigurationError, match="badly sampled"):
+        noise(MACHINE, nearly_empty)
+    empty = written(tmp_path, [[row[0], "", "", "", ""] for row in rows])
+    with pytest.raises(ConfigurationError, match=r"no window of 2 s can be used: .*no samples"):
+        noise(MACHINE, empty)
 
 
 @pytest.mark.parametrize(("count", "most", "kept"), [(0, 3, 0), (2, 3, 2), (5, 1, 1), (100, 7, 7)])

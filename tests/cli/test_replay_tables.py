@@ -91,9 +91,7 @@ def test_table_counts_and_locates_bad_rows_and_cells(
     data = written(tmp_path, rows)
     documents = reports(data, capsys)
     assert len(documents) == 5
-    for document in documents:  # two windows lack more than 1 % of their records
-        lacking = document.window.quality.missing > 0.01
-        assert document.parameters["R_a"].status is (Status.HELD if lacking else Status.ESTIMATED)
+    assert all(document.parameters["R_a"].status is Status.ESTIMATED for document in documents)
     assert [document.window.quality.missing > 0.01 for document in documents] == [False, True, True, False, False]
     assert documents[-1].counters is not None
     assert (documents[-1].counters.bad, documents[-1].counters.lost) == (4, 0)
@@ -122,18 +120,19 @@ def test_table_rows_are_reordered_within_the_window(
 def test_table_locates_a_time_far_ahead(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
     rows[500][0] = "99999999"
     text = summed_up(written(tmp_path, rows), capsys)
-    assert "2 windows: 2 good, 0 bad" in text
-    assert "closed: 499, the first in line 503, with t = 5.01 after t = 99999999 above" in text
+    assert "4 windows: 4 good, 0 bad" in text
+    assert "gaps longer than a window, skipped: 1, the longest of 1e+08 s" in text
+    assert "recordings in the file: 2" in text
 
 
-def test_table_short_gap_is_bad_and_long_gap_is_skipped(
+def test_table_gap_longer_than_a_window_is_skipped(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for silence, windows in ((10.0, 15), (1e5, 10)):
+    for silence in (10.0, 1e5):
         again = [[f"{float(row[0]) + 10.0 + silence:.3f}", *row[1:]] for row in rows]
         documents = reports(written(tmp_path, rows + again), capsys)
-        assert [document.window.index for document in documents] == list(range(windows))
-        assert sum(document.window.quality.verdict == "good" for document in documents) == 10
+        assert [document.window.index for document in documents] == list(range(10))
+        assert all(document.window.quality.verdict == "good" for document in documents)
         assert documents[-1].window.end == pytest.approx(20.0 + silence)
 
 
@@ -152,12 +151,20 @@ def test_table_with_irregular_rows_and_slow_columns(
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.005)
 
 
-def test_table_blank_column_gives_bad_windows_naming_it(
-    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("blank", "names"), [((3, 4), "i, omega"), ((1,), "V_a"), ((2,), "T_load")])
+def test_table_without_outputs_or_with_a_blank_input_gives_bad_windows_naming_it(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str], blank: tuple[int, ...], names: str
 ) -> None:
-    text = summed_up(written(tmp_path, [[*row[:4], ""] for row in rows]), capsys)
-    assert "5 windows: 0 good, 5 bad" in text
-    assert "5 bad like: no samples of omega (window 0)" in text
+    emptied = [["" if column in blank else cell for column, cell in enumerate(row)] for row in rows]
+    text = summed_up(written(tmp_path, emptied), capsys)
+    assert "0 good, " in text
+    assert f"bad like: no samples of {names} from t = " in text
+
+
+def test_table_with_one_blank_output_is_used(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+    documents = reports(written(tmp_path, [[*row[:4], ""] for row in rows]), capsys)
+    assert all(document.window.quality.verdict == "good" for document in documents)
+    assert documents[-1].window.quality.missing == 1.0
 
 
 def test_table_rows_denser_than_the_grid_are_not_lost(

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from otolith.acquisition.time_grid import TimeGrid
 from otolith.acquisition.window import Array, Quality, Verdict, Window
 from otolith.commissioning import identification as text
-from otolith.commissioning.identification import IdentifiedNoise, identify_noise, observable_states
+from otolith.commissioning.identification import IdentifiedNoise, identify_noise, observable_states, sample_noise
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
@@ -48,7 +49,7 @@ def window(
     inputs = np.column_stack([volts, load + slow])
     for record in range(RECORDS):
         outputs[record] = state
-        excitation = Excitation(inputs[record : record + 2], PERIOD, 4)
+        excitation = Excitation.uniform(inputs[record : record + 2], PERIOD, 4)
         if record + 1 < RECORDS:
             state = kernel_of(TWIN).simulate(parameters, state[None], excitation)[0, 1]
             state = state + np.array(process) * np.sqrt(PERIOD) * random.normal(size=2)
@@ -82,6 +83,43 @@ def test_process_noise_beside_sensor_noise(process: tuple[float, float], seed: i
     assert levels(noise)[:2] == pytest.approx(SENSORS, rel=0.15)
     assert levels(noise)[2:] == pytest.approx(process, rel=0.15, abs=0.1 * np.sqrt(PERIOD) * SENSORS.min())
     assert noise.consistency.factor == 1.0
+
+
+def thinned(random: np.random.Generator, whole: Window, missing: float, rows: float = 0.0) -> Window:
+    """The window without a share of the samples of its outputs, and without a share of its rows."""
+    kept = np.flatnonzero(random.random(whole.records) >= rows)
+    kept[0] = 0
+    grid = TimeGrid.at(whole.grid.offsets[kept], whole.grid.length) if rows else whole.grid
+    absent = np.zeros((len(kept), 4), dtype=np.bool_)
+    absent[:, 2:] = random.random((len(kept), 2)) < missing
+    values = np.where(absent, np.nan, whole.values[kept])
+    return replace(whole, grid=grid, values=values, missing=absent)
+
+
+@pytest.mark.parametrize(("missing", "rows"), [(0.5, 0.0), (0.0, 0.5), (0.5, 0.5)])
+def test_a_cubic_leaves_no_noise_at_any_times(missing: float, rows: float) -> None:
+    random = np.random.default_rng(20)
+    times = PERIOD * np.arange(RECORDS)
+    cubic = 3.0 - 40.0 * times + 50.0 * times**2 - 20.0 * times**3
+    levels_of_noise = []
+    for noise in (0.0, 0.01):
+        values = np.tile(cubic[:, None], (1, 4)) + noise * random.normal(size=(RECORDS, 4))
+        whole = [Window.whole(index, 0.0, PERIOD, TWIN.signals, values) for index in range(30)]
+        levels_of_noise.append(sample_noise("omega", [thinned(random, window, missing, rows) for window in whole]))
+    assert levels_of_noise[0] < 1e-9
+    assert levels_of_noise[1] == pytest.approx(0.01, rel=0.1)
+
+
+@pytest.mark.parametrize(("missing", "rows"), [(0.5, 0.0), (0.0, 0.3)])
+def test_noise_at_irregular_records(missing: float, rows: float) -> None:
+    """Rows may be dropped only if no input changes in between, so the voltage is constant."""
+    random, process = np.random.default_rng(21), (0.05, 0.3)
+    changing = (4.0, 20.0) if not rows else (12.0, 12.0)
+    whole = [window(random, index, process, changing) for index in range(30)]
+    problem = replace(PROBLEM, window=replace(PROBLEM.window, sample_period=PERIOD))
+    noise = identify_noise(problem, [thinned(random, item, missing, rows) for item in whole])
+    assert levels(noise)[:2] == pytest.approx(SENSORS, rel=0.2)
+    assert levels(noise)[2:] == pytest.approx(process, rel=0.2)
 
 
 def test_windows_at_rest_identify_sensor_noise_only() -> None:

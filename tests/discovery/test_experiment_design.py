@@ -27,7 +27,7 @@ STEADY = np.array([6.5 * CURRENT + 0.038 * SPEED, 0.06])
 
 def window(index: int, inputs: Array, initial: Array) -> Window:
     random = np.random.default_rng(index)
-    outputs = kernel_of(TWIN).simulate(PARAMETERS, initial[None], Excitation(inputs, PERIOD, 4))[0]
+    outputs = kernel_of(TWIN).simulate(PARAMETERS, initial[None], Excitation.uniform(inputs, PERIOD, 4))[0]
     values = np.column_stack([inputs, outputs + random.normal(size=outputs.shape) * [0.005, 0.02]])
     return Window.whole(index, 2.0 * index, PERIOD, TWIN.signals, values)
 
@@ -74,7 +74,7 @@ def test_window_length_shrinks_as_the_trend_grows() -> None:
         for _ in range(30):
             sd = 0.002 * np.sqrt(200 / records)  # of one window of this length
             excitation = WindowExcitation(np.array([sd]), np.array([trend]), explained=True)
-            records = next_records(options, records, PERIOD, excitation)
+            records = next_records(options, records * PERIOD, PERIOD, excitation)
         return records
 
     lengths = [settled(trend) for trend in (1e-6, 3e-4, 1e-3, 3e-3, 1e-1)]
@@ -86,7 +86,7 @@ def test_window_length_shrinks_as_the_trend_grows() -> None:
 
 def test_window_length_stays_if_its_bounds_are_equal() -> None:
     excitation = WindowExcitation(np.array([0.1]), np.array([10.0]), explained=False)
-    assert next_records(WindowOptions(200, 200, 200), 200, PERIOD, excitation) == 200
+    assert next_records(WindowOptions(200, 200, 200), 200 * PERIOD, PERIOD, excitation) == 200
 
 
 @pytest.mark.parametrize("records", [20_000, pytest.param(1_000_000, marks=pytest.mark.full)])

@@ -57,7 +57,7 @@ def test_guide_twin_estimates(folder: Path) -> None:
     random = np.random.default_rng(1)
     torque = np.repeat(random.uniform(2.0, 12.0, 10), 50)
     truth = np.array([[0.085, 0.9, 0.00031]])
-    omega = kernel_of(plan.twin).simulate(truth, np.array([[80.0]]), Excitation(torque[:, None], 0.02))[0, :, 0]
+    omega = kernel_of(plan.twin).simulate(truth, np.array([[80.0]]), Excitation.uniform(torque[:, None], 0.02))[0, :, 0]
     values = np.column_stack([torque, omega + random.normal(0.0, 0.1, 500)])
     window = Window.whole(0, 0.0, 0.02, ("T_m", "omega"), values)
     _, report = adapt(initial_state("fan-3", "hall-2", plan.problem), window)

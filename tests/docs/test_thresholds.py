@@ -15,7 +15,7 @@ SOURCES = {
     "commissioning": [DAEMON / "commissioning"],
     "discovery": [DAEMON / "discovery"],
     "drivers": [DRIVERS],
-    "estimation": [DAEMON / "estimation"],
+    "estimation": [DAEMON / "estimation", DAEMON / "estimation" / "timing"],
     "health": [DAEMON / "health", DAEMON / "adaptation"],
     "modbus": [DRIVERS / "modbus"],
     "plant": [DRIVERS / "plant"],

@@ -93,7 +93,7 @@ def test_constant_records_are_not_estimated_from() -> None:
         state, report = adapt(state, window)
         resistance = report.document.parameters["R_a"]
         assert resistance.status is not Status.ESTIMATED
-        assert "198 of 200 records repeat" in resistance.reason
+        assert "199 of 200 records repeat" in resistance.reason
 
 
 @pytest.mark.parametrize("steps", [1.0, 3.0, 8.0])

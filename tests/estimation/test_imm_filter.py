@@ -100,3 +100,16 @@ def test_imm_inconsistent_windows_widen_the_interval() -> None:
     inflated = update(posterior, evidence(SIZE, 0.0, 0.01, random))
     deviations = [posterior.prior().covariance[0, 0] ** 0.5 for posterior in (uninflated, inflated)]
     assert deviations[0] < 0.8 * deviations[1]
+
+
+@pytest.mark.parametrize("precision", [1e6, 1e9, 1e13, 1e60])
+def test_evidence_that_is_far_more_precise_in_one_direction_gives_a_posterior(precision: float) -> None:
+    """As of an axis that creeps for seconds: its offset is certain, and nothing else."""
+    prediction = imm_filter.initial_modes(np.zeros(4), np.diag([1.0, 1.0, 1e-6, 1e-6]))
+    root = np.outer([1.0, -0.3, 1.7, 0.1], [precision, 0.4 * precision, 0.0, 0.0]) + 1e-9 * np.eye(4)
+    certain = Evidence(np.zeros(4), root, np.array([0.5, -0.2, 0.1, 0.3]))
+    assert 0.0 <= imm_filter.nis(prediction, certain) < 1.0
+    mean, covariance = imm_filter.moment_match(imm_filter.update(prediction, certain))
+    assert np.isfinite(mean).all()
+    assert np.linalg.eigvalsh(covariance).min() >= -1e-9
+    assert covariance[0, 0] < 1.0

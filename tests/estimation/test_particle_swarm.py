@@ -89,7 +89,7 @@ def test_cold_start_converges_near_the_true_parameters(seed: int) -> None:
     random = np.random.default_rng(seed)
     inputs = np.column_stack([np.repeat(random.uniform(5.0, 20.0, 20), 10), np.full(200, 0.03)])
     outputs = kernel_of(TWIN).simulate(
-        np.array([list(NOMINAL.values())]), np.zeros((1, 2)), Excitation(inputs, 0.01, 8)
+        np.array([list(NOMINAL.values())]), np.zeros((1, 2)), Excitation.uniform(inputs, 0.01, 8)
     )
     values = np.column_stack([inputs, outputs[0] + random.normal(size=(200, 2)) * NOISE])
     window = Window.whole(0, 0.0, 0.01, TWIN.signals, values)

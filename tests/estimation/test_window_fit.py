@@ -171,7 +171,7 @@ def test_fast_electrical_dynamics_are_integrated_accurately() -> None:
     parameters = np.array([list(truth.values())])
     random = np.random.default_rng(3)
     inputs = np.column_stack([np.repeat(random.uniform(5.0, 20.0, 20), 10), np.full(200, 0.03)])
-    outputs = kernel_of(DC_MOTOR).simulate(parameters, np.zeros((1, 2)), Excitation(inputs, 0.01, 64))[0]
+    outputs = kernel_of(DC_MOTOR).simulate(parameters, np.zeros((1, 2)), Excitation.uniform(inputs, 0.01, 64))[0]
     values = np.column_stack([inputs, outputs + random.normal(size=(200, 2)) * [0.005, 0.02]])
     window = Window.whole(0, 0.0, 0.01, DC_MOTOR.signals, values)
     known = tuple((name, value) for name, value in truth.items() if name != "R_a")
@@ -209,7 +209,7 @@ def test_only_correlated_residuals_are_inflated_further() -> None:
     correlated = np.cumsum(random.standard_normal((200, 2)), axis=0)
     for residuals, low, high in ((white, 0.95, 1.1), (correlated, 3.0, 20.0)):
         cost = float(np.sqrt(np.mean(residuals**2)))
-        assert low <= inflation_of(3.0 / cost * residuals, 3.0) / 3.0 <= high
+        assert low <= inflation_of(3.0 / cost * residuals, np.ones_like(residuals, dtype=np.bool_), 3.0) / 3.0 <= high
 
 
 def test_diverging_guess_costs_the_penalty(scenario: MotorScenario, windows: Cut) -> None:

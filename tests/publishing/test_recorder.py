@@ -39,8 +39,12 @@ def record(folder: Path, rows: Lines, name: str = "run.rrd") -> Path:
     return path
 
 
-def assert_same(first: list[ReportDocument], again: list[ReportDocument]) -> None:
-    """Compare reports, except for what a recording does not contain: arrival times and counts of samples."""
+def assert_same(first: list[ReportDocument], again: list[ReportDocument], share: float = 0.0) -> None:
+    """Compare reports, except for what a recording does not contain: arrival times and counts of samples.
+
+    A recording leaves out bad windows. So the inputs before the window that follows are unknown in the replay: values
+    may differ by a ``share`` of their standard deviation.
+    """
     assert len(first) == len(again)
     for one, other in zip(first, again, strict=True):
         assert other.window.start == pytest.approx(one.window.start, abs=PERIOD / 2)  # jitter moves the grid
@@ -48,28 +52,30 @@ def assert_same(first: list[ReportDocument], again: list[ReportDocument]) -> Non
         assert other.decision is one.decision
         for name, parameter in one.parameters.items():
             assert other.parameters[name].status is parameter.status
-            assert other.parameters[name].value == pytest.approx(parameter.value, rel=1e-6)
-            assert other.parameters[name].sd == pytest.approx(parameter.sd, rel=1e-3)
+            assert other.parameters[name].value == pytest.approx(
+                parameter.value, rel=1e-6, abs=share * (parameter.sd or 0.0)
+            )
+            assert other.parameters[name].sd == pytest.approx(parameter.sd, rel=max(1e-3, share))
 
 
 @pytest.mark.parametrize("begun", [0.0, 1_700_000_000.0])
 def test_a_replayed_recording_gives_the_same_reports(
     tmp_path: Path, rows: Lines, begun: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The data have blank cells, a spike, a window with too many missing samples and one with jitter."""
+    """The data have blank cells, a spike, a window without outputs and one with jitter."""
     random = np.random.default_rng(3)
     for index, row in enumerate(rows):
         jitter = random.uniform(0.0, 0.02) if 2 * RECORDS < index < 3 * RECORDS else 0.0
         row[0] = f"{begun + float(row[0]) + jitter:.6f}"
-    rows[250][3], rows[260][1], rows[270][4] = "", "", "1e6"
-    for row in rows[650:690]:
-        row[2] = ""
+    rows[50][3], rows[60][1], rows[70][4] = "", "", "1e6"
+    for row in rows[RECORDS : 2 * RECORDS]:
+        row[3:5] = "", ""
     path = record(tmp_path, rows)
     capsys.readouterr()
     first, again = reports(tmp_path / "data.csv", capsys), reports(path, capsys)
     assert {document.window.quality.verdict for document in first} == {"good", "bad"}
-    assert_same(first, again)
-    assert "windows that were bad when they were recorded, left out: 2" in summed_up(path, capsys)
+    assert_same(first, again, share=0.1)
+    assert "windows that were bad when they were recorded, left out: 1" in summed_up(path, capsys)
 
 
 def test_two_replays_of_a_recording_are_identical(

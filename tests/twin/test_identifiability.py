@@ -67,7 +67,7 @@ def test_new_twin_estimates_parameters_by_role(machine_file: Path) -> None:
     assert [parameter.name for parameter in plan.problem.free] == ["C", "R_th"]
     random = np.random.default_rng(4)
     current = np.repeat(random.uniform(2.0, 15.0, 30), 10)
-    drive = Excitation(current[:, None], 1.0)
+    drive = Excitation.uniform(current[:, None], 1.0)
     truth = np.array([[1.5, 95.0, 1.1]])
     theta = kernel_of(plan.twin).simulate(truth, np.array([[20.0]]), drive)[0, :, 0] + random.normal(0.0, 0.1, 300)
     values = np.column_stack([current, theta])

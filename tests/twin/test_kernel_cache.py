@@ -20,7 +20,7 @@ import numpy as np
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
 twin = find_twin("dc_motor")
-drive = Excitation(np.zeros((10, 2)), 0.01)
+drive = Excitation.uniform(np.zeros((10, 2)), 0.01)
 print(kernel_of(twin).simulate(np.array([[p.nominal for p in twin.parameters]]), np.zeros((1, 2)), drive).sum())
 print("sympy" in sys.modules)
 """

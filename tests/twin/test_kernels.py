@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from otolith.acquisition.time_grid import TimeGrid
 from otolith.acquisition.window import Array
 from otolith.machine import find_twin
 from otolith.machine import library_twins as library
@@ -29,7 +30,7 @@ def excitation(definition: Definition, records: int = RECORDS, seed: int = 5) ->
     """Random levels within the inputs' ranges, each held for ten records or interpolated."""
     random = np.random.default_rng(seed)
     columns = [np.repeat(random.uniform(e.low, e.high, records // 10 + 1), 10)[:records] for e in definition.inputs]
-    return Excitation(np.column_stack(columns), PERIODS[definition.name])
+    return Excitation.uniform(np.column_stack(columns), PERIODS[definition.name])
 
 
 @pytest.fixture(params=library())
@@ -39,7 +40,7 @@ def twin(request: pytest.FixtureRequest) -> Definition:
 
 def resolved(twin: Definition, drive: Excitation) -> tuple[Excitation, Array, Array]:
     """The excitation with substeps for errors of 1e-7 of a signal's range, the reference prediction, the ranges."""
-    expected = Reference(twin, nominal(twin)).simulate(initial(twin), drive.inputs, drive.sample_period)
+    expected = Reference(twin, nominal(twin)).simulate(initial(twin), drive.inputs, PERIODS[twin.name])
     extent = np.ptp(expected, axis=0)
     assert (extent > 0.0).all(), "the excitation does not move every signal"
     substeps = kernel_of(twin).substeps(nominal(twin), initial(twin), drive, 1e-7 * extent)
@@ -64,7 +65,7 @@ def test_sensitivities_are_derivatives_of_the_reference(twin: Definition) -> Non
         step = np.zeros(len(point))
         step[column] = 1e-5 * min(width, max(abs(point[column]), 1e-2 * width))
         ahead, behind = (
-            Reference(twin, p[:split]).simulate(p[split:], drive.inputs, drive.sample_period)
+            Reference(twin, p[:split]).simulate(p[split:], drive.inputs, PERIODS[twin.name])
             for p in (point + step, point - step)
         )
         change = (ahead - behind) / (2.0 * step[column])
@@ -85,11 +86,9 @@ def test_drifts_are_derivatives_by_a_moving_parameter(name: str) -> None:
     for index, parameter in enumerate(twin.parameters):
         width = parameter.high - parameter.low
         reach = min(width, max(abs(parameter.nominal), 0.01 * width))
-        rate = 1e-4 * reach / (20 * drive.sample_period)
+        rate = 1e-4 * reach / (20 * PERIODS[name])
         ahead, behind = (
-            Reference(twin, nominal(twin)).simulate(
-                initial(twin), drive.inputs, drive.sample_period, {parameter.name: r}
-            )
+            Reference(twin, nominal(twin)).simulate(initial(twin), drive.inputs, PERIODS[name], {parameter.name: r})
             for r in (rate, -rate)
         )
         change = (ahead - behind) / (2.0 * rate)
@@ -102,7 +101,7 @@ def test_integrator_has_order_four(name: str) -> None:
     """Halving the step divides the error by sixteen."""
     twin = find_twin(name)
     drive = excitation(twin, records=20)
-    drive = replace(drive, sample_period=4 * drive.sample_period)
+    drive = Excitation.uniform(drive.inputs, 4 * PERIODS[name])
     coarse, fine, finest = (
         kernel_of(twin).simulate(nominal(twin)[None], initial(twin)[None], replace(drive, substeps=n))
         for n in (2, 4, 64)
@@ -150,7 +149,7 @@ def test_innovation_form_is_a_kalman_prediction() -> None:
     for record in range(RECORDS - 1):
         assert predicted[record] == pytest.approx(state, rel=1e-12)
         state = state + gain[record] @ np.nan_to_num(measured[record] - state)
-        piece = replace(drive, inputs=drive.inputs[record : record + 2])
+        piece = Excitation.uniform(drive.inputs[record : record + 2], PERIODS[twin.name])
         state = kernel.simulate(nominal(twin)[None], state[None], piece)[0, 1]
 
 
@@ -178,7 +177,8 @@ def test_gain_is_that_of_an_extended_kalman_filter() -> None:
     random = np.random.default_rng(4)
     measured = kernel.simulate(nominal(twin)[None], initial(twin)[None], drive)[0] + random.normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
-    noise = NoiseModel(np.array([0.5, 1.0]), np.array([0.0, 0.01]), np.array([0.2, 3.0]))
+    noisy = np.array([0.0, 0.01])
+    noise = NoiseModel.uniform(np.array([0.5, 1.0]), noisy, np.array([0.2, 3.0]), RECORDS)
     model = kernel.innovation_model(nominal(twin), initial(twin), replace(drive, measured=measured), noise)
     state, covariance, log_determinant = initial(twin), np.zeros((2, 2)), 0.0
     for record in range(RECORDS):
@@ -194,12 +194,12 @@ def test_gain_is_that_of_an_extended_kalman_filter() -> None:
             break
         state = state + gain @ (measured[record, seen] - state[seen])
         covariance = covariance - gain @ innovation @ gain.T
-        piece = replace(drive, inputs=drive.inputs[record : record + 2])
+        piece = Excitation.uniform(drive.inputs[record : record + 2], PERIODS[twin.name])
         step = kernel.sensitivities(nominal(twin), state, piece)
-        nudged = piece.inputs + noise.inputs
+        nudged = piece.inputs + noisy
         driven = kernel.sensitivities(nominal(twin), state, replace(piece, inputs=nudged)).last - step.last
         transition = step.last_slopes[:, 6:]
-        strays = np.diag(noise.states**2 * drive.sample_period) + np.outer(driven, driven)
+        strays = np.diag(noise.states**2 * PERIODS[twin.name]) + np.outer(driven, driven)
         state, covariance = step.last, transition @ covariance @ transition.T + strays
     assert model.log_determinant == pytest.approx(log_determinant, rel=1e-6)
 
@@ -215,3 +215,24 @@ def test_substeps_are_the_fewest_that_suffice() -> None:
         for n in (16 * count, count, count // 2)
     )
     assert np.abs(enough - exact).max() <= 1e-6 < np.abs(fewer - exact).max()
+
+
+def test_the_search_for_substeps_costs_as_much_per_record_at_any_times() -> None:
+    """Samples of two sources come in pairs a microsecond apart, and no number of substeps is enough."""
+    twin = find_twin("servo_axis")
+    grid = TimeGrid.at(
+        np.sort(np.concatenate([[0.0, 1e-6, 2e-6], np.add.outer(np.arange(1, 20), [0.0, 1e-6]).ravel()])), 20.0
+    )
+    drive = Excitation(np.full((grid.records, 1), 1e6), grid)
+    unreachable = np.zeros(len(twin.outputs))
+    count = kernel_of(twin).substeps(nominal(twin), initial(twin), drive, unreachable, limit=8)
+    # The search goes in powers of two, and an ordinary step is at least half the mean one.
+    assert replace(drive, substeps=count).counts.sum() <= (4 * 8 + 1) * grid.records
+
+
+def test_rounding_errors_end_the_search_for_substeps() -> None:
+    """A position in the wrong unit is so large that its rounding errors exceed the truncation error that is allowed."""
+    twin = find_twin("servo_axis")
+    drive = Excitation.uniform(np.zeros((RECORDS, 1)), 0.001)
+    far = np.array([3.0e8, 1.0e8])
+    assert kernel_of(twin).substeps(nominal(twin), far, drive, np.array([1e-9])) <= 8

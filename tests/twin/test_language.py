@@ -168,7 +168,7 @@ def test_other_units_give_the_same_machine() -> None:
         assert old in other
         other = other.replace(old, new)
     twins = [read_twin(SourceFile(Path("a.toml"), BASE)), read_twin(SourceFile(Path("b.toml"), other))]
-    drive = Excitation(np.column_stack([np.full(100, 12.0), np.full(100, 0.02)]), 0.01)
+    drive = Excitation.uniform(np.column_stack([np.full(100, 12.0), np.full(100, 0.02)]), 0.01)
     predicted = []
     for twin in twins:
         parameters = np.array([[parameter.nominal for parameter in twin.parameters]])
@@ -208,7 +208,7 @@ y = "{formula}"
 """
     twin = read_twin(SourceFile(Path("any.toml"), page))
     parameters, initial = np.array([0.7, 1.9, 0.3]), np.array([1.3])
-    drive = Excitation(np.array([[0.4], [2.3], [-1.1], [0.9], [0.2]]), 0.1, 8)
+    drive = Excitation.uniform(np.array([[0.4], [2.3], [-1.1], [0.9], [0.2]]), 0.1, 8)
     result = kernel_of(twin).sensitivities(parameters, initial, drive)
     expected = Reference(twin, parameters).simulate(initial, drive.inputs, 0.1)
     assert result.outputs == pytest.approx(expected, rel=1e-9, abs=1e-11)

@@ -1,188 +1,186 @@
-"""Align time-stamped samples to the uniform grid of a window, and assess the quality of the result.
+"""Cyclic signals: a source samples on a clock of its own; only the arrival jitters, late but never early.
 
-A cyclic source samples on a grid of its own; only the arrival jitters, and a frame can arrive late but never early.
-A signal whose period is about the sample period is therefore assigned to slots of the grid: late samples move to
-earlier slots, and values are not changed. A signal at another rate is interpolated linearly, and so is a polled
-signal, whose times say when each value was true.
+A signal whose period is that of the grid of the window is assigned to the slots of the grid: late samples move to
+earlier slots, and values are not changed. A signal with another period has slots of its own, whose times are estimated
+from the arrivals; they are slots of the grid if that period is a whole multiple of the grid's. Nothing is interpolated.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from otolith.acquisition.window import Array, Mask, Quality, Verdict
-from otolith_drivers.base import Sampling
+from otolith.acquisition.samples import Series, interval_of, merge_equal_times
+from otolith.acquisition.time_grid import GridSpan
+from otolith.acquisition.window import Array
 
 Indices = NDArray[np.int64]
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
-CYCLIC_TOLERANCE = 0.3  # share of the sample period by which the period of a signal on the grid may differ from it
+SAME_PERIOD = 0.02  # share by which the mean interval of a signal may differ from the period of the grid
+MEDIAN_SD = 1.2533  # standard deviation of a median over that of the mean, for normal deviates
+MAD_TO_SD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
+PERIOD_DEVIATIONS = 4.0  # standard deviations by which the median interval may differ from the period of the grid
 MAX_DROPPED_SAMPLES = 20  # surplus samples per window that are dropped; more of them show as jitter
-MAX_SURPLUS_SHARE = 0.02  # of the records; more surplus samples than this come from a second sender
-MAX_IRREGULARITY = 0.3  # standard deviation of the sampling interval over its mean; a second sender exceeds it
-MAX_POLLED_DISTANCE = 0.75  # sample periods from the nearest reading, beyond which a polled record is missing
-MAX_INTERVAL = 2.5  # median intervals between two samples, beyond which interpolated records are missing
+PUNCTUAL_QUANTILE = 0.1  # of lateness: stands for the samples that the computer's load did not delay
+MAX_CLOCK_JITTER = 0.25  # of its period: standard deviation of the arrivals about a clock, above which there is none
+MAX_PHASE_ERROR = 0.05  # sample periods by which a delayed signal may be off the grid and still count as on it
+MIN_CLOCK_SAMPLES = 4  # samples from which the clock of a signal with another period can be estimated
+MAX_CLOCK_SLOTS = 100  # per sample: with more of them the arrivals have no clock
+LAG_DEVIATIONS = 3.0  # standard deviations by which neighbouring intervals must be correlated to show a second sender
 
 
-@dataclass(frozen=True, slots=True)
-class QualityLimits:
-    """Bounds that the worst signal of a window must keep for the window to be good."""
+@dataclass(frozen=True, slots=True, eq=False)
+class CyclicSeries:
+    """The samples of a cyclic signal at the times of its clock."""
 
-    missing: float
-    """Share of records without a sample, 0 to 1."""
-    gap: float
-    """Longest time without a sample, s."""
-    jitter: float
-    """Root mean square lateness, s."""
-
-
-class AlignedSignal(NamedTuple):
-    """One signal on the grid of a window."""
-
-    values: Array
-    """(records,) in the unit of the signal; zero where nothing can be interpolated."""
-    missing: Mask
-    """(records,) true where the value is no measurement."""
+    series: Series
     lateness: Array
-    """Time of each sample minus that of its slot, s; empty for a signal at another rate than the grid's."""
+    """Arrival of each sample minus the time of its slot, s."""
+    on_grid: bool
+    """Whether the slots are those of the grid of the window."""
     surplus: int = 0
-    """Samples dropped because the grid had no slot for them."""
+    """Samples dropped because there was no slot for them."""
     irregularity: float = 0.0
-    """Standard deviation of the sampling interval over its mean, for a signal at another rate; otherwise 0."""
+    """Standard deviation of the interval over its mean, of a signal with a period of its own; zero if samples were lost
+    at random only."""
 
 
-def align(times: Array, values: Array, start: float, records: int, period: float) -> AlignedSignal:
-    """Return the samples of a cyclic signal (s, value) on the grid ``start + k * period``, ``k < records``.
-
-    Samples that are not finite count as missing. Gaps are interpolated linearly between their ends; at the edges the
-    nearest value is repeated. Without any sample all values are zero and missing.
-    """
-    times, values = _finite_samples(times, values)
-    if len(times) > 1 and abs(np.median(np.diff(times)) / period - 1.0) > CYCLIC_TOLERANCE:
-        return _align_other_rate(times, values, start, records, period)
-    kept, slots = _assign_slots(times, start, period)
-    inside = (slots >= 0) & (slots < records)
-    surplus = len(times) - len(kept)
-    slots, times, values = slots[inside], times[kept][inside], values[kept][inside]
-    grid = np.full(records, np.nan)
-    grid[slots] = values
-    missing = np.isnan(grid)
-    if missing.any() and not missing.all():
-        present = np.flatnonzero(~missing)
-        grid = np.interp(np.arange(records), present, grid[present])
-    return AlignedSignal(*_mark_non_finite(grid, missing), times - (start + slots * period), surplus)
-
-
-def align_polled(times: Array, values: Array, start: float, records: int, period: float) -> AlignedSignal:
-    """Return the samples of a polled signal (s, value), interpolated linearly onto the grid of :func:`align`."""
-    times, values = _finite_samples(times, values)
-    if not len(times):
-        return AlignedSignal(np.zeros(records), np.ones(records, dtype=np.bool_), np.zeros(0))
-    grid, after = _grid(times, start, records, period)
-    distance = np.minimum(np.abs(grid - times[after - 1]), np.abs(grid - times[np.minimum(after, len(times) - 1)]))
-    slots = np.rint((times - start) / period)
-    inside = (slots >= 0) & (slots < records)
-    lateness = (times - (start + slots * period))[inside]
-    missing = distance > MAX_POLLED_DISTANCE * period
-    return AlignedSignal(*_mark_non_finite(np.interp(grid, times, values), missing), lateness)
-
-
-def _align_other_rate(times: Array, values: Array, start: float, records: int, period: float) -> AlignedSignal:
-    """Interpolate a cyclic signal that is slower or faster than the grid; records in long intervals are missing."""
-    grid, after = _grid(times, start, records, period)
+def has_period(times: Array, period: float) -> bool:
+    """Whether samples that arrive at ``times`` (n,), s, come every ``period`` s, some lost and some late."""
     intervals = np.diff(times)
-    usual = max(float(np.median(intervals)), period)
-    outside = (grid < times[0] - usual) | (grid > times[-1] + usual)
-    missing: Mask = (times[after] - times[after - 1] > MAX_INTERVAL * usual) | outside
-    mean = intervals.mean()
-    irregularity = float(intervals.std() / mean) if len(intervals) > 1 and mean > 0.0 else 0.0
-    aligned = _mark_non_finite(np.interp(grid, times, values), missing)
-    return AlignedSignal(*aligned, np.zeros(0), irregularity=irregularity)
+    if not len(intervals):
+        return True
+    if abs(float(intervals.mean()) / period - 1.0) <= SAME_PERIOD:
+        return True
+    median = float(np.median(intervals))
+    spread = MAD_TO_SD * float(np.median(np.abs(intervals - median)))
+    allowed = max(SAME_PERIOD * period, PERIOD_DEVIATIONS * MEDIAN_SD * spread / np.sqrt(len(intervals)))
+    return bool(abs(median - period) <= allowed)
 
 
-def _grid(times: Array, start: float, records: int, period: float) -> tuple[Array, Indices]:
-    """Return the times of the grid, and for each the index of the first later sample, as far as there is one."""
-    grid = start + period * np.arange(records, dtype=np.float64)
-    return grid, np.clip(np.searchsorted(times, grid), 1, max(len(times) - 1, 1))
+def align(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
+    """Return the samples of a cyclic signal in the slots ``start + k * period``, or in slots of its own.
+
+    A sample belongs to the slots of the window if it comes from ``grace`` s before until ``grace`` s after it. The
+    lateness is that of the slots ``k < records``. The other samples keep their times.
+    """
+    if not has_period(samples.within(span.start - grace, span.end + grace).times, span.period):
+        return _own_clock(samples, span, grace)
+    return align_to_grid(samples, span, grace)
 
 
-def _finite_samples(times: Array, values: Array) -> tuple[Array, Array]:
-    finite = np.isfinite(values)
-    return times[finite], values[finite]
+def align_delayed(samples: Series, delay: float, span: GridSpan, grace: float) -> CyclicSeries:
+    """Return the samples of a cyclic signal at the times of their arrival, without lateness, minus ``delay`` (s).
+
+    Slots of the grid would take away a part of the delay: that by which this signal arrives later than the others.
+    """
+    phase = _arrival_phase(samples.times, span)
+    slots = round((delay - phase) / span.period)
+    own = replace(span, start=span.start + phase + slots * span.period)
+    aligned = align(samples, own, grace)
+    times = aligned.series.times - delay
+    off_grid = own.start - delay - span.start
+    if not aligned.on_grid or abs(off_grid) > MAX_PHASE_ERROR * span.period:
+        return replace(aligned, series=Series(times, aligned.series.values), on_grid=False)
+    return replace(aligned, series=Series(times - off_grid, aligned.series.values))
 
 
-def _assign_slots(times: Array, start: float, period: float) -> tuple[Indices, Indices]:
-    """Return the indices of the samples to keep, and the slot of each.
+def _arrival_phase(times: Array, span: GridSpan) -> float:
+    """Return when the punctual samples arrive after the slots of the grid, s: between zero and a period."""
+    if not len(times):
+        return 0.0
+    turns = (times - span.start) / span.period
+    middle = float(np.angle(np.exp(2j * np.pi * turns).mean())) / (2.0 * np.pi)
+    deviations = (turns - middle + 0.5) % 1.0 - 0.5
+    return (middle + float(np.quantile(deviations, PUNCTUAL_QUANTILE))) % 1.0 * span.period
+
+
+def align_to_grid(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
+    """Return the samples of a signal in the slots ``start + k * period``, as :func:`align` does."""
+    start, period = span.start, span.period
+    near = samples.within(start - grace, span.end + grace)
+    kept, slots = _assign_slots(near.times, np.rint((near.times - start) / period))
+    at: Array = np.asarray(start + slots * period)
+    inside = (slots >= 0) & (slots < span.records)
+    before = samples.within(-np.inf, min(start - grace, float(at[0]) if len(at) else np.inf))
+    after = samples.within(max(span.end + grace, float(at[-1]) + period / 2 if len(at) else -np.inf), np.inf)
+    series = Series(
+        np.concatenate([before.times, at, after.times]),
+        np.concatenate([before.values, near.values[kept], after.values]),
+    )
+    surplus = len(near.times) - len(kept)
+    return CyclicSeries(series, (near.times[kept] - at)[inside], on_grid=True, surplus=surplus)
+
+
+def _own_clock(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
+    """Return the samples in slots whose period and phase are estimated from the arrivals.
+
+    Where the arrivals are too irregular for a clock, each sample keeps the time of its arrival.
+    """
+    times, values, irregularity = samples.times, samples.values, irregularity_of(samples.times)
+    last_of_each = merge_equal_times(times, values, "zoh")
+    as_arrived = CyclicSeries(last_of_each, np.zeros(0), on_grid=False, irregularity=irregularity)
+    if len(last_of_each.times) < MIN_CLOCK_SAMPLES:
+        return as_arrived
+    nearest = np.rint(np.diff(times, prepend=times[0]) / interval_of(last_of_each.times).usual).cumsum()
+    for _ in range(2):  # from interval to interval, then on the clock that this gives
+        if float(np.abs(nearest).max()) > MAX_CLOCK_SLOTS * len(times):
+            return as_arrived
+        kept, slots = _assign_slots(times, nearest)
+        if len(kept) < MIN_CLOCK_SAMPLES:
+            return as_arrived
+        arrivals, slots = times[kept], slots - slots[0]
+        period, start = (float(number) for number in np.polyfit(slots, arrivals, 1))
+        if period <= 0.0:
+            return as_arrived
+        nearest = np.rint((times - start) / period)
+    lateness = arrivals - (start + slots * period)
+    if float(lateness.std()) > MAX_CLOCK_JITTER * period:
+        return as_arrived
+    start += float(np.quantile(lateness, PUNCTUAL_QUANTILE))
+    multiple = round(period / span.period)
+    on_grid = multiple > 0 and abs(period / (multiple * span.period) - 1.0) * float(slots[-1]) * multiple < 0.5
+    if on_grid and multiple == 1:
+        return align_to_grid(samples, span, grace)
+    if on_grid:
+        slots = round((start - span.start) / span.period) + slots * multiple
+        start, period = span.start, span.period
+    at: Array = np.asarray(start + slots * period)
+    return CyclicSeries(Series(at, values[kept]), arrivals - at, on_grid, len(times) - len(kept), irregularity)
+
+
+def irregularity_of(times: Array) -> float:
+    """Return the standard deviation of the intervals between ``times`` (n,) over their mean.
+
+    It is zero if neighbouring intervals are independent, as where samples are lost at random. With a second sender, or
+    with late samples, a short interval follows a long one.
+    """
+    intervals = np.diff(times)
+    count, deviations = len(intervals), intervals - intervals.mean() if len(intervals) else intervals
+    variance = float(np.mean(deviations**2)) if count else 0.0
+    if count < 2 or variance <= 0.0:
+        return 0.0
+    correlation = float(np.sum(deviations[1:] * deviations[:-1])) / (count * variance)
+    alternating = correlation < -LAG_DEVIATIONS / np.sqrt(count)
+    return float(np.sqrt(variance) / intervals.mean()) if alternating else 0.0
+
+
+def _assign_slots(times: Array, nearest: Array) -> tuple[Indices, Indices]:
+    """Return the indices of the samples to keep, and the slot of each; ``nearest`` is the slot nearest to each sample.
 
     A sample takes the nearest slot, or an earlier one where several came in a burst. If the samples of a burst find no
     free slot before them, one sample is surplus: the one closest to its predecessor is dropped. After
     ``MAX_DROPPED_SAMPLES`` dropped samples the rest keep their late slots.
     """
-    kept = np.arange(len(times))
+    kept, wanted = np.arange(len(times)), nearest.astype(np.int64)
     for droppable in range(MAX_DROPPED_SAMPLES, -1, -1):
         order = np.arange(len(kept))
-        nearest = np.rint((times[kept] - start) / period).astype(np.int64)
-        slots = np.minimum.accumulate((nearest - order)[::-1])[::-1] + order
-        moved = nearest > slots
+        slots = np.minimum.accumulate((wanted[kept] - order)[::-1])[::-1] + order
+        moved = wanted[kept] > slots
         if not len(kept) or not moved[0] or not droppable:
             break
         burst = len(moved) if moved.all() else int(np.argmin(moved))
         surplus = int(np.argmin(np.diff(times[kept][: burst + 1]))) + 1 if burst > 0 and len(kept) > 1 else 0
         kept = np.delete(kept, surplus)
     return kept, slots
-
-
-def _mark_non_finite(values: Array, missing: Mask) -> tuple[Array, Mask]:
-    """Replace values that are not finite by missing zeros: interpolation between huge values can overflow."""
-    invalid = ~np.isfinite(values)
-    return np.where(invalid, 0.0, values), missing | invalid
-
-
-def assess_quality(
-    aligned: Mapping[str, AlignedSignal], period: float, limits: QualityLimits, sampling: Sampling = Sampling.CYCLIC
-) -> Quality:
-    """Return the quality of a window from its signals; ``period`` is the sample period, s."""
-    missing = {name: float(signal.missing.mean()) for name, signal in aligned.items()}
-    gaps = {name: _longest_run(signal.missing) * period for name, signal in aligned.items()}
-    # The offset of a polled signal is its place in the round of requests, the same in each round: no jitter.
-    centred = sampling is Sampling.POLLED
-    jitters = {name: _jitter(signal.lateness, centred=centred) for name, signal in aligned.items()}
-    surplus = {name: signal.surplus / max(len(signal.values), 1) for name, signal in aligned.items()}
-    irregularity = {name: signal.irregularity for name, signal in aligned.items()}
-    offsets = [float(np.median(signal.lateness)) for signal in aligned.values() if len(signal.lateness)]
-    checks = (
-        (missing, limits.missing, 1.0, "{1:.0%} of {0} is missing"),
-        (gaps, limits.gap, 1e3, "{0} has a gap of {1:.0f} ms"),
-        (surplus, MAX_SURPLUS_SHARE, 1.0, "{0} comes more often than it should: do two nodes send it?"),
-        (irregularity, MAX_IRREGULARITY, 1.0, "{0} comes at irregular intervals: do two nodes send it?"),
-        (jitters, limits.jitter, 1e3, "{0} arrives with {1:.1f} ms of jitter"),
-    )
-    silent = [name for name, share in missing.items() if share == 1.0]
-    reasons = [f"no samples of {', '.join(silent)}"] if silent else []
-    for values, limit, scale, text in () if silent else checks:
-        worst = max(values, key=values.__getitem__)
-        if values[worst] > limit:
-            reasons.append(text.format(worst, scale * values[worst]))
-    return Quality(
-        verdict=Verdict.BAD if reasons else Verdict.GOOD,
-        missing=max(missing.values()),
-        longest_gap=max(gaps.values()),
-        jitter=max(jitters.values()),
-        skew=max(offsets) - min(offsets) if offsets else 0.0,
-        reasons=tuple(reasons),
-    )
-
-
-def _jitter(lateness: Array, *, centred: bool) -> float:
-    """Return the root mean square lateness in seconds, about its median if ``centred``."""
-    if not len(lateness):
-        return 0.0
-    return float(np.sqrt(np.mean((lateness - np.median(lateness) * centred) ** 2)))
-
-
-def _longest_run(mask: Mask) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
-    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0

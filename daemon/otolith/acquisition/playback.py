@@ -6,21 +6,24 @@ sample until the grace period ends. So the windows depend on the rows alone, not
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from otolith.acquisition.alignment import QualityLimits
+from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.ring import Rings
+from otolith.acquisition.samples import SignalPlan
+from otolith.acquisition.segments import SegmentFinder
 from otolith.acquisition.window import Array, Window
-from otolith.acquisition.windower import GRACE_PERIOD, Windower
+from otolith.acquisition.windower import Windower
 from otolith_drivers.replay.readers import Integers, Rows
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 RING_WINDOWS = 16  # windows that the rings hold
 MAX_RING_SAMPLES = 1 << 20  # samples of each signal, however many a window has
-MAX_SILENT_WINDOWS = 100  # window lengths; a longer silence is skipped instead of reported window by window
+MAX_SILENT_WINDOWS = 1  # window lengths; a longer time without any row is skipped
 
 
 @dataclass(slots=True)
@@ -40,8 +43,16 @@ class PlaybackCounts:
     """Reordered rows whose window was closed already."""
     first_late: tuple[int, float, float] | None = None
     """Line and time (s) of the first late row, and the latest time (s) before it."""
-    silences: int = 0
-    """Silences that were skipped."""
+    gaps: int = 0
+    """Times without any row, longer than a window, that were skipped."""
+    longest_gap: float = 0.0
+    """The longest of them, s."""
+    segments: int = 0
+    """Recordings that begin after the first one."""
+    repeated: int = 0
+    """Samples at the time of another one, which were not used."""
+    stale: int = 0
+    """Readings of a register that had not been renewed, which were not used."""
 
 
 def median_step(times: Array) -> float:
@@ -54,11 +65,14 @@ def median_step(times: Array) -> float:
 class Playback:
     """Cuts windows from rows; times are seconds of the data. ``windower.records`` may be set between two windows."""
 
-    def __init__(self, signals: tuple[str, ...], records: int, sample_period: float, limits: QualityLimits) -> None:
-        self.windower = Windower(signals, records, sample_period, limits)
+    def __init__(
+        self, plans: Sequence[SignalPlan], records: int, sample_period: float, limits: QualityLimits | None = None
+    ) -> None:
+        self.windower = Windower(plans, records, sample_period, limits)
         self.counts = PlaybackCounts()
-        self._limits = limits
-        self._rings = Rings(signals, 1)
+        self._plans, self._limits = tuple(plans), limits
+        self._rings = Rings(self.windower.signals, 1)
+        self._segments = SegmentFinder(self.windower.length)
         self._windows = 0
         self._clock = -math.inf  # latest time of a delivered row
         self._begun = self._checked = -math.inf
@@ -66,13 +80,35 @@ class Playback:
 
     def windows(self, rows: Rows) -> Iterator[Window]:
         """Yield the windows that ``rows`` complete; the generator must be exhausted."""
+        for part in self._segments.mark(rows):
+            yield from self._windows_of(part)
+
+    def rest(self) -> Iterator[Window]:
+        """Yield the windows that are complete if no further row comes."""
+        for part in self._segments.rest():
+            yield from self._windows_of(part)
+        yield from self._complete()
+
+    def _windows_of(self, rows: Rows) -> Iterator[Window]:
+        begins = [int(row) for row in np.flatnonzero(rows.begins)]
+        for first, last in pairwise([0, *begins, len(rows.times)]):
+            if first in begins and self._begun > -math.inf:
+                yield from self._complete()
+                self.counts.segments += 1
+                self._begun = self._clock = -math.inf
+            if last > first:
+                yield from self._windows_of_segment(rows.part(slice(first, last)))
+
+    def _windows_of_segment(self, rows: Rows) -> Iterator[Window]:
         clock = np.maximum.accumulate(np.maximum(rows.times, self._clock))
         self.counts.reordered += int(np.count_nonzero(rows.times < clock))
         at = 0
         while at < len(clock):
-            if clock[at] - self._clock > MAX_SILENT_WINDOWS * self.windower.length:
-                yield from self.rest()
+            if math.isinf(self._begun):
                 self._restart(rows, at)
+            elif clock[at] - self._clock > MAX_SILENT_WINDOWS * self.windower.length:
+                yield from self._complete()
+                self._skip_gap(float(clock[at]))
             check = self._next_check(float(clock[at]))
             until = at + int(np.searchsorted(clock[at:], check))
             self._deliver(rows, slice(at, until), clock)
@@ -80,35 +116,40 @@ class Playback:
             if at < len(clock):
                 yield from self._cut_due(check)
 
-    def rest(self) -> Iterator[Window]:
-        """Yield the windows that are complete if no further row comes."""
+    def _complete(self) -> Iterator[Window]:
         if self._begun > -math.inf:
-            yield from self._cut_due(self._clock + 1.5 * self.windower.sample_period + GRACE_PERIOD)
+            yield from self._cut_due(self._clock + 1.5 * self.windower.sample_period + self.windower.grace)
 
     @property
     def unused_seconds(self) -> float:
         """Length of the data since the end of the last window, s."""
-        return max(0.0, self._clock + self.windower.sample_period - self._start) if self._windows else 0.0
-
-    @property
-    def _start(self) -> float:
-        return self.windower.next_end - self.windower.length
+        start = self.windower.next_start
+        return max(0.0, self._clock + self.windower.sample_period - start) if self._windows else 0.0
 
     def _restart(self, rows: Rows, at: int) -> None:
         """Begin anew with row ``at``, like a daemon that is started then."""
-        self.counts.silences += self._begun > -math.inf
         old = self.windower
-        self.windower = Windower(old.signals, old.records, old.sample_period, self._limits)
+        self.windower = Windower(self._plans, old.records, old.sample_period, self._limits)
+        self.windower.counts = old.counts
         if math.isinf(self._step):
             self._step = median_step(rows.times)
         rows_per_window = max(old.records, old.length / self._step)
         self._rings = Rings(old.signals, int(min(RING_WINDOWS * rows_per_window, MAX_RING_SAMPLES)))
         self._clock = self._begun = self._checked = float(rows.times[at])
 
+    def _skip_gap(self, following: float) -> None:
+        """Let the next window start with the row at ``following`` (s); what commands hold is kept."""
+        self.counts.gaps += 1
+        self.counts.longest_gap = max(self.counts.longest_gap, following - self._clock)
+        self.windower.skip_to(following)
+        self._clock = self._checked = following
+        if math.isinf(self.windower.next_start):
+            self._begun = following
+
     def _next_check(self, coming: float) -> float:
         """Return when to check the rings (s), if the next row moves the clock to ``coming``."""
         period, end = self.windower.sample_period, self.windower.next_end
-        deadline = end + GRACE_PERIOD
+        deadline = self.windower.deadline
         if math.isinf(end):
             deadline = self._begun + self.windower.length
         elif self._checked < end + period / 2:
@@ -120,6 +161,7 @@ class Playback:
         begun = self.windower.begin(self._rings, now, now - self._begun)
         while begun and self.windower.due(self._rings, now):
             window = self.windower.cut(self._rings, unix_offset=0.0)
+            self.counts.repeated, self.counts.stale = self.windower.counts.repeated, self.windower.counts.stale
             self._windows += 1
             yield replace(window, index=self._windows - 1)
 
@@ -127,7 +169,7 @@ class Playback:
         times = rows.times[part]
         if not len(times):
             return
-        oldest = self._start - self.windower.sample_period / 2
+        oldest = self.windower.next_start - self.windower.sample_period / 2
         if math.isinf(oldest):
             oldest = self._begun - self.windower.length
         on_time = times >= oldest

@@ -31,16 +31,19 @@ class Ring:
         self._values = np.zeros(capacity)
         self._count = 0
         self._read_up_to = -math.inf
+        self._newest = -math.inf
+        self._unordered_until = 0  # count up to which a sample may be older than one that came before it
         self.overwritten = 0
 
     def append(self, time: float, value: float) -> None:
         """Add a sample: ``time`` in s, ``value`` NaN where the source had no reading."""
         slot = self._count % len(self._times)
-        if self._count >= len(self._times) and self._times[slot] > self._read_up_to:
+        if self._count >= len(self._times) and self._times[slot] >= self._read_up_to:
             self.overwritten += 1
         self._times[slot] = time
         self._values[slot] = value
         self._count += 1
+        self._note_order(time < self._newest, time)
 
     def extend(self, times: Array, values: Array) -> None:
         """Add many samples (s, value) at once, with the same result as :meth:`append` for each."""
@@ -49,19 +52,43 @@ class Ring:
             part = slice(first, first + capacity)
             slots = np.arange(self._count, self._count + len(times[part]))
             reused = slots[slots >= capacity] % capacity
-            self.overwritten += int(np.count_nonzero(self._times[reused] > self._read_up_to))
+            self.overwritten += int(np.count_nonzero(self._times[reused] >= self._read_up_to))
             self._times[slots % capacity] = times[part]
             self._values[slots % capacity] = values[part]
             self._count += len(slots)
+            back = bool((times[part] < np.maximum.accumulate(np.maximum(times[part], self._newest))).any())
+            self._note_order(back, float(times[part].max()))
 
-    def between(self, start: float, end: float) -> tuple[Array, Array]:
-        """Return times (s) and values with ``start <= time < end``, sorted by time, and mark them as read."""
-        filled = min(self._count, len(self._times))
-        order = np.argsort(self._times[:filled], kind="stable")
-        times, values = self._times[:filled][order], self._values[:filled][order]
-        inside = (times >= start) & (times < end)
-        self._read_up_to = max(self._read_up_to, end)
-        return times[inside], values[inside]
+    def _note_order(self, stepped_back: bool, newest: float) -> None:
+        if stepped_back:
+            self._unordered_until = self._count
+        self._newest = max(self._newest, newest)
+
+    def around(self, start: float, end: float, read_until: float) -> tuple[Array, Array]:
+        """Return times (s) and values with ``start <= time < end``, sorted by time, and the last finite one before.
+
+        Samples before ``read_until`` (s) are marked as read: if they are overwritten, they are not lost.
+        """
+        times, values = self._ordered()
+        first, last = (int(index) for index in np.searchsorted(times, (start, end)))
+        before = np.flatnonzero(np.isfinite(values[:first]))
+        self._read_up_to = max(self._read_up_to, read_until)
+        part = slice(int(before[-1]), int(before[-1]) + 1) if len(before) else slice(0, 0)
+        both = (np.concatenate([column[part], column[first:last]]) for column in (times, values))
+        return next(both), next(both)
+
+    def _ordered(self) -> tuple[Array, Array]:
+        """Return all samples, sorted by time."""
+        capacity = len(self._times)
+        if self._count <= capacity:
+            times, values = self._times[: self._count], self._values[: self._count]
+        else:
+            oldest = self._count % capacity
+            times, values = np.roll(self._times, -oldest), np.roll(self._values, -oldest)
+        if self._unordered_until > self._count - len(times):
+            order = np.argsort(times, kind="stable")
+            return times[order], values[order]
+        return times, values
 
     def first_time(self) -> float:
         """Return the time of the oldest sample still held, s; infinity if there is none."""
@@ -103,20 +130,20 @@ class Rings:
                     ring.extend(times, values)
                     self._received += int(np.count_nonzero(np.isfinite(values)))
 
-    def between(self, start: float, end: float) -> dict[str, tuple[Array, Array]]:
-        """Return the result of :meth:`Ring.between` for every signal."""
+    def around(self, signal: str, start: float, end: float, read_until: float) -> tuple[Array, Array]:
+        """Return the result of :meth:`Ring.around` for one signal."""
         with self._lock:
-            return {signal: ring.between(start, end) for signal, ring in self._rings.items()}
+            return self._rings[signal].around(start, end, read_until)
 
-    def first_times(self) -> list[float]:
+    def first_times(self) -> dict[str, float]:
         """Return the result of :meth:`Ring.first_time` for every signal."""
         with self._lock:
-            return [ring.first_time() for ring in self._rings.values()]
+            return {signal: ring.first_time() for signal, ring in self._rings.items()}
 
-    def last_times(self) -> list[float]:
+    def last_times(self) -> dict[str, float]:
         """Return the result of :meth:`Ring.last_time` for every signal."""
         with self._lock:
-            return [ring.last_time() for ring in self._rings.values()]
+            return {signal: ring.last_time() for signal, ring in self._rings.items()}
 
     def counters(self) -> RingCounters:
         """Return the counts since the start."""

@@ -1,4 +1,4 @@
-"""A window: uniformly sampled signals of a machine, and the quality of their sampling."""
+"""A window: the samples of a machine in a stretch of time, each at its own time, and the quality of their sampling."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -6,6 +6,8 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from otolith.acquisition.time_grid import TimeGrid
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -35,27 +37,50 @@ class Quality:
     """Why the verdict is bad, one sentence per limit; empty if it is good."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BridgeError:
+    """How far the inputs of a window may be from the truth between their samples; (records, signals) each.
+
+    An error that lasts longer than a step disturbs the states more than one that is independent from record to record.
+    ``noise_ratio`` and ``held_variance`` are those of the independent error with the same effect on the states.
+    """
+
+    noise_ratio: Array
+    """Variance of the independent noise of a record over that of the noise of a sample; one where each record has one.
+    """
+    variance: Array
+    """Variance of the value of a record beside that noise, in the squared unit of the signal."""
+    held_variance: Array
+    """Variance of the independent error of a record beside that noise, in the squared unit of the signal."""
+
+    def rows(self, part: slice) -> "BridgeError":
+        """Return the same for some of the records."""
+        return BridgeError(self.noise_ratio[part], self.variance[part], self.held_variance[part])
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Uniform records of all signals of a machine. Frozen and picklable."""
+    """Records of all signals of a machine. Frozen and picklable."""
 
     index: int
     start: float
     """Unix seconds of the first record."""
-    sample_period: float
-    """Time between two records, s."""
+    grid: TimeGrid
     signals: tuple[str, ...]
     values: Array
-    """(records, signals), each in the unit of its signal; gaps are interpolated."""
+    """(records, signals), each in the unit of its signal; an input is bridged between its samples."""
     missing: Mask
-    """(records, signals), true where a value is interpolated and no measurement."""
+    """(records, signals), true where a value is no measurement."""
     quality: Quality
+    bridge_error: BridgeError | None = None
+    """None if every record has a sample of every input."""
 
     @classmethod
     def whole(cls, index: int, start: float, sample_period: float, signals: tuple[str, ...], values: Array) -> Self:
         """Return a window without gaps and jitter, as simulations and files on a grid give it."""
         missing = np.zeros(values.shape, dtype=np.bool_)
-        return cls(index, start, sample_period, signals, values, missing, Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0))
+        grid = TimeGrid.uniform(len(values), sample_period)
+        return cls(index, start, grid, signals, values, missing, Quality(Verdict.GOOD, 0.0, 0.0, 0.0, 0.0))
 
     @property
     def records(self) -> int:
@@ -63,18 +88,28 @@ class Window:
         return len(self.values)
 
     @property
+    def sample_period(self) -> float:
+        """Mean time between two records, s."""
+        return self.grid.mean_step
+
+    @property
     def end(self) -> float:
         """Unix seconds at which the last record ends."""
-        return self.start + self.records * self.sample_period
+        return self.start + self.grid.length
 
     def since(self, record: int) -> Self:
         """Return the part of the window from ``record`` on."""
-        start = self.start + record * self.sample_period
-        return replace(self, start=start, values=self.values[record:], missing=self.missing[record:])
+        start = self.start + self.grid.offsets[record]
+        return self._rows(slice(record, None), float(start), self.grid.since(record))
 
     def until(self, record: int) -> Self:
         """Return the part of the window before ``record``."""
-        return replace(self, values=self.values[:record], missing=self.missing[:record])
+        return self._rows(slice(None, record), self.start, self.grid.until(record))
+
+    def _rows(self, part: slice, start: float, grid: TimeGrid) -> Self:
+        error = None if self.bridge_error is None else self.bridge_error.rows(part)
+        values, missing = self.values[part], self.missing[part]
+        return replace(self, start=start, grid=grid, values=values, missing=missing, bridge_error=error)
 
     def column(self, signal: str) -> Array:
         """Return the values of one signal, (records,) in its unit."""

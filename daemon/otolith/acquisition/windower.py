@@ -1,39 +1,49 @@
 """Cut consecutive windows out of the rings, without gap or overlap between them."""
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.alignment import AlignedSignal, QualityLimits, align, align_polled, assess_quality
+from otolith.acquisition.alignment import PUNCTUAL_QUANTILE, CyclicSeries, align, align_delayed, align_to_grid
+from otolith.acquisition.quality import QualityLimits, assess_quality
+from otolith.acquisition.records import EARLY, ON_GRID, lies_on_grid, make_records, phase_of_grid
 from otolith.acquisition.ring import Rings
+from otolith.acquisition.samples import Series, SignalPlan, finite_samples, has_equal_times, merge_equal_times
+from otolith.acquisition.time_grid import GridSpan
 from otolith.acquisition.window import Window
 from otolith_drivers.base import Sampling
 
-ALIGN = {Sampling.CYCLIC: align, Sampling.POLLED: align_polled}
-
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
-GRACE_PERIOD = 0.1  # s after its end that a window waits for late samples
-PUNCTUAL_QUANTILE = 0.1  # of lateness: stands for the samples that the computer's load did not delay
-MIN_GAP_LIMIT = 2.5  # sample periods: on a coarse grid a gap of two records alone must not make a window bad
+GRACE_PERIOD = 0.1  # s after its end that a window waits for late samples, at least,
+SLOW_GRACE = 1.5  # or so many intervals of the slowest measured input, at most a window's length
+
+
+@dataclass(slots=True)
+class WindowerCounts:
+    """Samples that no record has."""
+
+    repeated: int = 0
+    """Samples at the time of another one."""
+    stale: int = 0
+    """Readings of a register that had not been renewed."""
 
 
 class Windower:
     """Tracks where the next window begins. Times are seconds on the monotonic clock, given by the caller."""
 
     def __init__(
-        self,
-        signals: tuple[str, ...],
-        records: int,
-        sample_period: float,
-        limits: QualityLimits,
-        sampling: Sampling = Sampling.CYCLIC,
+        self, plans: Sequence[SignalPlan], records: int, sample_period: float, limits: QualityLimits | None = None
     ) -> None:
-        self.signals = signals
+        """``records`` and ``sample_period`` (s) are those of the grid: together the length of a window."""
+        self.plans = {plan.name: plan for plan in plans}
+        self.signals = tuple(self.plans)
         self.records = records
         self.sample_period = sample_period
-        self._limits, self._configured_gap = limits, limits.gap
-        self._sampling = sampling
+        self.counts = WindowerCounts()
+        self._limits = limits or QualityLimits()
+        self._grace = GRACE_PERIOD
         self._start = math.inf
         self._index = 0
 
@@ -43,9 +53,24 @@ class Windower:
         return self.records * self.sample_period
 
     @property
+    def next_start(self) -> float:
+        """Time at which the next window starts, s; infinity before the first window has begun."""
+        return self._start
+
+    @property
     def next_end(self) -> float:
         """Time at which the last record of the next window ends, s; infinity before the first window has begun."""
         return self._start + self.length
+
+    @property
+    def grace(self) -> float:
+        """Time after its end that the next window waits for late samples, s."""
+        return self._grace
+
+    @property
+    def deadline(self) -> float:
+        """Time after which the next window no longer waits for late samples, s."""
+        return self.next_end + max(plan.delay for plan in self.plans.values()) + self._grace
 
     def begin(self, rings: Rings, now: float, waited: float) -> bool:
         """Return whether the first window has begun.
@@ -53,63 +78,143 @@ class Windower:
         It begins when every signal has a sample, or after ``waited`` >= one window length without.
         """
         if math.isinf(self._start):
-            first_times = rings.first_times()
-            if all(map(math.isfinite, first_times)):
-                self._start = max(first_times)
+            first = [time - self.plans[name].delay for name, time in rings.first_times().items()]
+            if all(map(math.isfinite, first)):
+                self._start = max(first)
             elif waited >= self.length:
                 self._start = now - self.length
         return math.isfinite(self._start)
 
     def due(self, rings: Rings, now: float) -> bool:
-        """Return whether the next window is complete, or ``GRACE_PERIOD`` has passed since its end.
+        """Return whether the next window is complete, or the time to wait for late samples has passed.
 
-        Samples only ever arrive late, so a signal is complete when the first sample of the following window is there.
+        A signal is complete when the first sample of the following window is there. That of a cyclic signal is the one
+        that is closer to its first slot than to the last one of this window.
         """
-        complete = min(rings.last_times()) >= self.next_end - self.sample_period / 2
-        return complete or now >= self.next_end + GRACE_PERIOD
+        shares = {Sampling.CYCLIC: 0.5, Sampling.TRUE: EARLY}
+        complete = all(
+            time - self.plans[name].delay >= self.next_end - shares[self.plans[name].sampling] * self.sample_period
+            for name, time in rings.last_times().items()
+        )
+        return complete or now >= self.deadline
 
     def cut(self, rings: Rings, unix_offset: float) -> Window:
         """Return the next window; ``unix_offset`` is Unix time minus monotonic time, s."""
-        aligned = self._align(rings)
+        series, cyclic, counts = self._align(rings)
         if self._index == 0:  # the grid was laid through a single sample, which may have been late
-            self._start += self._grid_shift(aligned)
-            aligned = self._align(rings)
+            self._start += _grid_shift(cyclic, first=True, period=self.sample_period)
+            series, cyclic, counts = self._align(rings)
+        records = make_records(series, self.plans, self._span())
         window = Window(
             index=self._index,
             start=self._start + unix_offset,
-            sample_period=self.sample_period,
+            grid=records.grid,
             signals=self.signals,
-            values=np.column_stack([aligned[signal].values for signal in self.signals]),
-            missing=np.column_stack([aligned[signal].missing for signal in self.signals]),
-            quality=assess_quality(aligned, self.sample_period, self._limits, self._sampling),
+            values=records.values,
+            missing=records.missing,
+            quality=assess_quality(records, self.plans, cyclic, self._limits, self._span(unix_offset)),
+            bridge_error=records.bridge_error,
         )
+        self.counts.repeated += counts
+        self.counts.stale += sum(records.stale.values())
+        self._grace = self._next_grace(series)
         self._index += 1
-        self._start = self._start + self.length + self._grid_shift(aligned)
+        self._start = self._start + self.length + _grid_shift(cyclic, first=False, period=self.sample_period)
         return window
 
     def regrid(self, records: int, sample_period: float) -> None:
         """From the next window on, cut ``records`` records, ``sample_period`` s apart."""
         self.records, self.sample_period = records, sample_period
-        self._limits = replace(self._limits, gap=max(self._configured_gap, MIN_GAP_LIMIT * sample_period))
 
-    def _align(self, rings: Rings) -> dict[str, AlignedSignal]:
-        samples = rings.between(self._start - GRACE_PERIOD, self.next_end + GRACE_PERIOD)
-        return {
-            signal: ALIGN[self._sampling](*samples[signal], self._start, self.records, self.sample_period)
-            for signal in self.signals
-        }
+    def _span(self, offset: float = 0.0) -> GridSpan:
+        """Return the next window, with times that are ``offset`` s later."""
+        return GridSpan(self._start + offset, self.records, self.sample_period)
 
-    def _grid_shift(self, aligned: dict[str, AlignedSignal]) -> float:
-        """Return by how much to move the grid, in s, at most half a sample period.
+    def skip_to(self, start: float) -> None:
+        """Let the next window start at ``start`` (s), after a time without samples."""
+        if math.isfinite(self._start):
+            self._start = max(self._start, start)
 
-        The clock of the source drifts against the monotonic clock. The lateness of the two halves of a window gives
-        its slope; a straight line through both gives the lateness in the middle of the next window, or of the first
-        window itself, which is aligned twice.
+    def _align(self, rings: Rings) -> tuple[dict[str, Series], dict[str, CyclicSeries], int]:
+        """Return the samples of each signal, the lateness of those on the grid, and the number of repeated samples."""
+        series = {name: self._samples(rings, plan) for name, plan in self.plans.items()}
+        true = [item for name, item in series.items() if self.plans[name].sampling is Sampling.TRUE]
+        repeated = sum(item.repeated for item in true)
+        self._adopt_phase(true)
+        cyclic: dict[str, CyclicSeries] = {}
+        for name, plan in self.plans.items():
+            if plan.sampling is Sampling.CYCLIC:
+                span, delay = self._span(), plan.delay
+                cyclic[name] = (
+                    align_delayed(series[name], delay, span, GRACE_PERIOD)
+                    if delay
+                    else align(series[name], span, GRACE_PERIOD)
+                )
+            elif self._is_on_grid(series[name]):
+                cyclic[name] = align_to_grid(series[name], self._span(), GRACE_PERIOD)
+            series[name] = cyclic[name].series if name in cyclic else series[name]
+        return series, cyclic, repeated
+
+    def _samples(self, rings: Rings, plan: SignalPlan) -> Series:
+        """Return the samples of a signal from one window before this one until after it, and the one before them.
+
+        The number of repeated samples is that of this window alone.
         """
-        halves = [(len(s.lateness) // 2, s.lateness) for s in aligned.values() if len(s.lateness) > 1]
-        if not halves:
-            return 0.0
-        early = float(np.quantile(np.concatenate([lateness[:half] for half, lateness in halves]), PUNCTUAL_QUANTILE))
-        late = float(np.quantile(np.concatenate([lateness[half:] for half, lateness in halves]), PUNCTUAL_QUANTILE))
-        shift = late + (1.5 * (late - early) if self._index else 0.5 * (early - late))
-        return float(np.clip(shift, -self.sample_period / 2, self.sample_period / 2))
+        start, end = self._start - self.length + plan.delay, self.next_end + max(self._grace, self.length) + plan.delay
+        times, values = finite_samples(*rings.around(plan.name, start, end, self.next_end + plan.delay))
+        if plan.sampling is Sampling.CYCLIC:  # the alignment subtracts the delay
+            return Series(times, values)
+        times = times - plan.delay if plan.delay else times
+        repeated = 0
+        if has_equal_times(times):
+            here = slice(*np.searchsorted(times, (self._start, self.next_end)))
+            repeated = merge_equal_times(times[here], values[here], plan.hold).repeated
+        merged = merge_equal_times(times, values, plan.hold)
+        return Series(merged.times, merged.values, repeated)
+
+    def _is_on_grid(self, series: Series) -> bool:
+        times = self._within(series).times
+        return len(times) > 0 and lies_on_grid(times, self._start, self.sample_period)
+
+    def _within(self, series: Series) -> Series:
+        """Return the samples of the next window at true times; none of them is in the window before."""
+        early = EARLY * self.sample_period
+        return series.within(self._start - early, self.next_end - early)
+
+    def _adopt_phase(self, series: list[Series]) -> None:
+        """Move the start to where true times are, if they are on a grid: after a pause it may have another phase.
+
+        It moves forward, by less than a sample period, so that no sample is in two windows.
+        """
+        if not series:
+            return
+        times = np.concatenate([self._within(item).times for item in series])
+        phase = phase_of_grid(times, self._start, self.sample_period)
+        if phase is not None and abs(phase) > ON_GRID * self.sample_period:
+            self._start += phase if phase >= -EARLY * self.sample_period else phase + self.sample_period
+
+    def _next_grace(self, series: dict[str, Series]) -> float:
+        """Return how long to wait for the sample after the end of a window, s: a line needs both of its ends."""
+        intervals = [
+            float(np.median(np.diff(samples.times)))
+            for name, samples in series.items()
+            if self.plans[name].hold == "foh" and len(samples.times) > 1
+        ]
+        return float(np.clip(SLOW_GRACE * max(intervals, default=0.0), GRACE_PERIOD, max(self.length, GRACE_PERIOD)))
+
+
+def _grid_shift(cyclic: dict[str, CyclicSeries], *, first: bool, period: float) -> float:
+    """Return by how much to move the grid, in s, at most half a sample period.
+
+    The clock of the source drifts against the monotonic clock. The lateness of the two halves of a window gives its
+    slope; a straight line through both gives the lateness in the middle of the next window, or of the first window
+    itself, which is aligned twice.
+    """
+    lateness = [item.lateness for item in cyclic.values() if item.on_grid and len(item.lateness) > 1]
+    halves = [(len(late) // 2, late) for late in lateness]
+    if not halves:
+        return 0.0
+    early = float(np.quantile(np.concatenate([late[:half] for half, late in halves]), PUNCTUAL_QUANTILE))
+    late = float(np.quantile(np.concatenate([late[half:] for half, late in halves]), PUNCTUAL_QUANTILE))
+    shift = late + (0.5 * (early - late) if first else 1.5 * (late - early))
+    return float(np.clip(shift, -period / 2, period / 2))

@@ -13,6 +13,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.reporting import WindowResult, make_report
 from otolith.adaptation.state import AdaptationState, with_posterior
+from otolith.adaptation.unbridged_gap import unbridged_gap
 from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
 from otolith.discovery.decision import (
     MAX_COST,
@@ -23,7 +24,8 @@ from otolith.discovery.decision import (
     some_component_is_certain,
 )
 from otolith.discovery.hypotheses import FaultType
-from otolith.discovery.search import screen_window
+from otolith.discovery.screening import screen_window
+from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test
 from otolith.estimation.augmented import slot_of
 from otolith.estimation.data_checks import CheckedWindow, check_window
@@ -32,7 +34,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.window_fit import Search, WindowEstimate, estimate, estimate_window
 from otolith.estimation.window_length import WindowExcitation, next_records
 from otolith.health.schema import Report
-from otolith.health.status import PreviousStatus
+from otolith.health.status import PreviousStatus, some_parameter_is_determined
 
 UNUSED = "window not estimated from: "
 
@@ -40,18 +42,24 @@ UNUSED = "window not estimated from: "
 def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Report]:
     """Return the state after ``window``, and the report of it."""
     posterior = state.posterior.without_expired(window.start)
-    state = with_posterior(state, posterior)
+    if posterior is not state.posterior:
+        state = with_posterior(state, posterior)
     predicted = posterior.predict(window)
     checked = check_window(window, predicted)
-    if checked.is_usable:
-        search = Search.NEVER if state.is_determined else Search.FROM_BOUNDS
-        estimated = estimate_window(predicted, checked.window, search)
-        result = _decide(state, predicted, estimated)
-    else:
-        result = _reject(state, predicted, checked)
-    result = replace(result, notes=checked.notes)
+    act = _estimate if checked.is_usable else _reject
+    result = replace(act(state, predicted, checked), notes=checked.notes)
+    if result.adopted:
+        result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)
     return _next_state(state, result, previous), report
+
+
+def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
+    """Return the result of a window whose data are usable, unless a gap leaves nothing to determine."""
+    search = Search.NEVER if some_parameter_is_determined(state.previous) else Search.FROM_BOUNDS
+    estimated = estimate_window(predicted, checked.window, search)
+    gap = unbridged_gap(estimated) if checked.window.bridge_error is not None else ""
+    return _reject(state, predicted, replace(checked, bad=(gap,))) if gap else _decide(state, predicted, estimated)
 
 
 def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
@@ -67,7 +75,9 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     An expected window without such a sign updates the filter. Otherwise, or while a test is open, hypotheses are
     compared, and the update follows the decision.
     """
-    screening = screen_window(predicted, estimated, determined=state.is_determined)
+    screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
+    if screening.needs_threshold_test:
+        screening = with_threshold_test(screening)
     if state.test is None and _is_expected(predicted, estimated) and not screening.is_positive:
         return _update_filter(state, predicted, estimated)
     test = continue_test(state.test, predicted, screening)
@@ -92,15 +102,21 @@ def _update_filter(state: AdaptationState, predicted: Posterior, estimated: Wind
     if state.test is not None:  # the windows before were wrong for an unknown reason
         predicted = predicted.inflate_variance(state.test.null_reduced_chi_square)
     posterior = predicted.update(estimated.evidence, estimated.advance)
-    adopted = count_fading(state.adopted, posterior)
-    result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), adopted, estimate=estimated)
+    result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), (), estimate=estimated)
+    return _without_faded(state, result, estimated) if state.adopted else result
+
+
+def _without_faded(state: AdaptationState, result: WindowResult, estimated: WindowEstimate) -> WindowResult:
+    """Return the result without a component that has faded; it stays if the window is not explained without it."""
+    adopted = count_fading(state.adopted, result.posterior)
+    result = replace(result, adopted=adopted)
     faded = next((item for item in adopted if item.has_faded), None)
     slot = None if faded is None else slot_of(state.problem, faded.component)
     if slot is None:
         return result
-    fewer = _replace_posterior(WindowDecision.FADED, posterior.without_slot(slot), estimated, adopted)
+    fewer = _replace_posterior(WindowDecision.FADED, result.posterior.without_slot(slot), estimated, adopted)
     is_needed = fewer.estimate is None or fewer.estimate.cost > max(EXPLAINED, estimated.cost)
-    return result if is_needed else fewer  # an insignificant component stays if the window is not explained without it
+    return result if is_needed else fewer
 
 
 def _adopt_hypothesis(
@@ -151,8 +167,8 @@ def _keep_posterior(
 
 def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus]) -> AdaptationState:
     """Return the state for the next window."""
-    if result.decision is WindowDecision.BAD:
-        test, contradictions = state.test, state.contradictions
+    if result.estimate is None:  # data that are not used are evidence neither for a hypothesis nor against one
+        test, contradictions = state.test, state.contradictions + (result.decision is not WindowDecision.BAD)
     elif result.is_accepted:
         test, contradictions = None, 0
     else:
@@ -162,7 +178,7 @@ def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str
         posterior=result.posterior,
         test=test,
         contradictions=contradictions,
-        adopted=with_approvals(result.adopted, state.approved),
+        adopted=result.adopted,
         previous=previous,
         records=_next_records(state, result),
     )
@@ -173,8 +189,11 @@ def _next_records(state: AdaptationState, result: WindowResult) -> int:
     problem, known, estimated = result.posterior.problem, result.after, result.estimate
     if estimated is None:
         return state.records
+    if problem.window.shortest >= problem.window.longest:
+        return problem.window.records
     free, window = len(problem.free), estimated.fit.window
     trend: Array = np.sqrt(known.mean[free:] ** 2 + np.diag(known.covariance)[free:])
     sd = np.array([parameter.sd for parameter in estimated.parameters])
     excitation = WindowExcitation(sd, trend, estimated.cost <= EXPLAINED)
-    return next_records(problem.window, window.records, window.sample_period, excitation)
+    period = window.grid.period or problem.window.sample_period or window.sample_period
+    return next_records(problem.window, window.grid.length, period, excitation)

@@ -8,13 +8,13 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import AdaptationState
-from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives_of, with_approvals
+from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives_of
 from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
 from otolith.discovery.hypotheses import FaultType, describe_hypothesis
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import base_model, equation, indices, site_of, source_of
+from otolith.estimation.augmented import equation, indices, site_of, source_of
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
@@ -36,14 +36,21 @@ from otolith.health.schema import (
     Traces,
     window_document,
 )
-from otolith.health.status import MarginalPosterior, PreviousStatus, WindowEvidence, publish
+from otolith.health.status import (
+    MarginalPosterior,
+    PreviousStatus,
+    WindowEvidence,
+    publish,
+    some_parameter_is_determined,
+)
 from otolith.twin.component_families import SourceKind
 
 MAX_VARIANCE_RATIO = 3.0  # ratio of variances above which windows disagree with each other
 DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
-UNDECIDED = frozenset({WindowDecision.SUSPECTED, WindowDecision.SENSOR, WindowDecision.REFUSED})
+EXCLUDED = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
+UNDECIDED = frozenset({WindowDecision.SUSPECTED, WindowDecision.REFUSED}) | EXCLUDED
 OPEN_CONDITION = "the data do not yet decide between the hypotheses"
 
 
@@ -96,12 +103,11 @@ def make_report(
 ) -> tuple[dict[str, PreviousStatus], Report]:
     """Return the status of each free parameter by its label, and the report of ``window`` after ``state``."""
     problem = result.posterior.problem
-    traces = _traces(state.problem, window, result.estimate)
+    traces = _traces(state.posterior.problem, window, result.estimate)
     situation = _situation(result.estimate)
     previous, parameters = _parameters(state, result)
     _add_advice(parameters, result, situation)
-    adopted = with_approvals(result.adopted, state.approved)
-    components = _component_documents(problem, result.after, adopted)
+    components = _component_documents(problem, result.after, result.adopted)
     undecided = result.test if result.decision in UNDECIDED else None
     explanations = _explanations(undecided)
     document = ReportDocument(
@@ -181,7 +187,7 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     reasons = [*result.notes]
     if decision is not WindowDecision.LEARNED:
         reasons.append(decision.value)
-    if test is not None and decision in (WindowDecision.SENSOR, WindowDecision.SUSPECTED):
+    if test is not None and decision in EXCLUDED | {WindowDecision.SUSPECTED}:
         others = [f"or {other.text} ({other.probability:.0%})" for other in alternatives_of(test, test.best)[:2]]
         reasons.append("; ".join([f"{describe_hypothesis(test.best)} ({test.probabilities[0]:.0%})", *others]))
     if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:
@@ -189,7 +195,7 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     variance_ratio = result.posterior.belief.variance_ratio
     if variance_ratio > MAX_VARIANCE_RATIO:
         reasons.append(DISAGREEMENT.format(variance_ratio**0.5))
-    if decision is WindowDecision.REFUSED and not state.is_determined:
+    if decision is WindowDecision.REFUSED and not some_parameter_is_determined(state.previous):
         reasons.append(NEVER_EXPLAINED)
     return "; ".join(reasons)
 
@@ -207,7 +213,7 @@ def _model_name(problem: Problem, previous: Mapping[str, PreviousStatus]) -> str
     """Return the paper's name of the twin: as configured, with estimated parameters, or with components."""
     if problem.components:
         return "DT''"
-    return "DT'" if any(status.known for status in previous.values()) else "DT"
+    return "DT'" if some_parameter_is_determined(previous) else "DT"
 
 
 def _fit_and_cost(problem: Problem, result: WindowResult) -> dict[str, FitDocument | CostDocument]:
@@ -251,7 +257,7 @@ def _component_documents(
 def _component_values(problem: Problem, known: Prior, slot: int) -> dict[str, NumberDocument]:
     """Return amplitude, inner parameter and phase, as far as the component has them."""
     component = problem.components[slot]
-    place = source_of(base_model(problem), component.source).kind is SourceKind.PLACE
+    place = source_of(problem.base_model, component.source).kind is SourceKind.PLACE
     inner = component.model.inner
     inner_name = "order" if component.periodic and place else "inner" if inner is None else inner.meaning
     deviations = np.sqrt(np.maximum(np.diag(known.covariance), 0.0))
@@ -266,7 +272,7 @@ def _component_values(problem: Problem, known: Prior, slot: int) -> dict[str, Nu
 def _component_document(
     problem: Problem, component: Component, values: Mapping[str, NumberDocument], history: AdoptedComponent
 ) -> ComponentDocument:
-    twin = base_model(problem)
+    twin = problem.base_model
     site = site_of(twin, component.site)
     return ComponentDocument(
         id=component.key,
@@ -318,7 +324,7 @@ def _findings(
         findings.append(
             FindingDocument(
                 id="undecided",
-                severity=Severity.FAULT if best.reason is FaultType.SENSOR else Severity.WARNING,
+                severity=Severity.FAULT if best.reason in (FaultType.SENSOR, FaultType.TIMING) else Severity.WARNING,
                 condition=OPEN_CONDITION,
                 text=f"{best.reason}: {best.text} ({best.probability:.0%}){others}",
                 since=test.onset,
@@ -358,10 +364,11 @@ def _experiment(test: SequentialTest | None, situation: Situation | None) -> str
 
 def _traces(problem: Problem, window: Window, estimated: WindowEstimate | None) -> Traces:
     """Return the curves of the window as it was recorded, spikes included, so that it can be replayed from them."""
-    twin = base_model(problem)
+    twin = problem.base_model
     outputs, inputs = tuple(output.name for output in twin.outputs), tuple(source.name for source in twin.inputs)
     predicted = None if estimated is None else estimated.predicted
-    return Traces(outputs, _measured(window, outputs), predicted, problem.noise, inputs, _measured(window, inputs))
+    measured, driving = _measured(window, outputs), _measured(window, inputs)
+    return Traces(window.grid.offsets, outputs, measured, predicted, problem.noise, inputs, driving)
 
 
 def _measured(window: Window, names: tuple[str, ...]) -> Array:

@@ -44,11 +44,6 @@ class AdaptationState:
         """The estimation problem, with the components in the twin."""
         return self.posterior.problem
 
-    @property
-    def is_determined(self) -> bool:
-        """Whether any parameter has been determined."""
-        return any(status.known for status in self.previous.values())
-
 
 def initial_state(machine: str, site: str, problem: Problem) -> AdaptationState:
     """Return the state before the first window."""
@@ -69,7 +64,8 @@ def with_sample_grid(state: AdaptationState, configured: WindowOptions, ratio: f
     def scaled(records: int) -> int:
         return max(round(records / ratio), min(records, MIN_COARSE_RECORDS))
 
-    window = WindowOptions(scaled(configured.records), scaled(configured.shortest), scaled(configured.longest))
+    period = None if configured.sample_period is None else ratio * configured.sample_period
+    window = WindowOptions(scaled(configured.records), scaled(configured.shortest), scaled(configured.longest), period)
     return replace(with_problem(state, replace(state.problem, window=window)), records=window.records)
 
 

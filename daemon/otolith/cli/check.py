@@ -1,13 +1,17 @@
 """``otolith check``: what the daemon would do with a machine file, and whether its signals come."""
 
+import json
 import math
 import time
 from collections import Counter
 from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 
+from otolith.cli.common import progress_line
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import prefix
+from otolith.runtime.preview import preview_lines, preview_recording
+from otolith.runtime.replay import open_recorded
 from otolith_drivers.base import Sample
 from otolith_drivers.user_dirs import check_writable
 
@@ -18,6 +22,7 @@ PATIENCE = 4.0  # s to wait for missing signals until the driver gives the cause
 MIN_SHARE = 0.5  # of the samples expected at the sample period; below it "too few" is printed
 PAUSE = 0.1  # s between two looks at the driver
 PROBED = ("can", "modbus")  # drivers that have an 'otolith probe'
+FOR_REPLAY_ONLY = "no [driver] and no [signals]: for 'otolith replay' only"
 
 
 def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool) -> bool:
@@ -29,7 +34,7 @@ def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool)
     Raises:
         OtolithError: anything that would keep the daemon from starting.
     """
-    machine = load_machine(path)
+    machine = load_machine(path, for_replay=not with_device)
     for line in describe(machine):
         echo(line)
     if machine.file.recording.enabled:
@@ -42,14 +47,42 @@ def check_machine(path: Path, echo: Callable[[str], None], *, with_device: bool)
     return set(machine.twin.signals) <= set(counts)
 
 
-def describe(machine: LoadedMachine) -> list[str]:
-    """What the daemon would do, a line per fact; a value that the file leaves to the twin is marked."""
+def check_data(path: Path, data: Path, echo: Callable[[str], None], *, as_json: bool) -> bool:
+    """Print what the daemon would do with ``data``, and what the data offer: line by line, or the latter as JSON.
+
+    Returns:
+        Whether parameters can be estimated from any window.
+
+    Raises:
+        OtolithError: a file that cannot be used.
+    """
+    machine = load_machine(path, with_driver=False)
+    with progress_line("reading", enabled=not as_json) as show:
+        preview = preview_recording(machine, data, progress=show)
+    if as_json:
+        echo(json.dumps(preview.document(), indent=2, ensure_ascii=False))
+        return preview.is_usable
+    with open_recorded(machine, data) as reader:
+        sources = reader.describe()
+    for line in (*describe(machine, sources), *preview_lines(preview)):
+        echo(line)
+    if not preview.is_usable:
+        windows = "no window can be used" if preview.windows.count else "the data are too short for a window"
+        echo(f"{windows} as {path.name} configures them")
+    return preview.is_usable
+
+
+def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)) -> list[str]:
+    """What the daemon would do, a line per fact; a value that the file leaves to the twin is marked.
+
+    ``sources`` has the lines of a machine that was loaded without its driver.
+    """
     file, problem, twin = machine.file, machine.problem, machine.twin
     lines = [
         f"machine {file.machine.name} at {file.machine.site}, twin {twin.name}: {twin.title}",
         *(f"  {name} = {text}" for name, text, _ in twin.definitions),
         *(f"  {left} = {right}" for left, right in twin.equations),
-        *machine.driver.describe(),
+        *(machine.driver.describe() if machine.built_driver else sources),
         f"windows of {file.window.length:g} s, {machine.records} records",
     ]
     for name, value in problem.known:

@@ -17,6 +17,7 @@ INTERRUPTED = 128 + signal.SIGINT  # exit code of a command that Ctrl-C ended, a
 FILE = click.Path(path_type=Path, dir_okay=False)
 MACHINE_FILE = click.argument("file", type=FILE)
 DATA_FILE = click.argument("data", type=FILE)
+DATA_FILES = click.argument("data", type=FILE, nargs=-1, required=True)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 
 

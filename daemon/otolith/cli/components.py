@@ -1,6 +1,7 @@
 """``otolith components`` and ``otolith commission``: what the twin of a machine lacks, and what belongs to it."""
 
 import json
+import math
 import signal
 import time
 from collections.abc import Callable
@@ -70,7 +71,7 @@ def _key(record: "ComponentRecord") -> str:
 
 def _decision(record: "ComponentRecord", decisions: "OperatorDecisions") -> str:
     key = _key(record)
-    if decisions.forgotten.get(key, 0.0) > record.adopted.onset:
+    if decisions.forgotten.get(key, -math.inf) > record.adopted.onset:
         return "forgotten: it will be discovered again if it is present"
     return "approved" if key in decisions.approved else "rejected" if key in decisions.rejected else "open"
 
@@ -178,7 +179,7 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     machine, store = _store(file)
     state = _replayed(machine, data)
-    identified = identified_noise(machine, data, windows)
+    _, identified = identified_noise(machine, data, windows)
     if not state.adopted:  # the file's noise levels may have hidden a component, so search again with these
         state = _replayed(replace(machine, problem=identified.applied(machine.problem)), data)
     click.echo("\n".join(noise_lines(machine, identified)))

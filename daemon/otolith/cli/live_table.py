@@ -91,7 +91,7 @@ def _title_lines(document: ReportDocument) -> list[Text]:
     line = Text(f"window {window.index} ")
     line.append(quality.verdict, style="green" if quality.verdict is Verdict.GOOD else "red")
     line.append(f", {window.records} records, {quality.missing:.1%} missing, jitter {quality.jitter_s * 1e3:.1f} ms")
-    if document.fit is not None:
+    if document.fit is not None and document.cost.seconds is not None:
         line.append(f", {document.cost.seconds * 1e3:.0f} ms")
     return [title(document), line]
 

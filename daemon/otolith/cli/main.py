@@ -14,7 +14,7 @@ import click
 
 from otolith import __version__
 from otolith.cli.common import (
-    DATA_FILE,
+    DATA_FILES,
     FILE,
     INTERRUPTED,
     MACHINE_FILE,
@@ -32,7 +32,7 @@ EXIT_CODES = """\b
 Exit codes:
   0    done; run and plant also when stopped by SIGTERM
   1    demo: an estimate was wrong; probe: nothing answered or was received;
-       check: a signal was missing
+       check: a signal was missing, or no window of DATA can be used
   2    a file, option, bus or port cannot be used; the message says which, why
        and what to do
   130  interrupted by Ctrl-C (128 + n by another signal n)"""
@@ -124,36 +124,52 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
 
 @cli.command()
 @MACHINE_FILE
+@click.argument("data", type=FILE, required=False)
 @click.option("--no-device", is_flag=True, help="Do not open the machine's bus.")
-def check(file: Path, no_device: bool) -> int:
+@click.option("--json", "as_json", is_flag=True, help="Print only what DATA offers, as JSON.")
+def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
     """Explain the machine file FILE, and listen for its signals.
+
+    With DATA, recorded data in a format of 'otolith replay', it opens no bus: it shows rate, jitter, gaps and repeats
+    of each signal, which windows can be used, and which parameters they are expected to determine.
 
     \b
     Examples:
       otolith check config/dc-motor.toml
       otolith check --no-device config/dc-motor.toml
+      otolith check my-machine.toml monday.csv
     """
-    from otolith.cli.check import check_machine
+    from otolith.cli.check import check_data, check_machine
 
+    if data is not None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # so that Ctrl-C removes the line of progress
+        return 0 if check_data(file, data, click.echo, as_json=as_json) else 1
+    if as_json:
+        raise click.UsageError("--json needs DATA: it prints what recorded data offer")
     return 0 if check_machine(file, click.echo, with_device=not no_device) else 1
 
 
 @cli.command()
 @MACHINE_FILE
-@DATA_FILE
+@DATA_FILES
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a summary.")
 @click.option("--recording", type=FILE, callback=_new_recording, help="Record into this file, as the daemon does.")
 @click.option("--real-time", is_flag=True, help="Wait for the end of each window, as in operation.")
-def replay(file: Path, data: Path, as_json: bool, recording: Path | None, real_time: bool) -> int:
+@click.option("--timing", is_flag=True, help="Add computing times, which differ from run to run.")
+def replay(
+    file: Path, data: tuple[Path, ...], as_json: bool, recording: Path | None, real_time: bool, timing: bool
+) -> int:
     """Run recorded DATA through the daemon for the machine in FILE.
 
     DATA is a table (CSV: a column 't' in seconds and one for each signal of the twin, in its unit or the one in
     brackets), a recording (.rrd) or a log of a CAN bus (.log of candump, .asc, .blf, .trc, also with .gz). FILE needs
     [driver] and [signals] only for a log of a bus: they describe its frames.
+    Each of several files is a recording of its own: no window spans two.
 
     \b
     Examples:
       otolith replay my-machine.toml monday.csv
+      otolith replay my-machine.toml monday.csv tuesday.csv
       otolith replay my-machine.toml monday.blf --real-time
       otolith replay my-machine.toml monday.csv --json | jq .parameters.R_a.value
       otolith replay my-machine.toml monday.csv --recording monday.rrd
@@ -161,7 +177,9 @@ def replay(file: Path, data: Path, as_json: bool, recording: Path | None, real_t
     from otolith.cli.replay import replay
 
     stop = StopSignal()
-    replay(file, data, recording, as_json=as_json, stopped=stop.received, real_time=real_time)
+    first, *following = data
+    options = {"as_json": as_json, "real_time": real_time, "timing": timing}
+    replay(file, first, recording, following=following, stopped=stop.received, **options)
     return stop.code()
 
 

@@ -1,4 +1,4 @@
-"""``otolith noise``: noise levels identified from recorded data of a healthy machine, as lines of its machine file."""
+"""``otolith noise``: noise levels and delays from recorded data of a healthy machine, as lines of its machine file."""
 
 import json
 import signal
@@ -12,6 +12,7 @@ from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, 
 
 if TYPE_CHECKING:
     from otolith.acquisition.window import Window
+    from otolith.commissioning.delays import IdentifiedDelays
     from otolith.commissioning.identification import IdentifiedNoise, NoiseLevel
     from otolith.machine import LoadedMachine
 
@@ -24,10 +25,10 @@ Item = TypeVar("Item")
 @click.option("--windows", type=click.IntRange(1, 1000), default=30, help="Use at most so many, spread over the data.")
 @AS_JSON
 def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
-    """Identify the noise of the machine in FILE from DATA.
+    """Identify noise and delays of the machine in FILE from DATA.
 
     DATA is recorded from the healthy machine in motion, in a format of 'otolith replay'. The output replaces the
-    tables [noise] and [process_noise] of FILE.
+    tables [noise] and [process_noise] of FILE. Delays of signals against each other belong into [signals].
 
     \b
     Examples:
@@ -38,29 +39,31 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # so that Ctrl-C removes the line of progress
     machine = load_machine(file, with_driver=False)
-    identified = identified_noise(machine, data, windows)
+    delays, identified = identified_noise(machine, data, windows)
     if as_json:
-        click.echo(json.dumps(_document(machine, identified), indent=2, ensure_ascii=False))
+        click.echo(json.dumps(_document(machine, delays, identified), indent=2, ensure_ascii=False))
     else:
-        click.echo("\n".join(noise_lines(machine, identified)))
+        click.echo("\n".join([*noise_lines(machine, identified), "", *delay_lines(machine, delays)]))
 
 
-def identified_noise(machine: "LoadedMachine", data: Path, count: int) -> "IdentifiedNoise":
-    """Noise levels from at most ``count`` windows of the data.
+def identified_noise(machine: "LoadedMachine", data: Path, count: int) -> tuple["IdentifiedDelays", "IdentifiedNoise"]:
+    """Delays, and noise levels without them, from at most ``count`` windows of the data.
 
     Raises:
         ConfigurationError: no window can be used.
     """
-    from otolith.commissioning.identification import identify_noise
+    from otolith.commissioning.delays import identify_delays_and_noise
     from otolith_drivers.errors import ConfigurationError
 
     with progress_line("reading") as show:
-        identified = identify_noise(machine.problem, _good_windows(machine, data, count), progress=show)
+        declared = {name: table.delay for name, table in machine.signal_tables.items()}
+        chosen = _good_windows(machine, data, count)
+        delays, identified = identify_delays_and_noise(machine.problem, chosen, declared, progress=show)
     if machine.problem.open_loop:
         click.echo(f"{machine.path}: open_loop is true, so the process noise will not be used", err=True)
     if not identified.windows:
         raise ConfigurationError(f"{data}: {'; '.join(identified.remarks)}")
-    return identified
+    return delays, identified
 
 
 def _good_windows(machine: "LoadedMachine", data: Path, count: int) -> list["Window"]:
@@ -94,15 +97,12 @@ def _good_windows(machine: "LoadedMachine", data: Path, count: int) -> list["Win
 
 def evenly_spread(items: Iterable[Item], count: int) -> list[Item]:
     """At most ``count`` items, evenly spread; holds at most twice as many at a time, however many there are."""
-    kept: list[Item] = []
-    stride = 1
-    for index, item in enumerate(items):
-        if index % stride == 0:
-            kept.append(item)
-        if len(kept) > 2 * count:
-            kept, stride = kept[::2], 2 * stride
-    count = min(count, len(kept))
-    return [kept[round(index * (len(kept) - 1) / max(count - 1, 1))] for index in range(count)]
+    from otolith.runtime.preview import EvenSpread
+
+    spread = EvenSpread[Item](count)
+    for item in items:
+        spread.add(item)
+    return spread.chosen()
 
 
 def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iterator[str]:
@@ -130,6 +130,26 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
     yield from (f"# {remark}" for remark in identified.remarks)
 
 
+def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterator[str]:
+    """The keys ``delay`` of the table ``[signals]``, with uncertainties and remarks as comments.
+
+    A machine file that describes its signals has the table already, so the lines are comments.
+    """
+    late = [signal for signal in delays.signals if signal.is_late]
+    rows = []
+    for late_signal in late:
+        uncertainty = f"± {2e3 * late_signal.sd:.2g} ms" if late_signal.sd is not None else ""
+        line = f'{late_signal.name} = {{ delay = "{1e3 * late_signal.value:.4g} ms" }}'
+        rows.append((line, "; ".join(filter(None, [uncertainty, late_signal.remark]))))
+    if late and machine.file.signals:
+        yield "# under [signals], add the key delay to what is there:"
+        yield from (f"# {line}" for line in _aligned(rows))
+    elif late:
+        yield "[signals]"
+        yield from _aligned(rows)
+    yield from (f"# {signal.name}: {signal.remark}" for signal in delays.signals if not signal.is_late)
+
+
 def _row(level: "NoiseLevel", unit: str) -> tuple[str, str]:
     """A line of the machine file, and its comment."""
     uncertainty = f"± {level.sd / level.value:.1%}" if level.sd is not None and level.value else ""
@@ -141,7 +161,7 @@ def _aligned(rows: list[tuple[str, str]]) -> list[str]:
     return [f"{line:{width}}  # {comment}" if comment else line for line, comment in rows]
 
 
-def _document(machine: "LoadedMachine", identified: "IdentifiedNoise") -> dict[str, Any]:
+def _document(machine: "LoadedMachine", delays: "IdentifiedDelays", identified: "IdentifiedNoise") -> dict[str, Any]:
     from dataclasses import asdict
 
     units = machine.twin.units()
@@ -150,4 +170,5 @@ def _document(machine: "LoadedMachine", identified: "IdentifiedNoise") -> dict[s
         level["unit"] = units[level["name"]]
     for level in document["states"]:
         level["unit"] = f"({units[level['name']]})/s^0.5"
+    document["delays"] = [asdict(delay) | {"unit": "s"} for delay in delays.signals]
     return document

@@ -1,11 +1,12 @@
 """``otolith replay``: recorded data through the code of the daemon, and a summary of the reports."""
 
-import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import median
 
 import click
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -17,13 +18,15 @@ from otolith.cli.live_table import STYLES, parameter_table, title
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import ReportDocument, Status
 from otolith.health.text import component_text, finding_text, value_cells
-from otolith.machine import load_machine
-from otolith.runtime.replay import RealTimePacer, Replay, ReplayRecorder, open_recorded
+from otolith.machine import LoadedMachine, load_machine
+from otolith.runtime.preview import FIGURE, computing_time_text, preview_recording, short_lines
+from otolith.runtime.replay import RealTimePacer, Replay, ReplayRecorder, open_recordings
+from otolith_drivers.errors import OtolithError
 
 PLAIN_WIDTH = 110  # columns of a summary that goes into a file
 MAX_REASONS = 5  # kinds of bad windows that the summary lists
 UNIX_TIMES = (1e8, 1e11)  # s; between March 1973 and the year 5138 a time is a date, below it counts from zero
-FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")
+PREVIEWED_ROWS = 50_000  # of which a replay prints a preview
 
 
 def time_text(seconds: float) -> str:
@@ -42,6 +45,7 @@ class ReplaySummary:
         self._fitted = self._explained = 0
         self._decisions: Counter[WindowDecision] = Counter()
         self._statuses: Counter[tuple[str, Status]] = Counter()
+        self._seconds: list[float] = []
         self._reasons: Counter[str] = Counter()
         self._examples: dict[str, str] = {}
 
@@ -50,6 +54,8 @@ class ReplaySummary:
         self._first = self._first or document
         self._last = document
         self._decisions[document.decision] += 1
+        if document.cost.seconds is not None:
+            self._seconds.append(document.cost.seconds)
         if document.fit is not None:
             self._fitted += 1
             self._explained += document.fit.explained
@@ -91,6 +97,9 @@ class ReplaySummary:
         windows, bad = self._decisions.total(), self._decisions[WindowDecision.BAD]
         explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
         yield Text(f"{windows} windows: {windows - bad} good, {bad} bad; {explained}")
+        if self._seconds and self._last is not None:
+            length = self._last.window.end - self._last.window.start
+            yield Text(computing_time_text(median(self._seconds), max(self._seconds), length))
         for decision, count in self._decisions.items():
             if decision not in (WindowDecision.LEARNED, WindowDecision.BAD):
                 yield Text(f"  {count} good, but: {decision}", style="yellow")
@@ -103,26 +112,34 @@ def replay(
     data: Path,
     recording: Path | None,
     *,
+    following: Sequence[Path] = (),
     as_json: bool,
     stopped: Callable[[], bool],
     real_time: bool = False,
+    timing: bool = False,
 ) -> None:
     """Print the daemon's reports on ``data`` for the machine in ``file``: as JSON Lines, or as a summary.
+
+    Each of the ``following`` files is another recording. With ``timing`` reports have computing times, which differ
+    from run to run.
 
     Raises:
         OtolithError: a file that cannot be used.
     """
     machine = load_machine(file, with_driver=False)
     summary = ReplaySummary()
-    with open_recorded(machine, data) as recorded:
+    with open_recordings(machine, (data, *following)) as recorded:
         if recorded.ignored:
             click.echo(f"{data}: columns not used: {', '.join(recorded.ignored)}", err=True)
-        run = Replay(machine, recorded, stopped, RealTimePacer(stopped).wait if real_time else None)
+        if not as_json:
+            _echo_preview(machine, data, stopped)
+        wait = RealTimePacer(stopped).wait if real_time else None
+        run = Replay(machine, recorded, stopped, wait, timing=timing)
         with ReplayRecorder(recording, machine) as recorder, progress_line("reading", enabled=not as_json) as show:
             for report in run.reports():
                 summary.add(report.document)
                 recorder.add(report)
-                show(f"window {report.document.window.index}, {recorded.progress:.0%} of the data")
+                show(f"window {report.document.window.index}, {run.progress:.0%} of the data")
                 if as_json:
                     click.echo(report.document.to_json())
     if as_json:
@@ -132,3 +149,11 @@ def replay(
     console.print(summary)
     for line in (run.summary(), *run.warnings()):
         console.print(line, markup=False, soft_wrap=True)
+
+
+def _echo_preview(machine: LoadedMachine, data: Path, stopped: Callable[[], bool]) -> None:
+    """Print to standard error what the first rows of ``data`` offer."""
+    with suppress(OtolithError):  # the replay itself raises what is wrong with the file
+        preview = preview_recording(machine, data, stopped, max_rows=PREVIEWED_ROWS)
+        for line in short_lines(preview, PREVIEWED_ROWS):
+            click.echo(line, err=True)

@@ -153,8 +153,8 @@ class _InitialGuess:
 def _initial_guess(likelihood: Likelihood, windows: Sequence[Window], progress: Progress) -> _InitialGuess:
     """Windows at rest are used only if all are; then process noise is not free."""
     problem, remarks = likelihood.problem, []
-    usable = [window for window in windows if _is_usable(window)]
-    signal_noise = np.array([_signal_noise(output.name, usable) for output in problem.twin.outputs])
+    usable = [window for window in windows if _is_usable(problem, window)]
+    signal_noise = np.array([sample_noise(output.name, usable) for output in problem.twin.outputs])
     shown = signal_noise > 0.0
     sensors = np.where(shown, signal_noise, problem.noise)
     process, fits = np.full(len(problem.twin.states), np.nan), list[FittedWindow]()
@@ -242,22 +242,52 @@ def _state_levels(
             yield NoiseLevel(state.name, value, value * float(np.hypot(own, of_factor)), "")
 
 
-def _is_usable(window: Window) -> bool:
-    sampled = window.quality.verdict is Verdict.GOOD and window.records >= MIN_RECORDS
-    return sampled and bool(np.isfinite(window.values).all())
+def with_initial_noise(problem: Problem, windows: Sequence[Window]) -> Problem:
+    """The problem with the sensor noise that the signals show, and process noise that is just observable beside it."""
+    usable = [window for window in windows if _is_usable(problem, window)]
+    if not usable:
+        return problem
+    signal_noise = np.array([sample_noise(output.name, usable) for output in problem.twin.outputs])
+    sensors = np.where(signal_noise > 0.0, signal_noise, problem.noise)
+    process = _observable_process_noise(problem, sensors, _most_excited(problem, usable, sensors))
+    return with_levels(problem, np.concatenate([sensors, np.nan_to_num(process)]))
 
 
-def _signal_noise(output: str, windows: Sequence[Window]) -> float:
-    """Standard deviation of the changes from record to record; 0 for a constant signal, NaN without samples."""
+def _is_usable(problem: Problem, window: Window) -> bool:
+    samples = max(int((~window.missing_in(output.name)).sum()) for output in problem.twin.outputs)
+    sampled = window.quality.verdict is Verdict.GOOD and samples >= MIN_RECORDS
+    return sampled and bool((np.isfinite(window.values) | window.missing).all())
+
+
+def sample_noise(output: str, windows: Sequence[Window]) -> float:
+    """Standard deviation of the changes from sample to sample; 0 for a constant signal, NaN without samples."""
     deviations = []
     for window in windows:
-        missing, values = window.missing_in(output), window.column(output)
-        incomplete: Mask = np.convolve(missing, np.ones(DIFFERENCE_ORDER + 1))[DIFFERENCE_ORDER : len(values)] > 0.5
-        differences = np.diff(values, DIFFERENCE_ORDER)[~incomplete] / DIFFERENCE_GAIN
+        differences = _differences(output, window)
         if len(differences):
             robust = float(np.median(np.abs(differences))) / NORMAL_MEDIAN
             deviations.append(robust or float(np.std(differences)))
     return float(np.median(deviations)) if deviations else float("nan")
+
+
+def _differences(output: str, window: Window) -> Array:
+    """(differences,) of neighbouring samples, without what a cubic follows; of the noise's standard deviation.
+
+    At times that are not uniform they are divided differences (J. Stoer, R. Bulirsch, Introduction to Numerical
+    Analysis, section 2.1.3), normalised to the same gain for white noise.
+    """
+    present, values = ~window.missing_in(output), window.column(output)
+    if window.grid.period is not None and present.all():
+        return np.asarray(np.diff(values, DIFFERENCE_ORDER) / DIFFERENCE_GAIN)
+    values, times = values[present], window.grid.offsets[present]
+    if len(values) <= DIFFERENCE_ORDER:
+        return np.zeros(0)
+    neighbours = np.lib.stride_tricks.sliding_window_view(times, DIFFERENCE_ORDER + 1)
+    spacings = neighbours[:, :, None] - neighbours[:, None, :] + np.eye(DIFFERENCE_ORDER + 1)
+    weights = 1.0 / (spacings / np.ptp(neighbours, axis=1)[:, None, None]).prod(axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    around = np.lib.stride_tricks.sliding_window_view(values, DIFFERENCE_ORDER + 1)
+    return np.asarray((weights * around).sum(axis=1))
 
 
 def _observable_process_noise(problem: Problem, sensors: Array, window: Window) -> Array:
@@ -290,7 +320,13 @@ def _log_variance(problem: Problem, levels: Array, window: Window) -> float:
 def _most_excited(problem: Problem, windows: Sequence[Window], sensors: Array) -> Window:
     """The window in which the outputs move the most, in units of their noise."""
     names = [output.name for output in problem.twin.outputs]
-    return max(windows, key=lambda window: sum(np.ptp([window.column(name) for name in names], axis=1) / sensors))
+
+    def movement(window: Window) -> float:
+        signals = (window.column(name)[~window.missing_in(name)] for name in names)
+        moved = np.array([np.ptp(values) if len(values) else 0.0 for values in signals])
+        return float((moved / sensors).sum())
+
+    return max(windows, key=movement)
 
 
 def observable_states(twin: Definition) -> Mask:

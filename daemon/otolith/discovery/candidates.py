@@ -9,21 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.discovery.linear_response import (
-    CandidateForm,
-    Guess,
-    LinearResponse,
-    basis_functions,
-    candidate_library,
+from otolith.discovery.candidate_forms import CandidateForm
+from otolith.discovery.linear_response import Guess, LinearResponse, basis_functions
+from otolith.discovery.screening import (
+    DECISIVE,
+    Alternatives,
+    ScoredGuess,
+    Screening,
+    allowed_forms,
     inner_grid,
+    screen,
 )
-from otolith.estimation.augmented import base_model
 from otolith.estimation.particle_swarm import SwarmRule, particle_swarm
 from otolith.estimation.problem import Component, Problem
-from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
+from otolith.twin.augmentation import sites, sources
 
-DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
-COARSE, FINE = 1.5, 0.5  # spectral lines between two frequencies, in the screening test and in a search
+FINE = 0.5  # spectral lines between two frequencies
 PARTICLES, GENERATIONS = 10, 12  # of the swarm of one form
 START_SPREAD = 0.5  # steps of the grid by which particles are scattered around their starts
 PEAKS = 3  # best grid points at which a swarm starts
@@ -31,49 +32,6 @@ MAX_SWARMS = 16  # forms whose inner parameters are searched
 MAX_CANDIDATES, MIN_CANDIDATES = 10, 4  # candidates that are fitted
 AFFORDABLE_STEPS = 500  # integrator steps of a window up to which the largest number of candidates is fitted
 SCORE_MARGIN, SCORE_SHARE = 23.0, 0.3  # absolute (-2 log evidence) and relative error of the linear approximation
-MAX_AMPLITUDE = 1e9  # in the unit of the site
-
-
-@dataclass(frozen=True, slots=True)
-class ScoredGuess:
-    """A guess with the score of the linear response."""
-
-    form: CandidateForm
-    inner: float
-    amplitudes: Array
-    """(2,)."""
-    score: float
-    """Gain in -2 log evidence over parameters only."""
-
-    @property
-    def is_readable(self) -> bool:
-        """Whether the amplitude is neither zero nor beyond any equation that a person could use."""
-        return bool(0.0 < np.abs(self.amplitudes).max() < MAX_AMPLITUDE)
-
-
-@dataclass(frozen=True, slots=True)
-class Alternatives:
-    """How many forms compete, by kind."""
-
-    first_sensor: int
-    """Index of the first site that is a sensor."""
-    of_machine: float
-    of_sensors: float
-
-    @classmethod
-    def among(cls, problem: Problem, forms: list[CandidateForm]) -> "Alternatives":
-        """Count ``forms``."""
-        first = len(base_model(problem).sites)
-        sensors = sum(form.site >= first for form in forms)
-        return cls(first, float(max(len(forms) - sensors, 1)), float(max(sensors, 1)))
-
-    def of(self, form: CandidateForm) -> float:
-        """Return the number of forms of the same kind."""
-        return self.of_sensors if self.is_sensor(form) else self.of_machine
-
-    def is_sensor(self, form: CandidateForm) -> bool:
-        """Whether the form is the error of a sensor."""
-        return form.site >= self.first_sensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,55 +42,6 @@ class Candidate:
     alternatives: float
     """Number of forms of its kind."""
     of_sensor: bool
-
-
-def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
-    """Return the forms that may be searched where the sources are ``x`` (sources, records).
-
-    Components in the twin and excluded ones are left out, and all if the twin has no free slot. If discovery is off,
-    only errors of sensors remain.
-    """
-    twin = base_model(problem)
-    if len(problem.components) >= MAX_COMPONENTS:
-        return []
-    taken = problem.excluded | {component.key for component in problem.components}
-    return [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
-
-
-def screen(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> "Screening":
-    """Score all forms on a grid of inner parameters."""
-    guesses = [(form, float(inner)) for form in forms for inner in inner_grid(form, response.x, fineness)]
-    return Screening.of(response, guesses, Alternatives.among(response.problem, forms))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Screening:
-    """Many guesses and their scores."""
-
-    guesses: list[Guess]
-    amplitudes: Array
-    """(guesses, 2)."""
-    scores: Array
-    """(guesses,) gains in -2 log evidence over parameters only."""
-
-    @classmethod
-    def of(cls, response: LinearResponse, guesses: list[Guess], alternatives: Alternatives) -> "Screening":
-        """Score ``guesses`` by the linear response."""
-        statistics = response.score(guesses)
-        count = response.objective.count
-        parameters = np.array([_parameter_count(form) for form, _ in guesses], dtype=np.float64)
-        competing = np.array([alternatives.of(form) for form, _ in guesses])
-        variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)
-        scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * competing)
-        return cls(guesses, statistics.amplitudes, np.asarray(scores))
-
-    def __getitem__(self, index: int) -> ScoredGuess:
-        form, inner = self.guesses[index]
-        return ScoredGuess(form, inner, self.amplitudes[index], float(self.scores[index]))
-
-
-def _parameter_count(form: CandidateForm) -> int:
-    return len(form.model.phases) + (form.model.inner is not None)
 
 
 def find_candidates(response: LinearResponse) -> list[Candidate]:
@@ -218,7 +127,7 @@ def _affordable(response: LinearResponse) -> int:
 
 def threshold_like(problem: Problem, guesses: list[ScoredGuess]) -> list[ScoredGuess]:
     """Return for each site the best threshold-like family of a state: the linear response underrates dry friction."""
-    twin = base_model(problem)
+    twin = problem.base_model
     states = {state.name for state in twin.states}
     best: dict[int, ScoredGuess] = {}
     for guess in guesses:
@@ -229,7 +138,7 @@ def threshold_like(problem: Problem, guesses: list[ScoredGuess]) -> list[ScoredG
 
 def component_of(response: LinearResponse, guess: ScoredGuess) -> Component:
     """Return the component of a guess with the amplitude of the linear response."""
-    twin, form = base_model(response.problem), guess.form
+    twin, form = response.problem.base_model, guess.form
     first, second = map(float, guess.amplitudes)
     periodic = len(form.model.phases) > 1
     return Component(

@@ -9,6 +9,7 @@ from otolith.discovery.sequential_test import SequentialTest
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
 COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # the same for a component
+TIMING_WINDOWS = 2  # windows that must agree on a late signal
 SENSOR_PROBABILITY = 0.95  # of a faulty sensor while another type of hypothesis explains the windows as well
 SENSOR_PROBABILITY_ALONE = 0.5  # the same while no other type does
 MAX_OPEN_WINDOWS = 8  # windows after which a component is adopted although another one explains everything as well
@@ -23,6 +24,7 @@ class WindowDecision(StrEnum):
     DISCOVERED = "several windows agree on a new component"
     FADED = "a component is no longer there"
     SENSOR = "a sensor is wrong: the window does not update the estimates"
+    TIMING = "a signal is late: the window does not update the estimates"
     BAD = "the window is not good enough: it does not update the estimates"
     REFUSED = "nothing explains the window, neither parameters nor components: it does not update the estimates"
 
@@ -42,9 +44,11 @@ UPDATES = {
     WindowDecision.FADED: PosteriorUpdate.HYPOTHESIS,
     WindowDecision.SUSPECTED: PosteriorUpdate.NONE,
     WindowDecision.SENSOR: PosteriorUpdate.NONE,
+    WindowDecision.TIMING: PosteriorUpdate.NONE,
     WindowDecision.BAD: PosteriorUpdate.NONE,
     WindowDecision.REFUSED: PosteriorUpdate.NONE,
 }
+EXCLUDING = {FaultType.SENSOR: WindowDecision.SENSOR, FaultType.TIMING: WindowDecision.TIMING}
 ACCEPTED = frozenset(decision for decision, update in UPDATES.items() if update is not PosteriorUpdate.NONE)
 
 
@@ -72,9 +76,10 @@ def decide(test: SequentialTest) -> WindowOutcome:
     agreed = test.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
     if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
-    if test.probability(FaultType.SENSOR) >= (SENSOR_PROBABILITY if test.is_open else SENSOR_PROBABILITY_ALONE):
-        faulty = next(item for item in test.hypotheses if item.type is FaultType.SENSOR)
-        return WindowOutcome(WindowDecision.SENSOR, faulty)
+    for kind, decision in EXCLUDING.items():
+        needed = SENSOR_PROBABILITY if test.is_open else SENSOR_PROBABILITY_ALONE
+        if test.probability(kind) >= needed and (kind is FaultType.SENSOR or test.leading >= TIMING_WINDOWS):
+            return WindowOutcome(decision, next(item for item in test.hypotheses if item.type is kind))
     leads = best.type is FaultType.COMPONENT and test.leading >= COMPONENT_WINDOWS
     probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY
     alone = test.windows >= MAX_OPEN_WINDOWS or not test.alternatives(best)

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from otolith.acquisition.time_grid import TimeGrid
 from otolith.acquisition.window import Array
-from otolith.discovery.candidates import DECISIVE
 from otolith.discovery.hypotheses import TrackedHypothesis
+from otolith.discovery.screening import DECISIVE
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import base_model
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
 from otolith.twin.augmentation import ELAPSED
@@ -42,7 +42,7 @@ class Situation:
     """(states,)."""
     records: int
     sample_period: float
-    """s."""
+    """Mean time between two records, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +87,7 @@ def moves(problem: Problem, situation: Situation) -> Iterator[Move]:
     period = situation.records * situation.sample_period / records
     share = np.arange(records) / records
     for size in MOVE_SHARES:
-        for column, moved in enumerate(base_model(problem).inputs):
+        for column, moved in enumerate(problem.base_model.inputs):
             low, high = _ends(moved, float(situation.inputs[column]), size)
             step = f"a step of {moved.name} from {low:.3g} to {high:.3g} {moved.unit}"
             swing = f"swinging {moved.name} between {low:.3g} and {high:.3g} {moved.unit}"
@@ -96,6 +96,11 @@ def moves(problem: Problem, situation: Situation) -> Iterator[Move]:
                 inputs = np.tile(situation.inputs, (records, 1))
                 inputs[:, column] = low + (high - low) * curve
                 yield Move(text, inputs)
+
+
+def _grid(situation: Situation, records: int) -> TimeGrid:
+    """Return the times of an experiment as long as the window."""
+    return TimeGrid.uniform(records, situation.records * situation.sample_period / records)
 
 
 def _ends(moved: Input, present: float, size: float) -> tuple[float, float]:
@@ -118,10 +123,9 @@ def _interval_after(problem: Problem, known: Prior, situation: Situation, move: 
     """Return the half-width (free,) of each 95 % interval after ``move``; the initial state is estimated as well."""
     twin, kernel, free = problem.twin, kernel_of(problem.twin), len(problem.free)
     parameters, columns = _parameter_values(problem, known.mean)
-    records = len(move.inputs)
-    period = situation.records * situation.sample_period / records
+    grid = _grid(situation, len(move.inputs))
     with np.errstate(over="ignore", invalid="ignore"):
-        slopes = kernel.sensitivities(parameters, situation.state, Excitation(move.inputs, period, SUBSTEPS)).slopes
+        slopes = kernel.sensitivities(parameters, situation.state, Excitation(move.inputs, grid, SUBSTEPS)).slopes
         base = len(twin.parameters) - twin.settings
         columns += range(base, base + len(twin.states))
         jacobian = (slopes[:, :, columns] / np.array(problem.noise)[None, :, None]).reshape(-1, len(columns))
@@ -149,31 +153,35 @@ def _distance(first: TrackedHypothesis, second: TrackedHypothesis, situation: Si
     weighted = (slopes / noise[None, :, None]).reshape(len(difference), -1)
     if not (np.isfinite(difference).all() and np.isfinite(weighted).all()):
         return 0.0
-    free, states = len(first.problem.free), len(base_model(first.problem).states)
+    free, states = len(first.problem.free), len(first.problem.base_model.states)
     allowed = np.sqrt(np.maximum(np.diag(prior.covariance)[:free], 0.0))
     rows = np.vstack([weighted, np.diag(np.concatenate([1.0 / np.maximum(allowed, 1e-30), np.zeros(states)]))])
     target = np.concatenate([difference, np.zeros(free + states)])
-    size = np.maximum(np.linalg.norm(rows, axis=0), 1e-30)
-    solution, *_ = np.linalg.lstsq(rows / size, target, rcond=None)
-    remainder = target - rows / size @ solution
-    return float(remainder @ remainder)
+    with np.errstate(over="ignore"):
+        size = np.maximum(np.linalg.norm(rows, axis=0), 1e-30)
+        if not np.isfinite(size).all():
+            return 0.0
+        solution, *_ = np.linalg.lstsq(rows / size, target, rcond=None)
+        remainder = target - rows / size @ solution
+        distance = float(remainder @ remainder)
+    return distance if np.isfinite(distance) else 0.0
 
 
 def _prediction(problem: Problem, known: Prior, situation: Situation, move: Move) -> tuple[Array, Array]:
     """Return the prediction (records, outputs) and its derivatives (records, outputs, free + states)."""
-    twin, base = problem.twin, base_model(problem)
+    twin, base = problem.twin, problem.base_model
     parameters, columns = _parameter_values(problem, known.mean)
     records, own = len(move.inputs), len(base.inputs)
-    period = situation.records * situation.sample_period / records
+    grid = _grid(situation, records)
     inputs = np.zeros((records, len(twin.inputs)))
     inputs[:, :own] = move.inputs[:, :own]
     for column, source in enumerate(twin.inputs):
         if source.name == ELAPSED:
-            inputs[:, column] = period * np.arange(records, dtype=np.float64)
+            inputs[:, column] = grid.offsets
     states = len(base.states)
     initial = np.zeros(len(twin.states))
     initial[:states] = situation.state[:states]
     with np.errstate(over="ignore", invalid="ignore"):
-        prediction = kernel_of(twin).sensitivities(parameters, initial, Excitation(inputs, period, SUBSTEPS))
+        prediction = kernel_of(twin).sensitivities(parameters, initial, Excitation(inputs, grid, SUBSTEPS))
     first_state = len(twin.parameters) - twin.settings
     return prediction.outputs, prediction.slopes[:, :, [*columns, *range(first_state, first_state + states)]]

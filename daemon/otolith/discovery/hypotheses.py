@@ -1,4 +1,4 @@
-"""Hypotheses about a window: nothing happened, parameters moved, a component appeared, or a sensor is wrong.
+"""Hypotheses about a window: nothing, parameters moved, a component appeared, a sensor is wrong, a signal is late.
 
 A hypothesis is fitted to a window under its own prior and compared by evidence, in the form of the Bayesian information
 criterion (G. Schwarz, Annals of Statistics 6, 1978). A fitted hypothesis becomes a tracked one, which carries its own
@@ -14,13 +14,18 @@ import numpy as np
 from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
 from otolith.estimation.arrival_cost import Evidence, Prior, extend_prior, initial_prior
-from otolith.estimation.augmented import amplitude_indices, augment, base_model, equation, indices, site_of
+from otolith.estimation.augmented import amplitude_indices, augment, equation, indices, site_of
+from otolith.estimation.information import QUANTILE
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
+from otolith.estimation.timing.delay_response import delay_response, delayable
 from otolith.estimation.window_fit import Fit
 
 MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
 SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero is not significant
+MAX_DELAY_CHANGE = 5.0  # standard deviations: a delay that differs more between windows is no delay
+MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less says nothing
+MS = 1e3  # ms in a second
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 
 
@@ -31,6 +36,7 @@ class FaultType(StrEnum):
     PARAMETER = "parameters have moved"
     COMPONENT = "a component has appeared"
     SENSOR = "a sensor is wrong"
+    TIMING = "a signal is late"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +75,8 @@ class FittedHypothesis:
 
     hypothesis: FaultHypothesis
     fit: Fit
+    lost: float = 0.0
+    """Measured values of the window that its delay moves out of it."""
 
     @property
     def type(self) -> FaultType:
@@ -87,8 +95,8 @@ class FittedHypothesis:
 
     @property
     def chi_square(self) -> float:
-        """χ² of window and prior."""
-        return self.fit.chi_square
+        """χ² of window and prior; what the window has lost is as expected."""
+        return self.fit.chi_square + self.lost
 
     def deviance(self, count: float, variance_factor: float) -> float:
         """Return -2 log evidence of ``count`` measured values.
@@ -148,6 +156,8 @@ class TrackedHypothesis:
     """-2 log evidence of all windows so far, relative to the best hypothesis."""
     cost: float
     """RMSE of the last window in units of the noise."""
+    delay_information: float = 0.0
+    """About the delay that the hypothesis states, 1/s²; 0 if it states none."""
     explains_all: bool = True
     """Whether the screening test found nothing in what it left of the last window."""
 
@@ -178,11 +188,15 @@ class HypothesisStep:
         """Whether the prediction can be updated without losing all digits; always for the null hypothesis."""
         return is_usable(self.tracked.hypothesis, self.predicted, self.evidence)
 
-    def updated(self, excess: float) -> TrackedHypothesis:
-        """Return the hypothesis after the window; ``excess`` is added to its deviance."""
+    def updated(self, excess: float) -> TrackedHypothesis | None:
+        """Return the hypothesis after the window; ``excess`` is added to its deviance.
+
+        None if the window contradicts the delay that it states.
+        """
         posterior = self.predicted.update(self.evidence, self.fitted.fit.advance())
         deviance = self.tracked.deviance + excess
-        return replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost, deviance=deviance)
+        tracked = replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost, deviance=deviance)
+        return tracked if self.tracked.type is not FaultType.TIMING else _with_delay(tracked, self.fitted.fit)
 
 
 def is_usable(hypothesis: FaultHypothesis, predicted: Posterior, evidence: Evidence) -> bool:
@@ -204,7 +218,50 @@ def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float) -> Tr
     if not is_usable(fitted.hypothesis, own, evidence):
         return None
     posterior = own.update(evidence, fitted.fit.advance())
-    return TrackedHypothesis(fitted.hypothesis, posterior, deviance, fitted.fit.cost)
+    tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, fitted.fit.cost)
+    return tracked if fitted.type is not FaultType.TIMING else _with_delay(tracked, fitted.fit)
+
+
+def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | None:
+    """Return the hypothesis with what the window of ``fitted`` adds to the estimate of its delay.
+
+    None if the window contradicts the delay: it is no constant.
+    """
+    ((signal, delay),) = tracked.problem.delays
+    own = delay_score(fitted, signal)
+    before = tracked.delay_information
+    information = before + own.information
+    if before > 0.0 and own.step**2 * before * own.information > MAX_DELAY_CHANGE**2 * information:
+        return None
+    moved = delay + (own.information * own.step / information if information > 0.0 else 0.0)
+    problem = replace(tracked.problem, delays=((signal, moved),))
+    return replace(tracked, posterior=replace(tracked.posterior, problem=problem), delay_information=information)
+
+
+@dataclass(frozen=True, slots=True)
+class DelayScore:
+    """What one window says of a delay around the one that it was fitted with."""
+
+    step: float
+    """To the best delay, s."""
+    information: float
+    """1/s²; less if the window is not explained."""
+
+
+def delay_score(fitted: Fit, signal: str) -> DelayScore:
+    """Return the step of the delay of ``signal``, with what parameters, trends and initial state explain left out."""
+    twin, free, guess = fitted.problem.base_model, len(fitted.problem.free), fitted.result.guess
+    column = delay_response(fitted.objective, np.concatenate([guess[:free], guess[2 * free :]]))[
+        :, delayable(twin).index(signal)
+    ]
+    jacobian, residuals = fitted.result.jacobian, fitted.result.residuals
+    whole = np.concatenate([column, np.zeros(len(residuals) - len(column))])
+    basis = np.linalg.qr(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny))[0]
+    left = whole - basis @ (basis.T @ whole)
+    size = float(left @ left)
+    if size <= MIN_DELAY_SHARE * float(whole @ whole):
+        return DelayScore(0.0, 0.0)
+    return DelayScore(-float(left @ residuals) / size, size / max(fitted.cost, 1.0) ** 2)
 
 
 def complexity_penalty(predicted: Posterior, evidence: Evidence) -> float:
@@ -279,7 +336,9 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
     """Return what the hypothesis states, with its values."""
     if tracked.type in (FaultType.NOTHING, FaultType.PARAMETER):
         return tracked.hypothesis.name or str(tracked.type)
-    problem, twin = tracked.problem, base_model(tracked.problem)
+    if tracked.type is FaultType.TIMING:
+        return _describe_delay(tracked)
+    problem, twin = tracked.problem, tracked.problem.base_model
     values = tracked.posterior.prior().mean
     if tracked.type is FaultType.SENSOR and problem.components:
         component = problem.components[-1]
@@ -291,3 +350,14 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
         f"{component.site}: {equation(twin, component, values[indices(problem, slot)].tolist())}"
         for slot, component in enumerate(problem.components)
     )
+
+
+def _describe_delay(tracked: TrackedHypothesis) -> str:
+    ((signal, delay),) = tracked.problem.delays
+    reach = QUANTILE / np.sqrt(tracked.delay_information) if tracked.delay_information > 0.0 else np.inf
+    digits = max(0, int(np.ceil(-np.log10(MS * reach)))) if 0.0 < reach < np.inf else 1
+    size = abs(delay)
+    value, low, high = (f"{MS * number:.{digits}f}" for number in (size, size - reach, size + reach))
+    late = f"{signal} is {value} ms {'late' if delay > 0.0 else 'early'} ({low} to {high})"
+    place = f"[signals] {signal}" if delay > 0.0 else f"every other signal in [signals], as {signal} is the first"
+    return f'{late}: write delay = "{value} ms" under {place}'

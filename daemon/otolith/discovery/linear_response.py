@@ -8,19 +8,19 @@ therefore gains over "parameters only". ``docs/explanation/discovery.md`` has th
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask
-from otolith.estimation.augmented import base_model, input_matrix
-from otolith.estimation.problem import key_of
+from otolith.discovery.candidate_forms import CandidateForm
+from otolith.estimation.objective import input_matrix
+from otolith.estimation.timing.delay_response import delay_response
 from otolith.estimation.window_fit import Fit
-from otolith.twin.augmentation import ComponentSource, augmented_model, sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
-from otolith.twin.definition import Definition
+from otolith.twin.augmentation import augmented_model, sites, sources
+from otolith.twin.component_families import family_code
 from otolith.twin.kernel import Excitation, Indices, LinearisedModel, kernel_of
 
-SENSOR_FAMILIES = frozenset({"constant", "linear"})  # the errors of a sensor: an offset and a gain
 PROBE_RECORDS = 6  # from which the size of the finite difference is found
 PROBE_EFFECT = 1e-4  # relative effect of the finite difference on a state
 MAX_DIFFERENCE = (
@@ -30,71 +30,13 @@ SAME_DIRECTION = 1.0 - 1e-5  # cosine between the effects of a component and of 
 MIN_INPUT_VARIATION = 5.0  # times the noise of an input: less variation is noise
 MIN_REMAINDER = 1e-6  # share of a response that is left beside the effects of parameters; less is a parameter
 MIN_BASIS_SINGULAR = 1e-10  # relative singular value of the directions that are projected out
+MAX_BLOCK = 1 << 21  # residuals times curves that are computed at once: 16 MB
+PROBES = 16  # random vectors by which the length of a projected response is estimated
 MIN_INDEPENDENCE = 1e-9  # of the two curves of a periodic component
-
-
-@dataclass(frozen=True, slots=True)
-class CandidateForm:
-    """A component without amplitude, inner parameter and phase."""
-
-    site: int
-    """Index of the site."""
-    model: ComponentFamily
-    source: int
-    """Index of the source."""
-    bounds: tuple[float, float] = (0.0, 0.0)
-    """Of the inner parameter."""
 
 
 Guess = tuple[CandidateForm, float]
 """A form and its inner parameter."""
-
-
-def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[CandidateForm]:
-    """Return all forms that can be distinguished where the sources are ``x`` (sources, records).
-
-    ``twin`` is the base model. Forms whose keys are ``taken`` are left out.
-    """
-    valid = [
-        (model, number, source, _inner_bounds(model, x[number]))
-        for model in COMPONENT_FAMILIES
-        for number, source in enumerate(sources(twin))
-        if source.kind in model.inputs and model.valid(x[number])
-    ]
-    machine_sites = len(twin.sites)
-    return [
-        CandidateForm(index, model, number, bounds)
-        for index, site in enumerate(sites(twin))
-        for model, number, source, bounds in valid
-        if (index < machine_sites or _is_sensor_error(model, source, site.into))
-        and key_of(site.name, model.name, source.name) not in taken
-    ]
-
-
-def _inner_bounds(model: ComponentFamily, x: Array) -> tuple[float, float]:
-    if model.fixed_inner is not None:
-        return model.fixed_inner(x), model.fixed_inner(x)
-    return (0.0, 0.0) if model.inner is None else model.inner.bounds(x)
-
-
-def _is_sensor_error(model: ComponentFamily, source: ComponentSource, signal: str) -> bool:
-    """Whether the form is an offset, or a gain error, of the sensor of ``signal``."""
-    if model.name not in SENSOR_FAMILIES:
-        return False
-    return source.kind is SourceKind.NOTHING or source.name == signal
-
-
-def inner_grid(form: CandidateForm, x: Array, fineness: float) -> Array:
-    """Return values (points,) of the inner parameter; ``x`` (sources, records), ``fineness`` in spectral lines."""
-    inner = form.model.inner
-    low, high = form.bounds
-    if inner is None:
-        return np.array([low])
-    if inner.points:
-        points = max(round(inner.points / fineness**2), 2)
-        return np.exp(np.linspace(np.log(low), np.log(high), points))
-    width = fineness * 2.0 * np.pi / max(float(np.ptp(x[form.source])), 1e-9)  # of a spectral line
-    return np.arange(low, high, width)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,19 +89,17 @@ class LinearResponse:
 
     def _project(self, residuals: Array, jacobian: Array, window_rows: int) -> None:
         """Project out what parameters, trends and initial state explain; the last rows are those of the prior."""
-        size = np.linalg.norm(jacobian, axis=0)
-        alive = size > 0.0
-        basis, singular, _ = np.linalg.svd(jacobian[:, alive] / size[alive], full_matrices=False)
-        basis = basis[:, singular > MIN_BASIS_SINGULAR * singular[0]]
+        basis = _basis(jacobian)
         remainder = residuals - basis @ (basis.T @ residuals)
         self.chi_square = float(remainder @ remainder)
         """Of parameters only, with the prior."""
         self._remainder, self._basis = remainder[:window_rows], basis[:window_rows]
+        self._prior_basis = basis[window_rows:]
 
     def _linearise_slots(self) -> None:
         """Linearise the twin with slots along the predicted trajectory, and evaluate the sources there."""
         free, objective = len(self.problem.free), self.objective
-        slotted = augmented_model(base_model(self.problem))
+        slotted = augmented_model(self.problem.base_model)
         self._kernel = kernel_of(slotted)
         values, states = objective.parameters(self._guess[None, :free])[0], self._guess[2 * free :]
         parameters, initial = _padded(values, len(slotted.parameters)), _padded(states, len(slotted.states))
@@ -173,14 +113,8 @@ class LinearResponse:
 
     def _difference_sizes(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
         """Return the size (sites,) of each finite difference: above rounding, and within what is linear."""
-        count = len(sites(base_model(self.problem)))
-        few = replace(
-            excitation,
-            inputs=excitation.inputs[:PROBE_RECORDS],
-            measured=None if excitation.measured is None else excitation.measured[:PROBE_RECORDS],
-            gain=None if excitation.gain is None else excitation.gain[:PROBE_RECORDS],
-        )
-        trial = self._kernel.linearise(parameters, initial, few, np.full(count, 1e-3))
+        count = len(sites(self.problem.base_model))
+        trial = self._kernel.linearise(parameters, initial, excitation.until(PROBE_RECORDS), np.full(count, 1e-3))
         size = np.maximum(np.abs(trial.trajectory).max(axis=0), 1e-3)[:, None]
         effect = (np.abs(trial.input_now + trial.input_next).max(axis=0) / size).max(axis=0)
         noise = self.objective.noise.outputs[:, None]
@@ -189,7 +123,7 @@ class LinearResponse:
 
     def _sources(self, state_names: list[str], trajectory: Array, initial: Array) -> Array:
         """Return the sources (sources, records): nothing, states, time, predicted outputs, or inputs."""
-        twin, free, window = base_model(self.problem), len(self.problem.free), self.window
+        twin, free, window = self.problem.base_model, len(self.problem.free), self.window
         outputs, inputs = [output.name for output in twin.outputs], [source.name for source in twin.inputs]
         predicted = self.objective.predict(np.concatenate([self._guess[:free], initial])[None])[0]
         rows = []
@@ -199,7 +133,7 @@ class LinearResponse:
             elif source.symbol in state_names:
                 rows.append(trajectory[:, state_names.index(source.symbol)])
             elif source.name == "t":
-                rows.append(window.sample_period * np.arange(window.records, dtype=np.float64))
+                rows.append(window.grid.offsets)
             elif source.name in outputs:
                 rows.append(predicted[:, outputs.index(source.name)])
             else:
@@ -208,30 +142,82 @@ class LinearResponse:
 
     def _input(self, index: int, values: Array) -> Array:
         """Return an input (records,); a constant where it varies by no more than its noise."""
-        noise = self.objective.noise.inputs[index]
+        noise = np.median(self.objective.noise.inputs[:, index])
         return values if values.std() > MIN_INPUT_VARIATION * noise else np.full(len(values), values.mean())
 
     def score(self, guesses: list[Guess]) -> ScoreStatistics:
         """Return the score statistics of all guesses."""
-        if not guesses:
+        block = max(MAX_BLOCK // max(2 * len(self._remainder), 1), 1)
+        parts = [self._score_block(guesses[first : first + block]) for first in range(0, len(guesses), block)]
+        if not parts:
             return ScoreStatistics(np.zeros(0), np.zeros((0, 2)))
+        gain = np.concatenate([part.gain for part in parts])
+        return ScoreStatistics(gain, np.concatenate([part.amplitudes for part in parts]))
+
+    def _score_block(self, guesses: list[Guess]) -> ScoreStatistics:
         counts = np.array([len(form.model.phases) for form, _ in guesses], dtype=np.int64)
         first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
         pairs = np.column_stack([first, first + counts - 1])
         return self.score_responses(self.responses(basis_functions(iter(guesses))), pairs)
+
+    def estimated_gains(self, source: int, frequencies: Array) -> Array:
+        """Return about by how much χ² falls (sites, frequencies) by a sine of a source at each site of the machine.
+
+        ``frequencies`` (frequencies,) are equidistant. The cost is linear in records plus frequencies, because no
+        response is computed. The true gain over the estimate is χ² distributed with PROBES - 1 degrees of freedom,
+        divided by PROBES; ``docs/explanation/discovery.md`` derives it.
+        """
+        signals = self._adjoint_signals
+        records, machine_sites, count = signals.shape
+        width = float(frequencies[1] - frequencies[0]) if len(frequencies) > 1 else 1.0
+        columns = signals.reshape(records, -1)
+        sums = self._kernel.fourier_sums(self.x[source], columns, float(frequencies[0]), width, len(frequencies))
+        curves = np.stack([sums.imag, sums.real], axis=-1).reshape(-1, machine_sites, count, 2)  # sine and cosine
+        along, probes = curves[:, :, 0], curves[:, :, 1:]
+        squares = np.einsum("fspi,fspj->fsij", probes, probes) / PROBES
+        determinant = squares[..., 0, 0] * squares[..., 1, 1] - squares[..., 0, 1] ** 2
+        adjugate = squares[..., 1, 1] * along[..., 0] ** 2 + squares[..., 0, 0] * along[..., 1] ** 2
+        adjugate -= 2.0 * squares[..., 0, 1] * along[..., 0] * along[..., 1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gains = adjugate / determinant
+        return np.where(np.isfinite(gains), gains, 0.0).T
+
+    @cached_property
+    def _adjoint_signals(self) -> Array:
+        """(records, sites, 1 + probes): inner products with a curve give those of its response.
+
+        The first is with the remainder. The others are with random vectors after projection, whose covariance is the
+        projector: their mean square is the squared length of the projected response.
+        """
+        random = np.random.default_rng(self.problem.seed + self.window.index)
+        vectors = random.standard_normal((len(self._basis) + len(self._prior_basis), PROBES))
+        shared = self._basis.T @ vectors[: len(self._basis)] + self._prior_basis.T @ vectors[len(self._basis) :]
+        probes = vectors[: len(self._basis)] - self._basis @ shared
+        signals = np.column_stack([self._remainder, probes])
+        model, present = self.objective.innovation_model, self.objective.present
+        adjoint = self._kernel.adjoint(self._linear, model, present, signals)
+        return np.ascontiguousarray(adjoint[:, : len(self.problem.base_model.sites)])
 
     def score_parameters(self, names: list[str]) -> Array:
         """Return by how much χ² falls (parameters,) if each parameter moves alone."""
         one = np.arange(len(names))
         return self.score_responses(self._parameter_responses(names), np.column_stack([one, one])).gain
 
+    def score_delays(self) -> ScoreStatistics:
+        """Return by how much χ² falls if each output, then each input, is late alone; amplitudes are in seconds."""
+        free, twin = len(self.problem.free), self.problem.base_model
+        guess = np.concatenate([self._guess[:free], self._guess[2 * free :]])
+        columns = -delay_response(self.objective, guess)[:, : len(twin.outputs) + len(twin.inputs)]
+        one = np.arange(columns.shape[1])
+        return self.score_responses(columns, np.column_stack([one, one]))
+
     def is_parameter(self, curves: BasisFunctions, amplitudes: Array) -> Mask:
         """Return which curves (curves,) of these ``amplitudes`` a parameter within its bounds would produce as well."""
-        parameters_of_twin = base_model(self.problem).parameters
+        parameters_of_twin = self.problem.base_model.parameters
         names = [parameter.name for parameter in parameters_of_twin]
         parameters, responses = self._parameter_responses(names), self.responses(curves)
-        size, response_size = np.linalg.norm(parameters, axis=0), np.linalg.norm(responses, axis=0)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            size, response_size = np.linalg.norm(parameters, axis=0), np.linalg.norm(responses, axis=0)
             cosine = np.abs(parameters.T @ responses) / np.outer(size, response_size)
             step = (parameters.T @ responses) * amplitudes / (size**2)[:, None]
             difference = (1.0 - cosine**2) * (response_size * amplitudes) ** 2
@@ -284,6 +270,20 @@ class LinearResponse:
         valid = np.isfinite(gain) & np.isfinite(one) & np.isfinite(two) & (independence > MIN_INDEPENDENCE)
         amplitudes = np.where(valid[:, None], np.column_stack([one, two]), 0.0)
         return ScoreStatistics(np.where(valid, gain, 0.0), amplitudes)
+
+
+def _basis(jacobian: Array) -> Array:
+    """Return an orthonormal basis of what the columns of ``jacobian`` can explain."""
+    size = np.linalg.norm(jacobian, axis=0)
+    alive = size > 0.0
+    basis, singular, _ = np.linalg.svd(jacobian[:, alive] / size[alive], full_matrices=False)
+    return np.asarray(basis[:, singular > MIN_BASIS_SINGULAR * singular[0]])
+
+
+def chi_square_of_parameters(fitted: Fit) -> float:
+    """Return χ² that parameters, trends and initial state leave, with the prior, linearised where ``fitted`` began."""
+    _, residuals, jacobian = fitted.result.first
+    return float(residuals @ residuals) - float(((_basis(jacobian).T @ residuals) ** 2).sum())
 
 
 def _padded(values: Array, length: int) -> Array:

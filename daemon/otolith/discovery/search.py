@@ -1,125 +1,80 @@
 """Step 3 of the method: which component, moved parameter or faulty sensor explains what the twin leaves of a window.
 
-:func:`screening_test` asks of every window whether a search is worth its time. :func:`search` proposes hypotheses from
-the linear response, searches their inner parameters by swarms, and fits the best of them jointly with all parameters.
+:mod:`otolith.discovery.screening` tests whether a window is worth a search. :func:`search` proposes hypotheses from the
+linear response, searches their inner parameters by swarms, and fits the best of them jointly with all parameters.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
-from otolith.discovery.candidates import (
-    COARSE,
-    DECISIVE,
-    MAX_CANDIDATES,
-    Alternatives,
-    Candidate,
-    Screening,
-    allowed_forms,
-    component_of,
-    find_candidates,
-    screen,
-    threshold_like,
-)
+from otolith.acquisition.window import Window
+from otolith.discovery.candidates import MAX_CANDIDATES, Candidate, component_of, find_candidates, threshold_like
 from otolith.discovery.hypotheses import (
     FaultHypothesis,
     FaultType,
     FittedHypothesis,
     Proposal,
     all_parameters_moved,
+    delay_score,
     nothing_happened,
     residual_variance_factor,
     with_candidate,
 )
-from otolith.discovery.linear_response import LinearResponse
+from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
+from otolith.discovery.screening import (
+    DECISIVE,
+    Alternatives,
+    Screening,
+    ScreeningResult,
+    allowed_forms,
+    linearised,
+    screen_fit,
+)
 from otolith.estimation.arrival_cost import Prior, extend_prior, forget_parameter, initial_prior
-from otolith.estimation.augmented import base_model
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
-from otolith.estimation.window_fit import Fit, WindowEstimate, fit
-from otolith.twin.augmentation import MAX_COMPONENTS, sources
-from otolith.twin.component_families import SourceKind
+from otolith.estimation.timing.delay_response import delayable
+from otolith.estimation.window_fit import Fit, fit
+from otolith.twin.augmentation import MAX_COMPONENTS
 
-THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
 MAX_STEPS = 25  # of Gauss-Newton for a hypothesis
-MAX_RECORDS = 5000  # last records of a window that are searched
 PARTS = 8  # of a window, fitted one after another to find an onset
 FAR_OFF = 20.0  # squared innovation in units of its variance: one record in a hundred thousand
 EXPECTED_SPREAD = 5.0  # standard deviations of χ² up to which a part of a window is as predicted
-MIN_RECORDS_AFTER = 60  # records after an onset that say anything about it
+MIN_RECORDS_AFTER = 60  # measured records after an onset that say anything about it
+MAX_LATE, MIN_LATE_SHARE = 3, 0.1  # signals whose delays are tried, and their least share of the best gain
+MAX_DELAY, MAX_DELAY_SHARE = 0.2, 0.125  # s, and of a window: largest delay
+DELAY_POINTS, DELAY_RATIO = 16, 1.5  # delays that are tried; the first is half a record
+DELAY_STEPS = 4  # of Gauss-Newton for a delay
 MAX_MOVED, MIN_MOVED_SHARE = 3, 0.5  # parameters tried alone, and their least share of the best gain
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScreeningResult:
-    """Whether a search of a window is worth its time."""
-
-    gain: float
-    """Largest gain in -2 log evidence over parameters only, minus what is decisive; positive if worth a search."""
-    fitted: Fit
-    """Its start is the linearisation point."""
-    response: LinearResponse
-    always_lacking: bool = False
-    """Whether only a component with a threshold, fitted under the initial prior, gains enough."""
-
-    @property
-    def is_positive(self) -> bool:
-        """Whether a search is worth its time."""
-        return self.gain > 0.0
 
 
 def fit_hypotheses(proposals: Iterable[Proposal], window: Window) -> list[FittedHypothesis]:
     """Fit each proposal to ``window``."""
-    return [
-        FittedHypothesis(item.hypothesis, fit(item.problem, window, item.prior, item.start, MAX_STEPS))
-        for item in proposals
-    ]
+    return [_fitted(item, window) for item in proposals]
 
 
-def linearised(problem: Problem, window: Window, prior: Prior, start: Array) -> Fit:
-    """Return a fit of no steps: the window, linearised at ``start`` (free, ...)."""
-    return fit(problem, window, prior, start, max_steps=0)
-
-
-def screen_window(predicted: Posterior, estimated: WindowEstimate, *, determined: bool) -> ScreeningResult:
-    """Screen the window of an estimate, around the prediction.
-
-    While no parameter is determined or a phase is unknown, it is screened around the estimate instead.
-
-    Of a very long window the last records are screened, so that a search ends before the next window.
-    """
-    problem, prior, window = predicted.problem, predicted.prior(), estimated.fit.window
-    is_known = determined and not predicted.unknown_phases()
-    is_long = window.records > MAX_RECORDS and not problem.components
-    if is_known and not is_long:
-        return screening_test(estimated.fit)
-    start = prior.mean if is_known else np.array([parameter.value for parameter in estimated.parameters])
-    recent = window.since(window.records - MAX_RECORDS) if is_long else window
-    return screening_test(linearised(problem, recent, prior, start))
+def _fitted(item: Proposal, window: Window) -> FittedHypothesis:
+    result = fit(item.problem, window, item.prior, item.start, MAX_STEPS)
+    if not item.problem.delays:
+        return FittedHypothesis(item.hypothesis, result)
+    outputs = [window.missing_in(output.name) for output in item.problem.base_model.outputs]
+    return FittedHypothesis(item.hypothesis, result, max(float((~np.array(outputs)).sum()) - result.count, 0.0))
 
 
 def screening_test(fitted: Fit) -> ScreeningResult:
-    """Return what a component would gain at most, around the start of ``fitted``, on a coarse grid.
+    """Return whether what ``fitted`` leaves of its window is worth a search, around the start of the fit."""
+    screening = screen_fit(fitted)
+    return with_threshold_test(screening) if screening.needs_threshold_test else screening
 
-    Spectra cost most: those over time are tested in one window, those over angles in the next.
-    """
-    problem, index = fitted.problem, fitted.window.index
-    response = LinearResponse(fitted)
-    kind = (SourceKind.TIME, SourceKind.PLACE)[index % 2]
-    source_kinds = [source.kind for source in sources(base_model(problem))]
-    forms = [
-        form
-        for form in allowed_forms(problem, response.x)
-        if problem.discover and (len(form.model.phases) == 1 or source_kinds[form.source] is kind)
-    ]
-    gain = float(screen(response, forms, COARSE).scores.max(initial=-np.inf)) - DECISIVE
-    if gain <= 0.0 and problem.discover and index % THRESHOLD_TEST_EVERY == 0:
-        threshold_gain = _threshold_gain(response) - DECISIVE
-        return ScreeningResult(max(gain, threshold_gain), fitted, response, always_lacking=threshold_gain > 0.0)
-    return ScreeningResult(gain, fitted, response)
+
+def with_threshold_test(screening: ScreeningResult) -> ScreeningResult:
+    """Return the screening with what the threshold-like families gain if they are fitted."""
+    gain = _threshold_gain(screening.response) - DECISIVE
+    return replace(screening, gain=max(screening.gain, gain), always_lacking=gain > 0.0)
 
 
 def _threshold_gain(response: LinearResponse) -> float:
@@ -154,6 +109,7 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     proposals += _one_parameter_moved(problem, prior, screening.response)
     proposals += [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
     fitted = fit_hypotheses(proposals, window)
+    fitted += late_signals(fitted[0], screening.response)
     components = [item for item in fitted if item.type is FaultType.COMPONENT]
     best = min(components, key=_chi_square, default=None)
     while best is not None and len(best.problem.components) < MAX_COMPONENTS:
@@ -162,6 +118,44 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     if screening.always_lacking or not _is_convincing(fitted):
         fitted += _always_lacking(fitted[0])
     return fitted
+
+
+def late_signals(null: FittedHypothesis, response: LinearResponse) -> list[FittedHypothesis]:
+    """Return the hypotheses that one signal is late or early against all others, for those that would explain most."""
+    gains = response.score_delays().gain
+    least = max(MIN_LATE_SHARE * gains.max(initial=0.0), DECISIVE)
+    return [
+        _late_signal(null, index)
+        for index in np.argsort(-gains, kind="stable")[:MAX_LATE].tolist()
+        if gains[index] > least
+    ]
+
+
+def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
+    """Fit the delay of one signal: the best of a grid, then Gauss-Newton."""
+    problem, prior, window = null.problem, null.fit.prior, null.fit.window
+    names = delayable(problem.base_model)
+    stated = FaultHypothesis(FaultType.TIMING, f"{names[index]} is late", 1, float(len(names)))
+    limit = min(MAX_DELAY, MAX_DELAY_SHARE * window.grid.length)
+
+    def proposal(delay: float) -> Proposal:
+        late = replace(problem, delays=((names[index], float(np.clip(delay, -limit, limit))),))
+        return Proposal(stated, late, prior, prior.mean)
+
+    def unexplained(item: Proposal) -> float:
+        fitted = linearised(item.problem, window, prior, prior.mean)
+        return chi_square_of_parameters(fitted) / fitted.count
+
+    grid = 0.5 * window.sample_period * DELAY_RATIO ** np.arange(DELAY_POINTS)
+    grid = grid[grid <= limit]
+    best = _fitted(min(map(proposal, [*grid, *-grid, limit, -limit]), key=unexplained), window)
+    for _ in range(DELAY_STEPS):
+        ((signal, delay),) = best.problem.delays
+        trial = _fitted(proposal(delay + delay_score(best.fit, signal).step), window)
+        if trial.chi_square >= best.chi_square:
+            break
+        best = trial
+    return best
 
 
 def _chi_square(fitted: FittedHypothesis) -> float:
@@ -183,7 +177,7 @@ def _one_parameter_moved(problem: Problem, prior: Prior, response: LinearRespons
     known = dict(problem.known)
     given = [
         replace(parameter, nominal=known[parameter.name])
-        for parameter in base_model(problem).parameters
+        for parameter in problem.base_model.parameters
         if parameter.name in known and parameter.low < known[parameter.name] < parameter.high
     ]
     parameters = [*problem.free, *given]
@@ -241,13 +235,15 @@ def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple
     the null hypothesis is the only one.
     """
     window = screening.fitted.window
-    onset = find_onset(predicted, window)
+    onset = 0 if screening.always_late else find_onset(predicted, window)
     if not onset:
         return predicted, search(screening)
-    first = max(min(onset, window.records - MIN_RECORDS_AFTER), 0)
+    measured = np.flatnonzero(screening.fitted.objective.present.any(axis=1))
+    latest = int(measured[-MIN_RECORDS_AFTER]) if len(measured) >= MIN_RECORDS_AFTER else 0
+    first = min(onset, latest)
     later, rest = _advance_phases(predicted, window, first), window.since(first)
     problem, prior = later.problem, later.prior()
-    if window.records - onset < MIN_RECORDS_AFTER:
+    if onset > latest:
         return later, fit_hypotheses([nothing_happened(problem, prior)], rest)
     return later, search(screening_test(linearised(problem, rest, prior, prior.mean)))
 
@@ -258,7 +254,7 @@ def find_onset(predicted: Posterior, window: Window) -> int:
     record = 0
     null = nothing_happened(predicted.problem, predicted.prior())
     for part in range(1, PARTS + 1):
-        end = window.records * part // PARTS
+        end = max(window.records * part // PARTS, 1)
         (fitted,) = fit_hypotheses([null], window.until(end))
         count = fitted.fit.count
         if fitted.chi_square > count + EXPECTED_SPREAD * np.sqrt(2.0 * count):

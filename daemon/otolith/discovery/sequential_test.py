@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.discovery.candidates import DECISIVE
 from otolith.discovery.hypotheses import (
     FaultType,
     FittedHypothesis,
@@ -25,13 +24,8 @@ from otolith.discovery.hypotheses import (
     track,
     without_insignificant,
 )
-from otolith.discovery.search import (
-    ScreeningResult,
-    fit_hypotheses,
-    screening_test,
-    search,
-    search_from_onset,
-)
+from otolith.discovery.screening import DECISIVE, ScreeningResult
+from otolith.discovery.search import fit_hypotheses, screening_test, search, search_from_onset
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
@@ -158,9 +152,13 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
         return test
     steps, last = _with_deviances(steps)
     least = min(step.deviance for step in steps)
-    tracked = [step.updated(min(step.deviance - least, MAX_WINDOW_EVIDENCE)) for step in steps]
+    updated = [(step.updated(min(step.deviance - least, MAX_WINDOW_EVIDENCE)), step.deviance) for step in steps]
+    kept = [(item, deviance) for item, deviance in updated if item is not None]
+    if not kept:
+        return test
+    tracked = [item for item, _ in kept]
     if test.windows >= PRUNED_AFTER:
-        tracked = prune(tracked, [step.deviance for step in steps])
+        tracked = prune(tracked, [deviance for _, deviance in kept])
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     hypotheses = _screened(hypotheses, steps)

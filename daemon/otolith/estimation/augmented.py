@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Window
 from otolith.estimation.problem import Component, Problem
 from otolith.twin.augmentation import (
-    ELAPSED,
     MAX_COMPONENTS,
     ComponentSource,
     augmented_model,
@@ -38,18 +37,13 @@ def source_of(twin: Definition, name: str) -> ComponentSource:
     return next(source for source in sources(twin) if source.name == name)
 
 
-def base_model(problem: Problem) -> Definition:
-    """Return the twin without slots for components."""
-    return problem.twin.base or problem.twin
-
-
 def augment(problem: Problem, components: Sequence[Component]) -> Problem:
     """Return the problem with ``components`` added to those in its twin; their values are free parameters.
 
     Raises:
         ValueError: more components than the twin has slots.
     """
-    twin, together = base_model(problem), (*problem.components, *components)
+    twin, together = problem.base_model, (*problem.components, *components)
     if len(together) > MAX_COMPONENTS:
         raise ValueError(f"{len(together)} components: a twin has {MAX_COMPONENTS} slots")
     free = [parameter for parameter in problem.free if not parameter.name.startswith("_")]
@@ -66,7 +60,7 @@ def without(problem: Problem, removed: Component) -> Problem:
     rest = [component for component in problem.components if component is not removed]
     bare = replace(
         problem,
-        twin=base_model(problem),
+        twin=problem.base_model,
         components=(),
         free=tuple(parameter for parameter in problem.free if not parameter.name.startswith("_")),
         known=tuple(pair for pair in problem.known if not pair[0].startswith("_")),
@@ -124,19 +118,6 @@ def time_offsets(problem: Problem, window: Window) -> dict[str, float]:
         for slot, component in enumerate(problem.components)
         if component.source == "t" and not component.periodic
     }
-
-
-def input_matrix(twin: Definition, window: Window) -> Array:
-    """Return the inputs (records, inputs) of a twin with or without slots."""
-    columns = [np.zeros((window.records, 0))]
-    for source in twin.inputs:
-        if source.name == ELAPSED:
-            columns.append(window.sample_period * np.arange(window.records, dtype=np.float64)[:, None])
-        elif source.name.startswith("_"):
-            columns.append(np.zeros((window.records, 1)))
-        else:
-            columns.append(window.column(source.name)[:, None])
-    return np.hstack(columns)
 
 
 def equation(twin: Definition, component: Component, values: Sequence[float]) -> str:

@@ -1,38 +1,55 @@
 """Faulty data are rejected before estimating: bad windows, spikes, frozen or clipped channels, repeated records.
 
-- A **spike** rises and falls within two sampling periods, so the second difference around it reads -1/2, 1, -1/2. The
-  kink that a voltage step leaves in a current does not (compare F. R. Hampel, The influence curve and its role in
+- A **spike** rises and falls within two samples, so the second difference around it reads -1/2, 1, -1/2 at equal steps.
+  The kink that a voltage step leaves in a current does not (compare F. R. Hampel, The influence curve and its role in
   robust estimation, Journal of the American Statistical Association 69, 1974). Single spikes count as missing.
-- A channel is **frozen** where it stands still while the twin, simulated with the parameters known before, moves.
+- A channel is **frozen** where it keeps one value that its prediction from all other data makes improbable. The
+  prediction is that of the filter, with its uncertainty: the run counts as missing, and parameters, initial state and
+  process noise are free within what is known of them. What a disturbance of one equation explains, as dry friction that
+  holds an axis, is no fault of the sensor.
 - **Repeated records** are an old image that was read or sent again: every channel repeats bit for bit. Their errors are
   one and the same error, so only the first and the last of a run count; the first alone would be biased in the
   direction of motion. Coarse channels repeat by chance, and dropping those would bias them, so then all records count.
+
+All three look at measured samples only, each at its own time. A machine file turns each of them off for a signal.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from math import erf
 
 import numpy as np
+from numpy.typing import NDArray
 
+from otolith.acquisition.quality import time_text
+from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array, Mask, Verdict, Window
-from otolith.estimation.augmented import base_model
-from otolith.estimation.objective import Objective, adc_step
+from otolith.estimation.imm_filter import nis_limit
+from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, adc_step
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
-from otolith.twin.definition import Definition
+from otolith.estimation.window_fit import Fit, fit
+from otolith.twin.definition import Definition, Output
 
 MIN_RECORDS = 5
 MAX_VALUE = 1e12  # magnitude of a value, in the unit of its signal
 SPIKE_HEIGHT = 12.0  # times the usual second difference of the channel: least height of a spike
-SPIKE_SHAPE = 0.35  # largest distance of the neighbours' share from a half
+SPIKE_SHAPE = 0.35  # largest distance of the neighbours' share from that of a spike, which is a half at equal steps
 MAX_SPIKE_SHARE = 0.05  # share of records above which the channel is rejected
 MAD_TO_SD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 SECOND_DIFFERENCE_SD = 1.2247  # standard deviation of the second difference of unit noise, the root of 3/2
 MIN_FROZEN_RUN = 5  # records of one value
 MAX_FROZEN_SHARE = 0.05  # share of records above which the channel is rejected
-FROZEN_DISTANCE = 6.0  # standard deviations that the twin must move, and be away, while the channel stands still
+FROZEN_MOVEMENT = 6.0  # standard deviations that the prediction must move while the channel stands still
+FROZEN_STEPS = 2.0  # steps of the converter that it must move beside that
+RESOLVED_NOISE = 2.0  # steps of a converter from which on noise can be told from motion over coarse steps
+CHANCE = 1e-9  # probability of equal readings of a noisy sensor below which they are no chance
 MIN_REPEATED_RUN = 10  # records
 COARSE_REPEATS = 0.3  # share of the other records in which a coarse sensor repeats its value
 COARSE_STEPS = 2.0  # least steps that a coarse sensor usually moves by
+
+
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +76,17 @@ def check_window(window: Window, predicted: Posterior) -> CheckedWindow:
     bad = window.quality.reasons if window.quality.verdict is Verdict.BAD else _unusable_values(window)
     if bad:
         return CheckedWindow(window, bad=bad)
-    cleaned, notes, faulty = drop_spikes(window, base_model(problem), problem.noise)
-    faulty = faulty or frozen_channels(problem, cleaned, predicted.start())
+    cleaned, notes, faulty = drop_spikes(window, problem.base_model, problem.noise, _channels(problem, Check.SPIKES))
+    faulty = faulty or frozen_channels(predicted, cleaned)
     if faulty:
         return CheckedWindow(cleaned, faulty_sensors=tuple(faulty))
-    cleaned, repeated = drop_repeats(cleaned, base_model(problem))
+    cleaned, repeated = drop_repeats(cleaned, problem.base_model, _channels(problem, Check.STALE))
     return CheckedWindow(cleaned, (*notes, *repeated))
+
+
+def _channels(problem: Problem, check: Check) -> frozenset[str]:
+    """Return the signals for which ``check`` is on."""
+    return frozenset(name for name in problem.base_model.signals if (name, check) not in problem.unchecked)
 
 
 def _unusable_values(window: Window) -> tuple[str, ...]:
@@ -75,122 +97,302 @@ def _unusable_values(window: Window) -> tuple[str, ...]:
     return ()
 
 
-def drop_spikes(window: Window, twin: Definition, noise: tuple[float, ...]) -> tuple[Window, list[str], list[str]]:
+def drop_spikes(
+    window: Window, twin: Definition, noise: tuple[float, ...], checked: frozenset[str] | None = None
+) -> tuple[Window, list[str], list[str]]:
     """Return the window with spikes missing, notes, and a sentence for each channel with too many spikes.
 
-    ``noise`` holds the standard deviations of the outputs. Commands (``zoh`` inputs) may jump.
+    ``noise`` holds the standard deviations of the outputs. Commands (``zoh`` inputs) may jump. Of the other signals
+    those in ``checked`` are looked at, all by default.
     """
     levels = {output.name: level for output, level in zip(twin.outputs, noise, strict=True)}
     levels |= {source.name: 0.0 for source in twin.inputs if source.hold == "foh"}
     values, missing = window.values.copy(), window.missing.copy()
+    times = _times(window)
     notes, faulty = [], []
     for name, level in levels.items():
+        if checked is not None and name not in checked:
+            continue
         column = window.signals.index(name)
-        spikes = spike_records(window.values[:, column], level) & ~window.missing[:, column]
-        count = int(spikes.sum())
-        if count > MAX_SPIKE_SHARE * window.records:
-            faulty.append(f"{name} spikes in {count} of {window.records} records: look at its cable and its connector")
+        present = np.flatnonzero(~window.missing[:, column])
+        is_spike = spike_records(window.values[present, column], level, times[present])
+        count = int(is_spike.sum())
+        if count > MAX_SPIKE_SHARE * len(present):
+            way_out = f"look at its cable and its connector{_turned_off(name, Check.SPIKES)}"
+            faulty.append(f"{name} spikes in {count} of {len(present)} records: {way_out}")
         elif count:
-            values[:, column] = _bridge(values[:, column], spikes)
-            missing[:, column] |= spikes
+            values[:, column] = _bridge(times, values[:, column], present, is_spike)
+            missing[present[is_spike], column] = True
             notes.append(f"{name} has {count} spike{'s' if count > 1 else ''}, left out")
     return (replace(window, values=values, missing=missing) if notes else window), notes, faulty
 
 
-def spike_records(values: Array, noise: float) -> Mask:
-    """Return which of ``values`` (records,) are spikes above a ``noise`` of that standard deviation."""
+def _times(window: Window) -> Array:
+    """Return the times (records,) of the records; on a uniform grid in periods, so that equal steps are exactly so."""
+    return np.arange(window.records, dtype=np.float64) if window.grid.period is not None else window.grid.offsets
+
+
+def _turned_off(name: str, check: Check) -> str:
+    """Return how ``check`` is turned off for a signal."""
+    others = ", ".join(f'"{other}"' for other in Check if other is not check)
+    return f"; without {check} in checks of {name} in [signals], as in checks = [{others}], it counts as measured"
+
+
+def spike_records(values: Array, noise: float, times: Array | None = None) -> Mask:
+    """Return which of ``values`` (samples,) are spikes above a ``noise`` of that standard deviation.
+
+    ``times`` (samples,) are those of the samples, by default at equal steps. The second difference of a sample is its
+    distance from the line through its neighbours. It grows with the curvature of the signal times both steps.
+    """
     spikes = np.zeros(len(values), dtype=np.bool_)
     if len(values) < 5:
         return spikes
-    second = values[1:-1] - 0.5 * (values[:-2] + values[2:])
+    steps = np.diff(np.arange(len(values)) if times is None else times)
+    share = steps[1:] / (steps[:-1] + steps[1:])  # of the sample before in the line
+    second = values[1:-1] - (share * values[:-2] + (1.0 - share) * values[2:])
+    product = steps[:-1] * steps[1:]
+    spread = np.maximum(product / np.median(product), 1.0)
     usual = max(MAD_TO_SD * float(np.median(np.abs(second))), SECOND_DIFFERENCE_SD * noise)
-    high = np.abs(second[1:-1]) > SPIKE_HEIGHT * max(usual, float(np.finfo(float).tiny))
+    usual = max(usual, float(np.finfo(float).eps * np.abs(values).max()))  # of the rounding of numbers
+    height = SPIKE_HEIGHT * max(usual, float(np.finfo(float).tiny))
+    high = np.abs(second[1:-1]) > height * spread[1:-1]
     if not high.any():
         return spikes
+    before, after = 1.0 - share[:-2], share[2:]  # of the spike in the lines through the samples before and after
     with np.errstate(divide="ignore", invalid="ignore"):
-        before, after = second[:-2] / second[1:-1], second[2:] / second[1:-1]
-    spikes[2:-2] = high & (np.abs(before + 0.5) < SPIKE_SHAPE) & (np.abs(after + 0.5) < SPIKE_SHAPE)
+        first, last = second[:-2] / second[1:-1], second[2:] / second[1:-1]
+    shaped = [np.abs(ratio / share + 1.0) < 2.0 * SPIKE_SHAPE for ratio, share in ((first, before), (last, after))]
+    highest = (np.abs(first) < 1.0) & (np.abs(last) < 1.0)  # close in time to a spike, a sample seems to be one too
+    spikes[2:-2] = high & shaped[0] & shaped[1] & highest
     return spikes
 
 
-def _bridge(values: Array, gaps: Mask) -> Array:
-    known = np.flatnonzero(~gaps)
-    return np.interp(np.arange(len(values)), known, values[known])
+def _bridge(times: Array, values: Array, present: Indices, spikes: Mask) -> Array:
+    """Return ``values`` (records,) with lines over ``spikes`` (present,), between the ``present`` samples beside."""
+    kept = present[~spikes]
+    bridged = values.copy()
+    after = np.searchsorted(kept, present[spikes])
+    for right in np.unique(after):
+        left = kept[right - 1] if right else -1
+        gap = np.arange(left + 1, kept[right] if right < len(kept) else len(values))
+        bridged[gap] = np.interp(times[gap], times[kept], values[kept])
+    return bridged
 
 
-def frozen_channels(problem: Problem, window: Window, parameters: Array) -> list[str]:
-    """Return a sentence for each channel that stands still while the twin with ``parameters`` (free,) moves."""
-    sentences = []
-    simulated: Array | None = None
-    for index, output in enumerate(problem.twin.outputs):
-        values = window.column(output.name)
-        runs = [run for run in _constant_runs(values) if not window.missing_in(output.name)[run].any()]
-        if _records_in(runs) <= MAX_FROZEN_SHARE * window.records:
+def frozen_channels(predicted: Posterior, window: Window) -> list[str]:
+    """Return a sentence for each channel that keeps a value which its prediction makes improbable."""
+    problem, sentences = predicted.problem, []
+    for output in problem.base_model.outputs:
+        name = output.name
+        if (name, Check.FROZEN) in problem.unchecked:
             continue
-        if simulated is None:
-            objective = Objective(replace(problem, open_loop=True), window, parameters)
-            simulated = objective.simulate(objective.guess(parameters))
-        distance = FROZEN_DISTANCE * problem.noise[index] + 2.0 * adc_step(values)
-        frozen = [run for run in runs if _twin_moves(simulated[run, index], float(values[run.start]), distance)]
-        if _records_in(frozen) > MAX_FROZEN_SHARE * window.records:
-            excess = np.concatenate([simulated[run, index] for run in frozen]) - values[frozen[0].start]
-            at, kind = float(values[frozen[0].start]), _frozen_or_clipped(values, frozen[0], float(np.median(excess)))
-            moves = "while the twin moves on: look at the sensor"
-            sentences.append(f"{output.name} is {kind} at {at:.6g} {output.unit} {moves}")
+        present = np.flatnonzero(~window.missing_in(name))
+        runs = _constant_runs(window.column(name), present)
+        if _samples_in(runs) <= MAX_FROZEN_SHARE * len(present):
+            continue
+        run = _frozen_run(predicted, window, name, runs)
+        if run is not None:
+            sentences.append(_frozen_sentence(window, output, run))
     return sentences
 
 
-def _constant_runs(values: Array) -> list[slice]:
-    """Return the runs of one and the same value that are long enough."""
-    same = np.concatenate([[False], np.diff(values) == 0.0, [False]]).astype(np.int8)
-    edges = np.flatnonzero(np.diff(same))
-    runs = [slice(int(start), int(end) + 1) for start, end in zip(edges[::2], edges[1::2], strict=True)]
-    return [run for run in runs if run.stop - run.start >= MIN_FROZEN_RUN]
+def _constant_runs(values: Array, present: Indices) -> list[Indices]:
+    """Return the records of each run of one and the same value that is long enough, among the ``present`` ones."""
+    ends = np.flatnonzero(np.diff(values[present]) != 0.0) + 1
+    return [run for run in np.split(present, ends) if len(run) >= MIN_FROZEN_RUN]
 
 
-def _records_in(runs: list[slice]) -> int:
-    return sum(run.stop - run.start for run in runs)
+def _samples_in(runs: list[Indices]) -> int:
+    return sum(len(run) for run in runs)
 
 
-def _twin_moves(simulated: Array, value: float, distance: float) -> bool:
-    """Whether the twin moves by more than ``distance`` while the channel does not, and is that far from it."""
-    if not np.isfinite(simulated).all():
+@dataclass(frozen=True, slots=True, eq=False)
+class _FrozenRun:
+    """The longest of the runs in which a channel is frozen."""
+
+    records: Indices
+    excess: float
+    """How far the prediction is above the value of the runs: the median over all of them."""
+
+
+def _frozen_run(predicted: Posterior, window: Window, name: str, runs: list[Indices]) -> _FrozenRun | None:
+    """Return the longest of the ``runs`` in which a channel is frozen, or None if it is not.
+
+    It is frozen if the prediction moves while the channel does not, and either the noise is lacking that it shows at
+    other times, or the twin does not explain the readings. A machine that dry friction holds at rest may look alike:
+    then no disturbance of a state may explain them either.
+    """
+    problem, present = predicted.problem, ~window.missing_in(name)
+    index = [output.name for output in problem.twin.outputs].index(name)
+    values, noise = window.column(name)[present], problem.noise[index]
+    step = _step(values)
+    if step != adc_step(values):  # the objective would leave so few levels out
+        with_rounding = float(np.sqrt(noise**2 + step**2 / 12.0))
+        problem = replace(problem, noise=(*problem.noise[:index], with_rounding, *problem.noise[index + 1 :]))
+    hidden = _without(window, name, np.concatenate([run[1:] for run in runs]))
+    rest = _fit(predicted, problem, hidden)
+    prediction = rest.objective.predict_with_trends(rest.result.guess)[0][:, index]
+    movement = FROZEN_MOVEMENT * noise + FROZEN_STEPS * step
+    moving = [run for run in runs if np.ptp(prediction[run[0] : run[-1] + 1]) > movement]  # false for not-a-number
+    if _samples_in(moving) <= MAX_FROZEN_SHARE * present.sum():
+        return None
+    if not _lacks_noise(window, name, noise, runs):
+        rounding = _samples_in(runs) * 0.25 * step**2 / (noise**2 + step**2 / 12.0)
+        at_rest = _disturbances(problem, window) if _may_rest(problem, window, name, moving) else ()
+        if any(_is_probable(predicted, each, window, hidden, rounding) for each in (problem, *at_rest)):
+            return None
+    excess = np.concatenate([prediction[run] - window.column(name)[run] for run in moving])
+    return _FrozenRun(max(moving, key=len), float(np.median(excess)))
+
+
+def _step(values: Array) -> float:
+    """Return the step of the converter behind ``values`` (n,), 0 if they show none; two or three levels show it."""
+    levels = np.unique(values)
+    return float(np.diff(levels).min()) if 1 < len(levels) < MIN_ADC_LEVELS else adc_step(values)
+
+
+def _without(window: Window, name: str, records: Indices) -> Window:
+    """Return the window with a signal missing in ``records``."""
+    missing = window.missing.copy()
+    missing[records, window.signals.index(name)] = True
+    return replace(window, missing=missing)
+
+
+def _fit(predicted: Posterior, problem: Problem, window: Window, start: Array | None = None) -> Fit:
+    return fit(problem, window, predicted.prior(), predicted.start() if start is None else start)
+
+
+def _is_probable(predicted: Posterior, problem: Problem, window: Window, hidden: Window, rounding: float) -> bool:
+    """Whether the readings of ``window`` that ``hidden`` lacks are probable given all others.
+
+    The least χ² of prior and window grows by their normalised innovation squared if they are added, whose covariance
+    has the uncertainty of parameters, initial state, process noise, sensor and quantisation. Equal readings have no
+    noise: they count as one for each unknown, and ``rounding`` is the most that quantisation adds. If the twin does not
+    explain the other readings, its errors are larger by as much.
+    """
+    rest = _fit(predicted, problem, hidden)
+    if not rest.chi_square < PENALTY:
+        return True  # a twin that diverges predicts nothing
+    unknowns = len(problem.free) + len(problem.twin.states)
+    limit = rest.chi_square + max(rest.cost, 1.0) ** 2 * (nis_limit(unknowns) + rounding)
+    starts = (rest.parameters, predicted.start())  # either may lead into a local minimum
+    chi_squares = (_fit(predicted, problem, window, start).chi_square for start in starts)
+    return any(chi_square <= limit or not chi_square < PENALTY for chi_square in chi_squares)
+
+
+def _may_rest(problem: Problem, window: Window, name: str, runs: list[Indices]) -> bool:
+    """Whether a machine at rest could give the ``runs``: a position rests anywhere, a state of its own only at zero."""
+    twin = problem.base_model
+    equation = dict(twin.equations).get(f"der({name})", "").strip()
+    if name not in [state.name for state in twin.states] or equation in [state.name for state in twin.states]:
+        return True
+    noise = problem.noise[[output.name for output in twin.outputs].index(name)]
+    return any(abs(window.column(name)[run[0]]) <= FROZEN_MOVEMENT * noise for run in runs)
+
+
+def _lacks_noise(window: Window, name: str, noise: float, runs: list[Indices]) -> bool:
+    """Whether the ``noise`` of a sensor, as far as it shows outside the ``runs``, makes these improbable even at rest.
+
+    Noise of standard deviation s stays within a step of the converter with a probability of at most erf(step / (√8 s)).
+    A speed may be exactly zero at rest, as some sensors have a dead band there.
+    """
+    values, present = window.column(name), np.flatnonzero(~window.missing_in(name))
+    outside = ~np.isin(present, np.concatenate(runs))
+    samples = values[present]
+    second = samples[1:-1] - 0.5 * (samples[:-2] + samples[2:])
+    second = second[outside[:-2] & outside[1:-1] & outside[2:]]
+    levels = np.unique(samples)
+    if len(second) < MIN_FROZEN_RUN or len(levels) < MIN_ADC_LEVELS:
         return False
-    return bool(np.ptp(simulated) > distance and np.abs(simulated - value).max() > distance)
+    step = float(np.diff(levels).min())
+    deviation = min(noise, MAD_TO_SD * float(np.median(np.abs(second))) / SECOND_DIFFERENCE_SD)
+    if deviation < RESOLVED_NOISE * step:
+        return False
+    count = _samples_in([run for run in runs if values[run[0]] != 0.0])
+    return erf(step / (np.sqrt(8.0) * deviation)) ** count < CHANCE
 
 
-def _frozen_or_clipped(values: Array, run: slice, excess: float) -> str:
-    """Return the kind of fault; ``excess`` is how far the twin is above the value of the run."""
-    value = float(values[run.start])
+def _disturbances(problem: Problem, window: Window) -> Iterator[Problem]:
+    """Return the problem with each state in turn disturbed at will, except states that only sum up another one.
+
+    A force that no sensor shows enters the derivative of a speed, but nothing enters that of a position: it is the
+    speed.
+    """
+    twin = problem.base_model
+    equations, names = dict(twin.equations), [state.name for state in twin.states]
+    noise = problem.process_noise or (0.0,) * len(names)
+    for index, state in enumerate(twin.states):
+        if equations[f"der({state.name})"].strip() not in names:
+            free = (state.high - state.low) / np.sqrt(window.sample_period)
+            changed = (*noise[:index], float(free), *noise[index + 1 :])
+            yield replace(problem, process_noise=changed, open_loop=False)
+
+
+def _frozen_sentence(window: Window, output: Output, run: _FrozenRun) -> str:
+    """Return which channel is frozen, at which value, when and for how long, and the way out."""
+    present = ~window.missing_in(output.name)
+    values, times = window.column(output.name), window.grid.offsets[run.records]
+    value = float(values[run.records[0]])
+    kind = _frozen_or_clipped(values[present], value, run.excess)
+    length = f"{times[-1] - times[0]:.4g} s ({len(run.records)} samples)"
+    when = f"for {length} from {time_text(window.start + float(times[0]))}"
+    way_out = f"look at the sensor{_turned_off(output.name, Check.FROZEN)}"
+    return f"{output.name} is {kind} at {value:.6g} {output.unit} {when} while the twin moves on: {way_out}"
+
+
+def _frozen_or_clipped(values: Array, value: float, excess: float) -> str:
+    """Return the kind of fault; ``excess`` is how far the twin is above ``value``, at which the channel stands."""
     above, below = value == values.max() and excess > 0.0, value == values.min() and excess < 0.0
     return "clipped" if np.ptp(values) > 0.0 and (above or below) else "frozen"
 
 
-def drop_repeats(window: Window, twin: Definition) -> tuple[Window, list[str]]:
-    """Return the window with the outputs of repeated records missing, and notes."""
+def drop_repeats(window: Window, twin: Definition, checked: frozenset[str] | None = None) -> tuple[Window, list[str]]:
+    """Return the window with the outputs of repeated records missing, and notes.
+
+    Only outputs in ``checked`` become missing, all by default.
+    """
     outputs = np.isin(window.signals, [output.name for output in twin.outputs])
+    dropped = outputs if checked is None else outputs & np.isin(window.signals, list(checked))
     repeated = repeated_records(window, outputs)
     count = int(repeated.sum())
-    if not count:
+    if not count or not dropped.any():
         return window, []
     note = f"{count} of {window.records} records repeat the one before in every signal, bit for bit, and do not count"
-    return replace(window, missing=window.missing | (repeated[:, None] & outputs)), [note]
+    return replace(window, missing=window.missing | (repeated[:, None] & dropped)), [note]
 
 
 def repeated_records(window: Window, outputs: Mask) -> Mask:
-    """Return which records (records,) lie inside a long run of repeats; ``outputs`` (signals,) marks the sensors."""
-    changes = np.abs(np.diff(window.values, axis=0))
+    """Return which records (records,) lie inside a long run of repeats; ``outputs`` (signals,) marks the sensors.
+
+    An image of the machine has a sample of every sensor. Other records are no images: they end a run if they show that
+    a signal has changed, and do not count in it otherwise. If all are repeats, the window shows one image, and its
+    errors are those of one record: that in the middle counts.
+    """
+    changes = np.abs(np.diff(_last_samples(window, outputs), axis=0))
+    images = np.logical_not(window.missing[:, outputs].any(axis=1))
     same = (changes == 0.0).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     repeated = np.zeros(window.records, dtype=np.bool_)
     elsewhere = np.ones(len(changes), dtype=np.bool_)
     for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if last - first >= MIN_REPEATED_RUN:
-            repeated[first + 1 : last] = True
+        run = first + np.flatnonzero(images[first : last + 1])
+        if len(run) > MIN_REPEATED_RUN:
+            repeated[run[1:-1] if len(run) < images.sum() else np.delete(run, len(run) // 2)] = True
             elsewhere[first:last] = False
     if repeated.any() and _are_coarse(changes[elsewhere][:, outputs]):
         repeated[:] = False
     return repeated
+
+
+def _last_samples(window: Window, outputs: Mask) -> Array:
+    """Return the values, with that of the last sample where an output is missing, or of the first one before."""
+    values = window.values.copy()
+    for column in np.flatnonzero(outputs & window.missing.any(axis=0)):
+        present = np.flatnonzero(~window.missing[:, column])
+        if len(present):
+            last = np.searchsorted(present, np.arange(window.records), side="right") - 1
+            values[:, column] = values[present[np.maximum(last, 0)], column]
+    return values
 
 
 def _are_coarse(changes: Array) -> bool:

@@ -33,6 +33,7 @@ VARIANCE_RATIO_GAIN = 0.1  # share of the newest window in the variance ratio
 MAX_VARIANCE_RATIO = 1e4
 MAX_NIS_PER_DEGREE = 9.0  # above it a window raises the variance ratio no further; also the unit of inflate_variance
 NIS_DEVIATE = 6.0  # of the standard normal distribution: exceeded by one healthy window in a thousand million
+MAX_PRECISION = 1e7  # of a window: prior standard deviations over its own, in the direction of which it states most
 MAX_INFLATION = 25.0  # largest factor by which one contradictory window raises the variance ratio
 
 Levels = NDArray[np.int64]
@@ -174,9 +175,24 @@ def update(prediction: ImmPosterior, evidence: Evidence) -> ImmPosterior:
     return _recentre(ImmPosterior(prediction.level, mean, covariance, weight / weight.sum(), prediction.end, ratio))
 
 
+def _limited(evidence: Evidence, sd: Array) -> Evidence:
+    """Return evidence that is at most ``MAX_PRECISION`` times as precise as a prior of ``sd`` (2 free,).
+
+    Beyond it the innovation's covariance is singular up to rounding, as where an axis stands still for long steps.
+    """
+    directions, precision, _ = np.linalg.svd(evidence.sqrt_information * sd)
+    if precision.max(initial=0.0) <= MAX_PRECISION:
+        return evidence
+    factors = np.ones(len(directions))
+    factors[: len(precision)] = MAX_PRECISION / np.maximum(precision, MAX_PRECISION)
+    reduced = (directions * factors).T
+    return Evidence(evidence.point, reduced @ evidence.sqrt_information, reduced @ evidence.residual)
+
+
 def _innovation(prediction: ImmPosterior, evidence: Evidence) -> tuple[Array, Array, Array]:
     """Return the window's square-root information, and per mode the innovation's covariance and the innovation."""
     inflation = np.sqrt(prediction.variance_ratio)
+    evidence = _limited(evidence, np.sqrt(np.diagonal(prediction.covariance, axis1=1, axis2=2).max(axis=0)))
     root = evidence.sqrt_information / inflation
     covariance = np.eye(len(root)) + root @ prediction.covariance @ root.T
     innovation = evidence.residual / inflation + (prediction.mean - evidence.point) @ root.T

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Mask
 
 QUANTILE = 1.959964  # two-sided 95 % of the standard normal distribution
 MIN_SINGULAR = 1e-8  # relative singular value below which a direction is not observed
@@ -89,20 +89,21 @@ def information(jacobian: Array, width: Array, inflation: float) -> Information:
     return Information(sd, correlation)
 
 
-def inflation_of(residuals: Array, cost: float) -> float:
+def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
     """Return the factor on standard deviations for a residual larger than the noise.
 
-    ``residuals`` (records, outputs) are whitened. What exceeds the noise is correlated from record to record and does
-    not average out, so its long-run variance counts (W. K. Newey, K. D. West, Econometrica 55, 1987), summed up to the
-    first lag without correlation. White residuals show a correlation by chance, always of one sign; up to that size
-    their variance alone counts.
+    ``residuals`` (records, outputs) are whitened; those ``present`` count. What exceeds the noise is correlated from
+    sample to sample and does not average out, so its long-run variance counts (W. K. Newey, K. D. West, Econometrica
+    55, 1987), summed up to the first lag without correlation. White residuals show a correlation by chance, always of
+    one sign; up to that size their variance alone counts.
     """
     if cost <= MIN_INFLATED_COST:
         return max(cost, 1.0)
-    records = len(residuals)
-    lags = max(int(MAX_LAG * records), 1)
     long_run = cost**2
-    for series in residuals.T:
+    for column, measured in zip(residuals.T, present.T, strict=True):
+        series = column if measured.all() else column[measured]
+        records = len(series)
+        lags = max(int(MAX_LAG * records), 1)
         covariances = np.array([series[lag:] @ series[: records - lag] for lag in range(lags)]) / max(records, 1)
         ends = np.flatnonzero(covariances <= 0.0)
         correlated = covariances[1 : int(ends[0]) if len(ends) else lags]

@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.augmented import input_matrix, time_offsets
+from otolith.estimation.augmented import time_offsets
 from otolith.estimation.problem import Problem
+from otolith.twin.augmentation import ELAPSED
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
 
@@ -34,7 +35,7 @@ def predictor(
 
     A twin that diverges there, or that has no process noise, runs in open loop.
     """
-    if noise.inputs.any() or noise.states.any():
+    if noise.disturbs:
         model = kernel.innovation_model(parameters, initial, excitation, noise)
         if np.isfinite(model.gain).all() and np.isfinite(model.whitening).all():
             return model
@@ -67,12 +68,12 @@ class Objective:
         self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
         self.count = max(float(self.present.sum()), 1.0)
         """Measured values of all outputs."""
-        self.noise = self._noise_model(problem)
+        self.noise = self._noise_model(problem, window)
         lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
         if problem.components:  # a faulty sensor shows the first state far from where it is
             wider = np.where(highest > lowest, np.abs(self._first) + highest - lowest, 0.0)
             lowest, highest = lowest - wider, highest + wider
-        given = dict(problem.known) | time_offsets(problem, window)
+        given = dict(problem.known) | (time_offsets(problem, window) if problem.components else {})
         self._template = np.array([given.get(parameter.name, parameter.nominal) for parameter in twin.parameters])
         order = [parameter.name for parameter in twin.parameters[: len(twin.parameters) - twin.settings]]
         self._free_columns = [order.index(parameter.name) for parameter in problem.free]
@@ -86,7 +87,7 @@ class Objective:
         self._open_loop, self._states = problem.open_loop, len(twin.states)
         self._max_substeps = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
         self._base = twin.base or twin
-        self._excitation = Excitation(input_matrix(twin, window), window.sample_period)
+        self._excitation = Excitation(input_matrix(twin, window), window.grid)
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
         self.set_predictor(start, self._first if initial is None else initial)
 
@@ -132,7 +133,7 @@ class Objective:
     @property
     def integrator_steps(self) -> int:
         """Steps of the integrator in one prediction."""
-        return len(self.measured) * self._excitation.substeps
+        return int(self._excitation.counts.sum())
 
     def guess(self, parameters: Array) -> Array:
         """Return the guess (free + states,) of ``parameters`` (free,) that starts at the first record."""
@@ -147,7 +148,7 @@ class Objective:
     def linearise(self, guess: Array) -> tuple[Array, Array]:
         """Return whitened residuals (residuals,) and their derivatives (residuals, guess) at ``guess`` (guess,).
 
-        A prediction that is not finite gives very large residuals and zero derivatives.
+        A prediction that diverges gives very large residuals and zero derivatives.
         """
         return self._linearise(guess, [*self._free_columns, *self._state_columns])
 
@@ -170,7 +171,7 @@ class Objective:
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
             slopes = np.where(self.present[..., None], prediction.slopes[:, :, columns], 0.0)
             jacobian = -np.matmul(self.whitening, slopes).reshape(len(residuals), -1)
-        if np.isfinite(residuals).all() and np.isfinite(jacobian).all():
+        if all(np.abs(numbers).max(initial=0.0) <= PENALTY for numbers in (residuals, jacobian)):  # false for NaN
             return residuals, jacobian
         return np.full(len(residuals), PENALTY / len(residuals)), np.zeros(jacobian.shape)
 
@@ -184,8 +185,9 @@ class Objective:
         free = self.free
         parameters = self.parameters(guess[None])[0]
         prediction = self.kernel.sensitivities(parameters, guess[2 * free :], self._excitation, drifts=True)
-        trends = prediction.slopes[:, :, self._trend_columns] @ guess[free : 2 * free]
-        return prediction.outputs + trends, prediction.last
+        with np.errstate(over="ignore", invalid="ignore"):  # where the twin diverges
+            trends = prediction.slopes[:, :, self._trend_columns] @ guess[free : 2 * free]
+            return prediction.outputs + trends, prediction.last
 
     def simulate(self, guess: Array) -> Array:
         """Return the open-loop simulation (records, outputs) from the initial state of ``guess`` (guess,)."""
@@ -217,15 +219,35 @@ class Objective:
         counts = np.maximum(self.present.sum(axis=0), 1.0)
         return np.asarray(np.sqrt((errors**2).sum(axis=0) / counts))
 
-    def _noise_model(self, problem: Problem) -> NoiseModel:
+    def _noise_model(self, problem: Problem, window: Window) -> NoiseModel:
         twin = problem.twin.base or problem.twin
-        columns = zip(self.measured.T, self.present.T, strict=True)
-        steps = np.array([adc_step(values[present]) for values, present in columns])
-        return NoiseModel(
-            outputs=np.sqrt(np.array(problem.noise) ** 2 + steps**2 / 12.0),
-            inputs=np.array(problem.input_noise or [0.0] * len(twin.inputs)),
-            states=np.array(problem.process_noise or [0.0] * len(twin.states)),
-        )
+        measured = zip(self.measured.T, self.present.T, strict=True)
+        steps = np.array([adc_step(values[present]) for values, present in measured])
+        outputs = np.sqrt(np.array(problem.noise) ** 2 + steps**2 / 12.0)
+        states = np.array(problem.process_noise or [0.0] * len(twin.states))
+        inputs = np.array(problem.input_noise or [0.0] * len(twin.inputs))
+        error = window.bridge_error
+        if error is None:
+            model = NoiseModel.uniform(outputs, inputs, states, window.records)
+        else:
+            columns = [window.signals.index(driven.name) for driven in twin.inputs]
+            at_records = np.sqrt(inputs**2 + error.variance[:, columns])
+            held = np.sqrt(inputs**2 * error.noise_ratio[:, columns] + error.held_variance[:, columns])
+            model = NoiseModel(outputs, at_records, held, states)
+        return replace(model, period=problem.window.sample_period)
+
+
+def input_matrix(twin: Definition, window: Window) -> Array:
+    """Return the inputs (records, inputs) of a twin with or without slots."""
+    columns = [np.zeros((window.records, 0))]
+    for source in twin.inputs:
+        if source.name == ELAPSED:
+            columns.append(window.grid.offsets[:, None])
+        elif source.name.startswith("_"):
+            columns.append(np.zeros((window.records, 1)))
+        else:
+            columns.append(window.column(source.name)[:, None])
+    return np.hstack(columns)
 
 
 def adc_step(values: Array) -> float:
@@ -256,7 +278,10 @@ def _initial_state(twin: Definition, measured: Array, present: Mask, noise: Arra
             values = measured[present[:, index], index]
             first = float(values[0])
             reach = max(INITIAL_STATE_REACH * noise[index], float(np.ptp(values)))
-            rows.append((first - reach, first, first + reach))
+            low, high = first - reach, first + reach
+            if not present[0, index]:  # the state may have moved before its first measurement
+                low, high = min(low, state.low), max(high, state.high)
+            rows.append((low, first, high))
         else:
             rows.append((state.low, state.initial, state.high))
     low, start, high = np.array(rows).T

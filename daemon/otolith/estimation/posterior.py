@@ -12,11 +12,11 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.estimation import imm_filter
 from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
-from otolith.estimation.augmented import base_model, indices, source_of, without
+from otolith.estimation.augmented import indices, source_of, without
 from otolith.estimation.imm_filter import FIRST_LEVEL, ImmPosterior
 from otolith.estimation.problem import Problem
 
-START_TOLERANCE = 0.5  # sampling periods by which a window may start early or late and still follow its predecessor
+START_TOLERANCE = 0.5  # mean steps by which a window may start early or late and still follow its predecessor
 MAX_KNOWN_PHASE_SD = 1.0  # rad: a phase less certain than this counts as unknown
 UNKNOWN_PHASE_SD = np.pi / np.sqrt(3.0)  # rad: standard deviation of the uniform distribution over a turn
 PHASE_OFFSETS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad: added to unknown phases, one for each start of a fit
@@ -40,12 +40,12 @@ def phase_advance(problem: Problem, window: Window, last_state: Array) -> PhaseA
     names = [state.name for state in problem.twin.states]
     advance = []
     for component in problem.components:
-        symbol = source_of(base_model(problem), component.source).symbol
+        symbol = source_of(problem.base_model, component.source).symbol
         if component.source == "t":
-            advance.append(window.records * window.sample_period)
+            advance.append(window.grid.length)
         elif component.periodic and symbol.startswith("_"):
             speed = last_state[names.index(symbol.removeprefix("_angle_"))]
-            advance.append(float(last_state[names.index(symbol)] + speed * window.sample_period))
+            advance.append(float(last_state[names.index(symbol)] + speed * window.grid.steps[-1]))
         else:
             advance.append(0.0)
     return PhaseAdvance(window.start, window.end, tuple(advance))
@@ -194,7 +194,7 @@ class Posterior:
                 belief = _forget_phase(belief, problem, indices(problem, slot)[-1])
             elif follows:
                 belief = _advance_phase(belief, problem, slot, advance)
-            elif source_of(base_model(problem), component.source).symbol.startswith("_"):
+            elif source_of(problem.base_model, component.source).symbol.startswith("_"):
                 belief = _forget_phase(belief, problem, indices(problem, slot)[-1])
         return belief
 

@@ -1,9 +1,10 @@
 """The estimation problem of a machine: twin, known and free parameters, noise levels, components. Plain: it pickles."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array
 from otolith.twin.component_families import ComponentFamily, family_of
 from otolith.twin.definition import Definition, Parameter
@@ -75,6 +76,8 @@ class WindowOptions:
     """Of the first window, and of all windows if the length is fixed."""
     shortest: int = 200
     longest: int = 200
+    sample_period: float | None = None
+    """Nominal time between two records, s; None for that of each window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +101,10 @@ class Problem:
     """A parameter is determined when half of its 95 % interval is at most this share of its nominal value."""
     components: tuple[Component, ...] = ()
     """Components in the twin. Their values are free parameters with names that begin with an underscore."""
+    unchecked: frozenset[tuple[str, Check]] = frozenset()
+    """Checks of the data that are turned off, each with its signal."""
+    delays: tuple[tuple[str, float], ...] = ()
+    """Signals that are late in the windows, and by how many seconds: their samples are moved before a fit."""
     excluded: frozenset[str] = frozenset()
     """Keys of components that discovery leaves out."""
     discover: bool = True
@@ -106,17 +113,23 @@ class Problem:
     swarm: SwarmOptions = SwarmOptions()
     seed: int = 1
 
-    @property
-    def scale(self) -> Array:
-        """(free,) the size of each parameter, to which accuracy is relative."""
-        return np.array([max(abs(free.nominal), MIN_SCALE * (free.high - free.low)) for free in self.free])
+    base_model: Definition = field(init=False, compare=False, repr=False)
+    """The twin without slots for components."""
+    scale: Array = field(init=False, compare=False, repr=False)
+    """(free,) the size of each parameter, to which accuracy is relative."""
+    nominal: Array = field(init=False, compare=False, repr=False)
+    """(free,) values of the machine file."""
+    bounds: tuple[Array, Array] = field(init=False, compare=False, repr=False)
+    """(free,) lower and upper bounds."""
 
-    @property
-    def nominal(self) -> Array:
-        """(free,) values of the machine file."""
-        return np.array([free.nominal for free in self.free])
-
-    @property
-    def bounds(self) -> tuple[Array, Array]:
-        """(free,) lower and upper bounds."""
-        return np.array([free.low for free in self.free]), np.array([free.high for free in self.free])
+    def __post_init__(self) -> None:
+        low, high = (np.array([getattr(free, end) for free in self.free]) for end in ("low", "high"))
+        nominal = np.array([free.nominal for free in self.free])
+        derived = {
+            "base_model": self.twin.base or self.twin,
+            "scale": np.maximum(np.abs(nominal), MIN_SCALE * (high - low)),
+            "nominal": nominal,
+            "bounds": (low, high),
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)

@@ -27,6 +27,7 @@ from otolith.estimation.objective import EXPLAINED, PENALTY, Objective
 from otolith.estimation.particle_swarm import SwarmResult, search_parameters, spread_starts
 from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
 from otolith.estimation.problem import Problem
+from otolith.estimation.timing.shifted_window import shifted
 
 AT_BOUND = 1e-4  # share of the width of the bounds
 REFINED_PARTICLES = 4  # best particles of the swarm that Gauss-Newton starts from
@@ -35,6 +36,7 @@ TRIAL_STEPS = 15  # of Gauss-Newton from each of these starts
 AFFORDABLE_STEPS = 20_000  # integrator steps of a prediction above which fewer starts are tried
 UNINFORMATIVE = 0.25  # share of the width of the bounds: standard deviation of a parameter that a window leaves open
 ALONE_STEPS = 12  # of Gauss-Newton for the window alone, which starts at the fit under the prior
+LOCAL_MINIMUM = 0.5  # ratio of χ² between two fits under one prior below which the worse one is a local minimum
 DISTINCT = 5.0  # standard deviations between two different results
 EQUALLY_GOOD = 9.0  # difference in χ² between two explanations that are equally good
 MAX_HALVINGS = 20  # of start amplitudes with which the twin diverges
@@ -80,11 +82,12 @@ class Fit:
     def evidence(self) -> Evidence:
         """Return the evidence of the window; standard deviations are inflated by the unexplained residual."""
         residuals = self.map_objective.window_residuals(self.result).reshape(self.objective.measured.shape)
-        return self.map_objective.evidence(self.result, inflation_of(residuals, self.cost))
+        return self.map_objective.evidence(self.result, inflation_of(residuals, self.objective.present, self.cost))
 
     def linearised_at_end(self) -> "Fit":
         """Return the window linearised at the end of this fit, with a predictor made there."""
-        return fit(self.problem, self.window, self.prior, self.result.guess, max_steps=0)
+        initial = self.result.guess[2 * len(self.problem.free) :]
+        return _fit(self.problem, self.window, self.prior, self.parameters, max_steps=0, initial=initial)
 
     def advance(self) -> PhaseAdvance:
         """Return the advance of the components' phases to the next window."""
@@ -93,18 +96,37 @@ class Fit:
 
 
 def fit(problem: Problem, window: Window, prior: Prior, start: Array, max_steps: int = MAX_STEPS) -> Fit:
-    """Fit the free parameters to ``window`` under ``prior``; Gauss-Newton starts at ``start`` (free,)."""
+    """Fit the free parameters to ``window`` under ``prior``; Gauss-Newton starts at ``start`` (free,).
+
+    The window of the fit is without the delays of the problem.
+    """
+    if problem.delays:
+        window = shifted(problem.base_model, window, dict(problem.delays))
+    return _fit(problem, window, prior, start, max_steps)
+
+
+def _fit(  # noqa: PLR0913 - the two parts of a start
+    problem: Problem, window: Window, prior: Prior, start: Array, max_steps: int, *, initial: Array | None = None
+) -> Fit:
+    """Fit a window without delays from ``start`` (free,) and ``initial`` (states,), by default the first record."""
     start = np.clip(start[: len(problem.free)], *problem.bounds)
-    objective = Objective(problem, window, start)
+    objective = Objective(problem, window, start, initial)
     map_objective = MapObjective(objective, problem, prior)
-    amplitudes = amplitude_indices(problem)
-    initial = objective.guess(start)[len(start) :]
-    for _ in range(MAX_HALVINGS):  # the twin may diverge at an amplitude of the linear approximation
-        if not amplitudes or objective.cost(np.concatenate([start, initial])[None])[0] < PENALTY:
-            break
-        start[amplitudes] *= 0.5
+    initial = objective.guess(start)[len(start) :] if initial is None else initial
+    if problem.components:
+        start = _with_bounded_amplitudes(problem, objective, start, initial)
     result = gauss_newton(map_objective, map_objective.guess(start, initial), max_steps)
     return Fit(problem, prior, window, objective, map_objective, result)
+
+
+def _with_bounded_amplitudes(problem: Problem, objective: Objective, start: Array, initial: Array) -> Array:
+    """Return ``start`` (free,) with smaller amplitudes if the twin diverges at those of the linear approximation."""
+    start, amplitudes = start.copy(), amplitude_indices(problem)
+    for _ in range(MAX_HALVINGS):
+        if objective.cost(np.concatenate([start, initial])[None])[0] < PENALTY:
+            break
+        start[amplitudes] *= 0.5
+    return start
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +181,8 @@ def estimate(
     """
     fitted = fit(problem, window, prior, start)
     both = _fit_alone(fitted, fitted.result.evaluations)
+    if fitted.cost > EXPLAINED >= both.cost:
+        both = _leave_local_minimum(both)
     outcome, generations = Outcome.CONTINUED, 0
     unexplained = both.cost > EXPLAINED and search is not Search.NEVER
     if unexplained or (search is Search.FROM_BOUNDS and both.is_informative):
@@ -200,9 +224,24 @@ def _fit_alone(fitted: Fit, evaluations: int) -> _BothFits:
     constant = np.concatenate([guess[:free], guess[2 * free :]])
     alone = gauss_newton(objective, constant, ALONE_STEPS)
     residuals = alone.residuals.reshape(objective.measured.shape)
-    inflation = inflation_of(residuals, float(np.sqrt(alone.chi_square / objective.count)))
+    inflation = inflation_of(residuals, objective.present, float(np.sqrt(alone.chi_square / objective.count)))
     uncertainty = information(alone.jacobian, objective.high - objective.low, inflation)
     return _BothFits(fitted, alone, inflation, uncertainty, evaluations + alone.evaluations)
+
+
+def _leave_local_minimum(both: _BothFits) -> _BothFits:
+    """Return both fits, the one under the prior begun where the other explains the window, if that is far better.
+
+    Where a state is not measured, the first record may lead to a local minimum, which the fit of the window alone left.
+    """
+    fitted, objective, free = both.fit, both.fit.objective, both.fit.objective.free
+    parameters, initial = both.alone.guess[:free], both.alone.guess[free:]
+    result = gauss_newton(fitted.map_objective, fitted.map_objective.guess(parameters, initial))
+    if result.chi_square > LOCAL_MINIMUM * fitted.chi_square:
+        return both
+    objective.set_predictor(result.guess[:free], result.guess[2 * free :])  # the present one was made far from here
+    result = gauss_newton(fitted.map_objective, result.guess)
+    return _fit_alone(replace(fitted, result=result), both.evaluations + result.evaluations)
 
 
 def _search(both: _BothFits) -> tuple[_BothFits, Outcome, int]:
@@ -268,6 +307,8 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
 
 def _without_amplitudes(problem: Problem, guess: Array) -> Array:
     """Return a guess whose components have amplitude zero."""
+    if not problem.components:
+        return guess
     bare = guess.copy()
     bare[amplitude_indices(problem)] = 0.0
     return bare

@@ -29,12 +29,12 @@ class WindowExcitation:
     """Whether the twin leaves nothing but noise."""
 
 
-def next_records(options: WindowOptions, records: int, sample_period: float, excitation: WindowExcitation) -> int:
-    """Return the records of the window after one of ``records`` that showed ``excitation``."""
+def next_records(options: WindowOptions, length: float, sample_period: float, excitation: WindowExcitation) -> int:
+    """Return the records of the window after one of ``length`` (s) that showed ``excitation``.
+
+    Records are nominal ones, ``sample_period`` s apart, however many samples come.
+    """
     sd, trend, explained = excitation.sd, excitation.trend, excitation.explained
-    if options.shortest >= options.longest:
-        return options.records
-    length = records * sample_period
     determined = np.isfinite(sd) & (trend > 0.0)
     if not explained:
         wanted = SHORTENED * length
@@ -44,5 +44,5 @@ def next_records(options: WindowOptions, records: int, sample_period: float, exc
         wanted = float(np.cbrt(2.0 * sd[determined] ** 2 * length / trend[determined] ** 2).min())
     wanted = float(np.clip(wanted, length / MAX_CHANGE if explained else SHORTENED * length, MAX_CHANGE * length))
     if 1.0 / MIN_CHANGE < wanted / length < MIN_CHANGE:
-        return int(np.clip(records, options.shortest, options.longest))
+        return int(np.clip(round(length / sample_period), options.shortest, options.longest))
     return int(np.clip(round(wanted / sample_period), options.shortest, options.longest))

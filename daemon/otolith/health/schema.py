@@ -172,10 +172,10 @@ class FitDocument(StrictModel):
 class CostDocument(StrictModel):
     """Computing effort of a report."""
 
-    seconds: float = 0.0
-    """Computing time in seconds."""
-    latency_s: float = 0.0
-    """From the end of the window to the publication of this report."""
+    seconds: float | None = None
+    """Computing time in seconds; None in a replay, whose reports are the same in each run, unless it was asked for."""
+    latency_s: float | None = None
+    """From the end of the window to the publication of this report; None in a replay."""
     evaluations: int = 0
     generations: int = 0
     searched: bool = False
@@ -258,6 +258,8 @@ class ReportDocument(StrictModel):
 class Traces:
     """The curves of a window in the units of the twin; not-a-number where nothing was measured."""
 
+    offsets: Array
+    """(records,) time since the first record, s."""
     outputs: tuple[str, ...]
     measured: Array
     """(records, outputs)."""

@@ -1,6 +1,7 @@
 """The published status of a parameter: from what is known to value, interval, status with hysteresis, and reason."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
@@ -36,6 +37,11 @@ class PreviousStatus:
     known: bool = False
     """Whether it has been determined."""
     status: Status = Status.UNESTIMATED
+
+
+def some_parameter_is_determined(previous: Mapping[str, PreviousStatus]) -> bool:
+    """Whether any parameter has been determined, by the status of each in the report before."""
+    return any(status.known for status in previous.values())
 
 
 @dataclass(frozen=True, slots=True)

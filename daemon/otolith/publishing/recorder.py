@@ -96,8 +96,7 @@ class Recording:
 
     def _add_traces(self, report: Report) -> None:
         window, traces = report.document.window, report.traces
-        offsets = (window.end - window.start) * np.arange(window.records) / window.records
-        times = round(window.start * 1e9) + np.rint(offsets * 1e9).astype(np.int64)  # ns
+        times = round(window.start * 1e9) + np.rint(traces.offsets * 1e9).astype(np.int64)  # ns
         index = [rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))]
 
         def send(entity: str, values: Array) -> None:

@@ -7,21 +7,25 @@ The clock is that of the data, so two runs over the same files give the same rep
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
+
 from otolith.acquisition.playback import MAX_SILENT_WINDOWS, Playback, median_step
+from otolith.acquisition.recording_statistics import RecordingStatistics
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
 from otolith.machine import LoadedMachine, driver_config
 from otolith.runtime.worker import perform
-from otolith_drivers.base import Setup, Signal
+from otolith_drivers.base import Sampling, Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError
-from otolith_drivers.replay.readers import Reader, format_of, holds_frames
+from otolith_drivers.replay.joined import JoinedReader
+from otolith_drivers.replay.readers import Reader, Rows, format_of, holds_frames
 from otolith_drivers.user_dirs import writable
 
 if TYPE_CHECKING:
@@ -30,6 +34,7 @@ if TYPE_CHECKING:
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_SLEEP = 0.1  # s; bounds the reaction time to a stop signal
 MIN_ROWS_PER_WINDOW = 5  # fewer rows than this suggest that the time column is not in seconds
+MAX_UNUSED_SHARE = 0.1  # of the samples of a cyclic signal: more of them between the records are named
 
 Stopped = Callable[[], bool]
 
@@ -60,6 +65,17 @@ def open_recorded(machine: LoadedMachine, data: Path) -> Reader:
 
     with config.located_errors():
         return opener(data, config.options, config.setup)()
+
+
+def open_recordings(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
+    """Open one file, or several of which each is a recording of its own; see :func:`open_recorded`.
+
+    Raises:
+        ConfigurationError: as :func:`open_recorded`.
+    """
+    if len(files) == 1:
+        return open_recorded(machine, files[0])
+    return JoinedReader(files, lambda path: open_recorded(machine, path))
 
 
 def _open_by_name(machine: LoadedMachine, data: Path) -> Reader:
@@ -98,16 +114,28 @@ class Replay:
         data: Reader,
         stopped: Stopped = lambda: False,
         wait: Callable[[Window], None] | None = None,
+        *,
+        timing: bool = False,
     ) -> None:
-        """``stopped`` ends the replay early; ``wait`` is called with each window before it is adapted to."""
+        """``stopped`` ends the replay early; ``wait`` is called with each window before it is adapted to.
+
+        With ``timing`` the reports have computing times, so that they differ from run to run.
+        """
         identity, window = machine.file.machine, machine.file.window
         self.state = initial_state(identity.name, identity.site, machine.problem)
         """State after the last window."""
+        self.statistics = RecordingStatistics(machine.twin.signals)
+        """Of the rows that were read so far."""
+        self.progress = 0.0
+        """Share of the data in the windows so far, 0 to 1."""
         self._data = data
         self._stopped = stopped
         self._wait = wait
+        self._timing = timing
+        self._sample_period = window.sample_period
         self._length = window.length
-        self._playback = Playback(machine.twin.signals, machine.records, window.sample_period, machine.limits)
+        plans = machine.plans(data.sampling)
+        self._playback = Playback(plans, machine.records, window.sample_period, machine.limits)
         self._windows = self._windows_bad = self._missed = 0
 
     def reports(self) -> Iterator[Report]:
@@ -136,15 +164,29 @@ class Replay:
             ConfigurationError: as :meth:`reports`.
         """
         counts = self._playback.counts
+        before, begun, rows = 0.0, 0.0, None  # the shares of the file above the next and the present chunk
         for rows in self._data.chunks():
             if self._stopped():
                 return
             if self._data.is_table and not counts.rows:
                 self._check_time_unit(rows.times)
-            yield from self._playback.windows(rows)
+            self.statistics.add(rows)
+            begun, before = before, self._data.progress
+            yield from self._with_progress(self._playback.windows(rows), rows, begun)
+        if rows is not None:
+            yield from self._with_progress(self._playback.rest(), rows, begun)
         if counts.rows > 2 and counts.reordered == counts.rows - 1:
             raise ConfigurationError(f"{self._data.path}: time decreases from row to row: sort the rows by t")
-        yield from self._playback.rest()
+        if not self._stopped():
+            self.progress = 1.0
+
+    def _with_progress(self, windows: Iterator[Window], rows: Rows, before: float) -> Iterator[Window]:
+        """Yield ``windows``, each after the progress to its end; ``before`` is the share of the file above ``rows``."""
+        after = max(self._data.progress, before)
+        for window in windows:
+            done = np.count_nonzero(rows.times < window.end) / max(len(rows.times), 1)
+            self.progress = max(self.progress, before + (after - before) * float(done))
+            yield window
 
     def _check_time_unit(self, times: Array) -> None:
         step = median_step(times)
@@ -164,6 +206,8 @@ class Replay:
             self._missed += 1
             return None
         counts = self._playback.counts
+        seconds = result.seconds if self._timing else None
+        cost = result.report.document.cost.model_copy(update={"seconds": seconds})
         counters = CountersDocument(
             received=counts.received,
             bad=counts.bad,
@@ -172,7 +216,8 @@ class Replay:
             windows_bad=self._windows_bad,
             windows_missed=self._missed,
         )
-        return Report(result.report.document.model_copy(update={"counters": counters}), result.report.traces)
+        document = result.report.document.model_copy(update={"counters": counters, "cost": cost})
+        return Report(document, result.report.traces)
 
     def summary(self) -> str:
         """Return in one line how much was read."""
@@ -184,19 +229,40 @@ class Replay:
     def warnings(self) -> list[str]:
         """Return what a user must know of the file before trusting the reports, one sentence each."""
         counts, unused = self._playback.counts, self._playback.unused_seconds
-        lines = [f"interrupted after {self._data.progress:.0%} of the file"] if self._stopped() else []
+        lines = [f"interrupted after {self.progress:.0%} of the data"] if self._stopped() else []
         lines += self._data.warnings()
         if counts.first_late is not None:
             line, late_time, latest = counts.first_late
             first = f"the first in {self._data.place} {line}, with t = {late_time:.12g} after t = {latest:.12g} above"
             lines.append(f"rows that came after their window was closed: {counts.late}, {first}")
-        if counts.silences:
-            lines.append(f"silences of more than {MAX_SILENT_WINDOWS} windows, skipped: {counts.silences}")
+        if counts.gaps:
+            lines.append(
+                f"gaps longer than a window, skipped: {counts.gaps}, the longest of {counts.longest_gap:.3g} s"
+            )
+        if counts.segments:
+            lines.append(f"recordings in the file: {counts.segments + 1}; each begins with a window of its own")
+        if counts.repeated:
+            lines.append(f"samples at the time of another one, not used twice: {counts.repeated}")
+        if counts.stale:
+            lines.append(f"readings of registers that had not been renewed, not used: {counts.stale}")
+        lines += self.unused_samples()
         if self._missed:
             lines.append(f"windows that could not be computed: {self._missed}")
         if unused >= self._length / 2:
             lines.append(f"the last {unused:.3g} s are too short for a window of {self._length:g} s")
         return lines
+
+    def unused_samples(self) -> list[str]:
+        """Return a sentence for the cyclic signals that have more samples than the windows have records so far."""
+        shared: dict[str, list[str]] = {}
+        cyclic, period = self._data.sampling is Sampling.CYCLIC, self._sample_period
+        for name, sampled in self.statistics.signals().items() if cyclic else ():
+            unused = 1.0 - sampled.interval / period
+            if unused > MAX_UNUSED_SHARE:
+                rates = f"a sample every {sampled.interval * 1e3:.3g} ms, but a record every {period * 1e3:.3g} ms"
+                remedy = f'shorten [window] sample_period to "{sampled.interval * 1e3:.3g} ms"'
+                shared.setdefault(f"{rates}: {unused:.0%} of the samples are not used: {remedy}", []).append(name)
+        return [f"{', '.join(names)}: {text}" for text, names in shared.items()]
 
     def _why_no_window(self) -> str:
         rows = self._playback.counts.rows

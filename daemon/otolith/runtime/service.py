@@ -67,9 +67,7 @@ class Service:
         self._machine = machine
         self._listen = file.zenoh.listen if listen is None else listen
         self._rings = Rings(machine.twin.signals, RING_RATE * RING_WINDOWS * longest)
-        self._windower = Windower(
-            machine.twin.signals, machine.records, period, machine.limits, machine.driver.sampling
-        )
+        self._windower = Windower(machine.plans(machine.driver.sampling), machine.records, period, machine.limits)
         store = StateStore(
             file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
         )

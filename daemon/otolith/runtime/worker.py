@@ -47,7 +47,7 @@ class WorkerResult:
 
 def main(connection: Any, state: AdaptationState) -> None:
     """Serve in the worker process: receive (state, window) and send a result, until None comes."""
-    _warm_up(state)
+    warm_up(state)
     while (task := connection.recv()) is not None:
         connection.send(perform(*task))
 
@@ -66,7 +66,7 @@ def perform(state: AdaptationState, window: Window) -> WorkerResult:
     return WorkerResult(window.index, state, report, time.perf_counter() - begun, failure)
 
 
-def _warm_up(state: AdaptationState) -> None:
+def warm_up(state: AdaptationState) -> None:
     """Import and compile what the first window needs: no twin explains random values, so discovery runs as well."""
     signals = state.problem.twin.signals
     values = np.random.default_rng(state.problem.seed).standard_normal((WARM_UP_RECORDS, len(signals)))

@@ -1,7 +1,8 @@
 """Generated kernels of an augmented twin, for the search for components (docs/explanation/innovation-form.md).
 
 ``linearise`` is the linear time-varying system along a trajectory, ``curves`` are basis functions of components, and
-``respond`` runs curves through the system: all that a search by linear algebra needs.
+``respond`` runs curves through the system: all that a search by linear algebra needs. ``adjoint`` and ``spread`` score
+a whole spectrum of curves at the cost of a few.
 """
 
 import sympy
@@ -12,12 +13,11 @@ from otolith.twin.symbolic import absolute, sign
 
 LINEARISE = """
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def linearise(parameters, initial, inputs, sample_period, substeps, measured, gain, nudge):
+def linearise(parameters, initial, inputs, steps, counts, measured, gain, nudge):
     records = inputs.shape[0]
     trajectory, transition = np.zeros((records, $n_states)), np.zeros((records, $n_states, $n_states))
     input_now, input_next = np.zeros((2, records, $n_states, $n_sites))
     output, feedthrough = np.zeros((records, $n_outputs, $n_states)), np.zeros((records, $n_outputs, $n_sites))
-    step = sample_period / substeps
     correct = np.any(gain != 0.0)
     $read_parameters
     for record in range(records):
@@ -31,6 +31,8 @@ def linearise(parameters, initial, inputs, sample_period, substeps, measured, ga
             $correct_state
         if record + 1 == records:
             break
+        substeps = counts[record]
+        step = steps[record] / substeps
         $read_next_inputs
         $next_state
         $store_transition
@@ -137,6 +139,71 @@ def respond(transition, input_now, input_next, output, feedthrough, gain, whiten
                             target[curve] += factor * other[curve]
         first = last
     return response
+'''
+
+ADJOINT = '''
+@njit(cache=True, error_model="numpy", fastmath=True)
+def adjoint(transition, input_now, input_next, output, feedthrough, gain, whitening, present, signals):
+    """(records * outputs, signals) -> (records, sites, signals): the transpose of ``respond``, backward in time."""
+    records, sites, count = len(gain), input_now.shape[2], signals.shape[1]
+    outputs, states = gain.shape[2], gain.shape[1]
+    result = np.zeros((records, sites, count))
+    costate, before = np.zeros((states, count)), np.zeros((states, count))
+    weighted = np.zeros((outputs, count))
+    for record in range(records - 1, -1, -1):
+        before[:] = 0.0
+        if record + 1 < records:
+            for row in range(states):
+                for site in range(sites):
+                    now, following = input_now[record, row, site], input_next[record, row, site]
+                    for signal in range(count):
+                        result[record, site, signal] += now * costate[row, signal]
+                        result[record + 1, site, signal] += following * costate[row, signal]
+                for column in range(states):
+                    factor = transition[record, row, column]
+                    for signal in range(count):
+                        before[column, signal] += factor * costate[row, signal]
+        for row in range(outputs):
+            weighted[row] = 0.0
+            if present[record, row]:
+                for column in range(row, outputs):
+                    factor = whitening[record, column, row]
+                    for signal in range(count):
+                        weighted[row, signal] += factor * signals[record * outputs + column, signal]
+                for column in range(states):
+                    factor = gain[record, column, row]
+                    for signal in range(count):
+                        weighted[row, signal] -= factor * before[column, signal]
+        for row in range(outputs):
+            for site in range(sites):
+                factor = feedthrough[record, row, site]
+                for signal in range(count):
+                    result[record, site, signal] += factor * weighted[row, signal]
+            for column in range(states):
+                factor = output[record, row, column]
+                for signal in range(count):
+                    before[column, signal] += factor * weighted[row, signal]
+        costate[:] = before
+    return result
+'''
+
+# Each record goes to the few nearest points of a grid over the circle, with the weights of a Gaussian.
+SPREAD = '''
+@njit(cache=True, error_model="numpy", fastmath=True)
+def spread(x, signals, first, width, points, variance, reach):
+    """(records,), (records, signals) -> (points, signals): ``signals * exp(i first x)`` at the angles ``width * x``."""
+    grid = np.zeros((points, signals.shape[1]), dtype=np.complex128)
+    step = 2.0 * math.pi / points
+    for record in range(len(x)):
+        angle = width * x[record]
+        nearest = math.floor(angle / step)
+        phase = complex(math.cos(first * x[record]), math.sin(first * x[record]))
+        for point in range(nearest - reach + 1, nearest + reach + 1):
+            factor = phase * math.exp(-((point * step - angle) ** 2) / (4.0 * variance))
+            target = grid[point % points]
+            for signal in range(signals.shape[1]):
+                target[signal] += factor * signals[record, signal]
+    return grid
 '''
 
 CURVES = '''

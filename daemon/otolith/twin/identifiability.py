@@ -105,7 +105,7 @@ def _excitation(definition: Definition, period: float, random: np.random.Generat
     for driven in definition.inputs:
         levels = random.uniform(driven.low, driven.high, RECORDS)
         columns.append(levels[np.cumsum(random.random(RECORDS) < CHANGE_PROBABILITY)][:, None])
-    return Excitation(np.hstack(columns), period, SUBSTEPS)
+    return Excitation.uniform(np.hstack(columns), period, SUBSTEPS)
 
 
 def _judge(definition: Definition, columns: Array, index: int) -> StructuralIdentifiability:

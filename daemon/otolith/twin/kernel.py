@@ -1,9 +1,9 @@
 """Compiled twins: simulation of whole swarms, exact sensitivities, the innovation form and its Kalman gains.
 
-The integrator is the classical Runge-Kutta method with substeps; between records an input is held (``zoh``) or
-interpolated linearly (``foh``). With a gain the state is corrected after each record by ``gain @ (measured -
-predicted)``, so the outputs are one-step-ahead predictions (innovation form; L. Ljung, System Identification, 2nd ed.,
-section 4.3). docs/explanation has the equations.
+The integrator is the classical Runge-Kutta method with substeps; between records, which may be at any times, an input
+is held (``zoh``) or interpolated linearly (``foh``). With a gain the state is corrected after each record by
+``gain @ (measured - predicted)``, so the outputs are one-step-ahead predictions (innovation form; L. Ljung, System
+Identification, 2nd ed., section 4.3). docs/explanation has the equations.
 """
 
 import hashlib
@@ -16,14 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith import kernel_cache
+from otolith.acquisition.time_grid import TimeGrid
 from otolith.acquisition.window import Array, Mask
 from otolith.twin.definition import Definition
 from otolith_drivers.errors import ConfigurationError
 
 MAX_SUBSTEPS = 1024
 """Engineering choice: ends the search for substeps where the equations are too stiff for any number of them."""
+WHOLE = 1e-9
+"""Of a substep: a share that rounding leaves over a whole number, which needs no further substep."""
+SPREAD_REACH = 12
+"""Grid points on either side that a record reaches in a non-uniform Fourier sum: errors of 1e-12 of the largest sum."""
+MIN_SHARE_OF_MEAN = 0.5
+"""Of the mean step: least length of an ordinary one. Engineering choice: bounds the integrator's steps to twice as
+many as with equal steps."""
+
+RELATIVE_TOLERANCE = 1e-11
+"""Of the largest value of an output: truncation error that is allowed in any case, as rounding errors are near it."""
 
 Indices = NDArray[np.int64]
+ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,14 +44,47 @@ class Excitation:
 
     inputs: Array
     """(records, inputs)."""
-    sample_period: float
-    """s."""
+    grid: TimeGrid
+    """Times of the records."""
     substeps: int = 1
-    """Steps of the integrator per record."""
+    """Steps of the integrator on the longest step of the grid; a shorter one has as many as keep them no longer."""
     measured: Array | None = None
     """(records, outputs); a measurement that is NaN corrects nothing."""
     gain: Array | None = None
     """(records, states, outputs); None or all zero for open loop."""
+
+    @classmethod
+    def uniform(cls, inputs: Array, period: float, substeps: int = 1) -> "Excitation":
+        """Return an open-loop excitation by ``inputs`` (records, inputs), ``period`` s apart."""
+        return cls(inputs, TimeGrid.uniform(len(inputs), period), substeps)
+
+    @property
+    def counts(self) -> Indices:
+        """(records,) steps of the integrator to the next record."""
+        if self.grid.period is not None:
+            return np.full(self.grid.records, self.substeps)
+        shares = self.substeps * self.grid.steps / _longest(self.grid)
+        return np.maximum(np.ceil(shares - WHOLE), 1.0).astype(np.int64)
+
+    def until(self, record: int) -> "Excitation":
+        """Return the same before ``record``; substeps keep their length."""
+        record = min(record, self.grid.records)
+        part, grid = slice(record), self.grid.until(record)
+        measured = None if self.measured is None else self.measured[part]
+        gain = None if self.gain is None else self.gain[part]
+        substeps = self.substeps if grid.period is not None else int(self.counts[: max(record - 1, 1)].max())
+        return Excitation(self.inputs[part], grid, substeps, measured, gain)
+
+
+def _ordinary_step(grid: TimeGrid) -> float:
+    """The median step (s), but no small share of the mean one: samples may come in pairs."""
+    steps = grid.steps[:-1]
+    return max(float(np.median(steps)), MIN_SHARE_OF_MEAN * float(np.mean(steps)))
+
+
+def _longest(grid: TimeGrid) -> float:
+    """Return the longest step between two records, s; any number if there are no two."""
+    return float(grid.steps[:-1].max(initial=0.0)) or 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,9 +94,31 @@ class NoiseModel:
     outputs: Array
     """(outputs,) of the sensors."""
     inputs: Array
-    """(inputs,) of the measured or commanded inputs; independent from record to record."""
+    """(records, inputs) of the inputs' values at a record, which the outputs of that record depend on."""
+    held_inputs: Array
+    """(records, inputs) of the inputs over the step to the next record; independent from step to step."""
     states: Array
     """(states,) process noise per square root of a second."""
+    period: float | None = None
+    """Time in which process noise disturbs the states once, s, where records are at times of their own. None for once
+    in a step, as on a uniform grid."""
+
+    @classmethod
+    def uniform(cls, outputs: Array, inputs: Array, states: Array, records: int) -> "NoiseModel":
+        """Return the model of inputs with the same noise (inputs,) in all ``records``."""
+        every = np.tile(inputs, (records, 1))
+        return cls(outputs, every, every, states)
+
+    @property
+    def disturbs(self) -> bool:
+        """Whether anything but sensor noise makes the measurements differ from the prediction."""
+        return bool(self.inputs.any() or self.held_inputs.any() or self.states.any())
+
+    def parts(self, grid: TimeGrid) -> Indices:
+        """Return the parts (records,) of each step at whose ends process noise disturbs the states."""
+        if self.period is None or grid.period is not None:
+            return np.ones(grid.records, dtype=np.int64)
+        return np.maximum(np.rint(grid.steps / self.period), 1.0).astype(np.int64)
 
 
 class InnovationModel(NamedTuple):
@@ -123,14 +190,21 @@ class Kernel:
     ) -> Sensitivities:
         """One prediction and its exact derivatives, with ``drifts`` also by those; (parameters,), (states,)."""
         name = "drifting_sensitivities" if drifts else "sensitivities"
-        return Sensitivities(*self._call(name, parameters, initial, *self._arguments(excitation)))
+        times = (np.ascontiguousarray(excitation.grid.before_last),) if drifts else ()
+        return Sensitivities(*self._call(name, parameters, initial, *self._arguments(excitation), *times))
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
 
         States are updated in the author's order, each with the new values of those before it (Eq. 11-12).
+
+        Raises:
+            ValueError: the grid is not uniform; a difference equation has one step.
         """
-        inputs, period, *_ = self._arguments(excitation)
+        period = excitation.grid.period
+        if period is None:
+            raise ValueError("the difference equations of the paper need a uniform grid")
+        inputs, *_ = self._arguments(excitation)
         predicted: Array = self._call("euler", parameters, initial, inputs, period, max(1, round(period / step)))
         return predicted
 
@@ -141,11 +215,11 @@ class Kernel:
 
         Elements are not finite where the filter diverges.
         """
-        inputs, period, substeps, measured, _ = self._arguments(replace(excitation, gain=self._open_loop))
+        inputs, steps, counts, measured, _ = self._arguments(replace(excitation, gain=self._open_loop))
+        grid = (inputs, steps, counts, noise.parts(excitation.grid))
         variances = (noise.outputs**2, noise.states**2)
-        return InnovationModel(
-            *self._call("kalman", parameters, initial, inputs, period, substeps, measured, *variances, noise.inputs)
-        )
+        of_inputs = (np.ascontiguousarray(noise.inputs), np.ascontiguousarray(noise.held_inputs))
+        return InnovationModel(*self._call("kalman", parameters, initial, *grid, measured, *variances, *of_inputs))
 
     def linearise(self, parameters: Array, initial: Array, excitation: Excitation, nudge: Array) -> LinearisedModel:
         """The linear system along a window, by differences of ``nudge`` (sites,) in the units of the sites."""
@@ -168,32 +242,73 @@ class Kernel:
         response: Array = self._call("respond", *matrices, *rest)
         return response
 
+    def adjoint(self, linear: LinearisedModel, innovation: InnovationModel, present: Mask, signals: Array) -> Array:
+        """(records, sites, signals): the transpose of :meth:`respond`, for ``signals`` (records * outputs, signals).
+
+        The inner product of a curve with the result for a signal is that of the curve's response with the signal.
+        """
+        rest = (linear.feedthrough, innovation.gain, innovation.whitening, present, np.ascontiguousarray(signals))
+        matrices = (linear.transition, linear.input_now, linear.input_next, linear.output)
+        transposed: Array = self._call("adjoint", *matrices, *rest)
+        return transposed
+
+    def fourier_sums(self, x: Array, signals: Array, first: float, width: float, count: int) -> ComplexArray:
+        """(count, signals) sums over the records of ``signals`` (records, signals) times ``exp(i frequency x)``.
+
+        The frequencies are ``first + width * k``; ``x`` (records,) need not be uniform. The sums are accurate to 1e-12
+        of the largest (L. Greengard, J.-Y. Lee, Accelerating the nonuniform fast Fourier transform, SIAM Review 46,
+        2004, section 3).
+        """
+        half = max(count, 2 * SPREAD_REACH) // 2 + 1
+        points = 4 * half  # twice as many as there are frequencies
+        variance = np.pi * SPREAD_REACH / ((2 * half) ** 2 * 3.0)
+        middle = first + half * width
+        grid = self._call("spread", x, np.ascontiguousarray(signals), middle, width, points, variance, SPREAD_REACH)
+        harmonics = np.arange(count) - half
+        weights = np.sqrt(np.pi / variance) * np.exp(harmonics**2 * variance)
+        return np.asarray(weights[:, None] * np.fft.ifft(grid, axis=0)[harmonics % points])
+
     def substeps(
         self, parameters: Array, initial: Array, excitation: Excitation, tolerance: Array, limit: int = MAX_SUBSTEPS
     ) -> int:
         """The fewest substeps, a power of two up to ``limit``, with truncation errors below ``tolerance`` (outputs,).
 
         Shapes (parameters,), (states,). The error is estimated by halving the step (Richardson; Hairer, Norsett,
-        Wanner, Solving Ordinary Differential Equations I, section II.4).
+        Wanner, Solving Ordinary Differential Equations I, section II.4). ``limit`` is that of an ordinary step:
+        the longest one may have as many more as it is longer, so that the cost is linear in the records.
         """
-        count = 1
-        coarse = self.simulate(parameters[None], initial[None], replace(excitation, substeps=count))
+        grid, count = excitation.grid, 1
+        if grid.period is None and grid.records > 1:
+            limit *= 2 ** int(np.ceil(np.log2(_longest(grid) / _ordinary_step(grid)) - WHOLE))
+        first, second = parameters[None], initial[None]
+        coarse = self.simulate(first, second, replace(excitation, substeps=count))
         while count < limit:
-            fine = self.simulate(parameters[None], initial[None], replace(excitation, substeps=2 * count))
+            fine = self._halved(first, second, replace(excitation, substeps=count))
             with np.errstate(invalid="ignore"):
                 error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0  # of an order-4 method
-            if np.all(error <= tolerance):
+                allowed = np.maximum(tolerance, RELATIVE_TOLERANCE * np.abs(fine).max(axis=(0, 1), initial=0.0))
+            if np.all(error <= allowed):
                 break
-            count, coarse = 2 * count, fine
+            count *= 2
+            uniform = grid.period is not None
+            coarse = fine if uniform else self.simulate(first, second, replace(excitation, substeps=count))
         return count
 
-    def _arguments(self, excitation: Excitation) -> tuple[Array, float, int, Array, Array]:
-        inputs = np.ascontiguousarray(excitation.inputs, dtype=np.float64)
+    def _halved(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
+        """As :meth:`simulate`, with each substep halved."""
+        inputs, steps, counts, measured, gain = self._arguments(excitation)
+        halved: Array = self._call("simulate", parameters, initial, inputs, steps, 2 * counts, measured, gain)
+        return halved
+
+    def _arguments(self, excitation: Excitation) -> tuple[Array, Array, Indices, Array, Array]:
+        inputs, grid = np.ascontiguousarray(excitation.inputs, dtype=np.float64), excitation.grid
+        if len(inputs) != grid.records:
+            raise ValueError(f"{len(inputs)} records of inputs at {grid.records} times")
         measured, gain = self._unmeasured, self._open_loop
         if excitation.measured is not None and excitation.gain is not None:
             measured = np.ascontiguousarray(excitation.measured, dtype=np.float64)
             gain = np.ascontiguousarray(excitation.gain, dtype=np.float64)
-        return inputs, excitation.sample_period, excitation.substeps, measured, gain
+        return inputs, np.ascontiguousarray(grid.steps), excitation.counts, measured, gain
 
     @cached_property
     def _module(self) -> Any:

@@ -17,7 +17,7 @@ import can
 import numpy as np
 from can.io.blf import BLFParseError
 
-from otolith_drivers.base import Sample, Setup
+from otolith_drivers.base import Sample, Sampling, Setup
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.errors import ConfigurationError
@@ -45,6 +45,8 @@ def open_log(path: Path, setup: Setup, can: Any | None) -> "CanLogReader":
 
 class CanLogReader(Reader):
     """A CAN log of any format that python-can reads."""
+
+    sampling = Sampling.CYCLIC
 
     def __init__(self, path: Path, signals: tuple[str, ...], decoder: FrameDecoder) -> None:
         """Open ``path``.

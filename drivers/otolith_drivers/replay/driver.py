@@ -60,11 +60,12 @@ def build(options: ReplayOptions, setup: Setup) -> "ReplayDriver":
     open_file = opener(path, options, setup)
     try:
         with open_file() as reader:
-            lines = reader.describe()
+            lines, sampling = reader.describe(), reader.sampling
     except ConfigurationError as error:
         raise ConfigurationError(str(error), error.key or ("driver", "file")) from error
     title = f"recording {path}, {'in real time' if options.pace == 'real time' else options.pace}"
-    return ReplayDriver(open_file, options, setup.sample_period, [title + ", repeated" * options.repeat, *lines])
+    lines = [title + ", repeated" * options.repeat, *lines]
+    return ReplayDriver(open_file, options, setup.sample_period, lines, sampling)
 
 
 def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Reader]:
@@ -104,12 +105,16 @@ def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Rea
 class ReplayDriver:
     """Implements :class:`otolith_drivers.base.Driver` over a file."""
 
-    sampling = Sampling.CYCLIC
-
     def __init__(
-        self, open_file: Callable[[], Reader], options: ReplayOptions, gap: float, description: list[str]
+        self,
+        open_file: Callable[[], Reader],
+        options: ReplayOptions,
+        gap: float,
+        description: list[str],
+        sampling: Sampling = Sampling.TRUE,
     ) -> None:
         """``gap`` is the time in seconds from the last row to the first one of the next repetition."""
+        self.sampling = sampling
         self._open_file = open_file
         self._paced, self._repeat = options.pace == "real time", options.repeat
         self._gap = gap

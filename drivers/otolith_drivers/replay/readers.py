@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from otolith_drivers.base import Setup
+from otolith_drivers.base import Sampling, Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
 
@@ -55,6 +55,27 @@ class Rows:
     """(rows,) numbers of their lines, frames or records, from 1."""
     bad: Integers
     """(rows,) number of bad lines, cells or frames up to and with each row."""
+    marks: Mask | None = None
+    """(rows,) true for the first row of each recording, in a file with several of them; None for a file without marks.
+    """
+
+    @property
+    def begins(self) -> Mask:
+        """(rows,) true for the first row of each recording but the first."""
+        return np.zeros(len(self.times), dtype=np.bool_) if self.marks is None else self.marks
+
+    def part(self, rows: slice, marks: Mask | None = None) -> "Rows":
+        """Return some of the rows, if given with other marks."""
+        columns = {name: values[rows] for name, values in self.columns.items()}
+        kept = self.begins[rows] if marks is None else marks
+        return Rows(self.times[rows], columns, self.lines[rows], self.bad[rows], kept)
+
+    def followed_by(self, other: "Rows") -> "Rows":
+        """Return these rows and those of ``other``."""
+        columns = {name: np.concatenate([values, other.columns[name]]) for name, values in self.columns.items()}
+        times, lines = np.concatenate([self.times, other.times]), np.concatenate([self.lines, other.lines])
+        bad, marks = np.concatenate([self.bad, other.bad]), np.concatenate([self.begins, other.begins])
+        return Rows(times, columns, lines, bad, marks)
 
 
 class Reader(ABC):
@@ -64,6 +85,8 @@ class Reader(ABC):
     """What ``Rows.lines`` numbers: ``line``, ``frame`` or ``record``."""
     is_table = False
     """Whether the file is a text table, whose times may be in a unit that it does not name."""
+    sampling = Sampling.TRUE
+    """Meaning of the times of the file."""
     ignored: tuple[str, ...] = ()
     """Names of the columns that no signal uses."""
 

@@ -33,6 +33,7 @@ CHUNK = 1 << 19  # characters read at once
 MAX_LINE = 100_000  # characters
 
 TIME, SECONDS = "t", "s"  # column of the time, and its unit if the header names none
+SEGMENT = "segment"  # optional column: a change of its text begins a new recording
 SEPARATORS = (";", "\t", ",")  # in this order: a comma may be a decimal sign
 HEADER_CELL = re.compile(r"(.*?)\s*(?:\[(.*)\])?")  # name and unit
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
@@ -81,6 +82,8 @@ class Header:
     """Of the time and of every signal."""
     ignored: tuple[str, ...]
     """Names of the columns that no signal uses."""
+    segment: int | None = None
+    """Position of the column of segments in a row, from 0."""
 
 
 @dataclass(slots=True)
@@ -97,6 +100,8 @@ class TableCounts:
     """Line number and cause of the first bad row or cell."""
     decimal: str = ""
     """The decimal sign; empty until a chunk has one."""
+    segment: str | None = None
+    """Text of the present segment; None until a row has one."""
 
     @property
     def bad(self) -> int:
@@ -224,7 +229,7 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
     for index, cell in enumerate(cells):
         match = HEADER_CELL.fullmatch(cell)
         name, written = (match[1], match[2]) if match else (cell, None)
-        if name not in known:
+        if name not in known and name != SEGMENT:
             others += [name] if name else []
         elif name in places:
             raise ConfigurationError(f"{place}: column {index + 1} ({cell!r}): a second column {name}: remove one")
@@ -241,7 +246,8 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
         except ValueError as error:
             raise ConfigurationError(f"{place}: column {index + 1} ({cells[index]!r}): {error}") from error
     named = max(index for index, cell in enumerate(cells) if cell) + 1
-    return Header(number, separator, (named, len(cells)), columns, tuple(others))
+    segment = None if SEGMENT in known or SEGMENT not in places else places[SEGMENT][0]
+    return Header(number, separator, (named, len(cells)), columns, tuple(others), segment)
 
 
 def _header_line(path: Path, file: TextIO) -> tuple[int, str, str]:
@@ -298,7 +304,19 @@ class _TableChunk:
             values[name] = _numbers(text_of_rows, columns[name], counts.decimal)
             self._remove_bad_cells(name, values[name], text_of_rows, kept)
         counts.rows += len(kept)
-        return Rows(times[timed], values, kept + self._first, before + np.cumsum(self._bad)[kept])
+        marks = None
+        if self._header.segment is not None:
+            marks = self._marks(pc.list_element(cells, self._header.segment).filter(pa.array(timed)))
+        return Rows(times[timed], values, kept + self._first, before + np.cumsum(self._bad)[kept], marks)
+
+    def _marks(self, texts: pa.StringArray) -> Mask:
+        """Which rows begin a segment: those with another text than the one above; a blank cell repeats that."""
+        texts = pc.utf8_trim_whitespace(texts)
+        texts = pc.if_else(pc.match_substring_regex(texts, BLANK), pa.scalar(None, pa.string()), texts)
+        texts = pc.fill_null_forward(pa.concat_arrays([pa.array([self._counts.segment], pa.string()), texts]))
+        self._counts.segment = texts[-1].as_py()
+        changed: Mask = pc.fill_null(pc.not_equal(texts[1:], texts[:-1]), False).to_numpy(zero_copy_only=False)
+        return changed
 
     def _split(self, *, quoted: bool) -> pa.ListArray:
         """The cells of each line."""

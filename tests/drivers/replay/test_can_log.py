@@ -12,11 +12,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith.acquisition.alignment import QualityLimits
 from otolith.acquisition.playback import Playback
+from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.ring import Rings
+from otolith.acquisition.samples import SignalPlan
 from otolith.acquisition.window import Window
 from otolith.acquisition.windower import Windower
+from otolith_drivers.base import Sampling
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay.readers import Rows
@@ -25,6 +27,8 @@ from tests.drivers.logs import BEGUN, UNITS, frames_of, live, opened, samples_of
 SUFFIXES = [".log", ".asc", ".blf", ".trc"]
 PACKED = [*SUFFIXES, *(f"{suffix}.gz" for suffix in SUFFIXES)]
 TICKS, RECORDS, PERIOD = 1000, 200, 0.01
+PLANS = tuple(SignalPlan(name, sampling=Sampling.CYCLIC) for name in UNITS)
+LIMITS = QualityLimits(missing=0.05, gap=0.05)
 FRAME = re.compile(r"\s0?181[\s#]")  # the heads of some formats have times in them, in which there may be any digits
 
 
@@ -41,7 +45,7 @@ def read(path: Path) -> tuple[list[Rows], str, list[str]]:
 
 
 def windows_of(chunks: list[Rows]) -> list[Window]:
-    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
+    playback = Playback(PLANS, RECORDS, PERIOD, LIMITS)
     return [window for rows in chunks for window in playback.windows(rows)] + list(playback.rest())
 
 
@@ -62,7 +66,7 @@ def test_can_log_samples_equal_live_samples(tmp_path: Path, frames: list[can.Mes
 def cut_live(frames: list[can.Message]) -> list[Window]:
     """The windows that the service would cut while the frames come."""
     rings = Rings(tuple(UNITS), 4 * RECORDS)
-    windower = Windower(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
+    windower = Windower(PLANS, RECORDS, PERIOD, LIMITS)
     samples, windows = live(frames), list[Window]()
     now, last = BEGUN, samples[-1].time
     while now < last + 0.5:
@@ -103,7 +107,7 @@ def test_can_log_locates_frames_out_of_order(tmp_path: Path, frames: list[can.Me
         lines[first + 2000 : first + 2000] = lines[first : first + 3]
         path.write_text("".join(lines[:first] + lines[first + 30 :]), encoding="utf-8")
         place = first + 1971
-    playback = Playback(tuple(UNITS), RECORDS, PERIOD, QualityLimits(missing=0.05, gap=0.05, jitter=0.005))
+    playback = Playback(PLANS, RECORDS, PERIOD, LIMITS)
     with opened(path) as log:
         for rows in log.chunks():
             list(playback.windows(rows))

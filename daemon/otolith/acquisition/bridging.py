@@ -1,0 +1,224 @@
+"""Inputs between their samples: bridged as their hold says, with the variance of what the bridge may hide.
+
+A command (``zoh``) holds its value until the next sample. Where a sample of it was lost, it may have changed at any of
+the lost instants: the value moves from one end to the other with the probability that it has changed by then. A
+measured quantity (``foh``) is a straight line between two samples. How far it may be from that line is taken from the
+window itself: a sample against the line through its neighbours, at two spacings, gives a power law of the spacing.
+``docs/explanation/sampling.md`` derives the variances.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.alignment import Indices
+from otolith.acquisition.samples import Interval, Series, SignalPlan
+from otolith.acquisition.window import Array
+
+LINE_NOISE = 1.5  # variance of a sample about the line through its neighbours, in variances of the noise of a sample
+NORMAL_SQUARE_MEDIAN = 0.455  # of the square of a standard normal deviate
+EXPONENTS = (1.0, 4.0)  # of the variance of a line, by its length: a random walk, and a smooth curve
+MIN_STEP = 1e-9  # s; against division by the step between two equal times
+ROUNDING = 1e-6  # usual intervals: rounding of the times of lost instants
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LostIntervals:
+    """Where samples of a command were lost: it may have changed at every ``usual`` s between start and end."""
+
+    start: Array
+    end: Array
+    usual: Array
+
+    def instants(self, start: float, end: float, limit: int) -> Array:
+        """Return the times of the lost samples from ``start`` until ``end``, s; none if more than ``limit``."""
+        firsts = np.maximum(np.ceil((start - self.start) / self.usual), 1.0)
+        lasts = np.ceil((np.minimum(self.end, end) - self.start) / self.usual - 0.5)
+        if np.maximum(lasts - firsts, 0.0).sum() > limit:
+            return np.zeros(0)
+        bounds = zip(self.start, self.usual, firsts, lasts, strict=True)
+        return np.concatenate(
+            [np.zeros(0), *(at + usual * np.arange(first, last) for at, usual, first, last in bounds)]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OtherSamples:
+    """The samples of all other signals."""
+
+    times: Array
+    """s, increasing."""
+    interval: Interval
+    """Of the signal that comes most often."""
+
+
+def lost_samples(series: Series, plan: SignalPlan, own: Interval, others: OtherSamples) -> LostIntervals:
+    """Return where samples of an input were lost.
+
+    A command that is recorded when it changes has no sample while it holds, although other signals have theirs. Its
+    changes are lost only with the samples of all others, and never if they are recorded apart from the others.
+    """
+    starts, ends, usual = series.times[:-1], series.times[1:], own.usual
+    if plan.hold != "zoh" or not is_recorded_on_change(plan, series.values):
+        long = ends - starts > own.longest
+    elif np.isin(series.times, others.times).all():
+        last = np.searchsorted(others.times, ends) - 1
+        starts = np.maximum(starts, others.times[np.maximum(last, 0)])
+        long, usual = ends - starts > others.interval.longest, others.interval.usual
+    else:
+        long = np.zeros(len(starts), dtype=np.bool_)
+    return LostIntervals(starts[long], ends[long], np.full(int(long.sum()), usual))
+
+
+def is_recorded_on_change(plan: SignalPlan, values: Array) -> bool:
+    """Whether a command is recorded only when it changes: as the machine file says, else if no value is repeated."""
+    return bool((np.diff(values) != 0.0).all()) if plan.on_change is None else plan.on_change
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BridgedInput:
+    """An input at the records of a window, (records,) each; see :class:`otolith.acquisition.window.BridgeError`."""
+
+    values: Array
+    noise_ratio: Array
+    variance: Array
+    held_variance: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InputSamples:
+    """The samples of an input, at least one, and where some were lost."""
+
+    series: Series
+    plan: SignalPlan
+    interval: Interval
+    lost: LostIntervals
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the input keeps its value until the next sample, however late that comes."""
+        return self.plan.hold == "zoh" and is_recorded_on_change(self.plan, self.series.values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Error:
+    """Error of a bridge, (records,) each."""
+
+    variance: Array
+    duration: Array
+    """How long the error lasts, s."""
+
+
+def bridge(samples: InputSamples, times: Array, steps: Array) -> BridgedInput:
+    """Return an input at ``times`` (records,) s, each followed by a step (records,) s."""
+    series, usual = samples.series, samples.interval.usual
+    steps = np.maximum(steps, MIN_STEP)
+    rounding = ROUNDING * np.minimum(steps, usual)
+    before = np.maximum(np.searchsorted(series.times, times + rounding, "right") - 1, 0)
+    after = np.minimum(before + 1, len(series.times) - 1)
+    length = series.times[after] - series.times[before]
+    ended = after == before
+    spacing = np.where(ended, usual if np.isfinite(usual) else steps, length)
+    if samples.plan.hold == "zoh":
+        values, error = _hold(samples, times, before)
+    else:
+        values, error = _line(samples, times, before, after)
+    outdated = _outdated(samples, times)
+    variance = error.variance + outdated.variance
+    duration = np.where(outdated.variance > 0.0, outdated.duration, error.duration)
+    return BridgedInput(
+        values, np.maximum(spacing, steps) / steps, variance, variance * np.maximum(1.0, duration / steps)
+    )
+
+
+def _hold(samples: InputSamples, times: Array, before: Indices) -> tuple[Array, _Error]:
+    """Return a command at ``times``, and its error."""
+    series, lost = samples.series, samples.lost
+    values, none = series.values[before], np.zeros(len(times))
+    if not len(lost.start):
+        return values, _Error(none, none)
+    at = np.maximum(np.searchsorted(lost.start, times + ROUNDING * lost.usual[0], "right") - 1, 0)
+    start, end, usual = lost.start[at], lost.end[at], lost.usual[at]
+    inside = (times >= start - ROUNDING * usual) & (times < end - ROUNDING * usual)
+    chances = np.maximum(np.rint((end - start) / usual), 1.0)
+    share = np.clip(np.floor((times - start) / usual + ROUNDING) / chances, 0.0, 1.0)
+    following = np.minimum(np.searchsorted(series.times, end - ROUNDING * usual), len(series.times) - 1)
+    change = np.where(inside, series.values[following] - values, 0.0)
+    wander = _usual_change(series, samples.interval) * (end - start) / samples.interval.usual
+    variance = np.where(inside, np.maximum(change**2, wander) * share * (1.0 - share), 0.0)
+    duration = np.where(inside, np.maximum(usual, 0.5 * (end - start)), 0.0)
+    return values + change * share, _Error(variance, duration)
+
+
+def _usual_change(series: Series, own: Interval) -> float:
+    """Return the squared change of a command from sample to sample, robust against single steps."""
+    usual = np.diff(series.times) <= own.longest
+    return float(np.median(np.diff(series.values)[usual] ** 2)) / NORMAL_SQUARE_MEDIAN if usual.any() else 0.0
+
+
+def _line(samples: InputSamples, times: Array, before: Indices, after: Indices) -> tuple[Array, _Error]:
+    """Return a measured quantity at ``times``, and its error."""
+    series = samples.series
+    length = series.times[after] - series.times[before]
+    values, none = np.interp(times, series.times, series.values), np.zeros(len(times))
+    share = np.clip((times - series.times[before]) / np.maximum(length, MIN_STEP), 0.0, 1.0)
+    spread = np.where(after > before, 4.0 * share * (1.0 - share), 0.0)
+    inside = spread > ROUNDING
+    if not inside.any():
+        return values, _Error(none, none)
+    middle = line_variance(series, samples.plan.noise)
+    return values, _Error(np.where(inside, middle(length) * spread, 0.0), 0.5 * length)
+
+
+@dataclass(frozen=True, slots=True)
+class LineVariance:
+    """Variance of a quantity in the middle of a line between two samples: ``at_two * (length / two)**exponent``."""
+
+    at_two: float
+    two: float
+    """Two usual intervals, s."""
+    exponent: float
+
+    def __call__(self, length: Array) -> Array:
+        """Return the variance for lines of ``length`` s."""
+        return np.asarray(self.at_two * (np.maximum(length, 0.0) / self.two) ** self.exponent)
+
+
+def line_variance(series: Series, noise: float) -> LineVariance:
+    """Return the variance of a line through samples, from what the samples between show; ``noise`` is their own."""
+    short, long = (_about_line(series, reach, noise) for reach in (1, 2))
+    two = 2.0 * float(np.median(np.diff(series.times))) if len(series.times) > 1 else 1.0
+    if short <= 0.0:
+        return LineVariance(max(long, 0.0) / 2.0 ** EXPONENTS[0], two, EXPONENTS[0])
+    exponent = float(np.clip(np.log2(max(long, short) / short), *EXPONENTS))
+    return LineVariance(short, two, exponent)
+
+
+def _about_line(series: Series, reach: int, noise: float) -> float:
+    """Return the variance of samples about the line through those ``reach`` before and after, without their noise."""
+    times, values = series.times, series.values
+    if len(times) <= 2 * reach:
+        return float(np.var(values)) if len(values) > 1 else 0.0
+    left, middle, right = slice(None, -2 * reach), slice(reach, -reach), slice(2 * reach, None)
+    share = (times[middle] - times[left]) / (times[right] - times[left])
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = values[middle] - (1.0 - share) * values[left] - share * values[right]
+        variance = float(np.mean(error**2)) - LINE_NOISE * noise**2
+    return max(variance, 0.0) if np.isfinite(variance) else 0.0
+
+
+def _outdated(samples: InputSamples, times: Array) -> _Error:
+    """Return the error before the first and after the last sample, which grows with the distance in time."""
+    series, none = samples.series, np.zeros(len(times))
+    early, late = np.maximum(series.times[0] - times, 0.0), np.maximum(times - series.times[-1], 0.0)
+    if samples.is_held:
+        late = none
+    elif samples.plan.hold == "zoh":
+        late = np.where(late > samples.interval.longest, late, 0.0)
+    away = early + late
+    if not away.any() or len(series.times) < 2:
+        return _Error(none, none)
+    with np.errstate(over="ignore", invalid="ignore"):
+        change = float(np.mean(np.diff(series.values) ** 2)) - 2.0 * samples.plan.noise**2
+    change = max(change, 0.0) if np.isfinite(change) else 0.0
+    return _Error(change * away / samples.interval.usual, away)

@@ -1,0 +1,145 @@
+"""Whether a window can be estimated from: judged by what it lacks, against the limits of the machine file."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+
+from otolith.acquisition.alignment import CyclicSeries
+from otolith.acquisition.records import Records
+from otolith.acquisition.samples import SignalPlan
+from otolith.acquisition.time_grid import GridSpan, TimeGrid
+from otolith.acquisition.window import Array, Mask, Quality, Verdict
+
+CALENDAR = 1e8  # s: a larger time is Unix time and shown as a date; guarded by tests/acquisition/test_quality.py
+
+
+@dataclass(frozen=True, slots=True)
+class QualityLimits:
+    """Bounds that the worst signal of a window must keep for the window to be good."""
+
+    missing: float = 1.0
+    """Share of the records of the grid without a sample, 0 to 1."""
+    gap: float = np.inf
+    """Longest time without a sample, s."""
+    jitter: float = 0.005
+    """Root mean square lateness of a cyclic signal, s."""
+    surplus: float = 0.02
+    """Share of samples of a cyclic signal for which there is no slot: a second sender."""
+    irregularity: float = 0.3
+    """Standard deviation of the interval of a cyclic signal over its mean: a second sender."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """The longest time without a sample of a signal."""
+
+    start: float
+    """s, in the time of the window."""
+    length: float
+    """s."""
+
+
+def assess_quality(
+    records: Records,
+    plans: Mapping[str, SignalPlan],
+    cyclic: Mapping[str, CyclicSeries],
+    limits: QualityLimits,
+    span: GridSpan,
+) -> Quality:
+    """Return the quality of a window; times are told as those of ``span``.
+
+    A command that is recorded only when it changes has no gaps.
+    """
+    slots = span.records
+    present = {name: ~records.missing[:, column] for column, name in enumerate(plans)}
+    expected = [name for name in plans if name not in records.held]
+    gaps = {name: _longest_gap(present[name], records.grid, span) for name in expected}
+    missing = {name: max(0.0, 1.0 - float(present[name].sum()) / max(slots, 1)) for name in expected}
+    jitters = {name: _rms(item.lateness) for name, item in cyclic.items()}
+    offsets = [float(np.median(item.lateness)) for item in cyclic.values() if len(item.lateness)]
+    reasons = _useless(present, plans, records.unknown, span)
+    reasons = reasons or [
+        *_beyond(missing, limits.missing, "{1:.0%} of {0} is missing, more than missing_limit ({2:.0%})"),
+        *_long_gap(gaps, limits.gap),
+        *_beyond(
+            {name: item.surplus / max(slots, 1) for name, item in cyclic.items()},
+            limits.surplus,
+            "{0} comes more often than it should: do two nodes send it? If not, raise surplus_limit ({2:.0%})",
+        ),
+        *_beyond(
+            {name: item.irregularity for name, item in cyclic.items()},
+            limits.irregularity,
+            "{0} comes at irregular intervals: do two nodes send it? If not, raise irregularity_limit ({2:.0%})",
+        ),
+        *_beyond(jitters, limits.jitter, "{0} arrives with {1:.4g} s of jitter, more than jitter_limit ({2:.4g} s)"),
+    ]
+    return Quality(
+        verdict=Verdict.BAD if reasons else Verdict.GOOD,
+        missing=max(missing.values(), default=0.0),
+        longest_gap=max((gap.length for gap in gaps.values()), default=0.0),
+        jitter=max(jitters.values(), default=0.0),
+        skew=max(offsets) - min(offsets) if offsets else 0.0,
+        reasons=tuple(reasons),
+    )
+
+
+def _useless(
+    present: Mapping[str, Mask],
+    plans: Mapping[str, SignalPlan],
+    unknown: Collection[str],
+    span: GridSpan,
+) -> list[str]:
+    """Return why nothing can be estimated: no output came, or an input of which nothing is known."""
+    outputs = [name for name, plan in plans.items() if plan.hold is None]
+    silent = [name for name in outputs if not present[name].any()]
+    if len(silent) < len(outputs):
+        silent = []
+    silent += [
+        name for name, plan in plans.items() if name in unknown or (plan.hold == "foh" and not present[name].any())
+    ]
+    if not silent:
+        return []
+    when = f"from {time_text(span.start)} for {span.length:.4g} s"
+    return [f"no samples of {', '.join(silent)} {when}: is the source on, and is its signal right in [signals]?"]
+
+
+def _long_gap(gaps: Mapping[str, Gap], limit: float) -> list[str]:
+    """Return a sentence for the signal with the longest gap, if it is beyond the limit."""
+    name = max(gaps, key=lambda name: gaps[name].length, default="")
+    if not name or gaps[name].length <= limit:
+        return []
+    when = f"for {gaps[name].length:.4g} s from {time_text(gaps[name].start)}"
+    return [f"{name} has no sample {when}, longer than gap_limit ({limit:.4g} s)"]
+
+
+def _beyond(values: Mapping[str, float], limit: float, text: str) -> list[str]:
+    """Return a sentence for the worst signal, if it is beyond the limit."""
+    name = max(values, key=lambda name: values[name], default="")
+    return [text.format(name, values[name], limit)] if name and values[name] > limit else []
+
+
+def _longest_gap(present: Mask, grid: TimeGrid, span: GridSpan) -> Gap:
+    """Return the longest time without a sample of a signal; one period without a sample is no gap."""
+    start, period = span.start, span.period
+    if grid.period is not None:
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], ~present, [False])).astype(np.int8)))
+        runs = edges[1::2] - edges[::2]
+        at = int(np.argmax(runs)) if len(runs) else 0
+        return Gap(start + float(edges[2 * at]) * period, float(runs[at]) * period) if len(runs) else Gap(start, 0.0)
+    times = np.concatenate([[0.0], grid.offsets[present], [grid.length]])
+    lengths = np.diff(times) - period * (np.arange(len(times) - 1) > 0)
+    at = int(np.argmax(lengths))
+    return Gap(start + float(times[at]), max(float(lengths[at]), 0.0))
+
+
+def _rms(lateness: Array) -> float:
+    return float(np.sqrt(np.mean(lateness**2))) if len(lateness) else 0.0
+
+
+def time_text(seconds: float) -> str:
+    """Return a time of the data: a date and time of day (UTC) for Unix seconds, else seconds."""
+    if seconds < CALENDAR:
+        return f"t = {seconds:.4g} s" if seconds < 1e3 else f"t = {seconds:.2f} s"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S.%f}"[:-4] + " UTC"

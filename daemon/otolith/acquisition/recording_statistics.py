@@ -1,0 +1,192 @@
+"""How a recording was sampled: rate, jitter, gaps, repeats of each signal, in one pass and in bounded memory."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Mask
+from otolith_drivers.replay.readers import Integers, Rows
+
+# Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
+MAX_KEPT = 8192  # intervals and values of a signal that are kept; of more, as many are chosen at random
+MAX_GAPLESS = 2.5  # median intervals; a longer interval between two samples is a gap
+BINS_PER_OCTAVE = 8  # of the histogram of intervals
+OCTAVES = (-40, 40)  # of that histogram, in powers of two of a second
+MAX_RENEWAL = 64  # samples; a longer run of one value is no register that is renewed slowly
+MIN_RENEWAL_SHARE = 0.5  # of the runs of one value that have the same number of samples
+MIN_RUNS = 10  # runs of one value from which a slow renewal is seen
+SEED = 1
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedGap:
+    """A time without samples."""
+
+    seconds: float
+    start: float
+    """Time of the last sample before it, s."""
+    line: int
+    """Line, frame or record of the first sample after it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SignalSampling:
+    """How one signal was sampled."""
+
+    samples: int
+    """Finite values."""
+    blank: int
+    """Rows without a value of this signal."""
+    interval: float
+    """Median time between two samples, s; infinity if there are not two."""
+    jitter: float
+    """Standard deviation of the intervals that are no gaps, over their median."""
+    gaps: int
+    """Intervals of more than ``MAX_GAPLESS`` medians, up to the resolution of a histogram (9 %)."""
+    longest_gap: RecordedGap | None
+    """The longest interval, if it is a gap."""
+    duplicates: int
+    """Samples with time and value of the sample before."""
+    repeated_times: int
+    """Samples with the time of the sample before, but another value."""
+    repeats: int
+    """Samples with the value of the sample before at a later time."""
+    renewal: int
+    """Samples from one change of the value to the next, where most are the same number; otherwise 1."""
+    values: Array
+    """At most ``MAX_KEPT`` of the values, chosen at random."""
+
+
+class RandomChoice:
+    """A random choice of the numbers that were added: at most ``MAX_KEPT``, each with the same probability."""
+
+    def __init__(self) -> None:
+        self.kept: Array = np.zeros(0)
+        self._random = np.random.default_rng(SEED)
+        self._share = 1.0
+
+    def add(self, numbers: Array) -> None:
+        """Add numbers (n,)."""
+        if self._share < 1.0:
+            numbers = numbers[self._random.random(len(numbers)) < self._share]
+        self.kept = np.concatenate([self.kept, numbers])
+        while len(self.kept) > MAX_KEPT:
+            self.kept = self.kept[self._random.random(len(self.kept)) < 0.5]
+            self._share /= 2.0
+
+
+class SignalStatistics:
+    """Counters of one signal."""
+
+    def __init__(self) -> None:
+        self.samples = self.blank = self.duplicates = self.repeated_times = self.repeats = 0
+        self._values, self._intervals = RandomChoice(), RandomChoice()
+        self._histogram = np.zeros((OCTAVES[1] - OCTAVES[0]) * BINS_PER_OCTAVE, dtype=np.int64)
+        self._longest = RecordedGap(0.0, math.nan, 0)
+        self._runs = np.zeros(MAX_RENEWAL + 2, dtype=np.int64)
+        self._run = 0  # samples since the last change
+        self._last: tuple[float, float] | None = None
+
+    def add(self, times: Array, values: Array, lines: Integers) -> None:
+        """Add samples (s, value), NaN where there is none, with their lines, in the order of the file."""
+        present = np.isfinite(values)
+        self.blank += len(values) - int(np.count_nonzero(present))
+        times, values, lines = times[present], values[present], lines[present]
+        if not len(times):
+            return
+        self.samples += len(times)
+        self._values.add(values)
+        last_time, last_value = self._last or (math.nan, math.nan)
+        before = np.concatenate([[last_time], times[:-1]])
+        intervals, same = times - before, values == np.concatenate([[last_value], values[:-1]])
+        self._last = (float(times[-1]), float(values[-1]))
+        at_once, forward = intervals == 0.0, intervals > 0.0
+        self.duplicates += int(np.count_nonzero(at_once & same))
+        self.repeated_times += int(np.count_nonzero(at_once & ~same))
+        self.repeats += int(np.count_nonzero(forward & same))
+        self._count_runs(same[~(at_once & same)])
+        self._add_intervals(intervals[forward], before[forward], lines[forward])
+
+    def _count_runs(self, same: Mask) -> None:
+        changes = np.flatnonzero(~same)
+        if not len(changes):
+            self._run += len(same)
+            return
+        runs = np.diff(changes, prepend=-self._run)
+        runs = runs[runs > 0]  # the first sample of all ends no run
+        self._runs += np.bincount(np.minimum(runs, MAX_RENEWAL + 1), minlength=len(self._runs))
+        self._run = len(same) - int(changes[-1])
+
+    def _add_intervals(self, intervals: Array, before: Array, lines: Integers) -> None:
+        if not len(intervals):
+            return
+        self._intervals.add(intervals)
+        bins = np.floor((np.log2(intervals) - OCTAVES[0]) * BINS_PER_OCTAVE).astype(np.int64)
+        bins = np.clip(bins, 0, len(self._histogram) - 1)
+        self._histogram += np.bincount(bins, minlength=len(self._histogram))
+        longest = int(np.argmax(intervals))
+        if intervals[longest] > self._longest.seconds:
+            self._longest = RecordedGap(float(intervals[longest]), float(before[longest]), int(lines[longest]))
+
+    def summary(self) -> SignalSampling:
+        """Return what was counted so far."""
+        intervals = self._intervals.kept
+        median = float(np.median(intervals)) if len(intervals) else math.inf
+        gapless = intervals[intervals <= MAX_GAPLESS * median]
+        edges = np.exp2(np.arange(len(self._histogram)) / BINS_PER_OCTAVE + OCTAVES[0])
+        gap = self._longest if self._longest.seconds > MAX_GAPLESS * median else None
+        return SignalSampling(
+            samples=self.samples,
+            blank=self.blank,
+            interval=median,
+            jitter=float(gapless.std() / median) if len(gapless) else 0.0,
+            gaps=max(int(self._histogram[edges > MAX_GAPLESS * median].sum()), int(gap is not None)),
+            longest_gap=gap,
+            duplicates=self.duplicates,
+            repeated_times=self.repeated_times,
+            repeats=self.repeats,
+            renewal=self._renewal(),
+            values=self._values.kept,
+        )
+
+    def _renewal(self) -> int:
+        usual, runs = int(np.argmax(self._runs[: MAX_RENEWAL + 1])), int(self._runs.sum())
+        regular = runs >= MIN_RUNS and self._runs[usual] > MIN_RENEWAL_SHARE * runs
+        return usual if regular and usual > 1 else 1
+
+
+class RecordingStatistics:
+    """Counters of all rows and of each signal."""
+
+    def __init__(self, signals: tuple[str, ...]) -> None:
+        self.rows = 0
+        self.first, self.last = math.inf, -math.inf
+        """Earliest and latest time, s."""
+        self.steps_back = 0
+        """Rows with a time before that of the row above."""
+        self.first_step_back: tuple[int, float, float] | None = None
+        """Line and time (s) of the first of them, and the time (s) of the row above."""
+        self._signals = {signal: SignalStatistics() for signal in signals}
+        self._last_time = -math.inf
+
+    def add(self, rows: Rows) -> None:
+        """Add a chunk of rows, in the order of the file."""
+        if not len(rows.times):
+            return
+        self.rows += len(rows.times)
+        before = np.concatenate([[self._last_time], rows.times[:-1]])
+        back = np.flatnonzero(rows.times < before)
+        self.steps_back += len(back)
+        if len(back) and self.first_step_back is None:
+            first = int(back[0])
+            self.first_step_back = (int(rows.lines[first]), float(rows.times[first]), float(before[first]))
+        self._last_time = float(rows.times[-1])
+        self.first = min(self.first, float(rows.times.min()))
+        self.last = max(self.last, float(rows.times.max()))
+        for signal, statistics in self._signals.items():
+            statistics.add(rows.times, rows.columns[signal], rows.lines)
+
+    def signals(self) -> dict[str, SignalSampling]:
+        """Return how each signal was sampled so far."""
+        return {signal: statistics.summary() for signal, statistics in self._signals.items()}

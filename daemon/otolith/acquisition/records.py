@@ -1,0 +1,175 @@
+"""Records of a window from the samples of all signals, each sample at its own time.
+
+If every sample lies on the grid, so do the records; an output without a sample is missing there. Otherwise the window
+has a record at its start and at the time of every sample. Outputs are never interpolated: an interpolated value is no
+measurement. Inputs are bridged (:mod:`otolith.acquisition.bridging`).
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.alignment import Indices
+from otolith.acquisition.bridging import (
+    BridgedInput,
+    InputSamples,
+    LostIntervals,
+    OtherSamples,
+    bridge,
+    is_recorded_on_change,
+    lost_samples,
+)
+from otolith.acquisition.samples import Check, Interval, Series, SignalPlan, interval_of, stale_repeats
+from otolith.acquisition.time_grid import GridSpan, TimeGrid
+from otolith.acquisition.window import Array, BridgeError, Mask
+
+# Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
+ON_GRID = 1e-3  # sample periods: distance of a true time from the grid that is rounding
+EARLY = 2.0 * ON_GRID  # sample periods before the window that belong to its first record: rounding on both sides
+SAME_TIME = 1e-6  # s below which two samples belong to one record
+MAX_LOST_RECORDS = 4  # records of the grid: more lost instants of an input than that get no records
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Records:
+    """The records of a window; see :class:`otolith.acquisition.window.Window`."""
+
+    grid: TimeGrid
+    values: Array
+    missing: Mask
+    bridge_error: BridgeError | None
+    stale: dict[str, int]
+    """Repeats of a register that were skipped, of each signal that has any."""
+    held: frozenset[str]
+    """Commands that are recorded only when they change."""
+    unknown: frozenset[str]
+    """Inputs that never had a sample."""
+
+
+def lies_on_grid(times: Array, start: float, period: float) -> bool:
+    """Whether all ``times`` (n,), s, are on the grid ``start + k * period`` up to rounding."""
+    slots = (times - start) / period
+    return bool((np.abs(slots - np.rint(slots)) <= ON_GRID).all())
+
+
+def phase_of_grid(times: Array, start: float, period: float) -> float | None:
+    """Return by how much the grid must move so that all ``times`` (n,), s, are on it; None if they are on no grid."""
+    if len(times) < 2:
+        return None
+    turns = (times - start) / period
+    phase = float(np.angle(np.exp(2j * np.pi * turns).mean())) / (2.0 * np.pi)
+    return phase * period if lies_on_grid(times, start + phase * period, period) else None
+
+
+def without_stale(series: Mapping[str, Series], plans: Mapping[str, SignalPlan]) -> dict[str, Series]:
+    """Return the samples without repeats of a register that was not renewed; a command repeats what it holds."""
+    kept = dict(series)
+    for name, samples in series.items():
+        if plans[name].hold != "zoh" and Check.STALE in plans[name].checks:
+            stale = stale_repeats(samples.values)
+            kept[name] = Series(samples.times[~stale], samples.values[~stale]) if stale.any() else samples
+    return kept
+
+
+def make_records(series: Mapping[str, Series], plans: Mapping[str, SignalPlan], span: GridSpan) -> Records:
+    """Return the records of a window.
+
+    ``series`` has the samples in the window and those around it, as far as they are known: a command needs the sample
+    before, a measured input also the one after.
+    """
+    start, period = span.start, span.period
+    fresh = without_stale(series, plans)
+    stale = {name: len(series[name].times) - len(fresh[name].times) for name in series}
+    early = EARLY * period
+    inside = {name: samples.within(start - early, span.end - early) for name, samples in fresh.items()}
+    on_grid = all(lies_on_grid(samples.times, start, period) for samples in inside.values())
+    incomplete = [
+        name
+        for name, plan in plans.items()
+        if plan.hold is not None
+        and len(fresh[name].times)
+        and not (on_grid and len(inside[name].times) == span.records)
+    ]
+    intervals = {name: interval_of(samples.times) for name, samples in fresh.items()} if incomplete else {}
+    lost = {
+        name: lost_samples(fresh[name], plans[name], intervals[name], _others(name, fresh, intervals))
+        for name in incomplete
+    }
+    grid = TimeGrid.uniform(span.records, period) if on_grid else _own_times(inside, plans, lost.values(), span)
+    values, missing = np.zeros((grid.records, len(plans))), np.ones((grid.records, len(plans)), dtype=np.bool_)
+    bridged: dict[int, BridgedInput] = {}
+    for column, (name, plan) in enumerate(plans.items()):
+        at = _records_of(inside[name].times - start, grid, period)
+        missing[at, column] = False
+        if name in lost:
+            samples = InputSamples(fresh[name], plan, intervals[name], lost[name])
+            bridged[column] = bridge(samples, start + grid.offsets, grid.steps)
+            values[:, column] = bridged[column].values
+        elif len(at) < grid.records:
+            values[:, column] = _filled(fresh[name], start + grid.offsets)
+        values[at, column] = inside[name].values
+    held = frozenset(
+        name
+        for name in incomplete
+        if plans[name].hold == "zoh" and is_recorded_on_change(plans[name], fresh[name].values)
+    )
+    unknown = frozenset(name for name, plan in plans.items() if plan.hold is not None and not len(fresh[name].times))
+    stale = {name: count for name, count in stale.items() if count}
+    return Records(grid, values, missing, _bridge_error(bridged, values.shape), stale, held, unknown)
+
+
+def _others(name: str, series: Mapping[str, Series], intervals: Mapping[str, Interval]) -> OtherSamples:
+    """Return the samples of all signals but one."""
+    names = [other for other in series if other != name]
+    times = np.unique(np.concatenate([np.zeros(0), *(series[other].times for other in names)]))
+    most_often = min(
+        (intervals[other] for other in names), key=lambda item: item.usual, default=Interval(np.inf, np.inf)
+    )
+    return OtherSamples(times, most_often)
+
+
+def _own_times(
+    inside: Mapping[str, Series], plans: Mapping[str, SignalPlan], lost: Iterable[LostIntervals], span: GridSpan
+) -> TimeGrid:
+    """Return the grid of all times at which something is measured or an input may change."""
+    times = [np.array([span.start])]
+    for name, samples in inside.items():
+        changed = np.ones(len(samples.times), dtype=np.bool_)
+        if plans[name].hold == "zoh":
+            changed[1:] = np.diff(samples.values) != 0.0
+        times.append(samples.times[changed])
+    times += [intervals.instants(span.start, span.end, MAX_LOST_RECORDS * span.records) for intervals in lost]
+    offsets = np.maximum(np.sort(np.concatenate(times)) - span.start, 0.0)
+    apart = np.concatenate([[True], np.diff(offsets) > SAME_TIME])
+    return TimeGrid.at(offsets[apart], span.length)
+
+
+def _records_of(offsets: Array, grid: TimeGrid, period: float) -> Indices:
+    """Return the record of each sample at ``offsets`` (n,), s after the start: the nearest one."""
+    if grid.period is not None:
+        return np.clip(np.rint(offsets / period).astype(np.int64), 0, grid.records - 1)
+    after = np.clip(np.searchsorted(grid.offsets, offsets), 0, grid.records - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = offsets - grid.offsets[before] < grid.offsets[after] - offsets
+    return np.where(nearer, before, after)
+
+
+def _filled(samples: Series, times: Array) -> Array:
+    """Return values for display at ``times``; none of them is a measurement."""
+    if not len(samples.times):
+        return np.zeros(len(times))
+    with np.errstate(over="ignore", invalid="ignore"):
+        filled = np.interp(times, samples.times, samples.values)
+    return np.where(np.isfinite(filled), filled, 0.0)
+
+
+def _bridge_error(bridged: Mapping[int, BridgedInput], shape: tuple[int, ...]) -> BridgeError | None:
+    if not bridged:
+        return None
+    error = BridgeError(np.ones(shape), np.zeros(shape), np.zeros(shape))
+    for column, item in bridged.items():
+        error.noise_ratio[:, column] = item.noise_ratio
+        error.variance[:, column] = item.variance
+        error.held_variance[:, column] = item.held_variance
+    return error

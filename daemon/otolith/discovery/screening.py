@@ -1,0 +1,278 @@
+"""The screening test: whether a window is worth a search for what the twin lacks.
+
+All allowed forms are scored by the linear response, on a grid of their inner parameters.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Window
+from otolith.discovery.candidate_forms import CandidateForm, candidate_table
+from otolith.discovery.linear_response import Guess, LinearResponse
+from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.posterior import Posterior
+from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import Fit, WindowEstimate, fit
+from otolith.twin.augmentation import MAX_COMPONENTS, sources
+from otolith.twin.component_families import ComponentFamily, SourceKind
+from otolith.twin.definition import Definition
+
+DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
+COARSE = 1.5  # spectral lines between two frequencies
+ESTIMATE_SHARE = 0.3  # of the required gain: least estimated gain of a spectral line whose gain is computed
+MAX_LINES = 64  # of largest estimated gain, whose gain is computed
+MAX_AMPLITUDE = 1e9  # in the unit of the site
+MAX_RECORDS = 5000  # last records of a window that are searched
+THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
+
+
+@dataclass(frozen=True, slots=True)
+class Alternatives:
+    """How many forms compete, by kind."""
+
+    first_sensor: int
+    """Index of the first site that is a sensor."""
+    of_machine: float
+    of_sensors: float
+
+    @classmethod
+    def among(cls, problem: Problem, forms: list[CandidateForm]) -> "Alternatives":
+        """Count ``forms``."""
+        first = len(problem.base_model.sites)
+        sensors = sum(form.site >= first for form in forms)
+        return cls(first, float(max(len(forms) - sensors, 1)), float(max(sensors, 1)))
+
+    def of(self, form: CandidateForm) -> float:
+        """Return the number of forms of the same kind."""
+        return self.of_sensors if self.is_sensor(form) else self.of_machine
+
+    def is_sensor(self, form: CandidateForm) -> bool:
+        """Whether the form is the error of a sensor."""
+        return form.site >= self.first_sensor
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredGuess:
+    """A guess with the score of the linear response."""
+
+    form: CandidateForm
+    inner: float
+    amplitudes: Array
+    """(2,)."""
+    score: float
+    """Gain in -2 log evidence over parameters only."""
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether the amplitude is neither zero nor beyond any equation that a person could use."""
+        return bool(0.0 < np.abs(self.amplitudes).max() < MAX_AMPLITUDE)
+
+
+def inner_grid(form: CandidateForm, x: Array, fineness: float) -> Array:
+    """Return values (points,) of the inner parameter; ``x`` (sources, records), ``fineness`` in spectral lines."""
+    inner = form.model.inner
+    low, high = form.bounds
+    if inner is None:
+        return np.array([low])
+    if inner.points:
+        points = max(round(inner.points / fineness**2), 2)
+        return np.exp(np.linspace(np.log(low), np.log(high), points))
+    width = fineness * 2.0 * np.pi / max(float(np.ptp(x[form.source])), 1e-9)  # of a spectral line
+    return np.arange(low, high, width)
+
+
+def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[CandidateForm]:
+    """Return all forms that can be distinguished where the sources are ``x`` (sources, records).
+
+    ``twin`` is the base model. Forms whose keys are ``taken`` are left out.
+    """
+    bounds: dict[tuple[str, int], tuple[float, float] | None] = {}
+    library = []
+    for key, form in candidate_table(twin):
+        shape = form.model.name, form.source
+        if shape not in bounds:
+            bounds[shape] = _inner_bounds(form.model, x[form.source])
+        within = bounds[shape]
+        if within is not None and key not in taken:
+            library.append(CandidateForm(form.site, form.model, form.source, within))
+    return library
+
+
+def _inner_bounds(model: ComponentFamily, x: Array) -> tuple[float, float] | None:
+    """Return the bounds of the inner parameter, or None if ``x`` (records,) cannot tell the family from others."""
+    if not model.valid(x):
+        return None
+    if model.fixed_inner is not None:
+        return model.fixed_inner(x), model.fixed_inner(x)
+    return (0.0, 0.0) if model.inner is None else model.inner.bounds(x)
+
+
+def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
+    """Return the forms that may be searched where the sources are ``x`` (sources, records).
+
+    Components in the twin and excluded ones are left out, and all if the twin has no free slot. If discovery is off,
+    only errors of sensors remain.
+    """
+    twin = problem.base_model
+    if len(problem.components) >= MAX_COMPONENTS:
+        return []
+    taken = problem.excluded | {component.key for component in problem.components}
+    return [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
+
+
+def screen(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> "Screening":
+    """Score all forms on a grid of inner parameters."""
+    guesses = grid_guesses(response, forms, fineness)
+    return Screening.of(response, guesses, Alternatives.among(response.problem, forms))
+
+
+def grid_guesses(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
+    """Return all forms with all inner parameters of their grids."""
+    return [(form, float(inner)) for form in forms for inner in inner_grid(form, response.x, fineness)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Screening:
+    """Many guesses and their scores."""
+
+    guesses: list[Guess]
+    amplitudes: Array
+    """(guesses, 2)."""
+    scores: Array
+    """(guesses,) gains in -2 log evidence over parameters only."""
+
+    @classmethod
+    def of(cls, response: LinearResponse, guesses: list[Guess], alternatives: Alternatives) -> "Screening":
+        """Score ``guesses`` by the linear response."""
+        statistics = response.score(guesses)
+        count = response.objective.count
+        parameters = np.array([_parameter_count(form) for form, _ in guesses], dtype=np.float64)
+        competing = np.array([alternatives.of(form) for form, _ in guesses])
+        variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)
+        scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * competing)
+        return cls(guesses, statistics.amplitudes, np.asarray(scores))
+
+    def __getitem__(self, index: int) -> ScoredGuess:
+        form, inner = self.guesses[index]
+        return ScoredGuess(form, inner, self.amplitudes[index], float(self.scores[index]))
+
+
+def _parameter_count(form: CandidateForm) -> int:
+    return len(form.model.phases) + (form.model.inner is not None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScreeningResult:
+    """Whether a search of a window is worth its time."""
+
+    gain: float
+    """Largest gain in -2 log evidence over parameters only, minus what is decisive; positive if worth a search."""
+    fitted: Fit
+    """Its start is the linearisation point."""
+    response: LinearResponse
+    always_lacking: bool = False
+    """Whether only a component with a threshold, fitted under the initial prior, gains enough."""
+    always_late: bool = False
+    """Whether a late signal would gain enough while no parameter is determined: it has no onset."""
+
+    @property
+    def is_positive(self) -> bool:
+        """Whether a search is worth its time."""
+        return self.gain > 0.0
+
+    @property
+    def needs_threshold_test(self) -> bool:
+        """Whether families that the linear response underrates are to be fitted; this takes long, so not always."""
+        is_due = self.fitted.window.index % THRESHOLD_TEST_EVERY == 0
+        return is_due and not self.is_positive and self.fitted.problem.discover
+
+
+def screen_window(predicted: Posterior, estimated: WindowEstimate, *, determined: bool) -> ScreeningResult:
+    """Screen the window of an estimate, around the prediction.
+
+    While no parameter is determined or a phase is unknown, it is screened around the estimate instead. While no
+    parameter is determined, it is also screened for late signals: later a delay contradicts the prediction.
+
+    Of a very long window the last records are screened, so that a search ends before the next window.
+    """
+    problem, prior, window = predicted.problem, predicted.prior(), estimated.fit.window
+    is_known = determined and not predicted.unknown_phases()
+    is_long = window.records > MAX_RECORDS and not problem.components
+    if is_known and not is_long:
+        return screen_fit(estimated.fit)
+    start = prior.mean if is_known else np.array([parameter.value for parameter in estimated.parameters])
+    recent = window.since(window.records - MAX_RECORDS) if is_long else window
+    screening = screen_fit(linearised(problem, recent, prior, start))
+    if determined or (gain := _delay_gain(screening.response)) <= 0.0:
+        return screening
+    return replace(screening, gain=max(screening.gain, gain), always_late=True)
+
+
+def _delay_gain(response: LinearResponse) -> float:
+    """Return what a late signal would gain at most, minus what is decisive; parameters would absorb a part of it."""
+    gains = response.score_delays().gain
+    best, count = float(gains.max(initial=0.0)), response.objective.count
+    variance_factor = max((response.chi_square - best) / count, 1.0)
+    return float(best / variance_factor - np.log(count) - 2.0 * np.log(3.0 * len(gains))) - DECISIVE
+
+
+def linearised(problem: Problem, window: Window, prior: Prior, start: Array) -> Fit:
+    """Return a fit of no steps: the window, linearised at ``start`` (free, ...)."""
+    return fit(problem, window, prior, start, max_steps=0)
+
+
+def _linear_response(fitted: Fit) -> LinearResponse:
+    """Return the linear response around the start of ``fitted``, or around its end if the start is too far from it.
+
+    The start is far from the window where a state is not measured. The error of the linearisation would then pass for a
+    component.
+    """
+    response = LinearResponse(fitted)
+    error = response.chi_square - fitted.chi_square
+    is_linear = error <= DECISIVE * max(fitted.chi_square / fitted.count, 1.0)
+    return response if is_linear else LinearResponse(fitted.linearised_at_end())
+
+
+def screen_fit(fitted: Fit) -> ScreeningResult:
+    """Return what a component would gain at most, around ``fitted``, on a coarse grid.
+
+    Spectra cost most: those over time are tested in one window, those over angles in the next.
+    """
+    problem, index = fitted.problem, fitted.window.index
+    response = _linear_response(fitted)
+    kind = (SourceKind.TIME, SourceKind.PLACE)[index % 2]
+    source_kinds = [source.kind for source in sources(problem.base_model)]
+    forms = [
+        form
+        for form in allowed_forms(problem, response.x)
+        if problem.discover and (len(form.model.phases) == 1 or source_kinds[form.source] is kind)
+    ]
+    alternatives = Alternatives.among(problem, forms)
+    spectral = [form for form in forms if len(form.model.phases) > 1]
+    others = [form for form in forms if len(form.model.phases) == 1]
+    guesses = grid_guesses(response, others, COARSE) + promising_lines(response, spectral, alternatives)
+    gain = float(Screening.of(response, guesses, alternatives).scores.max(initial=-np.inf)) - DECISIVE
+    return ScreeningResult(gain, fitted, response)
+
+
+def promising_lines(response: LinearResponse, forms: list[CandidateForm], alternatives: Alternatives) -> list[Guess]:
+    """Return the spectral lines whose estimated gain is not far below what a search requires, those of largest gain.
+
+    A line that gains enough is left out with probability 4e-6 (:meth:`LinearResponse.estimated_gains`).
+    """
+    lines: list[tuple[float, Guess]] = []
+    for source in dict.fromkeys(form.source for form in forms):
+        of_source = [form for form in forms if form.source == source]
+        grid = inner_grid(of_source[0], response.x, COARSE)
+        gains = response.estimated_gains(source, grid)[[form.site for form in of_source]]
+        for form, row in zip(of_source, gains, strict=True):
+            required = DECISIVE + _penalty(form, alternatives, response.objective.count)
+            lines += [(row[at], (form, float(grid[at]))) for at in np.flatnonzero(row > ESTIMATE_SHARE * required)]
+    lines.sort(key=lambda line: -line[0])
+    return [guess for _, guess in lines[:MAX_LINES]]
+
+
+def _penalty(form: CandidateForm, alternatives: Alternatives, count: float) -> float:
+    """Return what is subtracted from the gain of a form, in -2 log evidence of ``count`` measured values."""
+    return float(_parameter_count(form) * np.log(count) + 2.0 * np.log(3.0 * alternatives.of(form)))

@@ -1,0 +1,483 @@
+"""What a recording offers to the twin of a machine: sampling, excitation, expected accuracy and computing time.
+
+The expected accuracy is the Cramér-Rao bound of a window at the nominal parameters. It needs no estimate, and it is as
+right as the noise levels of the machine file.
+"""
+
+import math
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from otolith.acquisition.recording_statistics import RecordingStatistics, SignalSampling
+from otolith.acquisition.window import Verdict, Window
+from otolith.adaptation.state import initial_state
+from otolith.estimation.information import QUANTILE, AccuracyTarget, Identifiability, classify, information
+from otolith.estimation.objective import Objective, adc_step
+from otolith.estimation.problem import Problem, WindowOptions
+from otolith.machine import MIN_WINDOW_RECORDS, LoadedMachine
+from otolith.runtime.replay import Replay, Stopped, open_recorded
+from otolith.runtime.worker import perform, warm_up
+
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+MAX_ANALYSED = 8  # windows whose information is computed
+TIMED_WINDOWS = 4  # whose computing time is measured
+TIMING_BUDGET = 20.0  # s of computing, after which no further window is timed
+MIN_MOTION = 12.0  # standard deviations of the noise: range of an output that moves in a window
+MAX_PERIOD_ERROR = 0.02  # share by which the sample period may differ from the interval of the fastest signal
+MAX_LENGTHENING = 10.0  # times the length of a window: a parameter that needs more needs another experiment
+MIN_PROPOSED_WINDOWS = 3  # windows of the proposed length that the recording has at least
+MIN_REMARKED_JITTER = 0.5  # of the interval: a larger jitter is remarked
+MAX_REFUSALS = 5  # causes of refused windows that are listed
+WIDTH = 80  # columns of a terminal
+FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # sentences that differ by their numbers only are of one kind
+
+Item = TypeVar("Item")
+
+
+class EvenSpread(Generic[Item]):
+    """At most ``count`` of many items, evenly spread; holds at most twice as many at a time."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._kept: list[Item] = []
+        self._stride, self._seen = 1, 0
+
+    def add(self, item: Item) -> None:
+        """Add an item."""
+        if self._seen % self._stride == 0:
+            self._kept.append(item)
+        self._seen += 1
+        if len(self._kept) > 2 * self._count:
+            self._kept, self._stride = self._kept[::2], 2 * self._stride
+
+    def chosen(self) -> list[Item]:
+        """Return the items, from the first to the last of those that are held."""
+        count = min(self._count, len(self._kept))
+        return [self._kept[round(index * (len(self._kept) - 1) / max(count - 1, 1))] for index in range(count)]
+
+
+@dataclass(frozen=True, slots=True)
+class SignalPreview:
+    """How one signal was sampled; times in s."""
+
+    unit: str
+    samples: int
+    blank: int
+    interval_s: float | None
+    """Median; None if there are not two samples."""
+    jitter: float
+    """Standard deviation of the intervals over their median."""
+    gaps: int
+    longest_gap_s: float | None
+    longest_gap_start: float | None
+    longest_gap_line: int | None
+    duplicates: int
+    repeated_times: int
+    repeats: int
+    renewal: int
+    step: float
+    """Quantisation step in the unit of the signal; 0 if the values show none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedAccuracy:
+    """What the analysed windows can tell about one parameter."""
+
+    unit: str
+    nominal: float
+    required: float
+    """Largest half-width of the 95 % interval of a determined parameter."""
+    half_width: float | None
+    """Expected half-width from one window, median over the windows; None if they do not determine the parameter."""
+    determined: int
+    """Windows that are expected to determine it."""
+    reason: str
+    """Why the other windows do not."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowPreview:
+    """The windows of the recording, and what is expected of them."""
+
+    length_s: float
+    sample_period_s: float
+    count: int
+    usable: int
+    """Of good quality."""
+    moving: int
+    """Usable windows in which an output moves by more than its noise."""
+    analysed: int
+    refusals: tuple[str, ...]
+    """Why windows were refused, one sentence per cause with its count."""
+    parameters: dict[str, ExpectedAccuracy]
+
+    @property
+    def usable_share(self) -> float:
+        """Share of usable windows, 0 to 1."""
+        return self.usable / max(self.count, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """Everything that was measured of a recording."""
+
+    data: str
+    rows: int
+    start: float | None
+    """Time of the earliest row, s."""
+    end: float | None
+    steps_back: int
+    signals: dict[str, SignalPreview]
+    windows: WindowPreview
+    """As the machine file configures them."""
+    proposed: WindowPreview
+    """With the proposed length and sample period; the same if those of the file fit."""
+    computing_s: float | None
+    """Computing time of a window of ``proposed``, s, median of some windows; None if it was not measured."""
+    longest_computing_s: float | None
+    """The longest of these times, s."""
+    remarks: tuple[str, ...]
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether parameters can be estimated from any window, as the machine file configures them."""
+        return self.windows.usable > 0
+
+    def document(self) -> dict[str, Any]:
+        """Return the preview as plain values for JSON."""
+        return asdict(self)
+
+
+def preview_recording(
+    machine: LoadedMachine,
+    data: Path,
+    stopped: Stopped = lambda: False,
+    *,
+    max_rows: float = math.inf,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Preview:
+    """Return the preview of ``data``, or without computing times that of its first ``max_rows`` rows.
+
+    ``progress`` is called with a line of text from time to time.
+
+    Raises:
+        ConfigurationError: the file cannot be read as the signals of the twin.
+    """
+    run, windows, chosen = _survey(machine, data, stopped, max_rows, progress)
+    statistics = run.statistics
+    duration = max(statistics.last - statistics.first, 0.0)
+    proposed, best = windows, machine
+    period = _proposed_period(statistics, machine.file.window.sample_period)
+    for _ in range(2):  # the sample period first, then the length that its windows ask for
+        length = _proposed_length(proposed, duration, period)
+        if (length, period) == (proposed.length_s, proposed.sample_period_s):
+            break
+        candidate = _with_window(machine, length, period)
+        _, preview, others = _survey(candidate, data, stopped, max_rows, progress)
+        if preview.usable_share < proposed.usable_share:
+            break
+        proposed, best, chosen = preview, candidate, others
+    progress("measuring the computing time of windows")
+    seconds = _computing_seconds(best, chosen) if math.isinf(max_rows) else []
+    samplings = statistics.signals()
+    return Preview(
+        data=str(data),
+        rows=statistics.rows,
+        start=statistics.first if statistics.rows else None,
+        end=statistics.last if statistics.rows else None,
+        steps_back=statistics.steps_back,
+        signals={name: _signal(machine.twin.unit_of(name), sampling) for name, sampling in samplings.items()},
+        windows=windows,
+        proposed=proposed,
+        computing_s=median(seconds) if seconds else None,
+        longest_computing_s=max(seconds, default=None),
+        remarks=(*_remarks(statistics, samplings), *run.unused_samples()),
+    )
+
+
+def _survey(
+    machine: LoadedMachine, data: Path, stopped: Stopped, max_rows: float, progress: Callable[[str], None]
+) -> tuple[Replay, WindowPreview, list[Window]]:
+    """Return the replay that has cut all windows of the data, their preview, and the windows that were analysed."""
+    usable, moving = EvenSpread[Window](MAX_ANALYSED), EvenSpread[Window](MAX_ANALYSED)
+    counts, refusals = Counter[str](), Counter[str]()
+    examples: dict[str, str] = {}
+    with open_recorded(machine, data) as reader:
+        run = Replay(machine, reader, stopped)
+        for window in run.windows():
+            counts["all"] += 1
+            progress(f"preview of window {window.index}, {run.progress:.0%} of the data")
+            for reason in window.quality.reasons:
+                kind = FIGURE.sub("…", reason)
+                refusals[kind] += 1
+                examples.setdefault(kind, reason)
+            if window.quality.verdict is Verdict.GOOD:
+                counts["usable"] += 1
+                usable.add(window)
+                if _moves(machine.problem, window):
+                    counts["moving"] += 1
+                    moving.add(window)
+            if run.statistics.rows > max_rows:
+                break
+    chosen = moving.chosen() or usable.chosen()
+    preview = WindowPreview(
+        length_s=machine.file.window.length,
+        sample_period_s=machine.file.window.sample_period,
+        count=counts["all"],
+        usable=counts["usable"],
+        moving=counts["moving"],
+        analysed=len(chosen),
+        refusals=tuple(f"{count} like: {examples[kind]}" for kind, count in refusals.most_common(MAX_REFUSALS)),
+        parameters=expected_accuracy(machine.problem, chosen),
+    )
+    return run, preview, chosen
+
+
+def _moves(problem: Problem, window: Window) -> bool:
+    for output, noise in zip(problem.twin.outputs, problem.noise, strict=True):
+        values = window.column(output.name)[~window.missing_in(output.name)]
+        if len(values) and np.ptp(values) > MIN_MOTION * noise + 2.0 * adc_step(values):
+            return True
+    return False
+
+
+def expected_accuracy(problem: Problem, windows: Sequence[Window]) -> dict[str, ExpectedAccuracy]:
+    """Return by name what each of ``windows`` can tell about the free parameters, if these are nominal."""
+    required = problem.determined_within * problem.scale
+    half_widths = np.full((len(windows), len(problem.free)), np.inf)
+    reasons: list[list[tuple[Identifiability, str]]] = []
+    for row, window in zip(half_widths, windows, strict=True):
+        objective = Objective(problem, window, problem.nominal)
+        _, jacobian = objective.linearise(objective.guess(problem.nominal))
+        uncertainty = information(jacobian, objective.high - objective.low, 1.0)
+        row[:] = QUANTILE * uncertainty.sd[: len(row)]
+        targets = [AccuracyTarget(float(required[index]), free.unit, False) for index, free in enumerate(problem.free)]
+        reasons.append([classify(uncertainty, index, objective.names, target) for index, target in enumerate(targets)])
+    accuracies = {}
+    for index, free in enumerate(problem.free):
+        kinds = [row[index] for row in reasons if row[index][0] is not Identifiability.DETERMINED]
+        usual = Counter(kind for kind, _ in kinds).most_common(1)
+        usual_width = float(np.median(half_widths[:, index])) if len(windows) else math.inf
+        accuracies[free.name] = ExpectedAccuracy(
+            unit=free.unit,
+            nominal=free.nominal,
+            required=float(required[index]),
+            half_width=usual_width if math.isfinite(usual_width) else None,
+            determined=int(np.count_nonzero(half_widths[:, index] <= required[index])),
+            reason=next((text for kind, text in kinds if kind is usual[0][0]), "") if usual else "",
+        )
+    return accuracies
+
+
+def _proposed_period(statistics: RecordingStatistics, configured: float) -> float:
+    """Return the interval of the fastest signal in s, with three digits; ``configured`` if that fits."""
+    fastest = min((sampling.interval for sampling in statistics.signals().values()), default=math.inf)
+    if not math.isfinite(fastest) or abs(fastest / configured - 1.0) <= MAX_PERIOD_ERROR:
+        return configured
+    return float(f"{np.clip(fastest, 1e-4, 10.0):.3g}")
+
+
+def _whole_length(length: float, period: float) -> float:
+    """Return the nearest length in s that a machine file accepts."""
+    records = max(round(length / period), MIN_WINDOW_RECORDS, math.ceil(0.1 / period))
+    return float(f"{records * period:.9g}")
+
+
+def _proposed_length(windows: WindowPreview, duration: float, period: float) -> float:
+    """Return a length in s, a multiple of ``period``, at which a window determines what a longer window can.
+
+    The variance of an estimate falls with the length. If there is no window, it is one that fits into ``duration``.
+    """
+    longest = duration / MIN_PROPOSED_WINDOWS
+    if not windows.count:
+        return _whole_length(min(longest, windows.length_s), period)
+    factors = [
+        (accuracy.half_width / accuracy.required) ** 2
+        for accuracy in windows.parameters.values()
+        if accuracy.half_width is not None
+    ]
+    wanted = max((factor for factor in factors if factor <= MAX_LENGTHENING), default=1.0) * windows.length_s
+    if wanted <= windows.length_s or wanted > longest:
+        return _whole_length(windows.length_s, period)
+    digit = 10.0 ** math.floor(math.log10(wanted))
+    nice = next(factor * digit for factor in (1.0, 2.0, 5.0, 10.0) if factor * digit >= wanted)
+    return _whole_length(min(nice, longest, 600.0), period)
+
+
+def _with_window(machine: LoadedMachine, length: float, period: float) -> LoadedMachine:
+    """Return the machine with windows of ``length`` s and ``period`` s between records."""
+    window = machine.file.window
+    if (length, period) == (window.length, window.sample_period):
+        return machine
+    changes = {"length": length, "sample_period": period, "shortest": None, "longest": None}
+    file = machine.file.model_copy(update={"window": window.model_copy(update=changes)})
+    records = round(length / period)
+    problem = replace(machine.problem, window=WindowOptions(records, records, records))
+    return replace(machine, file=file, problem=problem)
+
+
+def _computing_seconds(machine: LoadedMachine, windows: Sequence[Window]) -> list[float]:
+    """Return the computing times of some windows that are estimated from, s.
+
+    The first is left out if there are others: its estimate begins with a search of the bounds by a swarm.
+    """
+    identity = machine.file.machine
+    state = initial_state(identity.name, identity.site, machine.problem)
+    seconds: list[float] = []
+    if windows:
+        warm_up(state)
+    for window in windows[:TIMED_WINDOWS]:
+        result = perform(state, window)
+        state = result.state
+        if result.report is not None and result.report.document.fit is not None:
+            seconds.append(result.seconds)
+        if sum(seconds) > TIMING_BUDGET:
+            break
+    return seconds[1:] or seconds
+
+
+def _signal(unit: str, sampling: SignalSampling) -> SignalPreview:
+    gap = sampling.longest_gap
+    return SignalPreview(
+        unit=unit,
+        samples=sampling.samples,
+        blank=sampling.blank,
+        interval_s=sampling.interval if math.isfinite(sampling.interval) else None,
+        jitter=sampling.jitter,
+        gaps=sampling.gaps,
+        longest_gap_s=None if gap is None else gap.seconds,
+        longest_gap_start=None if gap is None else gap.start,
+        longest_gap_line=None if gap is None else gap.line,
+        duplicates=sampling.duplicates,
+        repeated_times=sampling.repeated_times,
+        repeats=sampling.repeats,
+        renewal=sampling.renewal,
+        step=adc_step(sampling.values),
+    )
+
+
+def _remarks(statistics: RecordingStatistics, samplings: dict[str, SignalSampling]) -> Iterator[str]:
+    """Yield what a user should know of the rows, a sentence each; signals with the same remark share it."""
+    if statistics.first_step_back is not None:
+        line, time, before = statistics.first_step_back
+        count = f"{statistics.steps_back} steps back in time"
+        yield f"{count}, the first in line {line}: t = {time:.12g} after t = {before:.12g}"
+    shared: dict[str, list[str]] = {}
+    for name, sampling in samplings.items():
+        for remark in _signal_remarks(sampling):
+            shared.setdefault(remark, []).append(name)
+    yield from (f"{', '.join(names)}: {remark}" for remark, names in shared.items())
+
+
+def _signal_remarks(sampling: SignalSampling) -> Iterator[str]:
+    if not sampling.samples:
+        yield "no sample"
+    if (gap := sampling.longest_gap) is not None:
+        yield f"the longest gap is {duration_text(gap.seconds)}, from t = {gap.start:.12g} s to line {gap.line}"
+    if sampling.duplicates:
+        share = sampling.duplicates / sampling.samples
+        yield f"{sampling.duplicates} samples ({share:.0%}) have time and value of the sample before"
+    if sampling.repeated_times:
+        yield f"{sampling.repeated_times} samples have the time of the sample before, but another value"
+    if sampling.renewal > 1:
+        every = duration_text(sampling.renewal * sampling.interval)
+        yield f"the value changes with every {_ordinal(sampling.renewal)} sample only, about every {every}"
+    if sampling.jitter > MIN_REMARKED_JITTER:
+        yield f"the intervals vary by {sampling.jitter:.0%} (standard deviation over median)"
+
+
+def _ordinal(number: int) -> str:
+    ending = "th" if 10 <= number % 100 <= 20 else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{ending}"
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration with three digits, in ms below one second."""
+    return f"{seconds * 1e3:.3g} ms" if seconds < 1.0 else f"{seconds:.4g} s"
+
+
+def computing_time_text(seconds: float, longest: float, length: float) -> str:
+    """Return usual and longest computing time of a window of ``length`` s, and whether it is too long for operation."""
+    text = f"a window of {length:.9g} s takes {duration_text(seconds)} to compute, at most {duration_text(longest)}"
+    return f"slower than real time: {text}" if seconds > length else text
+
+
+def preview_lines(preview: Preview) -> Iterator[str]:
+    """Yield the whole preview as lines of text, at most 80 columns wide."""
+    seconds = (preview.end or 0.0) - (preview.start or 0.0)
+    yield f"{Path(preview.data).name}: {preview.rows} rows in {seconds:.6g} s"
+    yield f"  {'signal':18}{'samples':>10}{'every':>9}{'jitter':>8}{'gaps':>7}{'longest':>9}{'step':>10}{'twice':>7}"
+    for name, signal in preview.signals.items():
+        label = f"{name} [{signal.unit}]"
+        every = "-" if signal.interval_s is None else duration_text(signal.interval_s)
+        longest = "-" if signal.longest_gap_s is None else duration_text(signal.longest_gap_s)
+        step = f"{signal.step:.3g}" if signal.step else "-"
+        cells = f"{signal.samples:>10}{every:>9}{signal.jitter:>8.1%}{signal.gaps:>7}{longest:>9}{step:>10}"
+        yield f"  {label if len(label) <= 18 else name[:18]:18}{cells}{signal.duplicates + signal.repeated_times:>7}"
+    for remark in preview.remarks:
+        yield from _wrapped(f"! {remark}")
+    yield from _window_lines(preview.windows)
+    if preview.proposed != preview.windows:
+        window = preview.proposed
+        yield "proposed for the machine file:"
+        yield "  [window]"
+        yield f'  length = "{window.length_s:.9g} s"'
+        yield f'  sample_period = "{window.sample_period_s * 1e3:.6g} ms"'
+        yield from _window_lines(window)
+    yield from _accuracy_lines(preview.proposed)
+    if preview.computing_s is not None and preview.longest_computing_s is not None:
+        times = (preview.computing_s, preview.longest_computing_s)
+        yield from _wrapped(computing_time_text(*times, preview.proposed.length_s), indent="")
+
+
+def short_lines(preview: Preview, max_rows: float = math.inf) -> Iterator[str]:
+    """Yield the preview in a few lines, for the start of a replay; ``max_rows`` as in :func:`preview_recording`."""
+    part = "at the beginning, " if preview.rows > max_rows else ""
+    rates: dict[str, list[str]] = {}
+    for name, signal in preview.signals.items():
+        rates.setdefault("-" if signal.interval_s is None else duration_text(signal.interval_s), []).append(name)
+    yield from _wrapped(part + "; ".join(f"{', '.join(names)} every {rate}" for rate, names in rates.items()))
+    for remark in preview.remarks:
+        yield from _wrapped(f"! {remark}")
+    yield from _window_lines(preview.windows)
+    expected = [
+        f"{name} undetermined" if accuracy.half_width is None else f"{name} ±{accuracy.half_width:.2g} {accuracy.unit}"
+        for name, accuracy in preview.windows.parameters.items()
+        if preview.windows.analysed
+    ]
+    if expected:
+        yield from _wrapped(f"expected 95 % intervals from one window: {', '.join(expected)}")
+
+
+def _window_lines(windows: WindowPreview) -> Iterator[str]:
+    grid = f"windows of {windows.length_s:.9g} s with a record every {duration_text(windows.sample_period_s)}"
+    motion = f"{windows.moving} with motion" if windows.usable else "none to estimate from"
+    yield f"{grid}: {windows.count}, {windows.usable} usable, {motion}"
+    for refusal in windows.refusals:
+        yield from _wrapped(f"! refused: {refusal}")
+
+
+def _accuracy_lines(windows: WindowPreview) -> Iterator[str]:
+    if not windows.analysed:
+        return
+    yield f"  {'parameter':14}{'nominal':>24}{'95 % interval':>15}{'required':>12}{'determined':>13}"
+    for name, accuracy in windows.parameters.items():
+        expected = "none" if accuracy.half_width is None else f"±{accuracy.half_width:.2g}"
+        cells = f"{f'{accuracy.nominal:.5g} {accuracy.unit}':>24}{expected:>15}{f'±{accuracy.required:.2g}':>12}"
+        yield f"  {name:14}{cells}{f'{accuracy.determined} of {windows.analysed}':>13}"
+    for name, accuracy in windows.parameters.items():
+        if accuracy.reason:
+            others = " in the other windows" if accuracy.determined else ""
+            yield from _wrapped(f"! {name}{others}: {accuracy.reason}")
+
+
+def _wrapped(text: str, indent: str = "  ") -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent="    ")

@@ -1,0 +1,191 @@
+"""Bridged inputs: the stated variances are those of what can happen between the samples, by Monte Carlo."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from otolith.acquisition.bridging import (
+    BridgedInput,
+    InputSamples,
+    LostIntervals,
+    OtherSamples,
+    bridge,
+    is_recorded_on_change,
+    line_variance,
+    lost_samples,
+)
+from otolith.acquisition.samples import Interval, Series, SignalPlan, interval_of
+from otolith.acquisition.window import Array
+from tests.acquisition.series import ramp
+
+PERIOD, DRAWS = 0.01, 20_000
+COMMAND, SAMPLED = SignalPlan("u", "zoh"), SignalPlan("u", "zoh", on_change=False)
+MEASURED = SignalPlan("v", "foh")
+NO_OTHERS = OtherSamples(np.zeros(0), Interval(np.inf, np.inf))
+WITHIN = 4.0 * np.sqrt(2.0 / DRAWS)  # of a variance: four standard deviations of its estimate from DRAWS normal numbers
+
+
+def bridged(times: Array, values: Array, plan: SignalPlan, at: Array, steps: Array) -> BridgedInput:
+    series = Series(times, values)
+    own = interval_of(times)
+    others = OtherSamples(times, own)
+    return bridge(InputSamples(series, plan, own, lost_samples(series, plan, own, others)), at, steps)
+
+
+def variance_of_integral(result: BridgedInput, steps: Array) -> float:
+    """Return that of independent errors of the records."""
+    return float(np.sum(result.held_variance * steps**2))
+
+
+@pytest.mark.parametrize("lost", [1, 2, 9])
+@pytest.mark.parametrize("plan", [COMMAND, SAMPLED], ids=["on change", "sampled"])
+def test_the_variance_of_a_lost_command_is_that_of_random_change_instants(lost: int, plan: SignalPlan) -> None:
+    """It changed once, at any of the lost instants or at the next sample."""
+    before, after, at = ramp(30) * PERIOD, 29 * PERIOD + (lost + 1) * PERIOD, ramp(lost + 1)
+    times = np.concatenate([before, after + ramp(30) * PERIOD])
+    values = np.where(times < after - PERIOD / 2, 1.0, 4.0)
+    records = 29 * PERIOD + at * PERIOD
+    steps = np.full(lost + 1, PERIOD)
+    if plan is COMMAND:  # its samples are those at which it changes, and the other signals have gaps
+        own = np.array([0.0, after]), np.array([1.0, 4.0])
+        series = Series(*own)
+        others = OtherSamples(times, interval_of(times))
+        lost_in = lost_samples(series, plan, interval_of(own[0]), others)
+        result = bridge(InputSamples(series, plan, interval_of(own[0]), lost_in), records, steps)
+    else:
+        result = bridged(times, values, plan, records, steps)
+    changes = np.random.default_rng(1).integers(1, lost + 2, DRAWS)
+    truth = np.where(at[None, :] >= changes[:, None], 4.0, 1.0)
+    assert result.values == pytest.approx(truth.mean(axis=0), abs=4.0 * 1.5 / np.sqrt(DRAWS))
+    assert result.variance == pytest.approx(truth.var(axis=0), abs=9.0 * WITHIN)
+    integral = ((truth - result.values) * steps).sum(axis=1)
+    assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=2.0 * WITHIN)
+
+
+def test_the_variance_of_a_lost_command_that_always_changes_is_that_of_a_random_walk() -> None:
+    random, lost = np.random.default_rng(2), 9
+    walks = np.cumsum(random.normal(size=(DRAWS, lost + 1)), axis=1)
+    ends = walks[:, -1:]
+    share = ramp(lost + 1) / (lost + 1)
+    truth = np.concatenate([np.zeros((DRAWS, 1)), walks[:, :-1]], axis=1) - share * ends  # given both ends
+    times = np.concatenate([ramp(400), 399 + lost + 1 + ramp(400)]) * PERIOD
+    values = np.cumsum(random.normal(size=800))
+    values[400:] += values[399] - values[400]  # the walk comes back to where it was: its ends show no change
+    steps = np.full(lost + 1, PERIOD)
+    result = bridged(times, values, SAMPLED, (399 + ramp(lost + 1)) * PERIOD, steps)
+    assert result.variance[1:] == pytest.approx(truth.var(axis=0)[1:], rel=0.25)  # of the walk's own scale: 800 samples
+    integral = (truth * steps).sum(axis=1)
+    assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=0.25)
+
+
+def bridges(random: np.random.Generator, count: int) -> Array:
+    """Return random walks of ``count`` steps of variance one that end where they began, (DRAWS, count)."""
+    walks = np.cumsum(random.normal(size=(DRAWS, count)), axis=1)
+    return np.concatenate([np.zeros((DRAWS, 1)), walks[:, :-1] - walks[:, -1:] * np.arange(1, count) / count], axis=1)
+
+
+@pytest.mark.parametrize("between", [5, 20])
+def test_the_variance_of_a_line_through_a_random_walk(between: int) -> None:
+    random = np.random.default_rng(3)
+    walk = np.cumsum(random.normal(size=between * 2000))
+    times = ramp(2000) * between * PERIOD
+    at = times[1000] + np.arange(between) * PERIOD
+    steps = np.full(between, PERIOD)
+    result = bridged(times, walk[::between], MEASURED, at, steps)
+    truth = bridges(random, between)
+    assert result.variance[0] == 0.0
+    assert result.variance[1:] == pytest.approx(truth.var(axis=0)[1:], rel=0.15)  # of a walk's scale from 2000 samples
+    integral = (truth * steps).sum(axis=1)
+    assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=0.2)
+
+
+def test_the_line_variance_follows_the_length_of_the_line() -> None:
+    """A gap of eight intervals in a random walk: eight times the variance; in a smooth curve 8**4 times."""
+    random, noise = np.random.default_rng(4), 0.002
+    times = np.arange(4000.0)
+    walk = line_variance(Series(times, np.cumsum(random.normal(size=4000))), 0.0)
+    smooth = line_variance(Series(times, np.sin(times / 8.0) + noise * random.normal(size=4000)), noise)
+    for length in (1.0, 8.0):
+        assert float(walk(np.array([length]))[0]) == pytest.approx(length / 4.0, rel=0.2)
+    curvature = 0.5 / 8.0**4  # mean square of the second derivative of the sine
+    for length in (2.0, 8.0):
+        assert float(smooth(np.array([length]))[0]) == pytest.approx(curvature * length**4 / 64.0, rel=0.3)
+
+
+@pytest.mark.parametrize("late", [5, 40])
+def test_the_variance_after_the_last_sample_is_that_of_a_random_walk(late: int) -> None:
+    random = np.random.default_rng(5)
+    values = np.cumsum(random.normal(size=4000))
+    at = (3999 + ramp(late)) * PERIOD
+    steps = np.full(late, PERIOD)
+    result = bridged(ramp(4000) * PERIOD, values, MEASURED, at, steps)
+    walks = np.concatenate([np.zeros((DRAWS, 1)), np.cumsum(random.normal(size=(DRAWS, late - 1)), axis=1)], axis=1)
+    assert np.array_equal(result.values, np.full(late, values[-1]))
+    assert result.variance == pytest.approx(walks.var(axis=0), rel=0.1, abs=1e-9)
+    integral = (walks * steps).sum(axis=1)
+    assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=0.15)
+
+
+def test_before_its_first_sample_an_input_is_uncertain() -> None:
+    random = np.random.default_rng(6)
+    values = np.cumsum(random.normal(size=4000))
+    at, steps = (ramp(40) - 40) * PERIOD, np.full(40, PERIOD)
+    for plan in (MEASURED, SAMPLED, COMMAND):
+        result = bridged(ramp(4000) * PERIOD, values, plan, at, steps)
+        assert np.array_equal(result.values, np.full(40, values[0]))
+        assert result.variance == pytest.approx(40.0 - np.arange(40.0), rel=0.15)
+
+
+def test_the_noise_of_samples_that_are_far_apart_lasts_longer() -> None:
+    """The noise of a sample disturbs the states for the whole time between two samples."""
+    random, between = np.random.default_rng(7), 10
+    times, steps = np.arange(0.0, 200.0, between) * PERIOD, np.full(150, PERIOD)
+    at = ramp(150) * PERIOD
+    noise = random.normal(size=(DRAWS, len(times)))
+    integrals = np.array([np.sum(np.interp(at, times, row) * steps) for row in noise[:4000]])
+    result = bridged(times, np.zeros(len(times)), MEASURED, at, steps)
+    assert result.noise_ratio == pytest.approx(between)
+    assert np.sum(result.noise_ratio * steps**2) == pytest.approx(np.var(integrals), rel=0.1)
+
+
+def test_a_command_that_is_recorded_on_change_is_exact_while_it_holds() -> None:
+    """Other signals have their samples, so no change was lost; and a command of its own clock loses none at all."""
+    series = Series(np.array([0.0, 0.5, 1.5]), np.array([1.0, 2.0, 0.5]))
+    at = np.arange(0.0, 2.0, PERIOD)
+    others = OtherSamples(at, Interval(PERIOD, 1.5 * PERIOD))
+    assert is_recorded_on_change(COMMAND, series.values)
+    for other in (others, NO_OTHERS, OtherSamples(at[::7] + 0.003, Interval(0.07, 0.1))):
+        lost = lost_samples(series, COMMAND, interval_of(series.times), other)
+        result = bridge(InputSamples(series, COMMAND, interval_of(series.times), lost), at, np.full(len(at), PERIOD))
+        assert np.array_equal(result.values, np.where(at < 0.5, 1.0, np.where(at < 1.5, 2.0, 0.5)))
+        assert not result.variance.any()
+        assert not result.held_variance.any()
+
+
+def test_the_machine_file_says_whether_a_command_is_recorded_on_change() -> None:
+    repeated = np.array([1.0, 1.0, 2.0])
+    assert not is_recorded_on_change(COMMAND, repeated)
+    assert is_recorded_on_change(SignalPlan("u", "zoh", on_change=True), repeated)
+    assert not is_recorded_on_change(SAMPLED, np.array([1.0, 2.0]))
+
+
+@given(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=8, unique=True), st.floats(-1.0, 11.0), st.floats(0.0, 3.0))
+def test_lost_instants_are_between_the_samples_around_them(edges: list[float], start: float, length: float) -> None:
+    edges = sorted(edges)
+    begins, ends = np.array(edges[:-1]), np.array(edges[1:])
+    lost = LostIntervals(begins, ends, np.full(len(begins), 0.1))
+    instants = lost.instants(start, start + length, 1000)
+    assert (np.diff(instants) > 0.0).all()
+    assert ((instants >= start - 1e-6) & (instants <= start + length + 1e-6)).all()
+    for instant in instants:
+        at = int(np.searchsorted(begins, instant)) - 1
+        assert begins[at] < instant < ends[at]
+        assert (instant - begins[at]) / 0.1 == pytest.approx(round((instant - begins[at]) / 0.1), abs=1e-6)
+
+
+def test_lost_instants_beyond_the_limit_are_not_computed() -> None:
+    """After a burst of samples a nanosecond apart, an hour without any would have lost billions of them."""
+    lost = LostIntervals(np.array([0.0]), np.array([3600.0]), np.array([1e-9]))
+    assert not len(lost.instants(0.0, 3600.0, 1000))
+    assert lost.instants(0.0, 10.7e-9, 10) == pytest.approx(1e-9 * np.arange(1, 11))

@@ -1,0 +1,225 @@
+"""Recordings as loggers write them: repeated rows, stale values, held commands, slow rows, gaps and joins.
+
+Every recording is replayed through the command line with the default limits.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.sampling.measure import (
+    FREE,
+    WINDOW,
+    WindowOutcome,
+    outcome,
+    some_motor,
+    summarise,
+    write_machine,
+)
+from benchmarks.sampling.plant import Motor, Voltage
+from benchmarks.sampling.schedules import Recording, Schedule, Timing, record
+
+from otolith.acquisition.window import Verdict, Window
+from otolith.cli.replay import replay
+from otolith.discovery.decision import ACCEPTED
+from otolith.health.schema import ReportDocument
+from otolith.machine import load_machine
+from otolith.runtime.replay import Replay, open_recorded
+
+WINDOWS = 10
+UNIFORM = Schedule(rows=Timing(0.01))
+Rows = list[list[str]]
+
+
+def recorded(schedule: Schedule, seed: int = 7, length: float = WINDOWS * WINDOW + 1.0) -> Recording:
+    random = np.random.default_rng(seed)
+    return record(schedule, some_motor(random), length, random)
+
+
+def write(folder: Path, header: Sequence[str], rows: Rows) -> Path:
+    path = folder / "recording.csv"
+    path.write_text("".join(",".join(row) + "\n" for row in [header, *rows]), encoding="utf-8")
+    return path
+
+
+class Log:
+    """A folder with a machine file and a table, and what the command line prints of them."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder, self._capsys = folder, capsys
+
+    def reports(self, schedule: Schedule, header: Sequence[str], rows: Rows) -> list[ReportDocument]:
+        machine, data = write_machine(self.folder, schedule), write(self.folder, header, rows)
+        self._capsys.readouterr()
+        replay(machine, data, None, as_json=True, stopped=lambda: False)
+        return [ReportDocument.from_json(line) for line in self._capsys.readouterr().out.splitlines()]
+
+    def of(self, schedule: Schedule, recording: Recording) -> list[ReportDocument]:
+        return self.reports(schedule, recording.header, recording.rows())
+
+
+@pytest.fixture
+def log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Log:
+    return Log(tmp_path, capsys)
+
+
+def cut(folder: Path, schedule: Schedule, recording: Recording) -> list[Window]:
+    """Windows of a recording, without estimating from them."""
+    machine = load_machine(write_machine(folder, schedule), with_driver=False)
+    with open_recorded(machine, write(folder, recording.header, recording.rows())) as opened:
+        return list(Replay(machine, opened).windows())
+
+
+def assert_used(documents: Sequence[ReportDocument], at_least: int = WINDOWS) -> None:
+    """Every window is good and updates the estimates."""
+    reasons = [(document.window.quality.reasons, document.decision) for document in documents]
+    assert len(documents) >= at_least, reasons
+    assert all(document.window.quality.verdict is Verdict.GOOD for document in documents), reasons
+    assert all(document.decision in ACCEPTED for document in documents), reasons
+
+
+def assert_honest(outcomes: Sequence[WindowOutcome]) -> None:
+    """Intervals hold the truth, except in as many windows as chance explains, and the errors are near the bound."""
+    summary = summarise(outcomes)
+    share = 3.3 * np.sqrt(0.95 * 0.05 / summary.windows)
+    assert (summary.raw_coverage >= 0.95 - share).all(), summary.raw_coverage
+    assert (summary.published_coverage >= 0.95 - share).all(), summary.published_coverage
+    assert (summary.spread <= 1.0 + 3.3 / np.sqrt(2.0 * summary.windows)).all(), summary.spread
+
+
+def test_each_row_twice_gives_the_estimates_of_each_row_once(log: Log) -> None:
+    recording = recorded(UNIFORM)
+    once, twice = log.of(UNIFORM, recording), log.of(UNIFORM, replace(recording, copies=2))
+    assert_used(once)
+    assert_used(twice)
+    for alone, repeated in zip(once, twice, strict=True):
+        for name in FREE:
+            assert repeated.parameters[name].raw == pytest.approx(alone.parameters[name].raw, rel=1e-6)
+            assert repeated.parameters[name].raw_sd == pytest.approx(alone.parameters[name].raw_sd, rel=1e-3)
+
+
+@pytest.mark.parametrize("copied", ["outputs", "all signals"])
+def test_a_register_renewed_every_fifth_row_is_used_and_counted_once(log: Log, copied: str) -> None:
+    """Stale repeats carry no information: they neither veto a window nor narrow its intervals."""
+    timing = Timing(renewed_every=5)
+    schedule = replace(UNIFORM, i=timing, omega=timing)
+    recording = recorded(schedule)
+    rows = recording.rows()
+    if copied == "all signals":
+        slow = Timing(0.05)
+        schedule = Schedule(rows=slow)
+        recording = recorded(schedule)
+        rows = [[f"{float(row[0]) + 0.01 * copy:.6f}", *row[1:]] for row in recording.rows() for copy in range(5)]
+    documents = log.reports(schedule, recording.header, rows)
+    assert_used(documents)
+    assert_honest([outcome(recording, document) for document in documents])
+
+
+COMMANDS = {
+    "steps": Schedule(voltage="steps", commands_on_change=True),
+    "outputs every 50 ms": Schedule(i=Timing(0.05), omega=Timing(0.05), commands_on_change=True),
+    "outputs mostly missing": Schedule(i=Timing(missing=0.8), omega=Timing(missing=0.8), commands_on_change=True),
+    "sampled every 10 ms": Schedule(voltage="sine"),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_is_held_between_its_samples(tmp_path: Path, name: str) -> None:
+    """No sample of it is lost, at whatever times the other signals have theirs."""
+    schedule = COMMANDS[name]
+    for seed in (7, 8, 9):
+        recording = recorded(schedule, seed, length=8.0)
+        windows = cut(tmp_path, schedule, recording)
+        assert len(windows) >= 3
+        for window in windows:
+            times = window.start + window.grid.offsets
+            nearest = np.abs(times[:, None] - recording.inputs.voltage_times).min(axis=1)
+            clear = nearest > 1e-6  # a record at the very time of a change may have either value
+            assert window.column("V_a")[clear] == pytest.approx(recording.inputs.voltage(times[clear]), abs=1e-9)
+            assert window.quality.verdict is Verdict.GOOD, window.quality.reasons
+
+
+@pytest.mark.parametrize("voltage", ["steps", "levels"])
+def test_commands_on_change_give_honest_estimates(log: Log, voltage: Voltage) -> None:
+    schedule = Schedule(voltage=voltage, commands_on_change=True)
+    recording = recorded(schedule)
+    documents = log.of(schedule, recording)
+    assert_used(documents)
+    assert_honest([outcome(recording, document) for document in documents])
+
+
+SLOW_OMEGA = Schedule(rows=Timing(0.01), omega=Timing(missing=0.8))
+LOGS = {
+    "rows every 10.7 ms": Schedule(rows=Timing(0.0107)),
+    "rows every 3.5 ms": Schedule(rows=Timing(0.0035)),
+    "30 % of rows missing": Schedule(rows=Timing(missing=0.3), load="walk", load_noise=True),
+    "rows with jitter": Schedule(rows=Timing(jitter=0.5), load="walk", load_noise=True),
+    "omega every 50 ms": Schedule(omega=Timing(0.05)),
+    "80 % of omega missing": SLOW_OMEGA,
+    "i every 100 ms, omega every 20 ms": Schedule(i=Timing(0.1), omega=Timing(0.02)),
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_an_irregular_or_slow_log_is_used_with_honest_intervals(log: Log, name: str) -> None:
+    schedule, outcomes = LOGS[name], []
+    for seed in (7, 8):
+        recording = recorded(schedule, seed)
+        documents = log.of(schedule, recording)
+        assert_used(documents)
+        outcomes += [outcome(recording, document) for document in documents]
+    assert_honest(outcomes)
+
+
+def test_outputs_are_never_interpolated(tmp_path: Path) -> None:
+    """A record counts as a measurement only where the log has a sample, with the value of that sample."""
+    recording = recorded(Schedule(omega=Timing(0.05)), length=8.0)
+    windows = cut(tmp_path, Schedule(omega=Timing(0.05)), recording)
+    assert len(windows) >= 3
+    for window in windows:
+        for name in ("i", "omega"):
+            own = recording.samples[name]
+            part = (own.stated >= window.start - 1e-9) & (own.stated < window.end - 1e-9)
+            present = ~window.missing_in(name)
+            assert present.sum() == part.sum()
+            assert window.column(name)[present] == pytest.approx(own.values[part], rel=1e-12)
+            assert (window.start + window.grid.offsets)[present] == pytest.approx(own.stated[part], abs=1e-6)
+
+
+@pytest.mark.parametrize("period", [0.01, 0.0107])
+def test_a_gap_of_27_s_at_the_start_does_not_spoil_what_follows(log: Log, period: float) -> None:
+    """The windows begin anew with the first sample after it."""
+    schedule = Schedule(rows=Timing(period))
+    gap_end = 27.5
+    recording = recorded(schedule, length=gap_end + WINDOWS * WINDOW + 0.2).without(0.5, gap_end)
+    outcomes = [outcome(recording, document) for document in log.of(schedule, recording)]
+    after = [item for item in outcomes if item.document.window.start >= gap_end - period]
+    assert_used([item.document for item in after])
+    assert_honest(after)
+    refused = [item.document.window for item in outcomes if item.document.window.start < gap_end - period]
+    assert all(window.quality.verdict is Verdict.BAD and window.quality.reasons for window in refused)
+
+
+def joined(later: float) -> tuple[Recording, Rows]:
+    """Two recordings of one motor of 7 s each, the second ``later`` s after the start of the first."""
+    random = np.random.default_rng(9)
+    motor: Motor = some_motor(random)
+    first, second = (record(UNIFORM, motor, 7.0, random) for _ in range(2))
+    rows = [[*row, "1"] for row in first.rows()] + [[*row, "2"] for row in second.rows(shift=later)]
+    return first, rows
+
+
+@pytest.mark.parametrize("later", [7.0, 0.0], ids=["times go on", "times begin anew"])
+def test_two_recordings_joined_by_a_segment_column_share_no_window(log: Log, later: float) -> None:
+    first, rows = joined(later)
+    documents = log.reports(UNIFORM, [*first.header, "segment"], rows)
+    assert_used(documents, at_least=6)
+    if later:
+        ends = [(document.window.start, document.window.end) for document in documents]
+        assert not any(start < later - 0.005 < end - 0.01 for start, end in ends), ends
+    truth = [getattr(first.motor, name) for name in FREE]
+    for name, value in zip(FREE, truth, strict=True):
+        last = documents[-1].parameters[name]
+        assert last.value == pytest.approx(value, rel=0.01)

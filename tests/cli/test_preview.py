@@ -1,0 +1,209 @@
+"""The preview of a recording: properties of a generated file are printed; short files and slow cores are named."""
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from otolith.cli.main import cli
+from otolith.cli.replay import replay
+from otolith.machine import load_machine
+from otolith.runtime.preview import Preview, preview_lines, preview_recording, short_lines
+from otolith_drivers.plant.dc_motor import MotorScenario
+from tests.cli.replays import MACHINE, Lines, recorded, written
+from tests.conftest import EXAMPLES
+from tests.drivers.logs import frames_of
+from tests.drivers.logs import written as written_log
+
+
+@pytest.fixture
+def rows(scenario: MotorScenario) -> Lines:
+    return recorded(scenario, 6)
+
+
+def previewed(data: Path, window: str = "", max_rows: float = np.inf) -> Preview:
+    machine = data.parent / "machine.toml"
+    machine.write_text(MACHINE.read_text(encoding="utf-8") + f"[window]\n{window}\n", encoding="utf-8")
+    loaded = load_machine(machine, with_driver=False)
+    return preview_recording(loaded, data, max_rows=max_rows)
+
+
+def retimed(rows: Lines, times: Sequence[float]) -> Lines:
+    return [[f"{time:.6f}", *row[1:]] for time, row in zip(times, rows, strict=True)]
+
+
+def check(*arguments: Path | str) -> Result:
+    return CliRunner().invoke(cli, ["check", *map(str, arguments)], standalone_mode=False)
+
+
+def row_of(text: str, label: str) -> list[str]:
+    (line,) = [line for line in text.splitlines() if line.startswith(f"  {label} ")]
+    return line.split()
+
+
+def test_a_clean_file_is_usable_and_every_line_fits_80_columns(tmp_path: Path, rows: Lines) -> None:
+    result = check(MACHINE, written(tmp_path, rows))
+    assert result.return_value == 0, result.exception
+    text = result.output[result.output.index("data.csv: ") :]
+    assert "data.csv: 1200 rows in 11.99 s" in text
+    assert row_of(text, "omega [rad/s]")[2:8] == ["1200", "10", "ms", "0.0%", "0", "-"]
+    assert "windows of 2 s with a record every 10 ms: 6, 6 usable, 6 with motion" in text
+    assert row_of(text, "R_a")[-3:] == ["6", "of", "6"]
+    assert re.search(r"a window of 2 s takes [\d.]+ m?s to compute", text)
+    assert "proposed" not in text
+    assert "!" not in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_rate_jitter_and_proposed_window(tmp_path: Path, rows: Lines) -> None:
+    random = np.random.default_rng(1)
+    times = np.arange(len(rows)) * 0.01 * 2.0 + random.uniform(-0.002, 0.002, len(rows))
+    preview = previewed(written(tmp_path, retimed(rows, times.tolist())))
+    omega = preview.signals["omega"]
+    assert omega.interval_s == pytest.approx(0.02, rel=0.01)
+    assert omega.jitter == pytest.approx(0.002 * np.sqrt(2.0 / 3.0) / 0.02, rel=0.1)
+
+
+def test_a_gap_is_shown_with_length_and_place(tmp_path: Path, rows: Lines) -> None:
+    times = [index * 0.01 + 3.0 * (index >= 700) for index in range(len(rows))]
+    preview = previewed(written(tmp_path, retimed(rows, times)))
+    text = "\n".join(preview_lines(preview))
+    assert row_of(text, "i [A]")[6:9] == ["1", "3.01", "s"]
+    (remark,) = [remark for remark in preview.remarks if "gap" in remark]
+    assert remark == "V_a, T_load, i, omega: the longest gap is 3.01 s, from t = 6.99 s to line 702"
+
+
+def test_rows_that_come_twice_and_steps_back_are_counted(tmp_path: Path, rows: Lines) -> None:
+    twice = [row for row in rows[:600] for _ in range(2)]
+    preview = previewed(written(tmp_path, [*twice, *rows[500:]]))
+    assert preview.signals["omega"].duplicates == 600
+    assert preview.steps_back == 1
+    assert "1 steps back in time, the first in line 1202: t = 5 after t = 5.99" in preview.remarks
+    assert any("600 samples (32%) have time and value of the sample before" in remark for remark in preview.remarks)
+
+
+def test_quantisation_step_and_slow_register(tmp_path: Path, rows: Lines) -> None:
+    values = np.array([float(row[4]) for row in rows])
+    slow = np.repeat(values[::5], 5)
+    coarse = [f"{round(float(row[3]) / 0.004) * 0.004:.3f}" for row in rows]
+    changed = [[*row[:3], *cells] for row, *cells in zip(rows, coarse, map(str, slow), strict=True)]
+    preview = previewed(written(tmp_path, changed))
+    assert preview.signals["i"].step == pytest.approx(0.004)
+    assert preview.signals["omega"].renewal == 5
+    assert "omega: the value changes with every 5th sample only, about every 50 ms" in preview.remarks
+    assert row_of("\n".join(preview_lines(preview)), "i [A]")[-2:] == ["0.004", "0"]
+
+
+def test_the_expected_accuracy_is_that_of_the_estimates(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = written(tmp_path, rows)
+    expected = previewed(data).windows.parameters
+    replay(MACHINE, data, None, as_json=True, stopped=lambda: False)
+    reports = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    for name, accuracy in expected.items():
+        measured = np.median([1.96 * report["parameters"][name]["raw_sd"] for report in reports])
+        assert accuracy.half_width == pytest.approx(measured, rel=0.2)
+        assert accuracy.determined == 6
+
+
+def test_a_machine_at_rest_has_no_motion_and_determines_nothing(tmp_path: Path, rows: Lines) -> None:
+    random = np.random.default_rng(1)
+    resting = [
+        [row[0], "0", "0", repr(0.005 * random.standard_normal()), repr(0.02 * random.standard_normal())]
+        for row in rows
+    ]
+    preview = previewed(written(tmp_path, resting))
+    assert (preview.windows.usable, preview.windows.moving) == (6, 0)
+    assert all(accuracy.determined == 0 for accuracy in preview.windows.parameters.values())
+    assert all(accuracy.reason for accuracy in preview.windows.parameters.values())
+
+
+def test_a_window_that_is_too_short_for_its_noise_gets_a_longer_one(tmp_path: Path, rows: Lines) -> None:
+    """Half of the 95 % interval of R_a is some 0.021 ohm in 0.5 s; here 0.25 % of 6.5 ohm are required."""
+    window = 'length = "0.5 s"\n[estimation]\ndetermined_within = "0.25 %"'
+    preview = previewed(written(tmp_path, rows), window)
+    assert preview.windows.length_s == 0.5
+    assert preview.proposed.length_s == 1.0
+    lines = list(preview_lines(preview))
+    start = lines.index("proposed for the machine file:")
+    assert lines[start + 1] == "  [window]"
+    pasted = "\n".join(line.strip() for line in lines[start + 2 : start + 4])
+    assert previewed(tmp_path / "data.csv", pasted).windows.length_s == preview.proposed.length_s
+
+
+def test_a_file_that_is_too_short_gives_exit_code_1_and_a_shorter_window(tmp_path: Path, rows: Lines) -> None:
+    result = check(MACHINE, written(tmp_path, rows[:150]))
+    assert result.return_value == 1
+    assert "too short for a window" in result.output
+    assert 'length = "0.5 s"' in result.output
+
+
+def test_windows_that_are_all_refused_give_exit_code_1_with_the_reasons(tmp_path: Path, rows: Lines) -> None:
+    blank = [[*row[:3], "", ""] for row in rows]
+    result = check(MACHINE, written(tmp_path, blank))
+    assert result.return_value == 1
+    assert "refused: " in result.output
+    assert "i, omega: no sample" in result.output
+    assert "no window can be used" in result.output
+
+
+def test_json_has_the_same_numbers(tmp_path: Path, rows: Lines) -> None:
+    result = check(MACHINE, written(tmp_path, rows), "--json")
+    assert result.return_value == 0, result.exception
+    document = json.loads(result.output)
+    assert document["rows"] == 1200
+    assert document["signals"]["omega"]["interval_s"] == pytest.approx(0.01)
+    assert document["windows"]["usable"] == 6
+    assert (
+        document["proposed"]["parameters"]["R_a"]["half_width"] < document["proposed"]["parameters"]["R_a"]["required"]
+    )
+    assert document["computing_s"] > 0.0
+
+
+def test_a_core_that_is_slower_than_the_machine_is_named(
+    tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter(range(0, 1000, 3))
+    monkeypatch.setattr("otolith.runtime.worker.time.perf_counter", lambda: float(next(clock)))
+    preview = previewed(written(tmp_path, rows))
+    assert "slower than real time: a window of 2 s takes 3 s to compute, at most 3 s" in list(preview_lines(preview))
+
+
+def test_a_replay_begins_with_a_short_preview_on_standard_error(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = written(tmp_path, rows)
+    replay(MACHINE, data, None, as_json=False, stopped=lambda: False)
+    printed = capsys.readouterr()
+    assert "V_a, T_load, i, omega every 10 ms" in printed.err
+    assert "6 usable, 6 with motion" in printed.err
+    assert "expected 95 % intervals from one window: R_a ±" in printed.err
+    assert len(printed.err.splitlines()) <= 5
+    assert "6 windows: 6 good" in printed.out
+    replay(MACHINE, data, None, as_json=True, stopped=lambda: False)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_short_preview_reads_only_the_beginning(
+    tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("otolith_drivers.replay.tables.CHUNK", 10_000)
+    preview = previewed(written(tmp_path, rows), max_rows=450)
+    assert 450 < preview.rows < 1000
+    assert next(short_lines(preview, 450)).strip().startswith("at the beginning, ")
+
+
+def test_the_preview_of_a_bus_log_says_how_many_samples_are_not_used(tmp_path: Path, scenario: MotorScenario) -> None:
+    text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
+    text = text.replace('"dc-motor.dbc"', f'"{EXAMPLES / "dc-motor.dbc"}"')
+    machine = tmp_path / "machine.toml"
+    machine.write_text(text.replace("# [window]", '[window]\nsample_period = "40 ms"'), encoding="utf-8")
+    log = written_log(tmp_path, frames_of(scenario, 800), ".log")
+    preview = preview_recording(load_machine(machine, with_driver=False), log)
+    assert any("75% of the samples are not used" in remark for remark in preview.remarks)
+    assert preview.proposed.sample_period_s == pytest.approx(0.01)

@@ -1,0 +1,145 @@
+"""Delays of signals against each other, on a plant of the tests' own: within 1 ms and within the interval."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.sampling.measure import some_motor, write_machine
+from benchmarks.sampling.schedules import Recording, Schedule, Timing, record
+
+from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.commissioning import delays as text
+from otolith.commissioning.delays import IdentifiedDelays, SignalDelay, identify_delays, identify_delays_and_noise
+from otolith.estimation.information import QUANTILE
+from otolith.estimation.problem import Problem
+from otolith.machine import load_machine
+from otolith.runtime.replay import Replay, open_recorded
+
+ROWS = Schedule(rows=Timing(0.01))
+SLOW = {"omega": Schedule(omega=Timing(0.05)), "i": Schedule(i=Timing(0.05)), "V_a": Schedule(omega=Timing(0.05))}
+MS = 1e-3
+
+
+def recorded(schedule: Schedule, seed: int, length: float = 13.0) -> Recording:
+    random = np.random.default_rng(seed)
+    return record(schedule, some_motor(random), length, random)
+
+
+def cut(folder: Path, schedule: Schedule, recording: Recording, extra: str = "") -> tuple[Problem, list[Window]]:
+    """The problem of the machine file, and the windows of the recording."""
+    machine = load_machine(write_machine(folder, schedule, extra), with_driver=False)
+    data = folder / "recording.csv"
+    data.write_text(recording.table(), encoding="utf-8")
+    with open_recorded(machine, data) as opened:
+        return machine.problem, list(Replay(machine, opened).windows())
+
+
+def late(identified: IdentifiedDelays) -> dict[str, SignalDelay]:
+    return {signal.name: signal for signal in identified.signals if signal.is_late}
+
+
+def deviation(signal: SignalDelay, truth: float) -> float:
+    """In standard deviations."""
+    assert signal.sd is not None
+    assert 0.0 < QUANTILE * signal.sd < MS
+    return abs(signal.value - truth) / signal.sd
+
+
+@pytest.mark.parametrize("rate", ["10 ms", "50 ms"])
+@pytest.mark.parametrize("delay", [10 * MS, 35 * MS])
+@pytest.mark.parametrize("name", ["omega", "i", "V_a"])
+def test_a_delay_is_identified_within_a_millisecond(tmp_path: Path, name: str, delay: float, rate: str) -> None:
+    schedule = ROWS if rate == "10 ms" else SLOW[name]
+    problem, windows = cut(tmp_path, schedule, recorded(schedule, 5).delayed({name: delay}))
+    signals = late(identify_delays(problem, windows, {}))
+    assert set(signals) == {name}
+    assert abs(signals[name].value - delay) < MS
+    assert deviation(signals[name], delay) < 3.3
+
+
+@pytest.mark.parametrize("schedule", [ROWS, SLOW["omega"], SLOW["i"]], ids=["rows", "slow omega", "slow i"])
+def test_signals_that_are_not_late_get_no_delay(tmp_path: Path, schedule: Schedule) -> None:
+    problem, windows = cut(tmp_path, schedule, recorded(schedule, 6))
+    identified = identify_delays(problem, windows, {})
+    assert not late(identified)
+    assert identified.windows == len(windows)
+    assert identified.applied(problem, windows) == windows
+    for signal in identified.signals:
+        assert "no delay is significant; up to about 0." in signal.remark
+        assert signal.sd is not None
+        assert signal.sd < MS
+
+
+def test_two_late_signals_are_identified(tmp_path: Path) -> None:
+    truth = {"omega": 20 * MS, "i": 5 * MS}
+    problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 8).delayed(truth))
+    signals = late(identify_delays(problem, windows, {}))
+    assert set(signals) == set(truth)
+    for name, delay in truth.items():
+        assert deviation(signals[name], delay) < 3.3
+
+
+def test_an_early_signal_makes_all_others_late(tmp_path: Path) -> None:
+    problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 9).delayed({"V_a": -15 * MS}))
+    signals = late(identify_delays(problem, windows, {}))
+    assert set(signals) == {"i", "omega", "T_load"}
+    for signal in signals.values():
+        assert deviation(signal, 15 * MS) < 3.3
+
+
+@pytest.mark.parametrize("count", [10, pytest.param(60, marks=pytest.mark.full)])
+def test_intervals_hold_the_truth(tmp_path: Path, count: int) -> None:
+    """Each recording has another motor, another late signal and another delay."""
+    random = np.random.default_rng(10)
+    held, named = [], []
+    for seed in range(count):
+        name, delay = ("omega", "i", "V_a")[seed % 3], float(random.uniform(2 * MS, 40 * MS))
+        problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 100 + seed, 9.0).delayed({name: delay}))
+        signals = late(identify_delays(problem, windows, {}))
+        named.append(set(signals) == {name})
+        held.append(name in signals and deviation(signals[name], delay) <= QUANTILE)
+    share = 3.3 * np.sqrt(0.95 * 0.05 / count)
+    assert np.mean(held) >= 0.95 - share
+    assert np.mean(named) >= 0.95 - share
+
+
+def test_noise_is_identified_without_the_delay(tmp_path: Path) -> None:
+    """Wrong noise levels hide no delay, and the delay does not become process noise."""
+    problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 11, 21.0).delayed({"omega": 10 * MS}))
+    wrong = replace(problem, noise=(0.05, 0.002))
+    identified, noise = identify_delays_and_noise(wrong, windows, {})
+    assert deviation(late(identified)["omega"], 10 * MS) < 3.3
+    assert [level.value for level in noise.outputs] == pytest.approx([0.005, 0.02], rel=0.1)
+    assert [level.value for level in noise.states] == pytest.approx([0.0, 0.0], abs=0.02)
+
+
+def test_a_declared_delay_is_part_of_the_result(tmp_path: Path) -> None:
+    """The result is the delay of the signal as it comes, whatever the machine file declares."""
+    declared = '[signals]\nomega = { delay = "7 ms" }'
+    problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 12).delayed({"omega": 10 * MS}), declared)
+    signals = late(identify_delays(problem, windows, {"omega": 7 * MS}))
+    assert set(signals) == {"omega"}
+    assert deviation(signals["omega"], 10 * MS) < 3.3
+
+
+def test_without_a_usable_window_the_declared_delays_stay(tmp_path: Path) -> None:
+    problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 13, 5.0))
+    bad = Quality(Verdict.BAD, 1.0, 2.0, 0.0, 0.0, ("no samples of i",))
+    for unusable in ([], [replace(windows[0], quality=bad)]):
+        identified = identify_delays(problem, unusable, {"omega": 7 * MS})
+        assert identified.values == {"i": 0.0, "omega": 7 * MS, "V_a": 0.0, "T_load": 0.0}
+        assert {signal.remark for signal in identified.signals} == {text.NO_WINDOW}
+
+
+def test_an_idle_machine_shows_no_delay(tmp_path: Path) -> None:
+    problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 14, 7.0))
+    resting = []
+    for window in windows:
+        values = np.random.default_rng(14).normal(size=window.values.shape) * [0.0, 0.0, 0.005, 0.02]
+        resting.append(replace(window, values=values))
+    identified = identify_delays(problem, resting, {})
+    assert not late(identified)
+    assert {signal.remark for signal in identified.signals if signal.name in problem.twin.signals} >= {
+        text.UNOBSERVABLE
+    }

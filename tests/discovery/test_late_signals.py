@@ -1,0 +1,114 @@
+"""A signal that is late is named, and its delay is not turned into a parameter."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.sampling.measure import FREE, replayed, some_motor, write_machine
+from benchmarks.sampling.plant import Motor
+from benchmarks.sampling.schedules import Recording, Samples, Schedule, Timing, record
+
+from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.discovery.hypotheses import FaultType
+from otolith.health.schema import ReportDocument, Status
+from otolith.machine import load_machine
+
+ROWS, SLOW_OMEGA = Schedule(rows=Timing(0.01)), Schedule(omega=Timing(0.05))
+FINDING = re.compile(
+    r'(\w+) is ([\d.]+) ms late \(([\d.]+) to ([\d.]+)\): write delay = "([\d.]+) ms" under \[signals\]'
+)
+
+
+def recorded(schedule: Schedule = ROWS, seed: int = 5, length: float = 13.0) -> Recording:
+    random = np.random.default_rng(seed)
+    return record(schedule, some_motor(random), length, random)
+
+
+def reports(folder: Path, recording: Recording, schedule: Schedule = ROWS, extra: str = "") -> list[ReportDocument]:
+    machine = load_machine(write_machine(folder, schedule, extra), with_driver=False)
+    data = folder / "recording.csv"
+    data.write_text(recording.table(), encoding="utf-8")
+    return replayed(machine, data)
+
+
+def assert_named(document: ReportDocument, name: str, delay: float) -> None:
+    """The first finding names signal, delay (ms) and interval."""
+    finding = FINDING.search(document.findings[0].text)
+    assert finding is not None, document.findings
+    value, low, high = map(float, finding.group(2, 3, 4))
+    assert finding.group(1) == name
+    assert value == pytest.approx(delay, abs=1.0)
+    assert low - 0.5 * (high - low) <= delay <= high + 0.5 * (high - low)
+    assert document.explanations[0].reason is FaultType.TIMING
+
+
+def assert_not_wrong(document: ReportDocument, motor: Motor) -> None:
+    """No parameter is published with a value that is off."""
+    for name in FREE:
+        parameter = document.parameters[name]
+        assert parameter.status is not Status.ESTIMATED
+        assert parameter.value is None or parameter.value == pytest.approx(getattr(motor, name), rel=0.01)
+
+
+CASES = [(ROWS, name, delay) for name in ("omega", "i", "V_a") for delay in (10.0, 35.0)]
+
+
+@pytest.mark.parametrize(
+    ("schedule", "name", "delay"), [*CASES, (SLOW_OMEGA, "omega", 10.0)], ids=lambda value: str(value)[:8]
+)
+def test_a_late_signal_is_named_from_the_first_window_on(
+    tmp_path: Path, schedule: Schedule, name: str, delay: float
+) -> None:
+    recording = recorded(schedule)
+    documents = reports(tmp_path, recording.delayed({name: 1e-3 * delay}), schedule)
+    assert len(documents) >= 5
+    for document in documents:
+        assert document.decision not in ACCEPTED
+        assert_not_wrong(document, recording.motor)
+    assert all(document.decision is WindowDecision.TIMING for document in documents[1:])
+    assert_named(documents[-1], name, delay)
+
+
+@pytest.mark.parametrize("name", ["omega", "V_a"])
+def test_a_signal_that_becomes_late_leaves_the_estimates_as_they_are(tmp_path: Path, name: str) -> None:
+    recording, since = recorded(length=15.0), 6.0
+    own = recording.samples[name]
+    stated = own.stated + np.where(own.stated > since, 0.01, 0.0)
+    changed = {**recording.samples, name: Samples(own.times, own.values, np.round(stated, 6), own.fresh)}
+    late = Recording(recording.motor, recording.initial, recording.inputs, changed, 0.0, False, recording.change_sd)
+    documents = reports(tmp_path, late)
+    healthy = [document for document in documents if document.window.end <= since]
+    assert all(document.decision is WindowDecision.LEARNED for document in healthy)
+    after = documents[len(healthy) + 1 :]
+    assert len(after) >= 3
+    for document in after:
+        assert document.decision is WindowDecision.TIMING
+        assert_not_wrong(document, recording.motor)
+    assert_named(documents[-1], name, 10.0)
+
+
+def test_a_delay_of_a_fifth_of_a_record_is_never_learned(tmp_path: Path) -> None:
+    """Parameters would explain the first window almost up to the noise without it."""
+    recording = recorded()
+    documents = reports(tmp_path, recording.delayed({"omega": 0.002}))
+    for document in documents:
+        assert document.decision not in ACCEPTED
+        assert_not_wrong(document, recording.motor)
+    assert_named(documents[-1], "omega", 2.0)
+
+
+@pytest.mark.parametrize(("name", "delay"), [("omega", 10), ("omega", 35), ("V_a", 10), ("i", 35)])
+def test_a_declared_delay_gives_the_estimates_of_no_delay(tmp_path: Path, name: str, delay: int) -> None:
+    recording = recorded()
+    without = reports(tmp_path, recording)
+    extra = f'[signals]\n{name} = {{ delay = "{delay} ms" }}'
+    declared = reports(tmp_path, recording.delayed({name: 1e-3 * delay}), ROWS, extra)
+    assert all(document.decision is WindowDecision.LEARNED for document in [*without, *declared])
+    for parameter in FREE:
+        own, other = declared[-1].parameters[parameter], without[-1].parameters[parameter]
+        assert own.value is not None
+        assert other.value is not None
+        assert own.sd is not None
+        assert abs(own.value - other.value) < 2.0 * own.sd
+        assert own.value == pytest.approx(getattr(recording.motor, parameter), abs=3.3 * own.sd)
