@@ -181,3 +181,13 @@ def test_reasons_name_signal_time_length_and_limit(keep: slice, sentence: str) -
     quality = quality_of(aligned((ramp(RECORDS) * PERIOD)[keep], ramp(RECORDS)[keep]))
     assert quality.verdict is Verdict.BAD
     assert sentence in quality.reasons
+
+
+def test_samples_around_a_window_that_arrive_at_once_are_one() -> None:
+    """A sample long before the window, and one after it, each arrive twice at the same time."""
+    inside = PERIOD * np.arange(RECORDS)
+    times = np.concatenate([[-1.0, -1.0], inside, [3.0, 3.0]])
+    series = aligned(times, np.arange(len(times), dtype=float)).series
+    assert (np.diff(series.times) > 0.0).all()
+    assert series.times[0] == -1.0
+    assert series.values[0] == 1.0

@@ -27,7 +27,7 @@ from otolith_drivers.replay.readers import Reader, Rows
 
 MAX_ROWS, MAX_RECORDS = 2500, 2000
 MAX_WINDOWS = 3
-MAX_STEPS = 2 * (2 * MAX_SUBSTEPS + 1)  # of the integrator per record: a power of two above the mean, and each halved
+MAX_STEPS = 2 * (4 * MAX_SUBSTEPS + 1)  # of the integrator per record: as kernel.py limits them, and each halved
 Folders = pytest.TempPathFactory
 GAPS = (0.003, 0.05, 0.4, 3.0, 90.0, 3600.0, 36_000.0)  # s
 INTERVALS = (0.001, 0.0035, 0.01, 0.0107, 0.05, 0.5, 5.0)  # s

@@ -105,9 +105,10 @@ def align_to_grid(samples: Series, span: GridSpan, grace: float) -> CyclicSeries
     inside = (slots >= 0) & (slots < span.records)
     before = samples.within(-np.inf, min(start - grace, float(at[0]) if len(at) else np.inf))
     after = samples.within(max(span.end + grace, float(at[-1]) + period / 2 if len(at) else -np.inf), np.inf)
-    series = Series(
+    series = merge_equal_times(  # those before and after the window may have equal times
         np.concatenate([before.times, at, after.times]),
         np.concatenate([before.values, near.values[kept], after.values]),
+        "zoh",
     )
     surplus = len(near.times) - len(kept)
     return CyclicSeries(series, (near.times[kept] - at)[inside], on_grid=True, surplus=surplus)
