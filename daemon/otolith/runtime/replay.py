@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 MAX_SLEEP = 0.1  # s; bounds the reaction time to a stop signal
 MIN_ROWS_PER_WINDOW = 5  # fewer rows than this suggest that the time column is not in seconds
 MAX_UNUSED_SHARE = 0.1  # of the samples of a cyclic signal: more of them between the records are named
+RECORDING = ".rrd"  # ends the name of a recording of the daemon
 
 Stopped = Callable[[], bool]
 
@@ -76,6 +77,13 @@ def open_recordings(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
     if len(files) == 1:
         return open_recorded(machine, files[0])
     return JoinedReader(files, lambda path: open_recorded(machine, path))
+
+
+def _sampling_of(machine: LoadedMachine, data: Reader) -> Sampling:
+    """Return the meaning of the times of ``data``: records of the daemon lie on the grids of its cyclic source."""
+    kind = machine.file.driver.get("type")
+    is_cyclic = data.path.suffix == RECORDING and kind not in (None, "replay", "modbus")
+    return Sampling.CYCLIC if is_cyclic else data.sampling
 
 
 def _open_by_name(machine: LoadedMachine, data: Path) -> Reader:
@@ -134,7 +142,7 @@ class Replay:
         self._timing = timing
         self._sample_period = window.sample_period
         self._length = window.length
-        plans = machine.plans(data.sampling)
+        plans = machine.plans(_sampling_of(machine, data))
         self._playback = Playback(plans, machine.records, window.sample_period, machine.limits)
         self._windows = self._windows_bad = self._missed = 0
 
