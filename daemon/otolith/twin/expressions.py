@@ -135,8 +135,8 @@ def _operands(tree: ast.expr) -> list[ast.expr]:
 
 
 def _folded(tree: ast.expr, operands: list[float | None]) -> float | None:
-    if isinstance(tree, ast.Constant):
-        return float(tree.value)  # type: ignore[arg-type]  # the parser has refused all other constants
+    if isinstance(tree, ast.Constant) and isinstance(tree.value, int | float):  # the parser has refused all others
+        return float(tree.value)
     if isinstance(tree, ast.Name):
         return math.pi if tree.id == "pi" else None
     if isinstance(tree, ast.BinOp) and isinstance(tree.op, ast.Div) and operands[1] == 0.0:

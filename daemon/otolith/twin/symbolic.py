@@ -8,6 +8,7 @@ import ast
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import sympy
 
@@ -47,11 +48,11 @@ class absolute(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has 
         del argindex
         return sign(self.args[0])
 
-    def _pretty(self, printer: object) -> object:
-        return printer._print(sympy.Abs(self.args[0]))  # type: ignore[attr-defined]  # SymPy calls it with a printer
+    def _pretty(self, printer: Any) -> Any:
+        return printer._print(sympy.Abs(self.args[0]))
 
-    def _latex(self, printer: object) -> str:
-        return str(printer._print(sympy.Abs(self.args[0])))  # type: ignore[attr-defined]  # as above
+    def _latex(self, printer: Any) -> str:
+        return str(printer._print(sympy.Abs(self.args[0])))
 
 
 class component(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no types; the class name is printed
