@@ -63,6 +63,8 @@ def write_machine(folder: Path, schedule: Schedule, extra: str = "") -> Path:
     lines += ['R_a = { value = "6.5 ohm", estimate = true }', 'D = { value = "0.00143 N*m*s/rad", estimate = true }']
     lines += ['J = { value = "0.001171 kg*m^2", estimate = true }', "[noise]"]
     lines += [f'{name} = "{level!r} {units[name]}"' for name, level in noise.items()]
+    if schedule.polled:
+        lines += ["[window]", 'times = "polled"']
     path = folder / "machine.toml"
     path.write_text("\n".join([*lines, extra]) + "\n", encoding="utf-8")
     return path

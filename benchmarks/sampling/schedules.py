@@ -16,6 +16,7 @@ from otolith.acquisition.window import Array, Mask
 OUTPUTS = ("i", "omega")
 NOISE = {"i": 0.005, "omega": 0.02, "T_load": 2e-4}  # A, rad/s, N·m: the sensors of config/dc-motor.toml
 MICROSECONDS = 6  # decimals of the times in a table
+COMMAND_PERIOD = 0.01  # s between the times at which a command can change
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,8 @@ class Schedule:
     load_noise: bool = False
     commands_on_change: bool = False
     """Whether the voltage has a sample at each of its changes and at no other time; otherwise with each of the load."""
+    polled: bool = False
+    """Whether the voltage changes at times of its own, between the readings."""
     copies: int = 1
     """How often each row is written."""
 
@@ -131,7 +134,9 @@ def record(schedule: Schedule, motor: Motor, length: float, random: np.random.Ge
     rows = schedule.rows
     full = (rows or Timing(schedule.load_period)).times(length, random, from_zero=True)
     kept = _kept(full, 0.0 if rows is None else rows.missing, random)
-    command_times = full if rows is not None else np.round(np.arange(0.0, length, 0.01), MICROSECONDS)
+    command_times = full if rows is not None else np.round(np.arange(0.0, length, COMMAND_PERIOD), MICROSECONDS)
+    if schedule.polled:
+        command_times = np.sort(random.uniform(0.0, length, int(length / COMMAND_PERIOD)))
     inputs = Inputs(*voltages(schedule.voltage, command_times, random), full, loads(schedule.load, full, random))
     timings = {name: getattr(schedule, name) for name in OUTPUTS}
     times = {name: _output_times(timings[name], full, kept, length, random, rows=rows is not None) for name in OUTPUTS}
@@ -144,8 +149,12 @@ def record(schedule: Schedule, motor: Motor, length: float, random: np.random.Ge
         "T_load": _plain(full[kept], load_values),
         **_measure(motor, initial, inputs, times, timings, random),
     }
-    exact = schedule.commands_on_change
-    changes = np.zeros(len(inputs.voltage_times)) if exact else _change_sd(inputs.voltage_times, full, seen)
+    if schedule.commands_on_change:
+        changes = np.zeros(len(inputs.voltage_times))
+    elif schedule.polled:  # uniform between two readings
+        changes = np.full(len(inputs.voltage_times), np.diff(seen).mean() / np.sqrt(12.0))
+    else:
+        changes = _change_sd(inputs.voltage_times, full, seen)
     return Recording(motor, initial, inputs, samples, noise, schedule.load == "walk", changes, schedule.copies)
 
 

@@ -7,7 +7,7 @@ import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,19 @@ MAX_GRID_ERROR = 1e-6  # share of a window's length by which it may differ from 
 
 
 @dataclass(frozen=True, slots=True)
+class RecordedMachine:
+    """What a recording has beside the reports. It can be sent to another process."""
+
+    title: str
+    """Name and site of the machine, for people."""
+    twin: Definition
+    parameters: Sequence[Parameter]
+    """Those that are estimated."""
+    sampling: Sampling
+    """Meaning of the times of its samples."""
+
+
+@dataclass(frozen=True, slots=True)
 class LoadedMachine:
     """A checked machine file: everything the service needs to start."""
 
@@ -77,6 +90,10 @@ class LoadedMachine:
         """Records of the first window."""
         return self.problem.window.records
 
+    def recorded(self, sampling: Sampling) -> RecordedMachine:
+        """Return what a recording has beside the reports; ``sampling`` is the meaning of the times of the source."""
+        return RecordedMachine(self.title, self.twin, self.problem.free, sampling)
+
     @property
     def limits(self) -> QualityLimits:
         """Bounds that a good window keeps."""
@@ -109,7 +126,8 @@ class LoadedMachine:
         if not self.file.signals:
             return ""
         options = {key: self.file.driver.get(key) for key in FINGERPRINT_KEYS}
-        text = json.dumps([self.file.signals, options], sort_keys=True, default=str)
+        read = {name: _own(table) for name, table in self.file.signals.items()}
+        text = json.dumps([read, options], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property

@@ -39,7 +39,9 @@ class Sampling(StrEnum):
     CYCLIC = "cyclic"
     """The source samples on its own grid; a time is an arrival time, which may be late but never early."""
     TRUE = "true"
-    """A time is the moment at which the value was true, and is used as it is."""
+    """A time is the moment at which the value was true, and is used as it is. A command changes at its samples."""
+    POLLED = "polled"
+    """As ``TRUE``, but the source is asked by a clock of its own: a command may have changed since the last reading."""
 
 
 @dataclass(frozen=True, slots=True)

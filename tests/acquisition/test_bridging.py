@@ -17,10 +17,12 @@ from otolith.acquisition.bridging import (
 )
 from otolith.acquisition.samples import Interval, Series, SignalPlan, interval_of
 from otolith.acquisition.window import Array
+from otolith_drivers.base import Sampling
 from tests.acquisition.series import ramp
 
 PERIOD, DRAWS = 0.01, 20_000
 COMMAND, SAMPLED = SignalPlan("u", "zoh"), SignalPlan("u", "zoh", on_change=False)
+POLLED = SignalPlan("u", "zoh", Sampling.POLLED)
 MEASURED = SignalPlan("v", "foh")
 NO_OTHERS = OtherSamples(np.zeros(0), Interval(np.inf, np.inf))
 WITHIN = 4.0 * np.sqrt(2.0 / DRAWS)  # of a variance: four standard deviations of its estimate from DRAWS normal numbers
@@ -61,6 +63,33 @@ def test_the_variance_of_a_lost_command_is_that_of_random_change_instants(lost: 
     assert result.variance == pytest.approx(truth.var(axis=0), abs=9.0 * WITHIN)
     integral = ((truth - result.values) * steps).sum(axis=1)
     assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=2.0 * WITHIN)
+
+
+@pytest.mark.parametrize("records", [1, 2, 4])
+def test_a_polled_command_may_change_at_any_instant_between_two_readings(records: int) -> None:
+    """Mean and variance over uniform instants: of the value, and of the integral over the interval."""
+    random, polls = np.random.default_rng(1), ramp(20) * PERIOD
+    step = PERIOD / records
+    values = np.where(ramp(20) < 10, 1.0, 4.0)
+    within = ramp(records) * step
+    steps = np.full(records, step)
+    result = bridged(polls, values, POLLED, 9 * PERIOD + within, steps)
+    changes = random.uniform(0.0, PERIOD, DRAWS)
+    means = 1.0 + 3.0 * np.clip((within[None, :] + step - changes[:, None]) / step, 0.0, 1.0)  # over each step
+    assert result.values == pytest.approx(means.mean(axis=0), abs=4.0 * 1.5 / np.sqrt(DRAWS))
+    at_record = np.where(changes[:, None] <= within[None, :], 4.0, 1.0)
+    assert result.variance == pytest.approx(np.mean((at_record - result.values) ** 2, axis=0), rel=2.0 * WITHIN)
+    integral = ((means - result.values) * steps).sum(axis=1)
+    assert variance_of_integral(result, steps) == pytest.approx(integral.var(), rel=2.0 * WITHIN)
+    assert result.values - result.expected_change == pytest.approx(np.ones(records))
+
+
+def test_a_polled_command_that_keeps_its_value_is_exact() -> None:
+    polls = ramp(20) * PERIOD
+    result = bridged(polls, np.where(ramp(20) < 10, 1.0, 4.0), POLLED, polls[:9], np.full(9, PERIOD))
+    assert (result.values == 1.0).all()
+    assert not result.variance.any()
+    assert not result.held_variance.any()
 
 
 def test_the_variance_of_a_lost_command_that_always_changes_is_that_of_a_random_walk() -> None:

@@ -65,6 +65,6 @@ def read_window(sampling: Sampling) -> float:
 
 
 def test_the_skew_between_requests_is_corrected() -> None:
-    skewed, corrected = read_window(Sampling.CYCLIC), read_window(Sampling.TRUE)
+    skewed, corrected = read_window(Sampling.CYCLIC), read_window(Sampling.POLLED)
     assert skewed > 0.3 * FREQUENCY * REQUEST_TIME / 2  # what there is to correct
     assert corrected < 0.5 * skewed

@@ -87,7 +87,7 @@ def test_any_log_gives_sound_windows_in_order(
     playback = Playback(plans, RECORDS, PERIOD)
     windows = [*playback.windows(log), *playback.rest()]
     for window in windows:
-        records = Records(window.grid, window.values, window.missing, window.bridge_error, {}, frozenset(), frozenset())
+        records = Records(window.grid, window.values, window.missing, window.bridge_error, 0, frozenset(), frozenset())
         assert_sound(records, SPAN.length)
         assert 0.0 <= window.quality.missing <= 1.0
         assert np.isfinite([window.quality.longest_gap, window.quality.jitter, window.quality.skew]).all()
@@ -196,6 +196,43 @@ def test_a_command_that_never_had_a_sample_is_unknown() -> None:
     assert at(times, u=none).unknown == {"u"}
     assert at(times, u=Series(np.array([-0.7]), np.array([3.0]))).unknown == set()
     assert (at(times, u=Series(np.array([-0.7]), np.array([3.0]))).values[:, 1] == 3.0).all()
+
+
+def test_the_grid_follows_a_clock_whose_signals_are_all_delayed() -> None:
+    """After 200 windows a clock that is 200 ppm fast would be off the grid by eight periods."""
+    delay, drift, count = 0.035, 2e-4, 200 * RECORDS
+    own = ramp(count) * (PERIOD * (1.0 + drift))
+    times = own + delay
+    log = Rows(times, {"x": np.sin(own), "y": np.cos(own)}, np.arange(count) + 2, np.zeros(count, dtype=np.int64))
+    plans = [SignalPlan(name, sampling=Sampling.CYCLIC, delay=delay) for name in ("x", "y")]
+    playback = Playback(plans, RECORDS, PERIOD)
+    windows = [*playback.windows(log), *playback.rest()]
+    assert len(windows) >= 198
+    for window in windows:
+        assert window.grid.period is not None
+        assert not window.missing.any()
+        assert window.quality.jitter < 0.01 * PERIOD
+        expected = np.sin(window.start + window.grid.offsets)
+        assert window.column("x") == pytest.approx(expected, abs=2.0 * drift * RECORDS * PERIOD + 1e-3)
+
+
+@pytest.mark.parametrize("read", [2, 5])
+def test_a_polled_command_is_recorded_as_it_was_read(read: int) -> None:
+    """The value of a record allows for a change before the next reading; the reading is kept."""
+    random = np.random.default_rng(3)
+    times = np.arange(400.0) * PERIOD
+    command = np.where(np.arange(400) % read == 0, np.repeat(random.normal(size=80), 5), np.nan)
+    log = Rows(times, {"u": command, "x": np.sin(times)}, np.arange(400) + 2, np.zeros(400, dtype=np.int64))
+    playback = Playback([SignalPlan("u", "zoh", sampling=Sampling.POLLED), SignalPlan("x")], RECORDS, PERIOD)
+    windows = [*playback.windows(log), *playback.rest()]
+    assert len(windows) >= 7
+    for window in windows:
+        present = ~window.missing_in("u")
+        at = np.rint((window.start + window.grid.offsets) / PERIOD).astype(int)
+        assert window.readings("u")[present] == pytest.approx(command[at[present]], abs=1e-12)
+        assert not np.allclose(window.column("u"), window.readings("u"))
+        assert window.bridge_error is not None
+        assert window.bridge_error.held_variance[:, 0].any()
 
 
 @pytest.mark.parametrize("delay", [0.0035, 0.01, 0.035])

@@ -234,4 +234,4 @@ def test_the_grace_period_covers_the_next_sample_of_a_slow_input(interval: float
     for _ in range(4):
         windower.cut(rings, unix_offset=0.0)
     expected = min(max(1.5 * interval, GRACE_PERIOD), RECORDS * PERIOD)
-    assert windower.grace == pytest.approx(expected if interval < 1.0 else GRACE_PERIOD)
+    assert windower.grace == pytest.approx(expected if interval < 3.0 * RECORDS * PERIOD else GRACE_PERIOD)

@@ -84,7 +84,10 @@ def bridged(record: Window, held: float, at_record: float = 0.0, ratio: float = 
     size = np.concatenate([[driven.high - driven.low for driven in TWIN.inputs], np.zeros(2)])
     every = np.ones((record.records, 1))
     error = BridgeError(
-        ratio * np.ones(record.values.shape), (at_record * every * size) ** 2, (held * every * size) ** 2
+        ratio * np.ones(record.values.shape),
+        (at_record * every * size) ** 2,
+        (held * every * size) ** 2,
+        np.zeros(record.values.shape),
     )
     return Window(record.index, record.start, record.grid, record.signals, record.values, record.missing, GOOD, error)
 

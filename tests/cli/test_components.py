@@ -55,15 +55,23 @@ def test_components_of_other_signals_are_not_restored(data: Path) -> None:
 
 
 def test_signal_fingerprint_depends_on_scale_unit_and_place(tmp_path: Path) -> None:
-    """The port of the same device does not matter."""
+    """Neither the port of the same device matters, nor when its samples come."""
     text = (EXAMPLES / "dc-motor-modbus.toml").read_text(encoding="utf-8")
     fingerprints = []
-    changes = {"": "", "port = 1502": "port = 1503", 'unit = "A"': 'unit = "mA"', "register = 4": "register = 5"}
+    current = "register = 2, type"
+    changes = {
+        "": "",
+        "port = 1502": "port = 1503",
+        'unit = "A"': 'unit = "mA"',
+        "register = 4": "register = 5",
+        current: f'delay = "5 ms", {current}',
+    }
     for old, new in changes.items():
         path = tmp_path / "machine.toml"
         path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
         fingerprints.append(load_machine(path, with_driver=False).signal_fingerprint)
     assert fingerprints[0] == fingerprints[1]
+    assert fingerprints[0] == fingerprints[4]
     assert len(set(fingerprints)) == 3
 
 

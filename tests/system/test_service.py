@@ -17,11 +17,12 @@ import pytest
 from otolith.adaptation.state import ComponentRecord, OperatorDecisions
 from otolith.discovery.adopted import AdoptedComponent, Approval
 from otolith.estimation.problem import Component
-from otolith.machine import find_twin, load_machine
+from otolith.machine import RecordedMachine, find_twin, load_machine
 from otolith.publishing import recorder
 from otolith.runtime.service import STALL_TIMEOUT, Service
 from otolith.runtime.state_store import StateStore
 from otolith.runtime.worker import COMPILE_TIMEOUT
+from otolith_drivers.base import Sampling
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
 from tests.waiting import PATIENCE, within
@@ -150,7 +151,7 @@ def test_the_recorder_ends_before_the_disk_is_full(tmp_path: Path, monkeypatch: 
     usage = namedtuple("usage", ["total", "used", "free"])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(1 << 40, 1 << 40, 1 << 20))
     twin = find_twin("dc_motor")
-    recorder.main(Pipe(), tmp_path / "full.rrd", "full", twin, twin.parameters[:1])
+    recorder.main(Pipe(), tmp_path / "full.rrd", RecordedMachine("full", twin, twin.parameters[:1], Sampling.TRUE))
     assert not (tmp_path / "full.rrd").exists()
 
 

@@ -73,7 +73,8 @@ def align(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
 def align_delayed(samples: Series, delay: float, span: GridSpan, grace: float) -> CyclicSeries:
     """Return the samples of a cyclic signal at the times of their arrival, without lateness, minus ``delay`` (s).
 
-    Slots of the grid would take away a part of the delay: that by which this signal arrives later than the others.
+    Slots of the grid would take away a part of the delay: that by which this signal arrives later than the others. The
+    lateness beyond the delay stays, so that the grid can follow the clock of the source.
     """
     phase = _arrival_phase(samples.times, span)
     slots = round((delay - phase) / span.period)
@@ -83,7 +84,8 @@ def align_delayed(samples: Series, delay: float, span: GridSpan, grace: float) -
     off_grid = own.start - delay - span.start
     if not aligned.on_grid or abs(off_grid) > MAX_PHASE_ERROR * span.period:
         return replace(aligned, series=Series(times, aligned.series.values), on_grid=False)
-    return replace(aligned, series=Series(times - off_grid, aligned.series.values))
+    series = Series(times - off_grid, aligned.series.values)
+    return replace(aligned, series=series, lateness=aligned.lateness + off_grid)
 
 
 def _arrival_phase(times: Array, span: GridSpan) -> float:

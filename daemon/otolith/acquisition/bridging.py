@@ -1,9 +1,10 @@
 """Inputs between their samples: bridged as their hold says, with the variance of what the bridge may hide.
 
 A command (``zoh``) holds its value until the next sample. Where a sample of it was lost, it may have changed at any of
-the lost instants: the value moves from one end to the other with the probability that it has changed by then. A
-measured quantity (``foh``) is a straight line between two samples. How far it may be from that line is taken from the
-window itself: a sample against the line through its neighbours, at two spacings, gives a power law of the spacing.
+the lost instants: the value moves from one end to the other with the probability that it has changed by then. A command
+that is polled may have changed at any time since the last reading, and moves in the same way. A measured
+quantity (``foh``) is a straight line between two samples. How far it may be from that line is taken from the window
+itself: a sample against the line through its neighbours, at two spacings, gives a power law of the spacing.
 ``docs/explanation/sampling.md`` derives the variances.
 """
 
@@ -14,6 +15,7 @@ import numpy as np
 from otolith.acquisition.alignment import Indices
 from otolith.acquisition.samples import Interval, Series, SignalPlan
 from otolith.acquisition.window import Array
+from otolith_drivers.base import Sampling
 
 LINE_NOISE = 1.5  # variance of a sample about the line through its neighbours, in variances of the noise of a sample
 NORMAL_SQUARE_MEDIAN = 0.455  # of the square of a standard normal deviate
@@ -59,7 +61,9 @@ def lost_samples(series: Series, plan: SignalPlan, own: Interval, others: OtherS
     changes are lost only with the samples of all others, and never if they are recorded apart from the others.
     """
     starts, ends, usual = series.times[:-1], series.times[1:], own.usual
-    if plan.hold != "zoh" or not is_recorded_on_change(plan, series.values):
+    if may_change_unseen(plan, series.values):
+        long = np.zeros(len(starts), dtype=np.bool_)
+    elif plan.hold != "zoh" or not is_recorded_on_change(plan, series.values):
         long = ends - starts > own.longest
     elif np.isin(series.times, others.times).all():
         last = np.searchsorted(others.times, ends) - 1
@@ -71,8 +75,16 @@ def lost_samples(series: Series, plan: SignalPlan, own: Interval, others: OtherS
 
 
 def is_recorded_on_change(plan: SignalPlan, values: Array) -> bool:
-    """Whether a command is recorded only when it changes: as the machine file says, else if no value is repeated."""
-    return bool((np.diff(values) != 0.0).all()) if plan.on_change is None else plan.on_change
+    """Whether a command is recorded only when it changes: as the machine file has it, else if no value is repeated."""
+    if plan.on_change is not None:
+        return plan.on_change
+    return plan.sampling is not Sampling.POLLED and bool((np.diff(values) != 0.0).all())
+
+
+def may_change_unseen(plan: SignalPlan, values: Array) -> bool:
+    """Whether an input is a command that may change between two readings, and does change in ``values``."""
+    polled = plan.hold == "zoh" and plan.sampling is Sampling.POLLED and not is_recorded_on_change(plan, values)
+    return polled and bool((np.diff(values) != 0.0).any())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +95,7 @@ class BridgedInput:
     noise_ratio: Array
     variance: Array
     held_variance: Array
+    expected_change: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +132,7 @@ def bridge(samples: InputSamples, times: Array, steps: Array) -> BridgedInput:
     length = series.times[after] - series.times[before]
     ended = after == before
     spacing = np.where(ended, usual if np.isfinite(usual) else steps, length)
+    none = np.zeros(len(times))
     if samples.plan.hold == "zoh":
         values, error = _hold(samples, times, before)
     else:
@@ -126,8 +140,42 @@ def bridge(samples: InputSamples, times: Array, steps: Array) -> BridgedInput:
     outdated = _outdated(samples, times)
     variance = error.variance + outdated.variance
     duration = np.where(outdated.variance > 0.0, outdated.duration, error.duration)
-    return BridgedInput(
-        values, np.maximum(spacing, steps) / steps, variance, variance * np.maximum(1.0, duration / steps)
+    held_variance = variance * np.maximum(1.0, duration / steps)
+    expected_change = none
+    if may_change_unseen(samples.plan, series.values):
+        unseen = _unseen_change(samples, times, steps, before, after)
+        values, expected_change = values + unseen.expected, unseen.expected
+        variance, held_variance = variance + unseen.variance, held_variance + unseen.held_variance
+    return BridgedInput(values, np.maximum(spacing, steps) / steps, variance, held_variance, expected_change)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _UnseenChange:
+    """The change of a polled command in the step after each record, (records,) each."""
+
+    expected: Array
+    """Mean over the step of what is expected beside the last reading."""
+    variance: Array
+    held_variance: Array
+
+
+def _unseen_change(samples: InputSamples, times: Array, steps: Array, before: Indices, after: Indices) -> _UnseenChange:
+    """Return what a command may have changed since its last reading; each instant until the next one is as likely."""
+    series = samples.series
+    length = np.maximum(series.times[after] - series.times[before], steps)
+    change = series.values[after] - series.values[before]
+    wander = np.where(
+        length > samples.interval.longest,
+        _usual_change(series, samples.interval) * length / samples.interval.usual,
+        0.0,
+    )
+    share = np.clip((times - series.times[before]) / length, 0.0, 1.0)
+    half_step = np.where(after > before, 0.5 * steps / length, 0.0)
+    squared = np.where(after > before, np.maximum(change**2, wander), 0.0)
+    return _UnseenChange(
+        change * (share + half_step),
+        squared * (share * (1.0 - share) + half_step**2),
+        squared * length / (12.0 * steps),
     )
 
 
@@ -213,7 +261,7 @@ def _outdated(samples: InputSamples, times: Array) -> _Error:
     early, late = np.maximum(series.times[0] - times, 0.0), np.maximum(times - series.times[-1], 0.0)
     if samples.is_held:
         late = none
-    elif samples.plan.hold == "zoh":
+    elif samples.plan.hold == "zoh" and samples.plan.sampling is not Sampling.POLLED:
         late = np.where(late > samples.interval.longest, late, 0.0)
     away = early + late
     if not away.any() or len(series.times) < 2:

@@ -133,8 +133,9 @@ class Playback:
         self.windower.counts = old.counts
         if math.isinf(self._step):
             self._step = median_step(rows.times)
-        rows_per_window = max(old.records, old.length / self._step)
-        self._rings = Rings(old.signals, int(min(RING_WINDOWS * rows_per_window, MAX_RING_SAMPLES)))
+        step = min(old.sample_period, self._step)
+        held = RING_WINDOWS * old.length + max(plan.delay for plan in self._plans)
+        self._rings = Rings(old.signals, int(min(held / step, MAX_RING_SAMPLES)))
         self._clock = self._begun = self._checked = float(rows.times[at])
 
     def _skip_gap(self, following: float) -> None:

@@ -19,6 +19,7 @@ from otolith.acquisition.bridging import (
     bridge,
     is_recorded_on_change,
     lost_samples,
+    may_change_unseen,
 )
 from otolith.acquisition.samples import Check, Interval, Series, SignalPlan, interval_of, stale_repeats
 from otolith.acquisition.time_grid import GridSpan, TimeGrid
@@ -39,8 +40,8 @@ class Records:
     values: Array
     missing: Mask
     bridge_error: BridgeError | None
-    stale: dict[str, int]
-    """Repeats of a register that were skipped, of each signal that has any."""
+    stale: int
+    """Repeats of a register in the window that were skipped."""
     held: frozenset[str]
     """Commands that are recorded only when they change."""
     unknown: frozenset[str]
@@ -80,16 +81,19 @@ def make_records(series: Mapping[str, Series], plans: Mapping[str, SignalPlan], 
     """
     start, period = span.start, span.period
     fresh = without_stale(series, plans)
-    stale = {name: len(series[name].times) - len(fresh[name].times) for name in series}
     early = EARLY * period
     inside = {name: samples.within(start - early, span.end - early) for name, samples in fresh.items()}
+    whole = (samples.within(start - early, span.end - early) for samples in series.values())
+    stale = sum(len(samples.times) for samples in whole) - sum(len(samples.times) for samples in inside.values())
     on_grid = all(lies_on_grid(samples.times, start, period) for samples in inside.values())
     incomplete = [
         name
         for name, plan in plans.items()
         if plan.hold is not None
         and len(fresh[name].times)
-        and not (on_grid and len(inside[name].times) == span.records)
+        and not (
+            on_grid and len(inside[name].times) == span.records and not may_change_unseen(plan, fresh[name].values)
+        )
     ]
     intervals = {name: interval_of(samples.times) for name, samples in fresh.items()} if incomplete else {}
     lost = {
@@ -108,14 +112,16 @@ def make_records(series: Mapping[str, Series], plans: Mapping[str, SignalPlan], 
             values[:, column] = bridged[column].values
         elif len(at) < grid.records:
             values[:, column] = _filled(fresh[name], start + grid.offsets)
-        values[at, column] = inside[name].values
+        if column in bridged and bridged[column].expected_change.any():
+            values[at, column] = inside[name].values + bridged[column].expected_change[at]
+        else:
+            values[at, column] = inside[name].values
     held = frozenset(
         name
         for name in incomplete
         if plans[name].hold == "zoh" and is_recorded_on_change(plans[name], fresh[name].values)
     )
     unknown = frozenset(name for name, plan in plans.items() if plan.hold is not None and not len(fresh[name].times))
-    stale = {name: count for name, count in stale.items() if count}
     return Records(grid, values, missing, _bridge_error(bridged, values.shape), stale, held, unknown)
 
 
@@ -138,6 +144,8 @@ def _own_times(
         changed = np.ones(len(samples.times), dtype=np.bool_)
         if plans[name].hold == "zoh":
             changed[1:] = np.diff(samples.values) != 0.0
+            if may_change_unseen(plans[name], samples.values):
+                changed[:-1] |= changed[1:]
         times.append(samples.times[changed])
     times += [intervals.instants(span.start, span.end, MAX_LOST_RECORDS * span.records) for intervals in lost]
     offsets = np.maximum(np.sort(np.concatenate(times)) - span.start, 0.0)
@@ -167,9 +175,10 @@ def _filled(samples: Series, times: Array) -> Array:
 def _bridge_error(bridged: Mapping[int, BridgedInput], shape: tuple[int, ...]) -> BridgeError | None:
     if not bridged:
         return None
-    error = BridgeError(np.ones(shape), np.zeros(shape), np.zeros(shape))
+    error = BridgeError(np.ones(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
     for column, item in bridged.items():
         error.noise_ratio[:, column] = item.noise_ratio
         error.variance[:, column] = item.variance
         error.held_variance[:, column] = item.held_variance
+        error.expected_change[:, column] = item.expected_change
     return error

@@ -48,6 +48,16 @@ class SignalPlan:
     checks: frozenset[Check] = frozenset(Check)
     """What its samples are checked for."""
 
+    @property
+    def is_cyclic(self) -> bool:
+        """Whether the time of a sample is an arrival time."""
+        return self.sampling is Sampling.CYCLIC
+
+    @property
+    def needs_next_sample(self) -> bool:
+        """Whether its value between two samples depends on the second one."""
+        return self.hold == "foh" or (self.hold == "zoh" and self.sampling is Sampling.POLLED)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:

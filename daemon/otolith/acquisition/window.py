@@ -52,10 +52,14 @@ class BridgeError:
     """Variance of the value of a record beside that noise, in the squared unit of the signal."""
     held_variance: Array
     """Variance of the independent error of a record beside that noise, in the squared unit of the signal."""
+    expected_change: Array
+    """What the value of a record has beside its reading: the change that is expected before the next reading."""
 
     def rows(self, part: slice) -> "BridgeError":
         """Return the same for some of the records."""
-        return BridgeError(self.noise_ratio[part], self.variance[part], self.held_variance[part])
+        return BridgeError(
+            self.noise_ratio[part], self.variance[part], self.held_variance[part], self.expected_change[part]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +118,12 @@ class Window:
     def column(self, signal: str) -> Array:
         """Return the values of one signal, (records,) in its unit."""
         return self.values[:, self.signals.index(signal)]
+
+    def readings(self, signal: str) -> Array:
+        """Return one signal as it was measured, (records,) in its unit; where it is missing, of no meaning."""
+        values = self.column(signal)
+        error = self.bridge_error
+        return values if error is None else values - error.expected_change[:, self.signals.index(signal)]
 
     def missing_in(self, signal: str) -> Mask:
         """Return where one signal is missing, (records,)."""

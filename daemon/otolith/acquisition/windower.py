@@ -13,7 +13,6 @@ from otolith.acquisition.ring import Rings
 from otolith.acquisition.samples import Series, SignalPlan, finite_samples, has_equal_times, merge_equal_times
 from otolith.acquisition.time_grid import GridSpan
 from otolith.acquisition.window import Window
-from otolith_drivers.base import Sampling
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 GRACE_PERIOD = 0.1  # s after its end that a window waits for late samples, at least,
@@ -44,6 +43,7 @@ class Windower:
         self.counts = WindowerCounts()
         self._limits = limits or QualityLimits()
         self._grace = GRACE_PERIOD
+        self._intervals: dict[str, float] = {}
         self._start = math.inf
         self._index = 0
 
@@ -91,19 +91,18 @@ class Windower:
         A signal is complete when the first sample of the following window is there. That of a cyclic signal is the one
         that is closer to its first slot than to the last one of this window.
         """
-        shares = {Sampling.CYCLIC: 0.5, Sampling.TRUE: EARLY}
         complete = all(
-            time - self.plans[name].delay >= self.next_end - shares[self.plans[name].sampling] * self.sample_period
-            for name, time in rings.last_times().items()
+            time - plan.delay >= self.next_end - (0.5 if plan.is_cyclic else EARLY) * self.sample_period
+            for plan, time in ((self.plans[name], time) for name, time in rings.last_times().items())
         )
         return complete or now >= self.deadline
 
     def cut(self, rings: Rings, unix_offset: float) -> Window:
         """Return the next window; ``unix_offset`` is Unix time minus monotonic time, s."""
-        series, cyclic, counts = self._align(rings)
+        series, aligned, repeated = self._align(rings)
         if self._index == 0:  # the grid was laid through a single sample, which may have been late
-            self._start += _grid_shift(cyclic, first=True, period=self.sample_period)
-            series, cyclic, counts = self._align(rings)
+            self._start += _grid_shift(aligned, first=True, period=self.sample_period)
+            series, aligned, repeated = self._align(rings)
         records = make_records(series, self.plans, self._span())
         window = Window(
             index=self._index,
@@ -112,14 +111,14 @@ class Windower:
             signals=self.signals,
             values=records.values,
             missing=records.missing,
-            quality=assess_quality(records, self.plans, cyclic, self._limits, self._span(unix_offset)),
+            quality=assess_quality(records, self.plans, aligned, self._limits, self._span(unix_offset)),
             bridge_error=records.bridge_error,
         )
-        self.counts.repeated += counts
-        self.counts.stale += sum(records.stale.values())
+        self.counts.repeated += repeated
+        self.counts.stale += records.stale
         self._grace = self._next_grace(series)
         self._index += 1
-        self._start = self._start + self.length + _grid_shift(cyclic, first=False, period=self.sample_period)
+        self._start = self._start + self.length + _grid_shift(aligned, first=False, period=self.sample_period)
         return window
 
     def regrid(self, records: int, sample_period: float) -> None:
@@ -138,22 +137,22 @@ class Windower:
     def _align(self, rings: Rings) -> tuple[dict[str, Series], dict[str, CyclicSeries], int]:
         """Return the samples of each signal, the lateness of those on the grid, and the number of repeated samples."""
         series = {name: self._samples(rings, plan) for name, plan in self.plans.items()}
-        true = [item for name, item in series.items() if self.plans[name].sampling is Sampling.TRUE]
+        true = [item for name, item in series.items() if not self.plans[name].is_cyclic]
         repeated = sum(item.repeated for item in true)
         self._adopt_phase(true)
-        cyclic: dict[str, CyclicSeries] = {}
+        aligned: dict[str, CyclicSeries] = {}
         for name, plan in self.plans.items():
-            if plan.sampling is Sampling.CYCLIC:
+            if plan.is_cyclic:
                 span, delay = self._span(), plan.delay
-                cyclic[name] = (
+                aligned[name] = (
                     align_delayed(series[name], delay, span, GRACE_PERIOD)
                     if delay
                     else align(series[name], span, GRACE_PERIOD)
                 )
             elif self._is_on_grid(series[name]):
-                cyclic[name] = align_to_grid(series[name], self._span(), GRACE_PERIOD)
-            series[name] = cyclic[name].series if name in cyclic else series[name]
-        return series, cyclic, repeated
+                aligned[name] = align_to_grid(series[name], self._span(), GRACE_PERIOD)
+            series[name] = aligned[name].series if name in aligned else series[name]
+        return series, aligned, repeated
 
     def _samples(self, rings: Rings, plan: SignalPlan) -> Series:
         """Return the samples of a signal from one window before this one until after it, and the one before them.
@@ -162,7 +161,7 @@ class Windower:
         """
         start, end = self._start - self.length + plan.delay, self.next_end + max(self._grace, self.length) + plan.delay
         times, values = finite_samples(*rings.around(plan.name, start, end, self.next_end + plan.delay))
-        if plan.sampling is Sampling.CYCLIC:  # the alignment subtracts the delay
+        if plan.is_cyclic:  # the alignment subtracts the delay
             return Series(times, values)
         times = times - plan.delay if plan.delay else times
         repeated = 0
@@ -194,23 +193,25 @@ class Windower:
             self._start += phase if phase >= -EARLY * self.sample_period else phase + self.sample_period
 
     def _next_grace(self, series: dict[str, Series]) -> float:
-        """Return how long to wait for the sample after the end of a window, s: a line needs both of its ends."""
-        intervals = [
-            float(np.median(np.diff(samples.times)))
-            for name, samples in series.items()
-            if self.plans[name].hold == "foh" and len(samples.times) > 1
-        ]
-        return float(np.clip(SLOW_GRACE * max(intervals, default=0.0), GRACE_PERIOD, max(self.length, GRACE_PERIOD)))
+        """Return how long to wait for the sample after the end of a window, s: a bridge needs both of its ends.
+
+        A signal without two samples in sight has its last known interval.
+        """
+        for name, samples in series.items():
+            if self.plans[name].needs_next_sample and len(samples.times) > 1:
+                self._intervals[name] = float(np.median(np.diff(samples.times)))
+        slowest = max(self._intervals.values(), default=0.0)
+        return float(np.clip(SLOW_GRACE * slowest, GRACE_PERIOD, max(self.length, GRACE_PERIOD)))
 
 
-def _grid_shift(cyclic: dict[str, CyclicSeries], *, first: bool, period: float) -> float:
+def _grid_shift(aligned: dict[str, CyclicSeries], *, first: bool, period: float) -> float:
     """Return by how much to move the grid, in s, at most half a sample period.
 
     The clock of the source drifts against the monotonic clock. The lateness of the two halves of a window gives its
     slope; a straight line through both gives the lateness in the middle of the next window, or of the first window
     itself, which is aligned twice.
     """
-    lateness = [item.lateness for item in cyclic.values() if item.on_grid and len(item.lateness) > 1]
+    lateness = [item.lateness for item in aligned.values() if item.on_grid and len(item.lateness) > 1]
     halves = [(len(late) // 2, late) for late in lateness]
     if not halves:
         return 0.0

@@ -373,5 +373,5 @@ def _traces(problem: Problem, window: Window, estimated: WindowEstimate | None) 
 
 def _measured(window: Window, names: tuple[str, ...]) -> Array:
     """Return (records, names), not-a-number where nothing was measured."""
-    columns = [np.where(window.missing_in(name), np.nan, window.column(name)) for name in names]
+    columns = [np.where(window.missing_in(name), np.nan, window.readings(name)) for name in names]
     return np.column_stack(columns) if columns else np.zeros((window.records, 0))

@@ -135,7 +135,10 @@ def replay(
             _echo_preview(machine, data, stopped)
         wait = RealTimePacer(stopped).wait if real_time else None
         run = Replay(machine, recorded, stopped, wait, timing=timing)
-        with ReplayRecorder(recording, machine) as recorder, progress_line("reading", enabled=not as_json) as show:
+        with (
+            ReplayRecorder(recording, machine.recorded(recorded.sampling)) as recorder,
+            progress_line("reading", enabled=not as_json) as show,
+        ):
             for report in run.reports():
                 summary.add(report.document)
                 recorder.add(report)

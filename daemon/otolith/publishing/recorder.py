@@ -20,21 +20,23 @@ import rerun.blueprint as rrb
 from otolith.acquisition.window import Array, Verdict
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import Report, ReportDocument, Status
+from otolith.machine import RecordedMachine
 from otolith.twin.definition import Definition, Parameter
 
 log = logging.getLogger(__name__)
 
 APPLICATION = "otolith"
 TIMELINE = "time"
+SAMPLING = "sampling"  # entity with the meaning of the times, for otolith_drivers.replay.recording
 MIN_FREE_BYTES = 100 << 20  # kept free on the disk, see docs/reference/thresholds-runtime.md
 MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
 
 
-def main(connection: Any, path: Path, title: str, twin: Definition, parameters: Sequence[Parameter]) -> None:
+def main(connection: Any, path: Path, source: RecordedMachine) -> None:
     """Record reports until None comes, the connection closes or the disk is full."""
     if not has_room(path):
         return
-    recording = Recording(path, title, twin, parameters)
+    recording = Recording(path, source)
     try:
         while (report := connection.recv()) is not None and has_room(path):
             recording.add(report)
@@ -54,11 +56,13 @@ def has_room(path: Path) -> bool:
 class Recording:
     """One ``.rrd`` file."""
 
-    def __init__(self, path: Path, title: str, twin: Definition, parameters: Sequence[Parameter]) -> None:
+    def __init__(self, path: Path, source: RecordedMachine) -> None:
+        twin, parameters = source.twin, source.parameters
         self._stream = rr.RecordingStream(APPLICATION, recording_id=path.stem)
         self._stream.set_log_time_enabled(False)
         self._stream.save(path, default_blueprint=blueprint(twin, parameters))
-        self._stream.send_recording_name(title)
+        self._stream.send_recording_name(source.title)
+        self._stream.log(SAMPLING, rr.TextDocument(source.sampling), static=True)
         for signal in twin.inputs:
             self._style(f"signals/{signal.name}", [f"{signal.name} measured [{signal.unit}]"], [MEASURED])
         for output in twin.outputs:

@@ -19,7 +19,7 @@ from otolith.acquisition.recording_statistics import RecordingStatistics
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
-from otolith.machine import LoadedMachine, driver_config
+from otolith.machine import LoadedMachine, RecordedMachine, driver_config
 from otolith.runtime.worker import perform
 from otolith_drivers.base import Sampling, Setup, Signal
 from otolith_drivers.config_files import read
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 MAX_SLEEP = 0.1  # s; bounds the reaction time to a stop signal
 MIN_ROWS_PER_WINDOW = 5  # fewer rows than this suggest that the time column is not in seconds
 MAX_UNUSED_SHARE = 0.1  # of the samples of a cyclic signal: more of them between the records are named
-RECORDING = ".rrd"  # ends the name of a recording of the daemon
-
 Stopped = Callable[[], bool]
 
 
@@ -77,13 +75,6 @@ def open_recordings(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
     if len(files) == 1:
         return open_recorded(machine, files[0])
     return JoinedReader(files, lambda path: open_recorded(machine, path))
-
-
-def _sampling_of(machine: LoadedMachine, data: Reader) -> Sampling:
-    """Return the meaning of the times of ``data``: records of the daemon lie on the grids of its cyclic source."""
-    kind = machine.file.driver.get("type")
-    is_cyclic = data.path.suffix == RECORDING and kind not in (None, "replay", "modbus")
-    return Sampling.CYCLIC if is_cyclic else data.sampling
 
 
 def _open_by_name(machine: LoadedMachine, data: Path) -> Reader:
@@ -142,7 +133,7 @@ class Replay:
         self._timing = timing
         self._sample_period = window.sample_period
         self._length = window.length
-        plans = machine.plans(_sampling_of(machine, data))
+        plans = machine.plans(data.sampling)
         self._playback = Playback(plans, machine.records, window.sample_period, machine.limits)
         self._windows = self._windows_bad = self._missed = 0
 
@@ -281,9 +272,9 @@ class Replay:
 class ReplayRecorder:
     """Records the reports of a replay into an ``.rrd`` file; without a path it does nothing."""
 
-    def __init__(self, path: Path | None, machine: LoadedMachine) -> None:
+    def __init__(self, path: Path | None, source: RecordedMachine) -> None:
         self._path = path
-        self._machine = machine
+        self._source = source
         self._recording: Recording | None = None
 
     def __enter__(self) -> Self:
@@ -308,6 +299,5 @@ class ReplayRecorder:
         if not has_room(self._path):
             raise ServiceError(f"{self._path}: less than {MIN_FREE_BYTES >> 20} MB are free on its disk")
         if self._recording is None:
-            machine = self._machine
-            self._recording = Recording(self._path, machine.title, machine.twin, machine.problem.free)
+            self._recording = Recording(self._path, self._source)
         self._recording.add(report)

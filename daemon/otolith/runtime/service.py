@@ -66,8 +66,10 @@ class Service:
         file, longest, period = machine.file, machine.problem.window.longest, machine.file.window.sample_period
         self._machine = machine
         self._listen = file.zenoh.listen if listen is None else listen
-        self._rings = Rings(machine.twin.signals, RING_RATE * RING_WINDOWS * longest)
-        self._windower = Windower(machine.plans(machine.driver.sampling), machine.records, period, machine.limits)
+        plans = machine.plans(machine.driver.sampling)
+        delay = max(plan.delay for plan in plans)
+        self._rings = Rings(machine.twin.signals, RING_RATE * (RING_WINDOWS * longest + math.ceil(delay / period)))
+        self._windower = Windower(plans, machine.records, period, machine.limits)
         store = StateStore(
             file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
         )
@@ -239,5 +241,5 @@ class Service:
             stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
             self._recording = machine.recording_folder / f"{machine.file.machine.name}-{stamp}-{os.getpid()}.rrd"
         writable(self._recording.parent)
-        self._recorder.start(self._recording, machine.title, machine.twin, machine.problem.free)
+        self._recorder.start(self._recording, machine.recorded(machine.driver.sampling))
         log.info("recording to %s", self._recording)

@@ -42,7 +42,7 @@ def build(options: ModbusOptions, setup: Setup) -> "ModbusPoller":
 class ModbusPoller:
     """Implements :class:`otolith_drivers.base.Driver` over pymodbus, with its own thread."""
 
-    sampling = Sampling.TRUE
+    sampling = Sampling.POLLED
 
     def __init__(self, options: ModbusOptions, signals: Sequence[RegisterSignal], period: float) -> None:
         self._options = options

@@ -1,7 +1,8 @@
 """A recording of Otolith (``.rrd``) as rows of numbers: the measured records of its windows.
 
-A missing record is NaN in the file and no reading in the replay. A record has the time of the grid, not that of its
-sample; a window may have been bad because of when its samples came. So the records of bad windows are left out.
+A missing record is NaN in the file and no reading in the replay. The records of a cyclic source have the times of its
+clock, not those of the arrivals; a window may have been bad because of when its samples came. So the records of bad
+windows are left out.
 """
 
 import re
@@ -17,19 +18,21 @@ import pyarrow as pa
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
-from otolith_drivers.base import Setup
+from otolith_drivers.base import Sampling, Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.replay.readers import Array, Integers, Mask, Reader, Rows
 from otolith_drivers.units import factor
 
 CHUNK = 50_000  # readings of all signals together; engineering choice, guarded by test_recorder.py
+ROUNDING = 1e3  # ns: the end of a window and the start of the next one differ by the rounding of Unix seconds
 MAX_NS, MIN_NS = np.iinfo(np.int64).max, np.iinfo(np.int64).min
 
 # The layout of otolith.publishing.recorder.
 APPLICATION, TIMELINE = "otolith", "time"
 VALUES, NAMES = "Scalars:scalars", "SeriesLines:names"
-FOLDER, WINDOWS = "/signals/", "/windows"
+FOLDER, WINDOWS, SAMPLING = "/signals/", "/windows", "/sampling"
+TEXT = "TextDocument:text"
 READ_ALL = "import sys; from rerun.chunk import RrdReader; [None for _ in RrdReader(sys.argv[1]).stream()]"
 NAME = re.compile(r".* measured \[(.*)\]")  # of a series; the group is the unit
 
@@ -116,16 +119,17 @@ class RecordingReader(Reader):
                 units[name] = written[1] if written else ""
             elif name in self._chunks:
                 self._chunks[name] += 1
+            elif str(chunk.entity_path) == SAMPLING:
+                self.sampling = Sampling(chunk.to_record_batch().column(TEXT).to_pylist()[0][0])
             elif str(chunk.entity_path) == WINDOWS and not chunk.is_static:
                 self._note_windows(chunk.to_record_batch().column(VALUES).to_pylist())
         return units
 
     def _note_windows(self, windows: list[Any]) -> None:
         for window in windows:
-            good, start, end, records = window if len(window) == 4 else (1.0, 0.0, 0.0, 1.0)
+            good, start, end, _ = window if len(window) == 4 else (1.0, 0.0, 0.0, 1.0)
             if not good:
-                half_period = 0.5 * (end - start) / records
-                self._bad_windows.append((1e9 * (start - half_period), 1e9 * (end - half_period)))
+                self._bad_windows.append((1e9 * start - ROUNDING, 1e9 * end - ROUNDING))
 
     def _scale(self, name: str, unit: str, written: dict[str, str]) -> tuple[float, float]:
         """Scale and offset from the recorded unit of a signal to ``unit``."""

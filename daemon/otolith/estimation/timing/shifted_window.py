@@ -65,17 +65,18 @@ def _grid(times: Array, end: float, tolerance: float) -> TimeGrid:
 
 def _bridge_error(
     window: Window, signal: str, before: "np.ndarray[tuple[int], np.dtype[np.intp]]", steps: Array
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Return the error of a signal at the new records: the same noise lasts as long as before."""
     old, error = window.grid.steps, window.bridge_error
     if error is None:
         ratio, none = np.ones(len(old)), np.zeros(len(steps))
-        return np.maximum(old[before], steps) / steps, none, none
+        return np.maximum(old[before], steps) / steps, none, none, none
     column = window.signals.index(signal)
     ratio, variance, held = (part[:, column] for part in (error.noise_ratio, error.variance, error.held_variance))
     spacing = np.maximum((ratio * old)[before], steps)
     duration = np.divide(held * old, variance, out=np.zeros(len(old)), where=variance > MIN_DURATION)[before]
-    return spacing / steps, variance[before], variance[before] * np.maximum(1.0, duration / steps)
+    change = error.expected_change[:, column][before]
+    return spacing / steps, variance[before], variance[before] * np.maximum(1.0, duration / steps), change
 
 
 def same_measurements(
