@@ -340,7 +340,6 @@ def check(machine: LoadedMachine, table: Path, log: Log, work: Work) -> list[Win
             refusal = str(error)
         replay.summary()
         replay.warnings()
-        replay.unused_samples()
     counts = replay._playback.counts
     assert not refusal or str(table) in refusal
     assert not refusal or not documents or "decreases" in refusal

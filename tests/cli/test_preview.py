@@ -15,9 +15,6 @@ from otolith.machine import load_machine
 from otolith.runtime.preview import Preview, preview_lines, preview_recording, short_lines
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.cli.replays import MACHINE, Lines, recorded, written
-from tests.conftest import EXAMPLES
-from tests.drivers.logs import frames_of
-from tests.drivers.logs import written as written_log
 
 
 @pytest.fixture
@@ -196,14 +193,3 @@ def test_the_short_preview_reads_only_the_beginning(
     preview = previewed(written(tmp_path, rows), max_rows=450)
     assert 450 < preview.rows < 1000
     assert next(short_lines(preview, 450)).strip().startswith("at the beginning, ")
-
-
-def test_the_preview_of_a_bus_log_says_how_many_samples_are_not_used(tmp_path: Path, scenario: MotorScenario) -> None:
-    text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
-    text = text.replace('"dc-motor.dbc"', f'"{EXAMPLES / "dc-motor.dbc"}"')
-    machine = tmp_path / "machine.toml"
-    machine.write_text(text.replace("# [window]", '[window]\nsample_period = "40 ms"'), encoding="utf-8")
-    log = written_log(tmp_path, frames_of(scenario, 800), ".log")
-    preview = preview_recording(load_machine(machine, with_driver=False), log)
-    assert any("75% of the samples are not used" in remark for remark in preview.remarks)
-    assert preview.proposed.sample_period_s == pytest.approx(0.01)

@@ -199,7 +199,7 @@ def preview_recording(
         proposed=proposed,
         computing_s=median(seconds) if seconds else None,
         longest_computing_s=max(seconds, default=None),
-        remarks=(*_remarks(statistics, samplings), *run.unused_samples()),
+        remarks=tuple(_remarks(statistics, samplings)),
     )
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_SLEEP = 0.1  # s; bounds the reaction time to a stop signal
 MIN_ROWS_PER_WINDOW = 5  # fewer rows than this suggest that the time column is not in seconds
-MAX_UNUSED_SHARE = 0.1  # of the samples of a cyclic signal: more of them between the records are named
+
 Stopped = Callable[[], bool]
 
 
@@ -131,7 +131,6 @@ class Replay:
         self._stopped = stopped
         self._wait = wait
         self._timing = timing
-        self._sample_period = window.sample_period
         self._length = window.length
         plans = machine.plans(data.sampling)
         self._playback = Playback(plans, machine.records, window.sample_period, machine.limits)
@@ -244,24 +243,11 @@ class Replay:
             lines.append(f"samples at the time of another one, not used twice: {counts.repeated}")
         if counts.stale:
             lines.append(f"readings of registers that had not been renewed, not used: {counts.stale}")
-        lines += self.unused_samples()
         if self._missed:
             lines.append(f"windows that could not be computed: {self._missed}")
         if unused >= self._length / 2:
             lines.append(f"the last {unused:.3g} s are too short for a window of {self._length:g} s")
         return lines
-
-    def unused_samples(self) -> list[str]:
-        """Return a sentence for the cyclic signals that have more samples than the windows have records so far."""
-        shared: dict[str, list[str]] = {}
-        cyclic, period = self._data.sampling is Sampling.CYCLIC, self._sample_period
-        for name, sampled in self.statistics.signals().items() if cyclic else ():
-            unused = 1.0 - sampled.interval / period
-            if unused > MAX_UNUSED_SHARE:
-                rates = f"a sample every {sampled.interval * 1e3:.3g} ms, but a record every {period * 1e3:.3g} ms"
-                remedy = f'shorten [window] sample_period to "{sampled.interval * 1e3:.3g} ms"'
-                shared.setdefault(f"{rates}: {unused:.0%} of the samples are not used: {remedy}", []).append(name)
-        return [f"{', '.join(names)}: {text}" for text, names in shared.items()]
 
     def _why_no_window(self) -> str:
         rows = self._playback.counts.rows
