@@ -42,6 +42,11 @@ class ServiceError(OtolithError):
     """
 
 
+def counted(number: int, noun: str) -> str:
+    """Return the number and its noun, which takes an ``s`` unless the number is one."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def nearest(word: str, known: list[str]) -> str:
     """Return a hint for a misspelt ``word``: the most similar known name, or the list of known names."""
     import difflib  # noqa: PLC0415 - only needed for an error

@@ -53,7 +53,7 @@ class Log:
     def reports(self, schedule: Schedule, header: Sequence[str], rows: Rows) -> list[ReportDocument]:
         machine, data = write_machine(self.folder, schedule), write(self.folder, header, rows)
         self._capsys.readouterr()
-        replay(machine, data, None, as_json=True, stopped=lambda: False)
+        replay(machine, [data], None, as_json=True, stopped=lambda: False)
         return [ReportDocument.from_json(line) for line in self._capsys.readouterr().out.splitlines()]
 
     def of(self, schedule: Schedule, recording: Recording) -> list[ReportDocument]:

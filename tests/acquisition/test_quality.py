@@ -168,10 +168,24 @@ def test_a_measured_input_without_samples_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(0.0, "t = 0 s"), (12.3456, "t = 12.35 s"), (1234.5678, "t = 1234.57 s"), (CALENDAR - 1.0, "t = 99999999.00 s")],
+    [
+        (0.0, "t = 0 s"),
+        (12.3456, "t = 12.35 s"),
+        (1234.5678, "t = 1234.57 s"),
+        (CALENDAR[0] - 1.0, "t = 99999999.00 s"),
+    ],
 )
 def test_a_time_of_the_data_is_shown_in_seconds(seconds: float, text: str) -> None:
     assert time_text(seconds) == text
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_any_time_has_a_text(seconds: float) -> None:
+    assert time_text(seconds)
+
+
+def test_a_column_of_milliseconds_since_1970_is_no_date() -> None:
+    assert [time_text(seconds) for seconds in (1.7e12, -2.5, -0.0)] == ["t = 1.7e+12 s", "t = -2.5 s", "t = 0 s"]
 
 
 def test_unix_time_is_shown_as_a_date() -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from otolith.acquisition import recording_statistics
 from otolith.acquisition.recording_statistics import RecordingStatistics, SignalSampling
+from otolith.acquisition.samples import stale_repeats
 from otolith.acquisition.window import Array
 from otolith_drivers.replay.readers import Rows
 
@@ -77,9 +78,15 @@ def test_duplicates_repeated_times_and_steps_back() -> None:
 
 def test_a_register_that_is_renewed_every_fifth_sample() -> None:
     times = np.arange(1000) * 0.01
-    stale = sampling_of(times, np.repeat(np.arange(200.0), 5), chunk=13)
-    assert (stale.renewal, stale.repeats) == (5, 800)
     random = np.random.default_rng(1)
+    values = np.repeat(random.standard_normal(200), 5)
+    stale = sampling_of(times, values, chunk=13)
+    assert (stale.renewal, stale.repeats) == (5, 800)
+    assert stale.renewal == sampling_of(times[3:], values[3:]).renewal
+    assert stale_repeats(values).sum() == 800
+    encoder = np.repeat(np.arange(200.0), 5)  # at a constant rate: it moves by single steps
+    assert sampling_of(times, encoder).renewal == 1
+    assert not stale_repeats(encoder).any()
     coarse = sampling_of(times, np.round(np.cumsum(random.standard_normal(1000)) / 3.0))
     assert coarse.repeats > 100
     assert coarse.renewal == 1

@@ -35,13 +35,13 @@ def written(folder: Path, rows: Lines, heading: tuple[str, ...] = HEADING, separ
 
 def reports(data: Path, capsys: pytest.CaptureFixture[str]) -> list[ReportDocument]:
     capsys.readouterr()
-    replay(MACHINE, data, None, as_json=True, stopped=lambda: False)
+    replay(MACHINE, [data], None, as_json=True, stopped=lambda: False)
     return [ReportDocument.from_json(line) for line in capsys.readouterr().out.splitlines()]
 
 
 def summed_up(data: Path, capsys: pytest.CaptureFixture[str]) -> str:
     capsys.readouterr()
-    replay(MACHINE, data, None, as_json=False, stopped=lambda: False)
+    replay(MACHINE, [data], None, as_json=False, stopped=lambda: False)
     return capsys.readouterr().out
 
 

@@ -11,9 +11,11 @@ from click.testing import CliRunner, Result
 
 from otolith.cli.main import cli
 from otolith.cli.replay import replay
-from otolith.machine import load_machine
+from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import Preview, preview_lines, preview_recording, short_lines
+from otolith.runtime.replay import open_recorded
 from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.replay.readers import Reader
 from tests.cli.replays import MACHINE, Lines, recorded, written
 
 
@@ -22,7 +24,7 @@ def rows(scenario: MotorScenario) -> Lines:
     return recorded(scenario, 6)
 
 
-def previewed(data: Path, window: str = "", max_rows: float = np.inf) -> Preview:
+def previewed(data: Path, window: str = "", max_rows: int | None = None) -> Preview:
     machine = data.parent / "machine.toml"
     machine.write_text(MACHINE.read_text(encoding="utf-8") + f"[window]\n{window}\n", encoding="utf-8")
     loaded = load_machine(machine, with_driver=False)
@@ -63,6 +65,11 @@ def test_rate_jitter_and_proposed_window(tmp_path: Path, rows: Lines) -> None:
     omega = preview.signals["omega"]
     assert omega.interval_s == pytest.approx(0.02, rel=0.01)
     assert omega.jitter == pytest.approx(0.002 * np.sqrt(2.0 / 3.0) / 0.02, rel=0.1)
+    assert preview.windows.sample_period_s == 0.01
+    assert preview.proposed.sample_period_s == pytest.approx(omega.interval_s, rel=0.01)
+    assert preview.proposed.length_s == pytest.approx(2.0, abs=0.02)
+    assert preview.proposed.usable == preview.proposed.count == 12
+    assert all(accuracy.determined for accuracy in preview.proposed.parameters.values())
 
 
 def test_a_gap_is_shown_with_length_and_place(tmp_path: Path, rows: Lines) -> None:
@@ -79,8 +86,10 @@ def test_rows_that_come_twice_and_steps_back_are_counted(tmp_path: Path, rows: L
     preview = previewed(written(tmp_path, [*twice, *rows[500:]]))
     assert preview.signals["omega"].duplicates == 600
     assert preview.steps_back == 1
-    assert "1 steps back in time, the first in line 1202: t = 5 after t = 5.99" in preview.remarks
-    assert any("600 samples (32%) have time and value of the sample before" in remark for remark in preview.remarks)
+    assert "1 step back in time in line 1202: t = 5 after t = 5.99" in preview.remarks
+    assert any(
+        "at time and with the value of the sample before: 600 samples (32%)" in remark for remark in preview.remarks
+    )
 
 
 def test_quantisation_step_and_slow_register(tmp_path: Path, rows: Lines) -> None:
@@ -100,7 +109,7 @@ def test_the_expected_accuracy_is_that_of_the_estimates(
 ) -> None:
     data = written(tmp_path, rows)
     expected = previewed(data).windows.parameters
-    replay(MACHINE, data, None, as_json=True, stopped=lambda: False)
+    replay(MACHINE, [data], None, as_json=True, stopped=lambda: False)
     reports = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     for name, accuracy in expected.items():
         measured = np.median([1.96 * report["parameters"][name]["raw_sd"] for report in reports])
@@ -131,6 +140,28 @@ def test_a_window_that_is_too_short_for_its_noise_gets_a_longer_one(tmp_path: Pa
     assert lines[start + 1] == "  [window]"
     pasted = "\n".join(line.strip() for line in lines[start + 2 : start + 4])
     assert previewed(tmp_path / "data.csv", pasted).windows.length_s == preview.proposed.length_s
+
+
+def test_the_accuracy_of_a_proposed_window_is_that_of_the_pasted_lines(tmp_path: Path, rows: Lines) -> None:
+    """At irregular times process noise has the step of the sample period, whatever the mean step of the records is."""
+    random = np.random.default_rng(1)
+    late = [
+        [
+            [f"{float(row[0]) + random.uniform(0.001, 0.009):.6f}", "", "", *cells]
+            for cells in ([row[3], ""], ["", row[4]])
+        ]
+        for row in rows
+    ]
+    data = written(
+        tmp_path, [line for row, others in zip(rows, late, strict=True) for line in ([*row[:3], "", ""], *others)]
+    )
+    noise = '[process_noise]\nomega = "0.5 rad/s/s^0.5"\ni = "0.02 A/s^0.5"\n'
+    proposed = previewed(data, f'length = "0.5 s"\n[estimation]\ndetermined_within = "0.5 %"\n{noise}').proposed
+    assert proposed.length_s > 0.5
+    period = f"{proposed.sample_period_s * 1e3:.6g} ms"
+    lines = f'length = "{proposed.length_s:.9g} s"\nsample_period = "{period}"\n'
+    pasted = previewed(data, f'{lines}[estimation]\ndetermined_within = "0.5 %"\n{noise}').windows
+    assert proposed.parameters == pasted.parameters
 
 
 def test_a_file_that_is_too_short_gives_exit_code_1_and_a_shorter_window(tmp_path: Path, rows: Lines) -> None:
@@ -175,14 +206,14 @@ def test_a_replay_begins_with_a_short_preview_on_standard_error(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = written(tmp_path, rows)
-    replay(MACHINE, data, None, as_json=False, stopped=lambda: False)
+    replay(MACHINE, [data], None, as_json=False, stopped=lambda: False)
     printed = capsys.readouterr()
     assert "V_a, T_load, i, omega every 10 ms" in printed.err
     assert "6 usable, 6 with motion" in printed.err
     assert "expected 95 % intervals from one window: R_a ±" in printed.err
     assert len(printed.err.splitlines()) <= 5
     assert "6 windows: 6 good" in printed.out
-    replay(MACHINE, data, None, as_json=True, stopped=lambda: False)
+    replay(MACHINE, [data], None, as_json=True, stopped=lambda: False)
     assert capsys.readouterr().err == ""
 
 
@@ -192,4 +223,46 @@ def test_the_short_preview_reads_only_the_beginning(
     monkeypatch.setattr("otolith_drivers.replay.tables.CHUNK", 10_000)
     preview = previewed(written(tmp_path, rows), max_rows=450)
     assert 450 < preview.rows < 1000
-    assert next(short_lines(preview, 450)).strip().startswith("at the beginning, ")
+    lines = list(short_lines(preview))
+    assert lines[0].strip().startswith(f"{preview.rows} rows of data.csv: V_a, T_load")
+    assert lines[-1].strip() == "not examined: a better window, the computing time; 'otolith check' does so"
+
+
+def test_the_data_are_read_once_and_again_for_a_proposal_unless_the_preview_is_short(
+    tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Path] = []
+
+    def counting(machine: LoadedMachine, path: Path) -> Reader:
+        opened.append(path)
+        return open_recorded(machine, path)
+
+    monkeypatch.setattr("otolith.runtime.preview.open_recorded", counting)
+    data = written(tmp_path, rows)
+    counts = []
+    for window, max_rows in (
+        ("", None),
+        ('length = "0.5 s"\n[estimation]\ndetermined_within = "0.25 %"', None),
+        ('sample_period = "20 ms"', None),
+        ('sample_period = "20 ms"', 10_000),
+    ):
+        preview = previewed(data, window, max_rows)
+        counts.append((len(opened), preview.proposed != preview.windows))
+        opened.clear()
+    assert counts == [(1, False), (2, True), (2, True), (1, False)]
+
+
+@pytest.mark.parametrize("constant", [(3, 4), (4,)])
+def test_a_constant_output_determines_nothing(tmp_path: Path, rows: Lines, constant: tuple[int, ...]) -> None:
+    still = [["1.5" if index in constant else cell for index, cell in enumerate(row)] for row in rows]
+    preview = previewed(written(tmp_path, still))
+    names = ", ".join({3: "i", 4: "omega"}[index] for index in constant)
+    assert f"{names}: the value never changes, so it determines no parameter" in preview.remarks
+    if constant == (3, 4):
+        for accuracy in preview.windows.parameters.values():
+            assert accuracy.determined == 0
+            assert accuracy.reason
+    else:
+        moving = previewed(written(tmp_path, rows)).windows
+        for name, accuracy in preview.windows.parameters.items():
+            assert (accuracy.half_width or np.inf) > 1.2 * (moving.parameters[name].half_width or np.inf)

@@ -58,7 +58,7 @@ def test_an_unusable_file_gets_its_error_message(case: Path) -> None:
     (data,) = case.glob("data.*")
     machine = case / "machine.toml" if (case / "machine.toml").exists() else MACHINE
     with pytest.raises(ConfigurationError) as caught:
-        replay(machine, data, None, as_json=True, stopped=lambda: False)
+        replay(machine, [data], None, as_json=True, stopped=lambda: False)
     message = str(caught.value).replace(str(data), "{file}").replace(str(machine), "{machine}") + "\n"
     if os.environ.get("OTOLITH_UPDATE_GOLDEN"):
         (case / "error.txt").write_text(message, encoding="utf-8")
@@ -70,11 +70,11 @@ def test_a_binary_or_missing_file_is_refused(tmp_path: Path) -> None:
         path = tmp_path / "data.csv"
         path.write_bytes(content)
         with pytest.raises(ConfigurationError, match=r"is not text|is this a CSV file\?"):
-            replay(MACHINE, path, None, as_json=True, stopped=lambda: False)
+            replay(MACHINE, [path], None, as_json=True, stopped=lambda: False)
     with pytest.raises(ConfigurationError, match="No such file"):
-        replay(MACHINE, tmp_path / "none.csv", None, as_json=True, stopped=lambda: False)
+        replay(MACHINE, [tmp_path / "none.csv"], None, as_json=True, stopped=lambda: False)
     with pytest.raises(ConfigurationError, match="is a directory"):
-        replay(MACHINE, tmp_path, None, as_json=True, stopped=lambda: False)
+        replay(MACHINE, [tmp_path], None, as_json=True, stopped=lambda: False)
 
 
 def test_only_replay_needs_no_driver() -> None:
@@ -127,13 +127,13 @@ def test_two_runs_print_the_same_bytes(tmp_path: Path, rows: Lines) -> None:
 
 def test_unknown_columns_are_named_and_ignored(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
     data = written(tmp_path, [[*row, "x"] for row in rows], heading=(*HEADING, "Bemerkung [-]"))
-    replay(MACHINE, data, None, as_json=True, stopped=lambda: False)
+    replay(MACHINE, [data], None, as_json=True, stopped=lambda: False)
     assert capsys.readouterr().err == f"{data}: columns not used: Bemerkung\n"
 
 
 def test_the_summary_has_parameters_and_counts(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
     text = summed_up(written(tmp_path, rows[:-50]), capsys)
-    assert "motor at site, twin dc_motor (DT'), from 0 s to 8 s" in text
+    assert "motor at site, twin dc_motor (DT'), from t = 0 s to t = 8 s" in text
     assert "R_a" in text
     assert "ohm" in text
     assert "4 windows: 4 good, 0 bad; the twin explains 4 of 4" in text
@@ -143,7 +143,7 @@ def test_the_summary_has_parameters_and_counts(tmp_path: Path, rows: Lines, caps
 
 def test_a_recording_is_written(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "run.rrd"
-    replay(MACHINE, written(tmp_path, rows), path, as_json=False, stopped=lambda: False)
+    replay(MACHINE, [written(tmp_path, rows)], path, as_json=False, stopped=lambda: False)
     assert "5 windows" in capsys.readouterr().out
     assert path.stat().st_size > 10_000
 
@@ -153,7 +153,7 @@ def test_a_full_disk_ends_a_recording_with_an_error(
 ) -> None:
     monkeypatch.setattr("otolith.publishing.recorder.MIN_FREE_BYTES", MIN_FREE_BYTES << 40)
     with pytest.raises(OtolithError, match="MB are free on its disk"):
-        replay(MACHINE, written(tmp_path, rows), tmp_path / "run.rrd", as_json=True, stopped=lambda: False)
+        replay(MACHINE, [written(tmp_path, rows)], tmp_path / "run.rrd", as_json=True, stopped=lambda: False)
 
 
 def test_ctrl_c_ends_a_replay_with_the_reports_so_far(tmp_path: Path, rows: Lines) -> None:
@@ -180,7 +180,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path, rows: Lines) -> None
     program = (
         "import resource, sys; from pathlib import Path; from otolith.cli.replay import replay\n"
         "for name in sys.argv[2:]:\n"
-        "    replay(Path(sys.argv[1]), Path(name), None, as_json=False, stopped=lambda: False)\n"
+        "    replay(Path(sys.argv[1]), [Path(name)], None, as_json=False, stopped=lambda: False)\n"
         "    print('peak', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )
     command = [sys.executable, "-c", program, str(MACHINE), str(short), str(long)]
@@ -208,7 +208,7 @@ def test_a_log_of_the_bus_gives_the_values_of_the_table(
         table_path,
         *(written_log(tmp_path, frames, suffix) for suffix in (".log", ".asc", ".blf", ".trc.gz")),
     ):
-        replay(machine, path, None, as_json=True, stopped=lambda: False)
+        replay(machine, [path], None, as_json=True, stopped=lambda: False)
         lines = capsys.readouterr().out.splitlines()
         estimates[path.suffix] = values([ReportDocument.from_json(line) for line in lines])
     assert len(estimates[".csv"]) == 3
@@ -226,7 +226,7 @@ def test_real_time_waits_for_the_end_of_each_window(
     printed = []
     for real_time in (False, True):
         begun = time.monotonic()
-        replay(machine, data, None, as_json=True, stopped=lambda: False, real_time=real_time)
+        replay(machine, [data], None, as_json=True, stopped=lambda: False, real_time=real_time)
         printed.append(capsys.readouterr().out)
     assert printed[0] == printed[1]
     assert len(printed[0].splitlines()) == 4
@@ -243,6 +243,6 @@ def test_columns_are_mapped_by_the_machine_file(
     signals = 'V_a = { column = "U" }\nT_load = {}\ni = {}\nomega = { column = "RotorSpeed", unit = "rpm" }\n'
     driver = f'[driver]\ntype = "replay"\nfile = "{data.name}"\n\n[signals]\n{signals}\n'
     machine.write_text(MACHINE.read_text(encoding="utf-8").replace("[twin]", driver + "[twin]"), encoding="utf-8")
-    replay(machine, data, None, as_json=True, stopped=lambda: False)
+    replay(machine, [data], None, as_json=True, stopped=lambda: False)
     documents = [ReportDocument.from_json(line) for line in capsys.readouterr().out.splitlines()]
     assert values(documents) == pytest.approx(plain, rel=1e-6)

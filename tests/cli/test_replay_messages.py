@@ -85,11 +85,11 @@ def test_computing_time_is_absent_in_a_replay_unless_it_is_asked_for(
     data = written(tmp_path, recorded(scenario, 3))
     costs = {}
     for timing in (False, True):
-        replay(MACHINE, data, None, as_json=True, stopped=lambda: False, timing=timing)
+        replay(MACHINE, [data], None, as_json=True, stopped=lambda: False, timing=timing)
         costs[timing] = [json.loads(line)["cost"] for line in capsys.readouterr().out.splitlines()]
     assert all("seconds" not in cost for cost in costs[False])
     assert all(cost["seconds"] > 0.0 for cost in costs[True])
-    replay(MACHINE, data, None, as_json=False, stopped=lambda: False, timing=True)
+    replay(MACHINE, [data], None, as_json=False, stopped=lambda: False, timing=True)
     assert re.search(r"a window of 2 s takes [\d.]+ m?s to compute", capsys.readouterr().out)
 
 
@@ -123,6 +123,39 @@ def test_progress_rises_steadily_in_a_file_of_many_chunks(
     assert min(steps) >= 0.0
     assert max(steps) < 0.08  # the reader is ahead by its buffer
     assert shares[-1] == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("repeated", [1, 3])
+def test_rows_in_reversed_order_are_an_error_before_any_report(
+    tmp_path: Path, scenario: MotorScenario, capsys: pytest.CaptureFixture[str], repeated: int
+) -> None:
+    rows = [row for row in recorded(scenario, 3)[::-1] for _ in range(repeated)]
+    with pytest.raises(ConfigurationError, match="time decreases from row to row: sort the rows by t"):
+        replay(MACHINE, [written(tmp_path, rows)], None, as_json=True, stopped=lambda: False)
+    assert capsys.readouterr().out == ""
+
+
+def test_rows_that_are_reversed_in_small_groups_are_sorted(
+    tmp_path: Path, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = recorded(scenario, 3)
+    grouped = [row for first in range(0, len(rows), 10) for row in rows[first : first + 10][::-1]]
+    printed = []
+    for order in (rows, grouped):
+        replay(MACHINE, [written(tmp_path, order)], None, as_json=True, stopped=lambda: False)
+        printed.append([json.loads(line)["parameters"] for line in capsys.readouterr().out.splitlines()])
+    assert len(printed[0]) == 3
+    assert printed[1] == printed[0]
+
+
+def test_a_time_that_repeats_at_the_start_of_a_slow_log_is_named_with_its_lines(
+    tmp_path: Path, scenario: MotorScenario
+) -> None:
+    rows = recorded(scenario)[:100]
+    times = [0.0] * 50 + [float(second) for second in range(50)]
+    retimed = [[str(time), *row[1:]] for time, row in zip(times, rows, strict=True)]
+    with pytest.raises(ConfigurationError, match="t is 0 from line 2 to line 52: write t with all its digits"):
+        replay(MACHINE, [written(tmp_path, retimed)], None, as_json=True, stopped=lambda: False)
 
 
 def test_json_of_a_check_needs_data() -> None:

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith.cli.replay import time_text
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import load_machine
 from otolith.runtime.replay import Replay
@@ -227,12 +226,3 @@ def check_any(path: Path) -> None:
     except OtolithError as error:
         message = str(error)
     assert str(path) in message
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(-2.5, "-2.5 s"), (0.0, "0 s"), (3600.25, "3600.25 s"), (1.7e9, "2023-11-14 22:13:20Z"), (1.7e12, "1.7e+12 s")],
-)
-def test_time_text_writes_unix_times_as_dates(seconds: float, text: str) -> None:
-    """A column of milliseconds since 1970 is none."""
-    assert time_text(seconds) == text

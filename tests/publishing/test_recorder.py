@@ -35,7 +35,7 @@ def machine() -> LoadedMachine:
 
 def record(folder: Path, rows: Lines, name: str = "run.rrd") -> Path:
     path = folder / name
-    replay(MACHINE, written(folder, rows), path, as_json=True, stopped=lambda: False)
+    replay(MACHINE, [written(folder, rows)], path, as_json=True, stopped=lambda: False)
     return path
 
 
@@ -90,7 +90,7 @@ def test_two_replays_of_a_recording_are_identical(
 def test_a_recording_of_a_replay_has_the_same_samples(tmp_path: Path, rows: Lines, machine: LoadedMachine) -> None:
     first = record(tmp_path, rows)
     second = tmp_path / "again.rrd"
-    replay(MACHINE, first, second, as_json=True, stopped=lambda: False)
+    replay(MACHINE, [first], second, as_json=True, stopped=lambda: False)
     with open_recorded(machine, first) as one, open_recorded(machine, second) as other:
         for left, right in zip(one.chunks(), other.chunks(), strict=True):
             assert left.times == pytest.approx(right.times, abs=2e-9)

@@ -1,5 +1,7 @@
 """Whether a window can be estimated from: judged by what it lacks, against the limits of the machine file."""
 
+import re
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,7 +14,10 @@ from otolith.acquisition.samples import SignalPlan
 from otolith.acquisition.time_grid import GridSpan, TimeGrid
 from otolith.acquisition.window import Array, Mask, Quality, Verdict
 
-CALENDAR = 1e8  # s: a larger time is Unix time and shown as a date; guarded by tests/acquisition/test_quality.py
+# Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
+CALENDAR = (1e8, 1e11)  # s: a time between them is Unix time and shown as a date
+MAX_REASONS = 5  # kinds of refused windows that are listed
+FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # sentences that differ by their numbers only are of one kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +143,27 @@ def _rms(lateness: Array) -> float:
     return float(np.sqrt(np.mean(lateness**2))) if len(lateness) else 0.0
 
 
+class ReasonCounts:
+    """Counts the reasons for which windows are refused, by kind."""
+
+    def __init__(self) -> None:
+        self._counts = Counter[str]()
+        self._examples: dict[str, str] = {}
+
+    def add(self, window: int, reasons: Collection[str]) -> None:
+        """Count the reasons of a window of that index."""
+        for reason in reasons:
+            kind = FIGURE.sub("…", reason)
+            self._counts[kind] += 1
+            self._examples.setdefault(kind, f"{reason} (window {window})")
+
+    def most_frequent(self) -> list[tuple[int, str]]:
+        """Return how often each of the ``MAX_REASONS`` most frequent kinds came, with its first example."""
+        return [(count, self._examples[kind]) for kind, count in self._counts.most_common(MAX_REASONS)]
+
+
 def time_text(seconds: float) -> str:
     """Return a time of the data: a date and time of day (UTC) for Unix seconds, else seconds."""
-    if seconds < CALENDAR:
-        return f"t = {seconds:.4g} s" if seconds < 1e3 else f"t = {seconds:.2f} s"
+    if not CALENDAR[0] <= seconds < CALENDAR[1]:
+        return f"t = {seconds:.2f} s" if 1e3 <= abs(seconds) < CALENDAR[0] else f"t = {seconds + 0.0:.4g} s"
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S.%f}"[:-4] + " UTC"

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Mask
+from otolith.acquisition.samples import renewal
+from otolith.acquisition.window import Array
 from otolith_drivers.replay.readers import Integers, Rows
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
@@ -13,9 +14,6 @@ MAX_KEPT = 8192  # intervals and values of a signal that are kept; of more, as m
 MAX_GAPLESS = 2.5  # median intervals; a longer interval between two samples is a gap
 BINS_PER_OCTAVE = 8  # of the histogram of intervals
 OCTAVES = (-40, 40)  # of that histogram, in powers of two of a second
-MAX_RENEWAL = 64  # samples; a longer run of one value is no register that is renewed slowly
-MIN_RENEWAL_SHARE = 0.5  # of the runs of one value that have the same number of samples
-MIN_RUNS = 10  # runs of one value from which a slow renewal is seen
 SEED = 1
 
 
@@ -53,7 +51,7 @@ class SignalSampling:
     repeats: int
     """Samples with the value of the sample before at a later time."""
     renewal: int
-    """Samples from one change of the value to the next, where most are the same number; otherwise 1."""
+    """Samples for which a register keeps its value, see :func:`otolith.acquisition.samples.renewal`."""
     values: Array
     """At most ``MAX_KEPT`` of the values, chosen at random."""
 
@@ -84,8 +82,8 @@ class SignalStatistics:
         self._values, self._intervals = RandomChoice(), RandomChoice()
         self._histogram = np.zeros((OCTAVES[1] - OCTAVES[0]) * BINS_PER_OCTAVE, dtype=np.int64)
         self._longest = RecordedGap(0.0, math.nan, 0)
-        self._runs = np.zeros(MAX_RENEWAL + 2, dtype=np.int64)
-        self._run = 0  # samples since the last change
+        self._runs, self._steps = RandomChoice(), RandomChoice()
+        self._run: int | None = None  # samples since the last change; None before the first one
         self._last: tuple[float, float] | None = None
 
     def add(self, times: Array, values: Array, lines: Integers) -> None:
@@ -105,18 +103,19 @@ class SignalStatistics:
         self.duplicates += int(np.count_nonzero(at_once & same))
         self.repeated_times += int(np.count_nonzero(at_once & ~same))
         self.repeats += int(np.count_nonzero(forward & same))
-        self._count_runs(same[~(at_once & same)])
+        self._add_runs(np.concatenate([[last_value], values])[np.concatenate([[True], ~(at_once & same)])])
         self._add_intervals(intervals[forward], before[forward], lines[forward])
 
-    def _count_runs(self, same: Mask) -> None:
-        changes = np.flatnonzero(~same)
-        if not len(changes):
-            self._run += len(same)
-            return
-        runs = np.diff(changes, prepend=-self._run)
-        runs = runs[runs > 0]  # the first sample of all ends no run
-        self._runs += np.bincount(np.minimum(runs, MAX_RENEWAL + 1), minlength=len(self._runs))
-        self._run = len(same) - int(changes[-1])
+    def _add_runs(self, values: Array) -> None:
+        """Add the runs of one value that end in ``values`` (n,), of which the first is the last one before, or NaN."""
+        with np.errstate(over="ignore"):
+            steps = np.diff(values)
+        changes = np.flatnonzero(np.nan_to_num(steps, nan=0.0))
+        ends = changes if self._run is None else np.concatenate([[-self._run], changes])
+        self._runs.add(np.diff(ends).astype(np.float64))
+        self._steps.add(steps[changes])
+        if len(ends):
+            self._run = len(steps) - int(ends[-1])
 
     def _add_intervals(self, intervals: Array, before: Array, lines: Integers) -> None:
         if not len(intervals):
@@ -146,14 +145,9 @@ class SignalStatistics:
             duplicates=self.duplicates,
             repeated_times=self.repeated_times,
             repeats=self.repeats,
-            renewal=self._renewal(),
+            renewal=renewal(self._runs.kept, self._steps.kept),
             values=self._values.kept,
         )
-
-    def _renewal(self) -> int:
-        usual, runs = int(np.argmax(self._runs[: MAX_RENEWAL + 1])), int(self._runs.sum())
-        regular = runs >= MIN_RUNS and self._runs[usual] > MIN_RENEWAL_SHARE * runs
-        return usual if regular and usual > 1 else 1
 
 
 class RecordingStatistics:

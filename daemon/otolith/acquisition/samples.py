@@ -105,26 +105,29 @@ def merge_equal_times(times: Array, values: Array, hold: str | None) -> Series:
     return Series(times[starts], merged, len(times) - len(starts))
 
 
-def stale_repeats(values: Array) -> Mask:
-    """Return which of ``values`` (n,) repeat the value of a register that was not renewed since it was read.
+def renewal(lengths: Array, steps: Array) -> int:
+    """Return the number of samples for which a register keeps its value; 1 if it is renewed for each.
 
-    Such a register gives runs of bit-identical values that are all equally long. So does a coarse sensor at a constant
-    rate, but its values move by single steps.
+    ``lengths`` are those of its runs of bit-identical values, ``steps`` the changes between them. The runs of a slow
+    register are all equally long. So are those of a coarse sensor at a constant rate, but it moves by single steps.
     """
-    none: Mask = np.zeros(len(values), dtype=np.bool_)
-    changed = np.flatnonzero(np.diff(values) != 0.0)
-    lengths = np.diff(changed)  # without the first and the last run, which the window cuts
     if len(lengths) < MIN_STALE_RUNS:
-        return none
-    usual = int(np.median(lengths))
-    regular = np.abs(lengths - usual) <= usual // 3
-    if usual < 2 or regular.mean() < STALE_SHARE:
-        return none
-    steps = np.abs(np.diff(values)[changed])
-    if float(np.median(steps)) <= COARSE_STEPS * float(steps.min()):
-        return none
-    none[1:] = np.diff(values) == 0.0
-    return none
+        return 1
+    usual, sizes = int(np.median(lengths)), np.abs(steps)
+    is_regular = (np.abs(lengths - usual) <= usual // 3).mean() >= STALE_SHARE
+    is_coarse = float(np.median(sizes)) <= COARSE_STEPS * float(sizes.min())
+    return usual if usual > 1 and is_regular and not is_coarse else 1
+
+
+def stale_repeats(values: Array) -> Mask:
+    """Return which of ``values`` (n,) repeat the value of a register that was not renewed since it was read."""
+    stale: Mask = np.zeros(len(values), dtype=np.bool_)
+    steps = np.diff(values)
+    changed = np.flatnonzero(steps)
+    lengths = np.diff(changed).astype(np.float64)  # without the first and the last run, which the window cuts
+    if renewal(lengths, steps[changed]) > 1:
+        stale[1:] = steps == 0.0
+    return stale
 
 
 @dataclass(frozen=True, slots=True)

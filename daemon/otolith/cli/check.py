@@ -11,7 +11,6 @@ from otolith.cli.common import progress_line
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import prefix
 from otolith.runtime.preview import preview_lines, preview_recording
-from otolith.runtime.replay import open_recorded
 from otolith_drivers.base import Sample
 from otolith_drivers.user_dirs import check_writable
 
@@ -62,9 +61,7 @@ def check_data(path: Path, data: Path, echo: Callable[[str], None], *, as_json: 
     if as_json:
         echo(json.dumps(preview.document(), indent=2, ensure_ascii=False))
         return preview.is_usable
-    with open_recorded(machine, data) as reader:
-        sources = reader.describe()
-    for line in (*describe(machine, sources), *preview_lines(preview)):
+    for line in (*describe(machine, preview.sources), *preview_lines(preview)):
         echo(line)
     if not preview.is_usable:
         windows = "no window can be used" if preview.windows.count else "the data are too short for a window"

@@ -177,9 +177,8 @@ def replay(
     from otolith.cli.replay import replay
 
     stop = StopSignal()
-    first, *following = data
     options = {"as_json": as_json, "real_time": real_time, "timing": timing}
-    replay(file, first, recording, following=following, stopped=stop.received, **options)
+    replay(file, data, recording, stopped=stop.received, **options)
     return stop.code()
 
 

@@ -107,6 +107,8 @@ def evenly_spread(items: Iterable[Item], count: int) -> list[Item]:
 
 def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iterator[str]:
     """The tables ``[noise]`` and ``[process_noise]``, with uncertainties and remarks as comments."""
+    from otolith_drivers.errors import counted
+
     twin, problem = machine.twin, machine.problem
     yield "[noise]"
     rows = [_row(level, twin.unit_of(level.name)) for level in identified.outputs]
@@ -120,7 +122,7 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
     yield "[process_noise]"
     yield from _aligned([_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in identified.states])
     yield ""
-    yield f"# identified from {identified.windows} windows of {machine.file.window.length:g} s"
+    yield f"# identified from {counted(identified.windows, 'window')} of {machine.file.window.length:g} s"
     consistency = identified.consistency
     if consistency.before is not None and consistency.after is not None:
         after = f", now {consistency.after:.3g}" if consistency.after != consistency.before else ""

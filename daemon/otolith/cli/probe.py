@@ -301,9 +301,7 @@ def _receive(bus: Any, options: "BusOptions", picture: "Picture", seconds: float
     while (left := end - time.monotonic()) > 0.0 and not stop.received():
         try:
             frame = bus.recv(min(left, RECEIVE_TIMEOUT))
-        except (
-            Exception
-        ) as error:  # a vendor's library raises its own types; counted, and fatal after MAX_CONSECUTIVE_BAD
+        except Exception as error:  # a vendor's library raises types of its own
             bad += 1
             picture.unreadable += 1
             if is_gone(error) or bad > MAX_CONSECUTIVE_BAD:

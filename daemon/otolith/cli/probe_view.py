@@ -15,6 +15,7 @@ from rich.text import Text
 
 from otolith_drivers.canbus import probe as canbus
 from otolith_drivers.canbus.bus import BusOptions
+from otolith_drivers.errors import counted
 from otolith_drivers.modbus import probe as modbus
 from otolith_drivers.modbus import probe_numbers
 from otolith_drivers.modbus.client import FUNCTION_CODES
@@ -145,7 +146,7 @@ def _modbus_lines(probe: DeviceProbe) -> list[str]:
 def _speed_lines(probe: DeviceProbe) -> list[str]:
     """How often it was read, how fast it answered, and which polling rate that allows."""
     count = max((len(words) for words in probe.readings.values()), default=0)
-    lines = [f"{count} readings in {probe.seconds:.1f} s"]
+    lines = [f"{counted(count, 'reading')} in {probe.seconds:.1f} s"]
     lines += [speed.describe() for speed in dict.fromkeys(probe.speeds)]
     if rate := modbus.possible_rate(probe.speeds):
         lines[-1] += f", so {rate:g} Hz is possible" + (" for all of it" if len(probe.speeds) > 1 else "")
@@ -256,8 +257,8 @@ def _finite(value: float) -> float | None:
 
 def bus_title(options: BusOptions, picture: canbus.Picture) -> str:
     """The bus, and how many frames came."""
-    identifiers = f"{len(picture.observed)} arbitration ID{'s' * (len(picture.observed) != 1)}"
-    return f"CAN bus {options.title()}, only listening: {picture.frames} frames of {identifiers}"
+    frames, identifiers = counted(picture.frames, "frame"), counted(len(picture.observed), "arbitration ID")
+    return f"CAN bus {options.title()}, only listening: {frames} of {identifiers}"
 
 
 def tables(picture: canbus.Picture, width: int) -> Iterator[RenderableType]:
@@ -324,11 +325,11 @@ def remarks(picture: canbus.Picture) -> Iterator[str]:
     """Error frames, frames that are not shown, and messages of the database that did not come; a line each."""
     if picture.error_frames:
         kinds = ", ".join(f"{count} {name}" for name, count in picture.errors.most_common())
-        yield f"{picture.error_frames} error frames: {kinds}"
+        yield f"{counted(picture.error_frames, 'error frame')}: {kinds}"
     if picture.unreadable:
-        yield f"{picture.unreadable} frames could not be unpacked"
+        yield f"{counted(picture.unreadable, 'frame')} could not be unpacked"
     if picture.left_out:
-        yield f"{picture.left_out} frames of further arbitration IDs are not shown"
+        yield f"not shown: {counted(picture.left_out, 'frame')} of further arbitration IDs"
     if missing := [message.name for message in picture.missing()]:
         yield f"in the database, but not received: {_names(missing)}"
 

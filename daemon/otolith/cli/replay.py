@@ -4,7 +4,6 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 
@@ -13,27 +12,19 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
+from otolith.acquisition.quality import ReasonCounts, time_text
 from otolith.cli.common import echo_warnings, progress_line
 from otolith.cli.live_table import STYLES, parameter_table, title
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import ReportDocument, Status
 from otolith.health.text import component_text, finding_text, value_cells
 from otolith.machine import LoadedMachine, load_machine
-from otolith.runtime.preview import FIGURE, computing_time_text, preview_recording, short_lines
+from otolith.runtime.preview import computing_time_text, preview_recording, short_lines
 from otolith.runtime.replay import RealTimePacer, Replay, ReplayRecorder, open_recordings
-from otolith_drivers.errors import OtolithError
+from otolith_drivers.errors import OtolithError, counted
 
 PLAIN_WIDTH = 110  # columns of a summary that goes into a file
-MAX_REASONS = 5  # kinds of bad windows that the summary lists
-UNIX_TIMES = (1e8, 1e11)  # s; between March 1973 and the year 5138 a time is a date, below it counts from zero
 PREVIEWED_ROWS = 50_000  # of which a replay prints a preview
-
-
-def time_text(seconds: float) -> str:
-    """A time of the data: seconds, or date and time (UTC) where only Unix seconds are that large."""
-    if not UNIX_TIMES[0] <= seconds < UNIX_TIMES[1]:
-        return f"{round(seconds, 6) + 0.0:.12g} s"
-    return f"{datetime.fromtimestamp(seconds, UTC):%F %T}Z"
 
 
 class ReplaySummary:
@@ -46,8 +37,7 @@ class ReplaySummary:
         self._decisions: Counter[WindowDecision] = Counter()
         self._statuses: Counter[tuple[str, Status]] = Counter()
         self._seconds: list[float] = []
-        self._reasons: Counter[str] = Counter()
-        self._examples: dict[str, str] = {}
+        self._reasons = ReasonCounts()
 
     def add(self, document: ReportDocument) -> None:
         """Count one report."""
@@ -60,10 +50,7 @@ class ReplaySummary:
             self._fitted += 1
             self._explained += document.fit.explained
         self._statuses.update((name, parameter.status) for name, parameter in document.parameters.items())
-        for reason in document.window.quality.reasons:
-            kind = FIGURE.sub("…", reason)  # "7 % missing" and "8 % missing" are the same kind
-            self._reasons[kind] += 1
-            self._examples.setdefault(kind, f"{reason} (window {document.window.index})")
+        self._reasons.add(document.window.index, document.window.quality.reasons)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Parameters, components and findings of the last report, and the counts."""
@@ -96,23 +83,22 @@ class ReplaySummary:
     def _counts(self) -> Iterator[Text]:
         windows, bad = self._decisions.total(), self._decisions[WindowDecision.BAD]
         explained = f"the twin explains {self._explained} of {self._fitted} up to the noise"
-        yield Text(f"{windows} windows: {windows - bad} good, {bad} bad; {explained}")
+        yield Text(f"{counted(windows, 'window')}: {windows - bad} good, {bad} bad; {explained}")
         if self._seconds and self._last is not None:
             length = self._last.window.end - self._last.window.start
             yield Text(computing_time_text(median(self._seconds), max(self._seconds), length))
         for decision, count in self._decisions.items():
             if decision not in (WindowDecision.LEARNED, WindowDecision.BAD):
                 yield Text(f"  {count} good, but: {decision}", style="yellow")
-        for kind, count in self._reasons.most_common(MAX_REASONS):
-            yield Text(f"  {count} bad like: {self._examples[kind]}", style="red")
+        for count, example in self._reasons.most_frequent():
+            yield Text(f"  {count} bad like: {example}", style="red")
 
 
 def replay(
     file: Path,
-    data: Path,
+    data: Sequence[Path],
     recording: Path | None,
     *,
-    following: Sequence[Path] = (),
     as_json: bool,
     stopped: Callable[[], bool],
     real_time: bool = False,
@@ -120,19 +106,19 @@ def replay(
 ) -> None:
     """Print the daemon's reports on ``data`` for the machine in ``file``: as JSON Lines, or as a summary.
 
-    Each of the ``following`` files is another recording. With ``timing`` reports have computing times, which differ
-    from run to run.
+    Each file of ``data`` is a recording of its own. With ``timing`` reports have computing times, which differ from run
+    to run.
 
     Raises:
         OtolithError: a file that cannot be used.
     """
     machine = load_machine(file, with_driver=False)
     summary = ReplaySummary()
-    with open_recordings(machine, (data, *following)) as recorded:
+    with open_recordings(machine, data) as recorded:
         if recorded.ignored:
-            click.echo(f"{data}: columns not used: {', '.join(recorded.ignored)}", err=True)
+            click.echo(f"{recorded.path}: columns not used: {', '.join(recorded.ignored)}", err=True)
         if not as_json:
-            _echo_preview(machine, data, stopped)
+            _echo_preview(machine, data[0], stopped)
         wait = RealTimePacer(stopped).wait if real_time else None
         run = Replay(machine, recorded, stopped, wait, timing=timing)
         with (
@@ -146,7 +132,7 @@ def replay(
                 if as_json:
                     click.echo(report.document.to_json())
     if as_json:
-        echo_warnings(data, run.warnings())
+        echo_warnings(data[0], run.warnings())
         return
     console = Console(highlight=False, width=None if sys.stdout.isatty() else PLAIN_WIDTH)
     console.print(summary)
@@ -158,5 +144,5 @@ def _echo_preview(machine: LoadedMachine, data: Path, stopped: Callable[[], bool
     """Print to standard error what the first rows of ``data`` offer."""
     with suppress(OtolithError):  # the replay itself raises what is wrong with the file
         preview = preview_recording(machine, data, stopped, max_rows=PREVIEWED_ROWS)
-        for line in short_lines(preview, PREVIEWED_ROWS):
+        for line in short_lines(preview):
             click.echo(line, err=True)

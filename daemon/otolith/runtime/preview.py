@@ -5,7 +5,6 @@ right as the noise levels of the machine file.
 """
 
 import math
-import re
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +15,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from otolith.acquisition.quality import ReasonCounts
 from otolith.acquisition.recording_statistics import RecordingStatistics, SignalSampling
+from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.estimation.information import QUANTILE, AccuracyTarget, Identifiability, classify, information
@@ -25,6 +26,8 @@ from otolith.estimation.problem import Problem, WindowOptions
 from otolith.machine import MIN_WINDOW_RECORDS, LoadedMachine
 from otolith.runtime.replay import Replay, Stopped, open_recorded
 from otolith.runtime.worker import perform, warm_up
+from otolith_drivers.base import Sampling
+from otolith_drivers.errors import counted
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_ANALYSED = 8  # windows whose information is computed
@@ -35,9 +38,7 @@ MAX_PERIOD_ERROR = 0.02  # share by which the sample period may differ from the 
 MAX_LENGTHENING = 10.0  # times the length of a window: a parameter that needs more needs another experiment
 MIN_PROPOSED_WINDOWS = 3  # windows of the proposed length that the recording has at least
 MIN_REMARKED_JITTER = 0.5  # of the interval: a larger jitter is remarked
-MAX_REFUSALS = 5  # causes of refused windows that are listed
 WIDTH = 80  # columns of a terminal
-FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # sentences that differ by their numbers only are of one kind
 
 Item = TypeVar("Item")
 
@@ -135,11 +136,15 @@ class Preview:
     """Time of the earliest row, s."""
     end: float | None
     steps_back: int
+    sources: tuple[str, ...]
+    """Where each signal comes from, a line per signal."""
     signals: dict[str, SignalPreview]
     windows: WindowPreview
     """As the machine file configures them."""
     proposed: WindowPreview
     """With the proposed length and sample period; the same if those of the file fit."""
+    is_partial: bool
+    """Whether only the first rows were read, and neither another window nor the computing time was examined."""
     computing_s: float | None
     """Computing time of a window of ``proposed``, s, median of some windows; None if it was not measured."""
     longest_computing_s: float | None
@@ -161,32 +166,23 @@ def preview_recording(
     data: Path,
     stopped: Stopped = lambda: False,
     *,
-    max_rows: float = math.inf,
+    max_rows: int | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Preview:
-    """Return the preview of ``data``, or without computing times that of its first ``max_rows`` rows.
+    """Return the preview of ``data``: of its first ``max_rows`` rows, without a proposal and computing times, if given.
 
-    ``progress`` is called with a line of text from time to time.
+    The file is read once, and again for a proposed window. ``progress`` is called from time to time with a text.
 
     Raises:
         ConfigurationError: the file cannot be read as the signals of the twin.
     """
-    run, windows, chosen = _survey(machine, data, stopped, max_rows, progress)
-    statistics = run.statistics
-    duration = max(statistics.last - statistics.first, 0.0)
-    proposed, best = windows, machine
-    period = _proposed_period(statistics, machine.file.window.sample_period)
-    for _ in range(2):  # the sample period first, then the length that its windows ask for
-        length = _proposed_length(proposed, duration, period)
-        if (length, period) == (proposed.length_s, proposed.sample_period_s):
-            break
-        candidate = _with_window(machine, length, period)
-        _, preview, others = _survey(candidate, data, stopped, max_rows, progress)
-        if preview.usable_share < proposed.usable_share:
-            break
-        proposed, best, chosen = preview, candidate, others
-    progress("measuring the computing time of windows")
-    seconds = _computing_seconds(best, chosen) if math.isinf(max_rows) else []
+    survey = _survey(machine, data, stopped, max_rows, progress)
+    proposed, seconds = survey, list[float]()
+    if max_rows is None:
+        proposed = _proposal(machine, survey, lambda other: _survey(other, data, stopped, None, progress))
+        progress("measuring the computing time of windows")
+        seconds = _computing_seconds(proposed.machine, proposed.chosen)
+    statistics = survey.statistics
     samplings = statistics.signals()
     return Preview(
         data=str(data),
@@ -194,38 +190,60 @@ def preview_recording(
         start=statistics.first if statistics.rows else None,
         end=statistics.last if statistics.rows else None,
         steps_back=statistics.steps_back,
+        sources=survey.sources,
         signals={name: _signal(machine.twin.unit_of(name), sampling) for name, sampling in samplings.items()},
-        windows=windows,
-        proposed=proposed,
+        windows=survey.windows,
+        proposed=proposed.windows,
+        is_partial=max_rows is not None,
         computing_s=median(seconds) if seconds else None,
         longest_computing_s=max(seconds, default=None),
-        remarks=tuple(_remarks(statistics, samplings)),
+        remarks=tuple(_remarks(machine, statistics, samplings)),
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Survey:
+    """One reading of the data."""
+
+    machine: LoadedMachine
+    sources: tuple[str, ...]
+    statistics: RecordingStatistics
+    windows: WindowPreview
+    chosen: list[Window]
+    """The windows that were analysed."""
+
+
+def _proposal(machine: LoadedMachine, survey: _Survey, again: Callable[[LoadedMachine], _Survey]) -> _Survey:
+    """Return the survey of a window that fits the data better, made by ``again``; ``survey`` if there is none."""
+    statistics, window = survey.statistics, machine.file.window
+    period = _proposed_period(statistics, window.sample_period)
+    length = _proposed_length(survey.windows, max(statistics.last - statistics.first, 0.0), period)
+    if (length, period) == (window.length, window.sample_period):
+        return survey
+    other = again(_with_window(machine, length, period))
+    return other if other.windows.usable_share >= survey.windows.usable_share else survey
+
+
 def _survey(
-    machine: LoadedMachine, data: Path, stopped: Stopped, max_rows: float, progress: Callable[[str], None]
-) -> tuple[Replay, WindowPreview, list[Window]]:
-    """Return the replay that has cut all windows of the data, their preview, and the windows that were analysed."""
+    machine: LoadedMachine, data: Path, stopped: Stopped, max_rows: int | None, progress: Callable[[str], None]
+) -> _Survey:
+    """Read the data once, and return what they offer to windows as ``machine`` configures them."""
     usable, moving = EvenSpread[Window](MAX_ANALYSED), EvenSpread[Window](MAX_ANALYSED)
-    counts, refusals = Counter[str](), Counter[str]()
-    examples: dict[str, str] = {}
+    counts, refusals = Counter[str](), ReasonCounts()
     with open_recorded(machine, data) as reader:
+        sources = tuple(reader.describe())
         run = Replay(machine, reader, stopped)
         for window in run.windows():
             counts["all"] += 1
             progress(f"preview of window {window.index}, {run.progress:.0%} of the data")
-            for reason in window.quality.reasons:
-                kind = FIGURE.sub("…", reason)
-                refusals[kind] += 1
-                examples.setdefault(kind, reason)
+            refusals.add(window.index, window.quality.reasons)
             if window.quality.verdict is Verdict.GOOD:
                 counts["usable"] += 1
                 usable.add(window)
                 if _moves(machine.problem, window):
                     counts["moving"] += 1
                     moving.add(window)
-            if run.statistics.rows > max_rows:
+            if max_rows is not None and run.statistics.rows > max_rows:
                 break
     chosen = moving.chosen() or usable.chosen()
     preview = WindowPreview(
@@ -235,10 +253,10 @@ def _survey(
         usable=counts["usable"],
         moving=counts["moving"],
         analysed=len(chosen),
-        refusals=tuple(f"{count} like: {examples[kind]}" for kind, count in refusals.most_common(MAX_REFUSALS)),
+        refusals=tuple(f"{count} like: {example}" for count, example in refusals.most_frequent()),
         parameters=expected_accuracy(machine.problem, chosen),
     )
-    return run, preview, chosen
+    return _Survey(machine, sources, run.statistics, preview, chosen)
 
 
 def _moves(problem: Problem, window: Window) -> bool:
@@ -255,7 +273,7 @@ def expected_accuracy(problem: Problem, windows: Sequence[Window]) -> dict[str, 
     half_widths = np.full((len(windows), len(problem.free)), np.inf)
     reasons: list[list[tuple[Identifiability, str]]] = []
     for row, window in zip(half_widths, windows, strict=True):
-        objective = Objective(problem, window, problem.nominal)
+        objective = Objective(problem, _without_constant_outputs(problem, window), problem.nominal)
         _, jacobian = objective.linearise(objective.guess(problem.nominal))
         uncertainty = information(jacobian, objective.high - objective.low, 1.0)
         row[:] = QUANTILE * uncertainty.sd[: len(row)]
@@ -275,6 +293,16 @@ def expected_accuracy(problem: Problem, windows: Sequence[Window]) -> dict[str, 
             reason=next((text for kind, text in kinds if kind is usual[0][0]), "") if usual else "",
         )
     return accuracies
+
+
+def _without_constant_outputs(problem: Problem, window: Window) -> Window:
+    """Return the window without the samples of outputs that keep one value: without noise they are no measurement."""
+    missing = window.missing.copy()
+    for output in problem.twin.outputs:
+        present = ~window.missing_in(output.name)
+        if present.any() and np.ptp(window.column(output.name)[present]) == 0.0:
+            missing[:, window.signals.index(output.name)] = True
+    return replace(window, missing=missing)
 
 
 def _proposed_period(statistics: RecordingStatistics, configured: float) -> float:
@@ -320,7 +348,7 @@ def _with_window(machine: LoadedMachine, length: float, period: float) -> Loaded
     changes = {"length": length, "sample_period": period, "shortest": None, "longest": None}
     file = machine.file.model_copy(update={"window": window.model_copy(update=changes)})
     records = round(length / period)
-    problem = replace(machine.problem, window=WindowOptions(records, records, records))
+    problem = replace(machine.problem, window=WindowOptions(records, records, records, period))
     return replace(machine, file=file, problem=problem)
 
 
@@ -364,17 +392,32 @@ def _signal(unit: str, sampling: SignalSampling) -> SignalPreview:
     )
 
 
-def _remarks(statistics: RecordingStatistics, samplings: dict[str, SignalSampling]) -> Iterator[str]:
+def _remarks(
+    machine: LoadedMachine, statistics: RecordingStatistics, samplings: dict[str, SignalSampling]
+) -> Iterator[str]:
     """Yield what a user should know of the rows, a sentence each; signals with the same remark share it."""
     if statistics.first_step_back is not None:
         line, time, before = statistics.first_step_back
-        count = f"{statistics.steps_back} steps back in time"
-        yield f"{count}, the first in line {line}: t = {time:.12g} after t = {before:.12g}"
+        count = f"{counted(statistics.steps_back, 'step')} back in time"
+        first = ", the first" if statistics.steps_back > 1 else ""
+        yield f"{count}{first} in line {line}: t = {time:.12g} after t = {before:.12g}"
     shared: dict[str, list[str]] = {}
-    for name, sampling in samplings.items():
-        for remark in _signal_remarks(sampling):
-            shared.setdefault(remark, []).append(name)
+    for plan in machine.plans(Sampling.TRUE):
+        sampling = samplings[plan.name]
+        remarks = [*_signal_remarks(sampling)]
+        if plan.hold != "zoh" and Check.STALE in plan.checks:  # a command repeats what it holds
+            remarks += _renewal_remarks(sampling)
+        if plan.hold is None and sampling.samples > 1 and not np.ptp(sampling.values):
+            remarks.append("the value never changes, so it determines no parameter")
+        for remark in remarks:
+            shared.setdefault(remark, []).append(plan.name)
     yield from (f"{', '.join(names)}: {remark}" for remark, names in shared.items())
+
+
+def _renewal_remarks(sampling: SignalSampling) -> Iterator[str]:
+    if sampling.renewal > 1:
+        every = duration_text(sampling.renewal * sampling.interval)
+        yield f"the value changes with every {_ordinal(sampling.renewal)} sample only, about every {every}"
 
 
 def _signal_remarks(sampling: SignalSampling) -> Iterator[str]:
@@ -384,12 +427,11 @@ def _signal_remarks(sampling: SignalSampling) -> Iterator[str]:
         yield f"the longest gap is {duration_text(gap.seconds)}, from t = {gap.start:.12g} s to line {gap.line}"
     if sampling.duplicates:
         share = sampling.duplicates / sampling.samples
-        yield f"{sampling.duplicates} samples ({share:.0%}) have time and value of the sample before"
+        count = f"{counted(sampling.duplicates, 'sample')} ({share:.0%})"
+        yield f"at time and with the value of the sample before: {count}"
     if sampling.repeated_times:
-        yield f"{sampling.repeated_times} samples have the time of the sample before, but another value"
-    if sampling.renewal > 1:
-        every = duration_text(sampling.renewal * sampling.interval)
-        yield f"the value changes with every {_ordinal(sampling.renewal)} sample only, about every {every}"
+        count = counted(sampling.repeated_times, "sample")
+        yield f"at the time of the sample before, but with another value: {count}"
     if sampling.jitter > MIN_REMARKED_JITTER:
         yield f"the intervals vary by {sampling.jitter:.0%} (standard deviation over median)"
 
@@ -413,7 +455,7 @@ def computing_time_text(seconds: float, longest: float, length: float) -> str:
 def preview_lines(preview: Preview) -> Iterator[str]:
     """Yield the whole preview as lines of text, at most 80 columns wide."""
     seconds = (preview.end or 0.0) - (preview.start or 0.0)
-    yield f"{Path(preview.data).name}: {preview.rows} rows in {seconds:.6g} s"
+    yield f"{Path(preview.data).name}: {counted(preview.rows, 'row')} in {seconds:.6g} s"
     yield f"  {'signal':18}{'samples':>10}{'every':>9}{'jitter':>8}{'gaps':>7}{'longest':>9}{'step':>10}{'twice':>7}"
     for name, signal in preview.signals.items():
         label = f"{name} [{signal.unit}]"
@@ -438,13 +480,13 @@ def preview_lines(preview: Preview) -> Iterator[str]:
         yield from _wrapped(computing_time_text(*times, preview.proposed.length_s), indent="")
 
 
-def short_lines(preview: Preview, max_rows: float = math.inf) -> Iterator[str]:
-    """Yield the preview in a few lines, for the start of a replay; ``max_rows`` as in :func:`preview_recording`."""
-    part = "at the beginning, " if preview.rows > max_rows else ""
+def short_lines(preview: Preview) -> Iterator[str]:
+    """Yield the preview in a few lines, for the start of a replay."""
     rates: dict[str, list[str]] = {}
     for name, signal in preview.signals.items():
         rates.setdefault("-" if signal.interval_s is None else duration_text(signal.interval_s), []).append(name)
-    yield from _wrapped(part + "; ".join(f"{', '.join(names)} every {rate}" for rate, names in rates.items()))
+    every = "; ".join(f"{', '.join(names)} every {rate}" for rate, names in rates.items())
+    yield from _wrapped(f"{counted(preview.rows, 'row')} of {Path(preview.data).name}: {every}")
     for remark in preview.remarks:
         yield from _wrapped(f"! {remark}")
     yield from _window_lines(preview.windows)
@@ -455,6 +497,8 @@ def short_lines(preview: Preview, max_rows: float = math.inf) -> Iterator[str]:
     ]
     if expected:
         yield from _wrapped(f"expected 95 % intervals from one window: {', '.join(expected)}")
+    if preview.is_partial:
+        yield from _wrapped("not examined: a better window, the computing time; 'otolith check' does so")
 
 
 def _window_lines(windows: WindowPreview) -> Iterator[str]:

@@ -16,14 +16,14 @@ import numpy as np
 
 from otolith.acquisition.playback import MAX_SILENT_WINDOWS, Playback, median_step
 from otolith.acquisition.recording_statistics import RecordingStatistics
-from otolith.acquisition.window import Array, Verdict, Window
+from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
 from otolith.machine import LoadedMachine, RecordedMachine, driver_config
 from otolith.runtime.worker import perform
 from otolith_drivers.base import Sampling, Setup, Signal
 from otolith_drivers.config_files import read
-from otolith_drivers.errors import ConfigurationError, ServiceError
+from otolith_drivers.errors import ConfigurationError, ServiceError, counted
 from otolith_drivers.replay.joined import JoinedReader
 from otolith_drivers.replay.readers import Reader, Rows, format_of, holds_frames
 from otolith_drivers.user_dirs import writable
@@ -166,15 +166,13 @@ class Replay:
         for rows in self._data.chunks():
             if self._stopped():
                 return
-            if self._data.is_table and not counts.rows:
-                self._check_time_unit(rows.times)
+            if not counts.rows:
+                self._check_times(rows)
             self.statistics.add(rows)
             begun, before = before, self._data.progress
             yield from self._with_progress(self._playback.windows(rows), rows, begun)
         if rows is not None:
             yield from self._with_progress(self._playback.rest(), rows, begun)
-        if counts.rows > 2 and counts.reordered == counts.rows - 1:
-            raise ConfigurationError(f"{self._data.path}: time decreases from row to row: sort the rows by t")
         if not self._stopped():
             self.progress = 1.0
 
@@ -186,12 +184,24 @@ class Replay:
             self.progress = max(self.progress, before + (after - before) * float(done))
             yield window
 
-    def _check_time_unit(self, times: Array) -> None:
+    def _check_times(self, rows: Rows) -> None:
+        """Raise an error if the first rows show that the times of the file cannot be meant.
+
+        Time runs backwards if most rows that differ from the row above are before it, and the last before the first.
+        """
+        times, steps = rows.times, np.diff(rows.times)
+        if len(times) > 2 and times[-1] < times[0] and 2 * np.count_nonzero(steps < 0.0) > np.count_nonzero(steps):
+            raise ConfigurationError(f"{self._data.path}: time decreases from row to row: sort the rows by t")
         step = median_step(times)
-        if math.isfinite(step) and step * MIN_ROWS_PER_WINDOW > self._length:
-            rate = f"one row every {step:.6g} s, but windows of {self._length:g} s"
-            remedy = "if t is not in seconds, name the column 't [ms]' or the like"
-            raise ConfigurationError(f"{self._data.path}: {rate}: {remedy}")
+        if not self._data.is_table or math.isinf(step) or step * MIN_ROWS_PER_WINDOW <= self._length:
+            return
+        mean = float(steps[steps > 0.0].sum()) / len(steps)  # smaller if times repeat
+        if mean * MIN_ROWS_PER_WINDOW <= self._length:
+            remedy = "write t with all its digits, or remove rows that repeat"
+            raise ConfigurationError(f"{self._data.path}: {_standstill(rows)}: {remedy}")
+        rate = f"one row every {step:.6g} s, but windows of {self._length:g} s"
+        remedy = "if t is not in seconds, name the column 't [ms]' or the like"
+        raise ConfigurationError(f"{self._data.path}: {rate}: {remedy}")
 
     def _adapt(self, window: Window) -> Report | None:
         """Return the report of a window, or None if the adaptation failed, which costs this window only."""
@@ -222,7 +232,7 @@ class Replay:
         counts = self._playback.counts
         first, *rest = self._data.summary_lines()
         parts = ", ".join([first, f"{counts.reordered} reordered", *rest])
-        return f"{parts}; {counts.received} samples, {counts.lost + self._data.lost} lost"
+        return f"{parts}; {counted(counts.received, 'sample')}, {counts.lost + self._data.lost} lost"
 
     def warnings(self) -> list[str]:
         """Return what a user must know of the file before trusting the reports, one sentence each."""
@@ -251,8 +261,18 @@ class Replay:
 
     def _why_no_window(self) -> str:
         rows = self._playback.counts.rows
-        reason = f"{rows} {'row is' if rows == 1 else 'rows are'} too short for a window of {self._length:g} s"
+        if rows > 1 and self.statistics.first == self.statistics.last:
+            return f"all {rows} rows have t = {self.statistics.first:.12g}: write t with all its digits"
+        reason = f"{counted(rows, 'row')} {'is' if rows == 1 else 'are'} too short for a window of {self._length:g} s"
         return "; ".join([f"{reason}: record for longer, or shorten [window] length", *self.warnings()])
+
+
+def _standstill(rows: Rows) -> str:
+    """Return where most rows in a row have the same time."""
+    begins = np.flatnonzero(np.diff(rows.times, prepend=np.nan, append=np.nan))
+    longest = int(np.argmax(np.diff(begins)))
+    first, last = int(begins[longest]), int(begins[longest + 1]) - 1
+    return f"t is {rows.times[first]:.12g} from line {rows.lines[first]} to line {rows.lines[last]}"
 
 
 class ReplayRecorder:

@@ -17,7 +17,7 @@ import can
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.config_files import StrictModel
-from otolith_drivers.errors import DeviceError
+from otolith_drivers.errors import DeviceError, counted
 from otolith_drivers.units import Quantity
 
 RECEIVE_BUFFER = 8 << 20  # bytes; a second or two of a bus at its limit
@@ -220,4 +220,5 @@ class DropCounter:
         """One line as long as a drop is recent at ``now`` (s)."""
         if not self.total or now - self._time > DROPS_SHOWN:
             return []
-        return [f"this computer was too busy to read {self.total} frames, the last {now - self._time:.1f} s ago"]
+        frames = counted(self.total, "frame")
+        return [f"this computer was too busy to read {frames}, the last {now - self._time:.1f} s ago"]

@@ -20,7 +20,7 @@ from can.io.blf import BLFParseError
 from otolith_drivers.base import Sample, Sampling, Setup
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.replay.readers import MAX_TIME, DataFile, Reader, Rows, suffix_of
 
 # Engineering choices, guarded by the tests with garbage and damaged logs in test_can_log.py.
@@ -143,9 +143,9 @@ class CanLogReader(Reader):
 
     def summary_lines(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.summary_lines`."""
-        lines = [f"{self._frames} frames read", f"{self._others} of other messages", f"{self.bad} bad"]
+        lines = [f"{counted(self._frames, 'frame')} read", f"{self._others} of other messages", f"{self.bad} bad"]
         passed = self._source.passed
-        return lines + ([f"{passed} {self.place}s without a frame"] if passed else [])
+        return lines + ([f"{counted(passed, self.place)} without a frame"] if passed else [])
 
     def warnings(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.warnings`."""

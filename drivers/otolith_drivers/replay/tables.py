@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 
 from otolith_drivers.base import Setup
 from otolith_drivers.config_files import StrictModel
-from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows
 from otolith_drivers.units import factor
 
@@ -181,8 +181,8 @@ class TableReader(Reader):
     def summary_lines(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.summary_lines`."""
         counts = self.counts
-        parts = [f"{counts.rows} rows read", f"{counts.bad_rows} bad rows", f"{counts.bad_cells} bad cells"]
-        return [*parts, f"{counts.blank} cells blank"]
+        parts = [f"{counted(counts.rows, 'row')} read", counted(counts.bad_rows, "bad row")]
+        return [*parts, counted(counts.bad_cells, "bad cell"), f"{counted(counts.blank, 'cell')} blank"]
 
     def warnings(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.warnings`."""
