@@ -154,7 +154,7 @@ def test_a_time_that_repeats_at_the_start_of_a_slow_log_is_named_with_its_lines(
     rows = recorded(scenario)[:100]
     times = [0.0] * 50 + [float(second) for second in range(50)]
     retimed = [[str(time), *row[1:]] for time, row in zip(times, rows, strict=True)]
-    with pytest.raises(ConfigurationError, match="t is 0 from line 2 to line 52: write t with all its digits"):
+    with pytest.raises(ConfigurationError, match="t is 0 from line 2 to line 52, so write t with all its digits"):
         replay(MACHINE, [written(tmp_path, retimed)], None, as_json=True, stopped=lambda: False)
 
 

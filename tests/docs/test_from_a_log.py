@@ -14,12 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array
 from otolith.cli.main import cli
-from otolith.cli.noise import identified_noise
+from otolith.commissioning.identification import identify_noise
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import ReportDocument
+from otolith.health.text import finding_text
 from otolith.machine import load_machine, load_twin
 from otolith.runtime.replay import Replay, open_recorded
 from otolith.twin.identifiability import structural_identifiability
@@ -42,7 +44,7 @@ KP_100 = 'gain = "0.2877 1/rad"'
 AT_REST = 0.02  # rad: an arm that moves by less within a window is at rest
 USED = 0.95  # share of the windows with motion
 DAMPING = 0.05  # largest error of the damping of a window
-NOISE = 0.5  # largest error of a noise level on the page
+FIGURE = 0.03  # largest error of a figure on the page: that of two or three digits
 
 
 def logs(name: str) -> Path:
@@ -129,10 +131,60 @@ def test_every_command_of_the_guide_runs(folder: Path, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(("machine", "log"), [("rotor-rig", "healthy_104"), ("servo-kp400", "sin_time_square_kp400")])
 def test_noise_levels_of_the_guide_are_identified(folder: Path, machine: str, log: str) -> None:
     loaded = load_machine(folder / f"{machine}.toml", with_driver=False)
-    _, levels = identified_noise(loaded, folder / f"{log}.csv", 30)
-    written = dict(zip((state.name for state in loaded.twin.states), loaded.problem.process_noise, strict=True))
-    for level in levels.states:
-        assert level.value == pytest.approx(written[level.name], rel=NOISE)
+    twin, problem = loaded.twin, loaded.problem
+    with open_recorded(loaded, folder / f"{log}.csv") as recorded:
+        levels = identify_noise(problem, list(Replay(loaded, recorded).windows()))
+    process = dict(zip((state.name for state in twin.states), problem.process_noise, strict=True))
+    sensors = dict(zip((output.name for output in twin.outputs), problem.noise, strict=True))
+    for identified, written in ((levels.states, process), (levels.outputs, sensors)):
+        for level in identified:
+            assert level.value == pytest.approx(written[level.name], rel=FIGURE)
+
+
+@needs_data
+def test_the_delay_and_its_noise_are_those_of_the_guide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (delay, level) = re.findall(r"a delay of `speed` of (\d+) ms, and a process noise of (\d+)", GUIDE)[0]
+    text = printed(folder, "noise rotor-rig.toml healthy_104.csv", monkeypatch)
+    (noise,) = re.findall(r'^speed = "([\d.]+) 1/s\^0\.5"', text, re.MULTILINE)
+    assert float(noise) == pytest.approx(float(level), rel=FIGURE)
+    (measured,) = re.findall(r'^speed = \{ delay = "([\d.]+) ms" \}', text, re.MULTILINE)
+    assert float(measured) == pytest.approx(float(delay), rel=FIGURE)
+    assert "no delay is significant" in printed(folder, "noise servo-kp400.toml sin_time_square_kp400.csv", monkeypatch)
+
+
+def printed(folder: Path, command: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Standard output of a command of the guide, in the folder of its files."""
+    monkeypatch.chdir(folder)
+    result = CliRunner().invoke(cli, shlex.split(command))
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@needs_data
+def test_the_preview_is_printed_as_shown(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = printed(folder, "check rotor-rig.toml damping_424.csv", monkeypatch)
+    lines = text[text.index("damping_424.csv: ") :].splitlines()
+    page = (ROOT / "docs" / "replay.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(
+        r"(?:^    .*\n)+", page[page.index("## Before a replay") : page.index("## Late")], re.MULTILINE
+    )
+    assert [line[4:] for line in shown.splitlines()][:-1] == lines[:-1]  # the last is the computing time
+    assert "windows of 2 s with a record every 16 ms: 10, 10 usable" in text
+    rows = {line.split()[0]: line.split()[-3:] for line in lines if line.startswith(("  inertia", "  damping"))}
+    assert rows == {"inertia": ["0", "of", "8"], "damping": ["8", "of", "8"]}
+
+
+@needs_data
+def test_the_replay_prints_the_figures_of_the_guide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = printed(folder, "replay rotor-rig.toml healthy_104.csv", monkeypatch)
+    for shown in ("1481 rows read", "11 windows: 11 good, 0 bad", "the twin explains 11 of 11 up to the noise"):
+        assert shown in GUIDE
+        assert shown in text
+    (value, half_width) = re.findall(r"^\| `damping ([\d.]+) ± ([\d.]+)`", GUIDE, re.MULTILINE)[0]
+    (row,) = [line.split("│") for line in text.splitlines() if line.startswith("│ damping")]
+    assert float(row[2]) == pytest.approx(float(value), abs=1e-4)
+    assert float(row[3]) == pytest.approx(float(half_width), rel=0.1)
+    assert re.search(r"│ inertia +│ +unknown", text)
 
 
 @needs_data
@@ -163,7 +215,7 @@ def test_each_window_alone_shows_the_damper(folder: Path, log: str) -> None:
     columns = table(folder / f"{log}.csv")
     checked = 0
     for document in reports(folder, "rotor-rig.toml", log):
-        inside = (columns["t"] >= document.window.start) & (columns["t"] < document.window.end)
+        inside = _inside(columns, document)
         labels = set(columns["damper_ohm"][inside])
         if len(labels) > 1:
             continue
@@ -175,16 +227,30 @@ def test_each_window_alone_shows_the_damper(folder: Path, log: str) -> None:
 
 
 @needs_data
-def test_the_guide_shows_the_damping_of_each_stretch() -> None:
+def test_the_guide_shows_the_damping_of_each_stretch(folder: Path) -> None:
     (log,) = re.findall(r"<!-- stretches: (\S+) -->", GUIDE)
     columns = table(logs(log))
     rows = re.findall(r"^\| (\d+) ohm \| ([\d.]+) \| ([\d.]+) \|$", GUIDE, re.MULTILINE)
+    documents = reports(folder, "rotor-rig.toml", Path(log).stem)
     assert len(rows) == 3
     for label, alone, mean in rows:
         stretch = columns["damper_ohm"] == float(label)
         expected = columns["control_effort"][stretch].mean() / columns["speed"][stretch].mean()
         assert float(mean) == pytest.approx(expected, abs=5e-5)
-        assert float(alone) == pytest.approx(expected, rel=0.01)
+        raw = [
+            document.parameters["damping"].raw
+            for document in documents
+            if set(columns["damper_ohm"][_inside(columns, document)]) == {float(label)}
+        ]
+        assert raw
+        assert np.median(np.array(raw, dtype=np.float64)) == pytest.approx(float(alone), abs=1e-3)
+    texts = [finding_text(finding) for document in documents for finding in document.findings]
+    assert any("damping" in text and "speed reads" in text for text in texts)
+
+
+def _inside(columns: dict[str, Array], document: ReportDocument) -> NDArray[np.bool_]:
+    """Which rows are in the window of a report."""
+    return (columns["t"] >= document.window.start) & (columns["t"] < document.window.end)
 
 
 @needs_data
@@ -193,9 +259,9 @@ def test_windows_of_the_servo_with_motion_are_used(folder: Path) -> None:
     for log in SERVO_LOGS:
         columns = table(folder / f"{log}.csv")
         documents = reports(folder, f"servo-{log[-5:]}.toml", log)
-        assert len(documents) >= 2
+        assert len(documents) == 3
         for document in documents:
-            inside = (columns["t"] >= document.window.start) & (columns["t"] < document.window.end)
+            inside = _inside(columns, document)
             if np.ptp(columns["position"][inside]) > AT_REST:
                 moving += 1
                 problems += [f"{log}, {text}" for text in refused([document])]

@@ -163,10 +163,22 @@ def catches(pid: int, number: signal.Signals) -> bool:
     return bool(int(caught, 16) >> (number - 1) & 1)
 
 
+def seconds_to_start() -> float:
+    """How long this computer takes now to start Python and import the daemon, s."""
+    begun = time.monotonic()
+    subprocess.run([sys.executable, "-c", "import otolith.runtime.service"], check=True)
+    return time.monotonic() - begun
+
+
 @pytest.mark.timed
 @pytest.mark.parametrize("moment", [0.02, 0.2, 0.5, 1.0, 1.5, 3.5])
 def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine, tmp_path: Path, moment: float) -> None:
-    """The whole process group gets the signal, as from a terminal."""
+    """The whole process group gets the signal, as from a terminal.
+
+    A signal that comes during the start is obeyed after the imports, so a computer on which three starts alone take
+    longer than three seconds gets their time.
+    """
+    limit = max(within(3.0), 3.0 * seconds_to_start())
     command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine), "--recording", str(tmp_path / "a.rrd")]
     shared = set(Path("/dev/shm").iterdir())  # noqa: S108 - looked at, not written to
     daemon = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -177,17 +189,17 @@ def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine,
     for process in [psutil.Process(daemon.pid), *children]:
         process.send_signal(signal.SIGINT)
     try:
-        _, errors = daemon.communicate(timeout=within(3.0))
+        _, errors = daemon.communicate(timeout=limit)
     except subprocess.TimeoutExpired:
         assert early, "the daemon did not end"  # but Python itself may lose a signal while it imports its own modules
         daemon.send_signal(signal.SIGINT)
         begun = time.monotonic()
-        _, errors = daemon.communicate(timeout=within(3.0))
-    assert time.monotonic() - begun < within(3.0)
+        _, errors = daemon.communicate(timeout=limit)
+    assert time.monotonic() - begun < limit
     # In the first hundredths of a second the interpreter has not reached our code, and may print its own traceback.
     assert "otolith" not in errors.partition("Traceback")[2]
     assert daemon.returncode in (130, -signal.SIGINT) or (daemon.returncode == 1 and "Traceback" in errors)
-    _, left = psutil.wait_procs(children, timeout=within(1.0))
+    _, left = psutil.wait_procs(children, timeout=limit / 3.0)
     # Where the first process of a container reaps nobody, an ended orphan stays listed as a zombie.
     assert [process for process in left if process.status() != psutil.STATUS_ZOMBIE] == []
     assert set(Path("/dev/shm").iterdir()) <= shared  # noqa: S108

@@ -165,5 +165,5 @@ class ReasonCounts:
 def time_text(seconds: float) -> str:
     """Return a time of the data: a date and time of day (UTC) for Unix seconds, else seconds."""
     if not CALENDAR[0] <= seconds < CALENDAR[1]:
-        return f"t = {seconds:.2f} s" if 1e3 <= abs(seconds) < CALENDAR[0] else f"t = {seconds + 0.0:.4g} s"
+        return f"t = {seconds:.2f} s" if 1e3 <= abs(seconds) < CALENDAR[0] else f"t = {round(seconds, 9) + 0.0:.4g} s"
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S.%f}"[:-4] + " UTC"

@@ -201,6 +201,8 @@ class Replay:
             raise ConfigurationError(f"{self._data.path}: {_standstill(rows)}: {remedy}")
         rate = f"one row every {step:.6g} s, but windows of {self._length:g} s"
         remedy = "if t is not in seconds, name the column 't [ms]' or the like"
+        if 2 * np.count_nonzero(steps == 0.0) > len(steps):
+            remedy += f"; {_standstill(rows)}, so write t with all its digits"
         raise ConfigurationError(f"{self._data.path}: {rate}: {remedy}")
 
     def _adapt(self, window: Window) -> Report | None:
