@@ -21,7 +21,7 @@ from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
 from otolith.machine import LoadedMachine, RecordedMachine, driver_config
 from otolith.runtime.worker import perform
-from otolith_drivers.base import Sampling, Setup, Signal
+from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError, counted
 from otolith_drivers.replay.joined import JoinedReader
