@@ -8,12 +8,13 @@ import pytest
 from benchmarks.sampling.measure import some_motor, write_machine
 from benchmarks.sampling.schedules import Recording, Schedule, Timing, record
 
-from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.acquisition.window import BridgeError, Quality, Verdict, Window
 from otolith.commissioning import delays as text
 from otolith.commissioning.delays import IdentifiedDelays, SignalDelay, identify_delays, identify_delays_and_noise
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
-from otolith.machine import load_machine
+from otolith.estimation.timing.shifted_window import shifted
+from otolith.machine import find_twin, load_machine
 from otolith.runtime.replay import Replay, open_recorded
 
 ROWS = Schedule(rows=Timing(0.01))
@@ -143,3 +144,13 @@ def test_an_idle_machine_shows_no_delay(tmp_path: Path) -> None:
     assert {signal.remark for signal in identified.signals if signal.name in problem.twin.signals} >= {
         text.UNOBSERVABLE
     }
+
+
+@pytest.mark.parametrize("variance", [1e-20, 1.0])
+def test_a_bridge_error_of_any_size_lasts_as_long_in_a_shifted_window(variance: float) -> None:
+    twin, one = find_twin("dc_motor"), np.ones((100, 4))
+    whole = Window.whole(0, 0.0, 0.01, twin.signals, one)
+    window = replace(whole, bridge_error=BridgeError(one, variance * one, 5.0 * variance * one, 0.0 * one))
+    error = shifted(twin, window, {"omega": 20 * MS}).bridge_error
+    assert error is not None
+    assert error.held_variance / error.variance == pytest.approx(5.0)

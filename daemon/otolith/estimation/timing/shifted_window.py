@@ -15,7 +15,6 @@ from otolith.twin.definition import Definition
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 SAME_TIME = 1e-6  # of the mean step: times that differ by less are one record
-MIN_DURATION = 1e-12  # s; against division by zero
 
 
 def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Window:
@@ -74,7 +73,7 @@ def _bridge_error(
     column = window.signals.index(signal)
     ratio, variance, held = (part[:, column] for part in (error.noise_ratio, error.variance, error.held_variance))
     spacing = np.maximum((ratio * old)[before], steps)
-    duration = np.divide(held * old, variance, out=np.zeros(len(old)), where=variance > MIN_DURATION)[before]
+    duration = np.divide(held * old, variance, out=np.zeros(len(old)), where=variance > 0.0)[before]
     change = error.expected_change[:, column][before]
     return spacing / steps, variance[before], variance[before] * np.maximum(1.0, duration / steps), change
 
