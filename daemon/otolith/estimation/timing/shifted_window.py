@@ -13,8 +13,8 @@ from otolith.acquisition.time_grid import TimeGrid
 from otolith.acquisition.window import Array, BridgeError, Mask, Window
 from otolith.twin.definition import Definition
 
-# Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
-SAME_TIME = 1e-6  # of the mean step: times that differ by less are one record
+# Values, units, origins and guarding tests: docs/reference/thresholds-estimation.md.
+SAME_RECORD_STEPS = 1e-6  # mean steps: times that differ by less are one record
 
 
 def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Window:
@@ -25,7 +25,7 @@ def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Wi
     """
     if not any(delays.values()):
         return window
-    length, tolerance = window.grid.length, SAME_TIME * window.sample_period
+    length, tolerance = window.grid.length, SAME_RECORD_STEPS * window.sample_period
     of_inputs = [delays.get(driven.name, 0.0) for driven in twin.inputs]
     start, end = max([0.0, *(-delay for delay in of_inputs)]), length - max([0.0, *of_inputs])
     distinct = sorted({delays.get(signal, 0.0) for signal in window.signals})
