@@ -6,10 +6,11 @@ each window refuses a number that is not finite, so reading a document back is t
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -202,11 +203,16 @@ class Log:
     """A machine file and a table."""
 
     machine: str
-    table: str = field(repr=False)
+    table: str
     chunk: int
     """Rows that are read at once."""
     marks: tuple[float, ...]
     """Shares of the rows before each that begins a recording."""
+
+    def __repr__(self) -> str:
+        """Return a short text that names the log; hypothesis refuses a long one."""
+        lines = self.table.splitlines()
+        return f"Log({len(lines)} lines, crc {crc32(self.table.encode()):08x}, chunk {self.chunk}, {self.marks})"
 
 
 @st.composite
