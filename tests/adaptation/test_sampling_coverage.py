@@ -110,7 +110,9 @@ def test_the_effect_of_the_load_on_the_outputs_is_exact(recording: Recording) ->
 
 
 @pytest.mark.parametrize(("period", "low", "high"), [(0.01, 1.0, 1.01), (0.05, 1.1, 2.0)])
-def test_the_bound_allows_for_a_load_whose_samples_do_not_show_its_shape(period: float, low: float, high: float) -> None:
+def test_the_bound_allows_for_a_load_whose_samples_do_not_show_its_shape(
+    period: float, low: float, high: float
+) -> None:
     """A sine with 6 rad/s is off the lines between samples at 50 ms by more than the sensors' noise shows."""
     random = np.random.default_rng(3)
     coarse = record(Schedule(load_period=period, commands_on_change=True), some_motor(random), 3.0, random)
