@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from hypothesis.vendor.pretty import RepresentationPrinter
 
 from otolith.acquisition.records import MAX_LOST_RECORDS
 from otolith.acquisition.window import Array, Window
@@ -209,10 +210,10 @@ class Log:
     marks: tuple[float, ...]
     """Shares of the rows before each that begins a recording."""
 
-    def __repr__(self) -> str:
-        """Return a short text that names the log; hypothesis refuses a long one."""
-        lines = self.table.splitlines()
-        return f"Log({len(lines)} lines, crc {crc32(self.table.encode()):08x}, chunk {self.chunk}, {self.marks})"
+    def _repr_pretty_(self, printer: RepresentationPrinter, _cycle: bool) -> None:
+        """Print the log without its table, of which hypothesis prints no long one; the test's folder keeps it."""
+        lines, checksum = self.table.count("\n"), crc32(self.table.encode())
+        printer.text(f"Log({self.machine!r}, {lines} lines, CRC {checksum:08x}, {self.chunk}, {self.marks})")
 
 
 @st.composite
