@@ -6,15 +6,17 @@ each window refuses a number that is not finite, so reading a document back is t
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from hypothesis.vendor.pretty import RepresentationPrinter
 
 from otolith.acquisition.records import MAX_LOST_RECORDS
 from otolith.acquisition.window import Array, Window
@@ -202,11 +204,16 @@ class Log:
     """A machine file and a table."""
 
     machine: str
-    table: str = field(repr=False)
+    table: str
     chunk: int
     """Rows that are read at once."""
     marks: tuple[float, ...]
     """Shares of the rows before each that begins a recording."""
+
+    def _repr_pretty_(self, printer: RepresentationPrinter, _cycle: bool) -> None:
+        """Print the log without its table, of which hypothesis prints no long one; the test's folder keeps it."""
+        lines, checksum = self.table.count("\n"), crc32(self.table.encode())
+        printer.text(f"Log({self.machine!r}, {lines} lines, CRC {checksum:08x}, {self.chunk}, {self.marks})")
 
 
 @st.composite

@@ -80,7 +80,7 @@ def assert_used(documents: Sequence[ReportDocument], at_least: int = WINDOWS) ->
     assert all(document.decision in ACCEPTED for document in documents), reasons
 
 
-def assert_honest(outcomes: Sequence[WindowOutcome]) -> None:
+def assert_valid_intervals(outcomes: Sequence[WindowOutcome]) -> None:
     """Intervals hold the truth, except in as many windows as chance explains, and the errors are near the bound."""
     summary = summarise(outcomes)
     share = 3.3 * np.sqrt(0.95 * 0.05 / summary.windows)
@@ -114,7 +114,7 @@ def test_a_register_renewed_every_fifth_row_is_used_and_counted_once(log: Log, c
         rows = [[f"{float(row[0]) + 0.01 * copy:.6f}", *row[1:]] for row in recording.rows() for copy in range(5)]
     documents = log.reports(schedule, recording.header, rows)
     assert_used(documents)
-    assert_honest([outcome(recording, document) for document in documents])
+    assert_valid_intervals([outcome(recording, document) for document in documents])
 
 
 COMMANDS = {
@@ -142,12 +142,12 @@ def test_a_command_is_held_between_its_samples(tmp_path: Path, name: str) -> Non
 
 
 @pytest.mark.parametrize("voltage", ["steps", "levels"])
-def test_commands_on_change_give_honest_estimates(log: Log, voltage: Voltage) -> None:
+def test_commands_on_change_give_valid_intervals(log: Log, voltage: Voltage) -> None:
     schedule = Schedule(voltage=voltage, commands_on_change=True)
     recording = recorded(schedule)
     documents = log.of(schedule, recording)
     assert_used(documents)
-    assert_honest([outcome(recording, document) for document in documents])
+    assert_valid_intervals([outcome(recording, document) for document in documents])
 
 
 SLOW_OMEGA = Schedule(rows=Timing(0.01), omega=Timing(missing=0.8))
@@ -163,14 +163,14 @@ LOGS = {
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_an_irregular_or_slow_log_is_used_with_honest_intervals(log: Log, name: str) -> None:
+def test_an_irregular_or_slow_log_is_used_with_valid_intervals(log: Log, name: str) -> None:
     schedule, outcomes = LOGS[name], []
     for seed in (7, 8):
         recording = recorded(schedule, seed)
         documents = log.of(schedule, recording)
         assert_used(documents)
         outcomes += [outcome(recording, document) for document in documents]
-    assert_honest(outcomes)
+    assert_valid_intervals(outcomes)
 
 
 def test_outputs_are_never_interpolated(tmp_path: Path) -> None:
@@ -197,7 +197,7 @@ def test_a_gap_of_27_s_at_the_start_does_not_spoil_what_follows(log: Log, period
     outcomes = [outcome(recording, document) for document in log.of(schedule, recording)]
     after = [item for item in outcomes if item.document.window.start >= gap_end - period]
     assert_used([item.document for item in after])
-    assert_honest(after)
+    assert_valid_intervals(after)
     refused = [item.document.window for item in outcomes if item.document.window.start < gap_end - period]
     assert all(window.quality.verdict is Verdict.BAD and window.quality.reasons for window in refused)
 

@@ -8,7 +8,7 @@ import pytest
 from otolith.acquisition.time_grid import TimeGrid
 from otolith.acquisition.window import Array, BridgeError, Quality, Verdict, Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import initial_state
+from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem, WindowOptions
@@ -22,6 +22,8 @@ TRUTH = {parameter.name: parameter.nominal for parameter in TWIN.parameters}
 NOISE = np.array([0.005, 0.02])  # A, rad/s
 FINE, LENGTH = 1e-3, 2.0  # s
 FREE = ("R_a", "D", "J")
+HIDDEN = 0.03  # N*m
+OFFSET = "sensor of T_load/constant"
 PROBLEM = Problem(
     TWIN,
     known=tuple((name, value) for name, value in TRUTH.items() if name not in FREE),
@@ -124,13 +126,31 @@ def test_window_length_counts_nominal_records(step: float) -> None:
 
 @pytest.mark.parametrize("missing", [0.0, 0.8])
 def test_a_component_is_discovered_at_random_times(missing: float) -> None:
-    """A load that no sensor shows begins between two windows."""
+    """A load that no sensor shows begins between two windows; an offset of the load's sensor is ruled out."""
+    trusted = replace(PROBLEM, discover=True, excluded=frozenset({OFFSET}))
+    state, decisions = with_hidden_load(trusted, missing, windows=9)
+    assert decisions == ["learned"] * 6 + ["suspected"] * 2 + ["discovered"]
+    (adopted,) = state.adopted
+    assert adopted.component.key == "shaft/constant"
+    assert adopted.component.amplitude == pytest.approx(-HIDDEN, rel=0.01)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.8])
+def test_a_component_that_looks_like_an_offset_of_a_sensor_is_not_adopted(missing: float) -> None:
+    """No window distinguishes a constant hidden load from an offset of the load's sensor."""
+    state, decisions = with_hidden_load(replace(PROBLEM, discover=True), missing, windows=16)
+    assert decisions == ["learned"] * 6 + ["suspected"] * 10
+    assert state.test is not None
+    assert {item.hypothesis.name for item, _ in state.test.alternatives(state.test.best)} == {"shaft/constant"}
+    assert state.test.best.hypothesis.name == OFFSET
+
+
+def with_hidden_load(problem: Problem, missing: float, windows: int) -> tuple[AdaptationState, list[str]]:
+    """Return state and decisions after windows of which the first six have no hidden load."""
     random = np.random.default_rng(35)
-    state = initial_state("motor", "test", replace(PROBLEM, discover=True))
+    state = initial_state("motor", "test", problem)
     decisions = []
-    for index in range(14):
-        hidden = 0.03 if index >= 6 else 0.0
-        state, report = adapt(state, window(random, index, missing, hidden))
-        decisions.append(report.document.decision)
-    assert decisions[:6] == ["learned"] * 6
-    assert state.adopted or state.test is not None, decisions
+    for index in range(windows):
+        state, report = adapt(state, window(random, index, missing, HIDDEN if index >= 6 else 0.0))
+        decisions.append(report.document.decision.name.lower())
+    return state, decisions

@@ -8,12 +8,13 @@ import pytest
 from benchmarks.sampling.measure import some_motor, write_machine
 from benchmarks.sampling.schedules import Recording, Schedule, Timing, record
 
-from otolith.acquisition.window import Quality, Verdict, Window
+from otolith.acquisition.window import BridgeError, Quality, Verdict, Window
 from otolith.commissioning import delays as text
 from otolith.commissioning.delays import IdentifiedDelays, SignalDelay, identify_delays, identify_delays_and_noise
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
-from otolith.machine import load_machine
+from otolith.estimation.timing.shifted_window import shifted
+from otolith.machine import find_twin, load_machine
 from otolith.runtime.replay import Replay, open_recorded
 
 ROWS = Schedule(rows=Timing(0.01))
@@ -104,6 +105,19 @@ def test_intervals_hold_the_truth(tmp_path: Path, count: int) -> None:
     assert np.mean(named) >= 0.95 - share
 
 
+@pytest.mark.parametrize("recordings", [1, pytest.param(5, marks=pytest.mark.full)])
+def test_intervals_hold_delays_of_whole_steps(tmp_path: Path, recordings: int) -> None:
+    """The slope of i jumps where V_a does: at these delays the likelihood has another curvature on each side."""
+    cases = [(name, delay) for name in ("omega", "i", "V_a") for delay in (0.0, 10 * MS, 35 * MS)] * recordings
+    held = []
+    for seed, (name, delay) in enumerate(cases, 300):
+        problem, windows = cut(tmp_path, ROWS, recorded(ROWS, seed, 9.0).delayed({name: delay}))
+        signals = late(identify_delays(problem, windows, {}))
+        is_named = set(signals) == ({name} if delay else set())
+        held.append(is_named and all(deviation(signal, delay) <= QUANTILE for signal in signals.values()))
+    assert np.mean(held) >= 0.95 - 3.3 * np.sqrt(0.95 * 0.05 / len(held))
+
+
 def test_noise_is_identified_without_the_delay(tmp_path: Path) -> None:
     """Wrong noise levels hide no delay, and the delay does not become process noise."""
     problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 11, 21.0).delayed({"omega": 10 * MS}))
@@ -140,6 +154,17 @@ def test_an_idle_machine_shows_no_delay(tmp_path: Path) -> None:
         resting.append(replace(window, values=values))
     identified = identify_delays(problem, resting, {})
     assert not late(identified)
-    assert {signal.remark for signal in identified.signals if signal.name in problem.twin.signals} >= {
-        text.UNOBSERVABLE
-    }
+    assert {signal.name for signal in identified.signals} == set(problem.twin.signals)
+    assert text.UNOBSERVABLE in {signal.remark for signal in identified.signals}
+    for signal in identified.signals:  # noise alone could not show even a delay of 100 ms
+        assert signal.remark == text.UNOBSERVABLE or (signal.sd is not None and QUANTILE * signal.sd > 100 * MS)
+
+
+@pytest.mark.parametrize("variance", [1e-20, 1.0])
+def test_a_bridge_error_of_any_size_lasts_as_long_in_a_shifted_window(variance: float) -> None:
+    twin, one = find_twin("dc_motor"), np.ones((100, 4))
+    whole = Window.whole(0, 0.0, 0.01, twin.signals, one)
+    window = replace(whole, bridge_error=BridgeError(one, variance * one, 5.0 * variance * one, 0.0 * one))
+    error = shifted(twin, window, {"omega": 20 * MS}).bridge_error
+    assert error is not None
+    assert error.held_variance / error.variance == pytest.approx(5.0)

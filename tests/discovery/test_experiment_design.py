@@ -89,7 +89,7 @@ def test_window_length_stays_if_its_bounds_are_equal() -> None:
     assert next_records(WindowOptions(200, 200, 200), 200 * PERIOD, PERIOD, excitation) == 200
 
 
-@pytest.mark.parametrize("records", [20_000, pytest.param(1_000_000, marks=pytest.mark.full)])
+@pytest.mark.parametrize("records", [50_000, pytest.param(1_000_000, marks=pytest.mark.full)])
 def test_long_window_is_estimated(records: int) -> None:
     inputs = np.tile(STEADY, (records, 1))
     inputs[:, 0] += np.repeat(np.random.default_rng(1).uniform(-2.0, 2.0, 1000), records // 1000)

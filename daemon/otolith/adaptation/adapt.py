@@ -75,9 +75,8 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     An expected window without such a sign updates the filter. Otherwise, or while a test is open, hypotheses are
     compared, and the update follows the decision.
     """
-    screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
-    if screening.needs_threshold_test:
-        screening = with_threshold_test(screening)
+    determined = some_parameter_is_determined(state.previous)
+    screening = with_threshold_test(screen_window(predicted, estimated, determined=determined))
     if state.test is None and _is_expected(predicted, estimated) and not screening.is_positive:
         return _update_filter(state, predicted, estimated)
     test = continue_test(state.test, predicted, screening)

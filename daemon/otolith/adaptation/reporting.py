@@ -180,7 +180,7 @@ def _marginals(result: WindowResult) -> list[MarginalPosterior]:
 
 
 def _reason(state: AdaptationState, result: WindowResult) -> str:
-    """Return what there is to say of the window as a whole."""
+    """Return the remarks on the window as a whole."""
     if result.estimate is None:
         return result.reason
     decision, test = result.decision, result.test
@@ -355,7 +355,7 @@ def _machine_file_advice(test: SequentialTest) -> str:
 
 
 def _experiment(test: SequentialTest | None, situation: Situation | None) -> str:
-    """Return the experiment that would tell the most probable hypothesis from the next one."""
+    """Return the experiment that would distinguish the most probable hypothesis from the next one."""
     if test is None or situation is None:
         return ""
     others = test.alternatives(test.best)

@@ -12,7 +12,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
 from otolith.health.status import PreviousStatus
 
-MIN_COARSE_RECORDS = 50  # records of a window on a coarser grid: fewer say little, however long the sample period
+MIN_COARSE_RECORDS = 50  # records of a window on a coarser grid: fewer determine little, however long the sample period
 RESTART_FACTOR = 3.0  # on the standard deviations before a restart: nothing was observed meanwhile
 PHASE = 2  # position of the phase among the values of a component
 

@@ -1,4 +1,4 @@
-"""Consistency test: do the estimates of several windows scatter as much as their uncertainties say?
+"""Consistency test: do the estimates of several windows scatter as much as their uncertainties predict?
 
 White process noise is identified from fast innovations, so it misses an error of the twin that is slow compared with
 the sample period. Each window then underestimates its uncertainty, which only other windows can show. Process noise is

@@ -15,13 +15,10 @@ from otolith.commissioning.likelihood import FittedWindow, Likelihood, Progress
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing.delay_response import delay_response, delayable
-from otolith.estimation.timing.shifted_window import same_measurements, shifted
+from otolith.estimation.timing.shifted_window import largest_delay, same_measurements, shifted, trial_delays
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
-MAX_DELAY = 0.2  # s
-MAX_WINDOW_SHARE = 0.125  # of a window: largest delay
-GRID_RATIO = 1.5  # between two delays that are tried; the first is half a record
-SEARCHED_WINDOWS = 8  # windows with the most information, in which these delays are tried
+SEARCHED_WINDOWS = 8  # windows with the most information, in which delays are tried
 SEARCH_STEPS, MAX_STEPS = 3, 8  # of Gauss-Newton for one delay in these windows, and for all delays in all windows
 SIGNIFICANCE = 0.01  # probability that a signal without a delay is given one, over all signals
 NEGLIGIBLE_STEP = 0.05  # standard deviations: step of a delay after which the search has ended
@@ -87,12 +84,12 @@ class _Point:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Score:
-    """What the windows say about the delays of some signals around a point."""
+    """Estimate of the delays of some signals from all windows, around a point."""
 
     step: Array
     """(signals,) to the minimum, s."""
     covariance: Array
-    """(signals, signals); enlarged where the windows differ by more than their uncertainties say."""
+    """(signals, signals); enlarged where the windows differ by more than their uncertainties explain."""
     gain: float
     """By which the deviance falls, with the same enlargement."""
 
@@ -145,7 +142,7 @@ class _Search:
         self._levels = np.array([*problem.noise, *(problem.process_noise or (0.0,) * len(twin.states))])
         good = [window for window in windows if window.quality.verdict is Verdict.GOOD]
         length = min((window.grid.length for window in good), default=0.0)
-        self._limit = min(MAX_DELAY, MAX_WINDOW_SHARE * length)
+        self._limit = largest_delay(length)
         self._windows = [window for window in good if window.records >= MIN_RECORDS]
         starts = [problem.nominal] * len(self._windows)
         point = self._evaluate(np.zeros(len(self.names)), self._windows, starts)
@@ -200,9 +197,7 @@ class _Search:
         scores, information = [], []
         for fit in point.fits:
             response = delay_response(fit.objective, fit.guess)[:, list(signals)]
-            scaled = fit.result.jacobian * self._likelihood.width
-            normal = np.eye(scaled.shape[1]) + scaled.T @ scaled
-            left = response - scaled @ np.linalg.solve(normal, scaled.T @ response)
+            left = self._likelihood.project(response, fit.result.jacobian)
             scores.append(left.T @ fit.result.residuals / max(fit.cost, 1.0) ** 2)
             information.append(left.T @ response / max(fit.cost, 1.0) ** 2)
         total = np.sum(information, axis=0)
@@ -284,10 +279,8 @@ class _Search:
     def _searched(self, before: _Point, index: int, step: float, chosen: Sequence[int]) -> _Point:
         """Return the ``chosen`` windows with the best delay of one signal, from a grid and then by Gauss-Newton."""
         period = min(window.sample_period for window in self._windows)
-        decades = np.arange(0.0, max(np.log(2.0 * self._limit / period), 0.0), np.log(GRID_RATIO))
-        grid = 0.5 * period * np.exp(decades)
         best = before
-        for value in [step, *grid, *-grid, self._limit, -self._limit]:
+        for value in [step, *trial_delays(period, self._limit)]:
             delays = before.delays.copy()
             delays[index] = np.clip(value, -self._limit, self._limit)
             best = min(best, self._again(before, delays, chosen), key=lambda trial: trial.deviance)

@@ -2,7 +2,7 @@
 
 The initial guess comes from the signals alone. Then the likelihood of the innovations is maximised
 (:mod:`otolith.commissioning.likelihood`), which identifies fast process noise. If the windows' estimates still scatter
-more than their uncertainties say (:mod:`otolith.commissioning.consistency`), process noise is inflated.
+more than their uncertainties predict (:mod:`otolith.commissioning.consistency`), process noise is inflated.
 """
 
 import re
@@ -53,10 +53,10 @@ EXCLUDED = "windows excluded because they are badly sampled, too short, or the t
 EXCLUDED_AT_REST = "windows excluded because nothing moves in them: {} of {}"
 ONE_WINDOW = "consistency of windows: not tested, as there is only one window"
 NOT_COMPARABLE = "consistency of windows: not tested, as no two windows determine the same parameters"
-CONSISTENT = "consistency of windows: they scatter as their uncertainties say"
-INFLATED = "consistency of windows: they scattered more than their uncertainties say, so process noise was inflated"
-ADDED = "consistency of windows: they scattered more than their uncertainties say, so process noise was added"
-NOT_INFLATED = "consistency of windows: they scatter more than their uncertainties say, but process noise is no cause"
+CONSISTENT = "consistency of windows: they scatter as their uncertainties predict"
+INFLATED = "consistency of windows: they scattered more than their uncertainties predict, so process noise was inflated"
+ADDED = "consistency of windows: they scattered more than their uncertainties predict, so process noise was added"
+NOT_INFLATED = "consistency of windows: they scatter more than their uncertainties predict, but not from process noise"
 DOUBTFUL = "; by so much that the machine probably changes between windows, or the twin lacks something"
 
 
@@ -154,14 +154,9 @@ def _initial_guess(likelihood: Likelihood, windows: Sequence[Window], progress: 
     """Windows at rest are used only if all are; then process noise is not free."""
     problem, remarks = likelihood.problem, []
     usable = [window for window in windows if _is_usable(problem, window)]
-    signal_noise = np.array([sample_noise(output.name, usable) for output in problem.twin.outputs])
-    shown = signal_noise > 0.0
-    sensors = np.where(shown, signal_noise, problem.noise)
-    process, fits = np.full(len(problem.twin.states), np.nan), list[FittedWindow]()
-    if usable:
-        process = _observable_process_noise(problem, sensors, _most_excited(problem, usable, sensors))
-        first = _first_fits(likelihood, np.concatenate([sensors, np.nan_to_num(process)]), usable, progress)
-        fits = [fit for fit in first if fit.cost < MAX_COST]
+    levels = _initial_levels(problem, usable)
+    shown, process = levels.signal_noise > 0.0, levels.process
+    fits = [fit for fit in _first_fits(likelihood, levels.values, usable, progress) if fit.cost < MAX_COST]
     if len(fits) < len(windows):
         remarks.append(EXCLUDED.format(len(windows) - len(fits), len(windows)))
     moving = [fit for fit in fits if len(sqrt_information(fit, likelihood.width))]
@@ -169,11 +164,11 @@ def _initial_guess(likelihood: Likelihood, windows: Sequence[Window], progress: 
         remarks.append(EXCLUDED_AT_REST.format(len(fits) - len(moving), len(windows)))
     variances = VarianceParametrisation(
         likelihood,
-        initial=np.concatenate([sensors, np.nan_to_num(process)]),
-        floor=np.concatenate([np.where(shown, MIN_SENSOR_SHARE, 1.0) * sensors, np.zeros(len(process))]),
+        initial=levels.values,
+        floor=np.concatenate([np.where(shown, MIN_SENSOR_SHARE, 1.0) * levels.sensors, np.zeros(len(process))]),
         free=np.concatenate([shown, np.isfinite(process) & bool(moving)]),
     )
-    return _InitialGuess(signal_noise, process, variances, moving or fits, tuple(remarks))
+    return _InitialGuess(levels.signal_noise, process, variances, moving or fits, tuple(remarks))
 
 
 def _first_fits(
@@ -245,12 +240,33 @@ def _state_levels(
 def with_initial_noise(problem: Problem, windows: Sequence[Window]) -> Problem:
     """The problem with the sensor noise that the signals show, and process noise that is just observable beside it."""
     usable = [window for window in windows if _is_usable(problem, window)]
-    if not usable:
-        return problem
+    return with_levels(problem, _initial_levels(problem, usable).values) if usable else problem
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _InitialLevels:
+    """Noise levels that the signals show, before any fit."""
+
+    signal_noise: Array
+    """(outputs,) what the signals show; 0 if one is constant, NaN if it is never measured."""
+    sensors: Array
+    """(outputs,) the same, or the level of the problem where the signals show none."""
+    process: Array
+    """(states,) process noise that is just observable; NaN if none is."""
+
+    @property
+    def values(self) -> Array:
+        """(outputs + states,) all levels; zero where no process noise is observable."""
+        return np.concatenate([self.sensors, np.nan_to_num(self.process)])
+
+
+def _initial_levels(problem: Problem, usable: Sequence[Window]) -> _InitialLevels:
     signal_noise = np.array([sample_noise(output.name, usable) for output in problem.twin.outputs])
     sensors = np.where(signal_noise > 0.0, signal_noise, problem.noise)
-    process = _observable_process_noise(problem, sensors, _most_excited(problem, usable, sensors))
-    return with_levels(problem, np.concatenate([sensors, np.nan_to_num(process)]))
+    process = np.full(len(problem.twin.states), np.nan)
+    if usable:
+        process = _observable_process_noise(problem, sensors, _most_excited(problem, usable, sensors))
+    return _InitialLevels(signal_noise, sensors, process)
 
 
 def _is_usable(problem: Problem, window: Window) -> bool:

@@ -100,7 +100,7 @@ class Likelihood:
             objective = self._objective(levels, fit.window, fit.centre)
             residuals, jacobian = objective.linearise(fit.guess)
             deviance += self._deviance(objective, float(residuals @ residuals), jacobian)
-            innovations.append(self._project(residuals, fit.result.jacobian))
+            innovations.append(self.project(residuals, fit.result.jacobian))
             factors.append(np.log(np.diagonal(objective.whitening, axis1=1, axis2=2)).ravel())
         return Linearisation(deviance, np.concatenate([*innovations, *factors]))
 
@@ -125,8 +125,8 @@ class Likelihood:
         _, log_determinant = np.linalg.slogdet(self._information(jacobian))
         return chi_square + objective.innovation_model.log_determinant + float(log_determinant)
 
-    def _project(self, residuals: Array, jacobian: Array) -> Array:
-        """(residuals,) the part that no change of the guess explains, as a new fit would leave it."""
+    def project(self, residuals: Array, jacobian: Array) -> Array:
+        """(residuals,) or (residuals, columns) the part that no change of the guess explains, after a new fit."""
         scaled = jacobian * self.width
         return np.asarray(residuals - scaled @ np.linalg.solve(self._information(jacobian), scaled.T @ residuals))
 

@@ -27,7 +27,7 @@ class Approval(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """Another hypothesis that the data could not tell apart."""
+    """Another hypothesis that the data do not distinguish."""
 
     type: FaultType
     text: str
@@ -81,7 +81,7 @@ def with_approvals(adopted: tuple[AdoptedComponent, ...], approved: frozenset[st
 
 
 def alternatives_of(test: SequentialTest, to: TrackedHypothesis) -> tuple[Alternative, ...]:
-    """Return what the data do not tell from ``to``, in words."""
+    """Return what the data do not distinguish from ``to``, in words."""
     return tuple(Alternative(item.type, describe_hypothesis(item), share) for item, share in test.alternatives(to))
 
 

@@ -48,7 +48,8 @@ UPDATES = {
     WindowDecision.BAD: PosteriorUpdate.NONE,
     WindowDecision.REFUSED: PosteriorUpdate.NONE,
 }
-EXCLUDING = {FaultType.SENSOR: WindowDecision.SENSOR, FaultType.TIMING: WindowDecision.TIMING}
+EXCLUDING = {FaultType.SENSOR: (WindowDecision.SENSOR, 0), FaultType.TIMING: (WindowDecision.TIMING, TIMING_WINDOWS)}
+"""The decision on a window that a type of hypothesis explains, and how many windows must agree."""
 ACCEPTED = frozenset(decision for decision, update in UPDATES.items() if update is not PosteriorUpdate.NONE)
 
 
@@ -76,9 +77,9 @@ def decide(test: SequentialTest) -> WindowOutcome:
     agreed = test.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
     if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
-    for kind, decision in EXCLUDING.items():
-        needed = SENSOR_PROBABILITY if test.is_open else SENSOR_PROBABILITY_ALONE
-        if test.probability(kind) >= needed and (kind is FaultType.SENSOR or test.leading >= TIMING_WINDOWS):
+    needed = SENSOR_PROBABILITY if test.is_open else SENSOR_PROBABILITY_ALONE
+    for kind, (decision, windows) in EXCLUDING.items():
+        if test.probability(kind) >= needed and test.leading >= windows:
             return WindowOutcome(decision, next(item for item in test.hypotheses if item.type is kind))
     leads = best.type is FaultType.COMPONENT and test.leading >= COMPONENT_WINDOWS
     probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY

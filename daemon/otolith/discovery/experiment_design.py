@@ -74,7 +74,7 @@ def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[st
 
 
 def deciding_experiment(first: TrackedHypothesis, second: TrackedHypothesis, situation: Situation) -> str:
-    """Return the smallest move that would tell ``first`` from ``second``, as a sentence."""
+    """Return the smallest move that would distinguish ``first`` from ``second``, as a sentence."""
     for move in moves(first.problem, situation):
         if _distance(first, second, situation, move) >= MIN_DISTANCE:
             return f"{move.text} would decide{OTHER_INPUTS}"

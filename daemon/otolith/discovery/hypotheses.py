@@ -15,7 +15,7 @@ from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
 from otolith.estimation.arrival_cost import Evidence, Prior, extend_prior, initial_prior
 from otolith.estimation.augmented import amplitude_indices, augment, equation, indices, site_of
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, orthonormal_basis
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing.delay_response import delay_response, delayable
@@ -24,7 +24,7 @@ from otolith.estimation.window_fit import Fit
 MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
 SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero is not significant
 MAX_DELAY_CHANGE = 5.0  # standard deviations: a delay that differs more between windows is no delay
-MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less says nothing
+MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less shows no delay
 MS = 1e3  # ms in a second
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 
@@ -148,7 +148,7 @@ def residual_variance_factor(chi_squares: Iterable[float], count: float) -> floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedHypothesis:
-    """A hypothesis with what it knows after some windows. Plain: it pickles."""
+    """A hypothesis with its posterior after some windows. Plain: it pickles."""
 
     hypothesis: FaultHypothesis
     posterior: Posterior
@@ -240,7 +240,7 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
 
 @dataclass(frozen=True, slots=True)
 class DelayScore:
-    """What one window says of a delay around the one that it was fitted with."""
+    """Estimate of a delay from one window, around the one that it was fitted with."""
 
     step: float
     """To the best delay, s."""
@@ -256,7 +256,7 @@ def delay_score(fitted: Fit, signal: str) -> DelayScore:
     ]
     jacobian, residuals = fitted.result.jacobian, fitted.result.residuals
     whole = np.concatenate([column, np.zeros(len(residuals) - len(column))])
-    basis = np.linalg.qr(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny))[0]
+    basis = orthonormal_basis(jacobian)
     left = whole - basis @ (basis.T @ whole)
     size = float(left @ left)
     if size <= MIN_DELAY_SHARE * float(whole @ whole):

@@ -14,6 +14,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Mask
 from otolith.discovery.candidate_forms import CandidateForm
+from otolith.estimation.information import orthonormal_basis
 from otolith.estimation.objective import input_matrix
 from otolith.estimation.timing.delay_response import delay_response
 from otolith.estimation.window_fit import Fit
@@ -23,13 +24,10 @@ from otolith.twin.kernel import Excitation, Indices, LinearisedModel, kernel_of
 
 PROBE_RECORDS = 6  # from which the size of the finite difference is found
 PROBE_EFFECT = 1e-4  # relative effect of the finite difference on a state
-MAX_DIFFERENCE = (
-    10.0  # of χ²: a component that differs less from a parameter cannot be distinguished from it in a window
-)
+MAX_DIFFERENCE = 10.0  # of χ²: less than that, and a window does not distinguish a component from a parameter
 SAME_DIRECTION = 1.0 - 1e-5  # cosine between the effects of a component and of a parameter that are the same
 MIN_INPUT_VARIATION = 5.0  # times the noise of an input: less variation is noise
 MIN_REMAINDER = 1e-6  # share of a response that is left beside the effects of parameters; less is a parameter
-MIN_BASIS_SINGULAR = 1e-10  # relative singular value of the directions that are projected out
 MAX_BLOCK = 1 << 21  # residuals times curves that are computed at once: 16 MB
 PROBES = 16  # random vectors by which the length of a projected response is estimated
 MIN_INDEPENDENCE = 1e-9  # of the two curves of a periodic component
@@ -89,7 +87,7 @@ class LinearResponse:
 
     def _project(self, residuals: Array, jacobian: Array, window_rows: int) -> None:
         """Project out what parameters, trends and initial state explain; the last rows are those of the prior."""
-        basis = _basis(jacobian)
+        basis = orthonormal_basis(jacobian)
         remainder = residuals - basis @ (basis.T @ residuals)
         self.chi_square = float(remainder @ remainder)
         """Of parameters only, with the prior."""
@@ -171,14 +169,15 @@ class LinearResponse:
         records, machine_sites, count = signals.shape
         width = float(frequencies[1] - frequencies[0]) if len(frequencies) > 1 else 1.0
         columns = signals.reshape(records, -1)
-        sums = self._kernel.fourier_sums(self.x[source], columns, float(frequencies[0]), width, len(frequencies))
-        curves = np.stack([sums.imag, sums.real], axis=-1).reshape(-1, machine_sites, count, 2)  # sine and cosine
-        along, probes = curves[:, :, 0], curves[:, :, 1:]
-        squares = np.einsum("fspi,fspj->fsij", probes, probes) / PROBES
-        determinant = squares[..., 0, 0] * squares[..., 1, 1] - squares[..., 0, 1] ** 2
-        adjugate = squares[..., 1, 1] * along[..., 0] ** 2 + squares[..., 0, 0] * along[..., 1] ** 2
-        adjugate -= 2.0 * squares[..., 0, 1] * along[..., 0] * along[..., 1]
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
+            sums = self._kernel.fourier_sums(self.x[source], columns, float(frequencies[0]), width, len(frequencies))
+            curves = np.stack([sums.imag, sums.real], axis=-1).reshape(-1, machine_sites, count, 2)  # sine and cosine
+            curves /= np.abs(curves[:, :, 1:]).max(axis=2, keepdims=True)  # gains are the same; no square overflows
+            along, probes = curves[:, :, 0], curves[:, :, 1:]
+            squares = np.einsum("fspi,fspj->fsij", probes, probes) / PROBES
+            determinant = squares[..., 0, 0] * squares[..., 1, 1] - squares[..., 0, 1] ** 2
+            adjugate = squares[..., 1, 1] * along[..., 0] ** 2 + squares[..., 0, 0] * along[..., 1] ** 2
+            adjugate -= 2.0 * squares[..., 0, 1] * along[..., 0] * along[..., 1]
             gains = adjugate / determinant
         return np.where(np.isfinite(gains), gains, 0.0).T
 
@@ -272,18 +271,10 @@ class LinearResponse:
         return ScoreStatistics(np.where(valid, gain, 0.0), amplitudes)
 
 
-def _basis(jacobian: Array) -> Array:
-    """Return an orthonormal basis of what the columns of ``jacobian`` can explain."""
-    size = np.linalg.norm(jacobian, axis=0)
-    alive = size > 0.0
-    basis, singular, _ = np.linalg.svd(jacobian[:, alive] / size[alive], full_matrices=False)
-    return np.asarray(basis[:, singular > MIN_BASIS_SINGULAR * singular[0]])
-
-
 def chi_square_of_parameters(fitted: Fit) -> float:
     """Return χ² that parameters, trends and initial state leave, with the prior, linearised where ``fitted`` began."""
     _, residuals, jacobian = fitted.result.first
-    return float(residuals @ residuals) - float(((_basis(jacobian).T @ residuals) ** 2).sum())
+    return float(residuals @ residuals) - float(((orthonormal_basis(jacobian).T @ residuals) ** 2).sum())
 
 
 def _padded(values: Array, length: int) -> Array:

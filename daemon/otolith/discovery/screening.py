@@ -100,7 +100,7 @@ def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozen
 
 
 def _inner_bounds(model: ComponentFamily, x: Array) -> tuple[float, float] | None:
-    """Return the bounds of the inner parameter, or None if ``x`` (records,) cannot tell the family from others."""
+    """Return the bounds of the inner parameter, or None if ``x`` (records,) does not single out the family."""
     if not model.valid(x):
         return None
     if model.fixed_inner is not None:

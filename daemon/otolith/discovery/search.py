@@ -37,6 +37,7 @@ from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing.delay_response import delayable
+from otolith.estimation.timing.shifted_window import largest_delay, trial_delays
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.augmentation import MAX_COMPONENTS
 
@@ -44,10 +45,8 @@ MAX_STEPS = 25  # of Gauss-Newton for a hypothesis
 PARTS = 8  # of a window, fitted one after another to find an onset
 FAR_OFF = 20.0  # squared innovation in units of its variance: one record in a hundred thousand
 EXPECTED_SPREAD = 5.0  # standard deviations of χ² up to which a part of a window is as predicted
-MIN_RECORDS_AFTER = 60  # measured records after an onset that say anything about it
+MIN_RECORDS_AFTER = 60  # measured records after an onset from which its cause can be identified
 MAX_LATE, MIN_LATE_SHARE = 3, 0.1  # signals whose delays are tried, and their least share of the best gain
-MAX_DELAY, MAX_DELAY_SHARE = 0.2, 0.125  # s, and of a window: largest delay
-DELAY_POINTS, DELAY_RATIO = 16, 1.5  # delays that are tried; the first is half a record
 DELAY_STEPS = 4  # of Gauss-Newton for a delay
 MAX_MOVED, MIN_MOVED_SHARE = 3, 0.5  # parameters tried alone, and their least share of the best gain
 
@@ -67,12 +66,13 @@ def _fitted(item: Proposal, window: Window) -> FittedHypothesis:
 
 def screening_test(fitted: Fit) -> ScreeningResult:
     """Return whether what ``fitted`` leaves of its window is worth a search, around the start of the fit."""
-    screening = screen_fit(fitted)
-    return with_threshold_test(screening) if screening.needs_threshold_test else screening
+    return with_threshold_test(screen_fit(fitted))
 
 
 def with_threshold_test(screening: ScreeningResult) -> ScreeningResult:
-    """Return the screening with what the threshold-like families gain if they are fitted."""
+    """Return the screening with what the threshold-like families gain if they are fitted, where it needs that."""
+    if not screening.needs_threshold_test:
+        return screening
     gain = _threshold_gain(screening.response) - DECISIVE
     return replace(screening, gain=max(screening.gain, gain), always_lacking=gain > 0.0)
 
@@ -136,7 +136,7 @@ def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
     problem, prior, window = null.problem, null.fit.prior, null.fit.window
     names = delayable(problem.base_model)
     stated = FaultHypothesis(FaultType.TIMING, f"{names[index]} is late", 1, float(len(names)))
-    limit = min(MAX_DELAY, MAX_DELAY_SHARE * window.grid.length)
+    limit = largest_delay(window.grid.length)
 
     def proposal(delay: float) -> Proposal:
         late = replace(problem, delays=((names[index], float(np.clip(delay, -limit, limit))),))
@@ -146,9 +146,8 @@ def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
         fitted = linearised(item.problem, window, prior, prior.mean)
         return chi_square_of_parameters(fitted) / fitted.count
 
-    grid = 0.5 * window.sample_period * DELAY_RATIO ** np.arange(DELAY_POINTS)
-    grid = grid[grid <= limit]
-    best = _fitted(min(map(proposal, [*grid, *-grid, limit, -limit]), key=unexplained), window)
+    trials = trial_delays(window.sample_period, limit).tolist()
+    best = _fitted(min(map(proposal, trials), key=unexplained), window)
     for _ in range(DELAY_STEPS):
         ((signal, delay),) = best.problem.delays
         trial = _fitted(proposal(delay + delay_score(best.fit, signal).step), window)

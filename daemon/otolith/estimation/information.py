@@ -10,6 +10,7 @@ from otolith.acquisition.window import Array, Mask
 
 QUANTILE = 1.959964  # two-sided 95 % of the standard normal distribution
 MIN_SINGULAR = 1e-8  # relative singular value below which a direction is not observed
+MIN_BASIS_SINGULAR = 1e-10  # relative singular value of the directions that are projected out
 MAX_BLIND_SHARE = 1e-4  # share in an unobserved direction above which a parameter is not observed
 MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
 PUSHED = 2.0  # times the required interval: a wider one does not tell on which side of a bound the value lies
@@ -87,6 +88,14 @@ def information(jacobian: Array, width: Array, inflation: float) -> Information:
             np.outer(blind, blind), 1.0, covariance / np.outer(deviation, deviation)
         )
     return Information(sd, correlation)
+
+
+def orthonormal_basis(jacobian: Array) -> Array:
+    """Return an orthonormal basis (residuals, directions) of what a change of the guess can explain."""
+    size = np.linalg.norm(jacobian, axis=0)
+    alive = size > 0.0
+    basis, singular, _ = np.linalg.svd(jacobian[:, alive] / size[alive], full_matrices=False)
+    return np.asarray(basis[:, singular > MIN_BASIS_SINGULAR * singular.max(initial=0.0)])
 
 
 def inflation_of(residuals: Array, present: Mask, cost: float) -> float:

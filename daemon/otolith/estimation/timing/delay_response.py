@@ -65,22 +65,21 @@ def output_slopes(objective: Objective, guess: Array) -> Array:
     order = np.argsort(times, kind="stable")
     count = len(grid.offsets)
     source = np.concatenate([np.arange(count), np.arange(count - 1)])[order]
-    is_record = (order < count)[:, None]
+    is_record = order < count
     inputs = excitation.inputs[source]
     held = [driven.hold == "zoh" for driven in objective.kernel.definition.inputs]
     following = excitation.inputs[np.minimum(source + 1, count - 1)]
     between = np.where(held, inputs, inputs + (1.0 - SLOPE_SHARE) * (following - inputs))
     gain, measured = excitation.gain, excitation.measured
     finer = Excitation(
-        np.where(is_record, inputs, between),
+        np.where(is_record[:, None], inputs, between),
         TimeGrid.at(times[order], grid.length),
         excitation.substeps,
-        None if measured is None else np.where(is_record, measured[source], np.nan),
-        None if gain is None else np.where(is_record[:, :, None], gain[source], 0.0),
+        None if measured is None else np.where(is_record[:, None], measured[source], np.nan),
+        None if gain is None else np.where(is_record[:, None, None], gain[source], 0.0),
     )
     predicted = objective.kernel.simulate(objective.parameters(guess[None]), guess[None, objective.free :], finer)[0]
-    at_record = order < count
-    rise = predicted[at_record][1:] - predicted[~at_record]
+    rise = predicted[is_record][1:] - predicted[~is_record]
     slopes = rise / (SLOPE_SHARE * np.diff(grid.offsets))[:, None]
     return np.concatenate([slopes[:1], slopes])
 

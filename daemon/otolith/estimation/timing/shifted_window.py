@@ -1,4 +1,4 @@
-"""A window as it would have been recorded if some of its signals had other delays.
+"""A window as it would have been recorded if some of its signals had other delays, and which delays are tried.
 
 Each sample moves in time with its value; nothing measured is interpolated. Inputs are evaluated at the new records by
 their hold. ``docs/explanation/delays.md`` has the equations.
@@ -13,9 +13,22 @@ from otolith.acquisition.time_grid import TimeGrid
 from otolith.acquisition.window import Array, BridgeError, Mask, Window
 from otolith.twin.definition import Definition
 
-# Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
-SAME_TIME = 1e-6  # of the mean step: times that differ by less are one record
-MIN_DURATION = 1e-12  # s; against division by zero
+# Values, units, origins and guarding tests: docs/reference/thresholds-estimation.md.
+SAME_RECORD_STEPS = 1e-6  # mean steps: times that differ by less are one record
+MAX_DELAY, MAX_DELAY_SHARE = 0.2, 0.125  # s, and of a window: largest delay that is searched
+DELAY_RATIO = 1.5  # between two delays that are tried; the first is half a record
+
+
+def largest_delay(length: float) -> float:
+    """Return the largest delay, s, that is searched in a window of ``length`` s."""
+    return min(MAX_DELAY, MAX_DELAY_SHARE * length)
+
+
+def trial_delays(period: float, limit: float) -> Array:
+    """Return delays (delays,) of both signs, s, from half a ``period`` up to ``limit``, which is the last pair."""
+    count = np.ceil(np.log(max(2.0 * limit / period, 1.0)) / np.log(DELAY_RATIO))
+    grid = 0.5 * period * DELAY_RATIO ** np.arange(count)
+    return np.concatenate([grid, -grid, [limit, -limit]])
 
 
 def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Window:
@@ -26,7 +39,7 @@ def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Wi
     """
     if not any(delays.values()):
         return window
-    length, tolerance = window.grid.length, SAME_TIME * window.sample_period
+    length, tolerance = window.grid.length, SAME_RECORD_STEPS * window.sample_period
     of_inputs = [delays.get(driven.name, 0.0) for driven in twin.inputs]
     start, end = max([0.0, *(-delay for delay in of_inputs)]), length - max([0.0, *of_inputs])
     distinct = sorted({delays.get(signal, 0.0) for signal in window.signals})
@@ -58,7 +71,7 @@ def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Wi
 def _grid(times: Array, end: float, tolerance: float) -> TimeGrid:
     offsets, length = times - times[0], end - float(times[0])
     step = length / len(times)
-    if np.abs(offsets - step * np.arange(len(times))).max() <= len(times) * tolerance:
+    if np.abs(offsets - step * np.arange(len(times))).max() <= tolerance:
         return TimeGrid.uniform(len(times), step)
     return TimeGrid.at(offsets, length)
 
@@ -69,12 +82,12 @@ def _bridge_error(
     """Return the error of a signal at the new records: the same noise lasts as long as before."""
     old, error = window.grid.steps, window.bridge_error
     if error is None:
-        ratio, none = np.ones(len(old)), np.zeros(len(steps))
+        none = np.zeros(len(steps))
         return np.maximum(old[before], steps) / steps, none, none, none
     column = window.signals.index(signal)
     ratio, variance, held = (part[:, column] for part in (error.noise_ratio, error.variance, error.held_variance))
     spacing = np.maximum((ratio * old)[before], steps)
-    duration = np.divide(held * old, variance, out=np.zeros(len(old)), where=variance > MIN_DURATION)[before]
+    duration = np.divide(held * old, variance, out=np.zeros(len(old)), where=variance > 0.0)[before]
     change = error.expected_change[:, column][before]
     return spacing / steps, variance[before], variance[before] * np.maximum(1.0, duration / steps), change
 
