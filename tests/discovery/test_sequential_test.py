@@ -29,7 +29,7 @@ def hypothesis(kind: FaultType, problem: Problem, **certain: tuple[float, float]
     deviations = np.array([sd for _, sd in values] + [1e-9] * len(values))
     posterior = Posterior.initial(problem).set_prior(Prior(mean, np.diag(deviations**2)))
     posterior = replace(posterior, phase=PhaseAdvance(0.0, 2.0, ()))
-    return TrackedHypothesis(FaultHypothesis(kind, kind.value), posterior, 0.0, 1.0)
+    return TrackedHypothesis(FaultHypothesis(kind, kind.value), posterior, 0.0, 0.0, 1.0)
 
 
 def test_hypotheses_equal_to_the_null_hypothesis_are_pruned() -> None:

@@ -46,7 +46,7 @@ def test_report_contains_only_finite_numbers(
     contradictions: int,
     before: PreviousStatus,
 ) -> None:
-    evidence = WindowEvidence(estimate, decision, contradictions, 1.0, "why")
+    evidence = WindowEvidence(estimate, decision, contradictions, 1.0, reason="why")
     after, document = publish(RESISTANCE, ALLOWED, marginal, evidence, before)
     text = report(R_a=document).to_json()
     assert ReportDocument.from_json(text).parameters["R_a"] == document
@@ -101,12 +101,9 @@ def test_status_has_hysteresis_at_its_limit() -> None:
 
 def test_status_is_held_then_invalid_after_contradictions() -> None:
     before = PreviousStatus(True, Status.ESTIMATED)
+    assert publish_after(0.1, decision=WindowDecision.REFUSED, contradictions=1, before=before)[1].status is Status.HELD
     assert (
-        publish_after(0.1, decision=WindowDecision.SUSPECTED, contradictions=1, before=before)[1].status is Status.HELD
-    )
-    assert (
-        publish_after(0.1, decision=WindowDecision.SUSPECTED, contradictions=2, before=before)[1].status
-        is Status.INVALID
+        publish_after(0.1, decision=WindowDecision.REFUSED, contradictions=2, before=before)[1].status is Status.INVALID
     )
 
 

@@ -15,15 +15,14 @@ from otolith.adaptation.reporting import WindowResult, make_report
 from otolith.adaptation.state import AdaptationState, with_posterior
 from otolith.adaptation.unbridged_gap import unbridged_gap
 from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
+from otolith.discovery.ambiguity import mixture
 from otolith.discovery.decision import (
     MAX_COST,
     PosteriorUpdate,
     WindowDecision,
     WindowOutcome,
     decide,
-    some_component_is_certain,
 )
-from otolith.discovery.hypotheses import FaultType
 from otolith.discovery.screening import screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test
@@ -75,8 +74,9 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     An expected window without such a sign updates the filter. Otherwise, or while a test is open, hypotheses are
     compared, and the update follows the decision.
     """
-    determined = some_parameter_is_determined(state.previous)
-    screening = with_threshold_test(screen_window(predicted, estimated, determined=determined))
+    screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
+    if screening.needs_threshold_test:
+        screening = with_threshold_test(screening)
     if state.test is None and _is_expected(predicted, estimated) and not screening.is_positive:
         return _update_filter(state, predicted, estimated)
     test = continue_test(state.test, predicted, screening)
@@ -156,12 +156,10 @@ def _keep_posterior(
     if outcome.decision is WindowDecision.LEARNED:  # the null hypothesis leads, but does not explain the whole window
         return WindowResult.unchanged(state, predicted, WindowDecision.REFUSED, estimate=estimated)
     result = WindowResult.unchanged(state, predicted, outcome.decision, estimate=estimated, test=test)
-    best = outcome.hypothesis
-    if best.type is FaultType.COMPONENT and some_component_is_certain(test):
-        # That there is a component is certain, though not which: the best one gives the parameters to report.
-        prior = best.posterior.remap_parameters(state.problem).prior()
-        result = replace(result, before=prior, after=prior)
-    return result
+    if outcome.decision is WindowDecision.REFUSED:
+        return result
+    known = mixture(test.hypotheses, state.problem, test.windows, result.before)
+    return replace(result, before=known, after=known)
 
 
 def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus]) -> AdaptationState:
@@ -178,6 +176,7 @@ def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str
         test=test,
         contradictions=contradictions,
         adopted=result.adopted,
+        noisier_since=result.noisier_since(state),
         previous=previous,
         records=_next_records(state, result),
     )

@@ -11,7 +11,7 @@ from otolith.adaptation.state import AdaptationState
 from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives_of
 from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
-from otolith.discovery.hypotheses import FaultType, describe_hypothesis
+from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_noise
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.augmented import equation, indices, site_of, source_of
@@ -50,8 +50,11 @@ DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
 EXCLUDED = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
-UNDECIDED = frozenset({WindowDecision.SUSPECTED, WindowDecision.REFUSED}) | EXCLUDED
+UNDECIDED = frozenset({WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS, WindowDecision.REFUSED}) | EXCLUDED
 OPEN_CONDITION = "the data do not yet decide between the hypotheses"
+NOISE_CONDITION = "the innovations are white, but larger than [noise] allows"
+NOISE_ADVICE = "if it has always been so, correct [noise]; otherwise inspect the sensor, its cable and its supply"
+AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot tell them apart"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,14 +91,18 @@ class WindowResult:
         test: SequentialTest | None = None,
         reason: str = "",
     ) -> "WindowResult":
-        """Return the result of a window that does not update the posterior."""
-        prior = predicted.prior()
+        """Return the result of a window that does not update the posterior: values are held, intervals grow."""
+        prior = state.posterior.held(predicted)
         return cls(decision, state.posterior, prior, prior, state.adopted, estimate, test, reason)
 
     @property
     def is_accepted(self) -> bool:
         """Whether the window updated the posterior."""
         return self.decision in ACCEPTED
+
+    def noisier_since(self, state: AdaptationState) -> float | None:
+        """Return from when on sensors are noisier than stated, Unix seconds; None if they are not."""
+        return self.test.onset if self.decision is WindowDecision.NOISIER and self.test else state.noisier_since
 
 
 def make_report(
@@ -120,7 +127,9 @@ def make_report(
         parameters=parameters,
         components=components,
         explanations=explanations,
-        findings=_findings(components, explanations, result.test, _experiment(undecided, situation)),
+        findings=_findings(
+            components, explanations, result, result.noisier_since(state), _experiment(undecided, situation)
+        ),
         **_fit_and_cost(problem, result),
     )
     return previous, Report(document, traces)
@@ -142,12 +151,12 @@ def _parameters(
     documents: dict[str, ParameterDocument] = {}
     previous: dict[str, PreviousStatus] = {}
     required = problem.determined_within * problem.scale
-    doubted = result.test is None or result.test.doubts_parameters
-    contradictions = _contradictions(state, result) if doubted else 0
+    contradictions = _contradictions(state, result)
+    is_mixture = result.test is not None and result.decision in UNDECIDED - {WindowDecision.REFUSED}
     variance_ratio, reason = result.posterior.belief.variance_ratio, _reason(state, result)
     for index, (parameter, marginal) in enumerate(zip(problem.free, _marginals(result), strict=True)):
         alone = None if estimated is None else estimated.parameters[index]
-        evidence = WindowEvidence(alone, result.decision, contradictions, variance_ratio, reason)
+        evidence = WindowEvidence(alone, result.decision, contradictions, variance_ratio, is_mixture, reason)
         before = state.previous.get(parameter.label, PreviousStatus())
         previous[parameter.label], document = publish(parameter, float(required[index]), marginal, evidence, before)
         if not parameter.name.startswith("_"):
@@ -187,7 +196,7 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     reasons = [*result.notes]
     if decision is not WindowDecision.LEARNED:
         reasons.append(decision.value)
-    if test is not None and decision in EXCLUDED | {WindowDecision.SUSPECTED}:
+    if test is not None and decision in EXCLUDED | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}:
         others = [f"or {other.text} ({other.probability:.0%})" for other in alternatives_of(test, test.best)[:2]]
         reasons.append("; ".join([f"{describe_hypothesis(test.best)} ({test.probabilities[0]:.0%})", *others]))
     if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:
@@ -310,22 +319,36 @@ def _alternative_documents(alternatives: Sequence[Alternative]) -> tuple[Alterna
 def _findings(
     components: Sequence[ComponentDocument],
     explanations: Sequence[AlternativeDocument],
-    test: SequentialTest | None,
+    result: WindowResult,
+    noisier_since: float | None,
     experiment: str,
 ) -> tuple[FindingDocument, ...]:
-    """Return a finding for each component that is not approved, and one for an open test.
+    """Return a finding for each component that is not approved, for noisier sensors, and for an open test.
 
     ``experiment`` is what would decide the test.
     """
+    decision, test = result.decision, result.test
     findings = [_component_finding(component) for component in components if component.approval is Approval.OPEN]
+    if noisier_since is not None:
+        noisier = describe_noise(result.posterior.problem)
+        findings.append(
+            FindingDocument(
+                id="noise",
+                severity=Severity.WARNING,
+                condition=NOISE_CONDITION,
+                text=noisier,
+                since=noisier_since,
+                advice=NOISE_ADVICE,
+            )
+        )
     if explanations and test is not None:
         best = explanations[0]
         others = "".join(f"; or {other.text} ({other.probability:.0%})" for other in explanations[1:3])
         findings.append(
             FindingDocument(
                 id="undecided",
-                severity=Severity.FAULT if best.reason in (FaultType.SENSOR, FaultType.TIMING) else Severity.WARNING,
-                condition=OPEN_CONDITION,
+                severity=Severity.FAULT if decision in EXCLUDED else Severity.WARNING,
+                condition=AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION,
                 text=f"{best.reason}: {best.text} ({best.probability:.0%}){others}",
                 since=test.onset,
                 advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),

@@ -38,6 +38,8 @@ class AdaptationState:
     """Keys of components that the operator approved."""
     adopted: tuple[AdoptedComponent, ...] = ()
     """The components in the twin."""
+    noisier_since: float | None = None
+    """Unix seconds from which on sensors are noisier than stated; None if they are not."""
 
     @property
     def problem(self) -> Problem:

@@ -18,7 +18,13 @@ HISTORY = 200  # windows that the curve of a parameter can show
 OTHER_COLUMNS = 72  # characters that the table needs beside the curve
 SILENT_WINDOWS = 3  # lengths of a window without a report until a warning; engineering choice, no test
 BARS = "▁▂▃▄▅▆▇█"
-STYLES = {Status.ESTIMATED: "green", Status.HELD: "yellow", Status.INVALID: "red", Status.UNESTIMATED: "dim"}
+STYLES = {
+    Status.ESTIMATED: "green",
+    Status.AMBIGUOUS: "magenta",
+    Status.HELD: "yellow",
+    Status.INVALID: "red",
+    Status.UNESTIMATED: "dim",
+}
 VALUE_COLUMNS = ("parameter", "value", "± 95 %", "unit", "change")
 RIGHT = {"value", "± 95 %", "change"}
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from enum import Enum, StrEnum
 
+from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.sequential_test import SequentialTest
 
@@ -10,9 +11,8 @@ MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accept
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
 COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # the same for a component
 TIMING_WINDOWS = 2  # windows that must agree on a late signal
-SENSOR_PROBABILITY = 0.95  # of a faulty sensor while another type of hypothesis explains the windows as well
-SENSOR_PROBABILITY_ALONE = 0.5  # the same while no other type does
-MAX_OPEN_WINDOWS = 8  # windows after which a component is adopted although another one explains everything as well
+EXCLUDING_PROBABILITY = 0.5  # of a faulty sensor or a late signal, if no other type explains the windows as well
+AMBIGUOUS_WINDOWS = 3  # windows that several types of hypotheses explain equally
 
 
 class WindowDecision(StrEnum):
@@ -23,6 +23,8 @@ class WindowDecision(StrEnum):
     STEPPED = "two windows agree on a sudden change"
     DISCOVERED = "several windows agree on a new component"
     FADED = "a component is no longer there"
+    NOISIER = "two windows agree that a sensor is noisier than stated"
+    AMBIGUOUS = "several hypotheses explain the windows equally well: what they agree on is estimated"
     SENSOR = "a sensor is wrong: the window does not update the estimates"
     TIMING = "a signal is late: the window does not update the estimates"
     BAD = "the window is not good enough: it does not update the estimates"
@@ -42,7 +44,9 @@ UPDATES = {
     WindowDecision.STEPPED: PosteriorUpdate.HYPOTHESIS,
     WindowDecision.DISCOVERED: PosteriorUpdate.HYPOTHESIS,
     WindowDecision.FADED: PosteriorUpdate.HYPOTHESIS,
+    WindowDecision.NOISIER: PosteriorUpdate.HYPOTHESIS,
     WindowDecision.SUSPECTED: PosteriorUpdate.NONE,
+    WindowDecision.AMBIGUOUS: PosteriorUpdate.NONE,
     WindowDecision.SENSOR: PosteriorUpdate.NONE,
     WindowDecision.TIMING: PosteriorUpdate.NONE,
     WindowDecision.BAD: PosteriorUpdate.NONE,
@@ -75,11 +79,16 @@ def decide(test: SequentialTest) -> WindowOutcome:
         return WindowOutcome(WindowDecision.REFUSED, best)
     own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
     agreed = test.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
-    if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
+    moved = best.type is FaultType.PARAMETER and not test.is_ambiguous
+    if moved and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
-    needed = SENSOR_PROBABILITY if test.is_open else SENSOR_PROBABILITY_ALONE
+    if test.is_ambiguous:
+        several = test.windows >= AMBIGUOUS_WINDOWS
+        return WindowOutcome(WindowDecision.AMBIGUOUS if several else WindowDecision.SUSPECTED, best)
+    if best.type is FaultType.NOISE and agreed:
+        return WindowOutcome(WindowDecision.NOISIER, best)
     for kind, (decision, windows) in EXCLUDING.items():
-        if test.probability(kind) >= needed and test.leading >= windows:
+        if test.probability(kind) >= EXCLUDING_PROBABILITY and test.leading >= windows:
             return WindowOutcome(decision, next(item for item in test.hypotheses if item.type is kind))
     leads = best.type is FaultType.COMPONENT and test.leading >= COMPONENT_WINDOWS
     probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY
@@ -87,9 +96,3 @@ def decide(test: SequentialTest) -> WindowOutcome:
     if leads and probable and alone:
         return WindowOutcome(WindowDecision.DISCOVERED, best)
     return WindowOutcome(WindowDecision.SUSPECTED, best)
-
-
-def some_component_is_certain(test: SequentialTest) -> bool:
-    """Whether a component has appeared, although it is open which."""
-    windows, probability = test.windows, test.probability(FaultType.COMPONENT)
-    return windows >= COMPONENT_WINDOWS and probability >= COMPONENT_PROBABILITY

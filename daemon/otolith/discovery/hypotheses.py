@@ -24,6 +24,7 @@ from otolith.estimation.window_fit import Fit
 MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
 SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero is not significant
 MAX_DELAY_CHANGE = 5.0  # standard deviations: a delay that differs more between windows is no delay
+MAX_DELAY_SDS = 100  # windows whose delays count for the parameters
 MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less shows no delay
 MS = 1e3  # ms in a second
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
@@ -37,6 +38,7 @@ class FaultType(StrEnum):
     COMPONENT = "a component has appeared"
     SENSOR = "a sensor is wrong"
     TIMING = "a signal is late"
+    NOISE = "sensors are noisier than stated"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +77,9 @@ class FittedHypothesis:
 
     hypothesis: FaultHypothesis
     fit: Fit
-    lost: float = 0.0
-    """Measured values of the window that its delay moves out of it."""
+    normalisation: float = 0.0
+    """What -2 log likelihood has beside χ², against the null hypothesis: of a larger noise; and what is as expected, of
+    the measured values that a delay moves out of the window."""
 
     @property
     def type(self) -> FaultType:
@@ -95,8 +98,13 @@ class FittedHypothesis:
 
     @property
     def chi_square(self) -> float:
-        """χ² of window and prior; what the window has lost is as expected."""
-        return self.fit.chi_square + self.lost
+        """-2 log likelihood of window and prior, up to a constant: χ² with its normalisation."""
+        return self.fit.chi_square + self.normalisation
+
+    @property
+    def unexplained(self) -> float:
+        """χ² that is left, in the noise of the hypothesis."""
+        return self.fit.chi_square if self.type is FaultType.NOISE else self.chi_square
 
     def deviance(self, count: float, variance_factor: float) -> float:
         """Return -2 log evidence of ``count`` measured values.
@@ -154,10 +162,16 @@ class TrackedHypothesis:
     posterior: Posterior
     deviance: float
     """-2 log evidence of all windows so far, relative to the best hypothesis."""
+    misfit: float
+    """The same from the data alone: without the prior weight, and without the complexity of the first fit."""
     cost: float
     """RMSE of the last window in units of the noise."""
     delay_information: float = 0.0
     """About the delay that the hypothesis states, 1/s²; 0 if it states none."""
+    delay_sds: tuple[float, ...] = ()
+    """Standard deviation, in s, of the delay with which each window was fitted."""
+    shift_by_delay: tuple[float, ...] = ()
+    """(free,) how far the parameters move with that delay, per second; empty if it states none."""
     explains_all: bool = True
     """Whether the screening test found nothing in what it left of the last window."""
 
@@ -170,6 +184,29 @@ class TrackedHypothesis:
     def problem(self) -> Problem:
         """The problem with what the hypothesis adds."""
         return self.posterior.problem
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Sites of its components and signals of its delays."""
+        return (*(item.site for item in self.problem.components), *(signal for signal, _ in self.problem.delays))
+
+    def known(self, problem: Problem) -> Prior:
+        """Return what is known of the free parameters of ``problem`` under the hypothesis.
+
+        Its delay is estimated as well, and the parameters move with it. The errors of the delays with which the windows
+        were fitted are taken as one.
+        """
+        prior = self.posterior.remap_parameters(problem).prior()
+        if not self.delay_sds:
+            return prior
+        shifts = dict(zip((free.label for free in self.problem.free), self.shift_by_delay, strict=True))
+        moved = np.array([shifts.get(free.label, 0.0) for free in problem.free] + [0.0] * len(problem.free))
+        variance = float(np.mean(self.delay_sds)) ** 2
+        return replace(prior, covariance=prior.covariance + variance * np.outer(moved, moved))
+
+    def worse_by(self, deviance: float, misfit: float) -> "TrackedHypothesis":
+        """Return the hypothesis with more deviance and misfit."""
+        return replace(self, deviance=self.deviance + deviance, misfit=self.misfit + misfit)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,13 +226,12 @@ class HypothesisStep:
         return is_usable(self.tracked.hypothesis, self.predicted, self.evidence)
 
     def updated(self, excess: float) -> TrackedHypothesis | None:
-        """Return the hypothesis after the window; ``excess`` is added to its deviance.
+        """Return the hypothesis after the window; ``excess`` is added to its deviance and misfit.
 
         None if the window contradicts the delay that it states.
         """
         posterior = self.predicted.update(self.evidence, self.fitted.fit.advance())
-        deviance = self.tracked.deviance + excess
-        tracked = replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost, deviance=deviance)
+        tracked = replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost).worse_by(excess, excess)
         return tracked if self.tracked.type is not FaultType.TIMING else _with_delay(tracked, self.fitted.fit)
 
 
@@ -208,7 +244,7 @@ def is_usable(hypothesis: FaultHypothesis, predicted: Posterior, evidence: Evide
     return bool((relative < MAX_GAIN_OF_INFORMATION).all())  # also false for not-a-number
 
 
-def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float) -> TrackedHypothesis | None:
+def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float, misfit: float) -> TrackedHypothesis | None:
     """Return the hypothesis after its first window, or None if its twin all but diverges.
 
     ``predicted`` is the prediction of what was known before the hypothesis.
@@ -218,7 +254,7 @@ def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float) -> Tr
     if not is_usable(fitted.hypothesis, own, evidence):
         return None
     posterior = own.update(evidence, fitted.fit.advance())
-    tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, fitted.fit.cost)
+    tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, misfit, fitted.fit.cost)
     return tracked if fitted.type is not FaultType.TIMING else _with_delay(tracked, fitted.fit)
 
 
@@ -235,7 +271,10 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
         return None
     moved = delay + (own.information * own.step / information if information > 0.0 else 0.0)
     problem = replace(tracked.problem, delays=((signal, moved),))
-    return replace(tracked, posterior=replace(tracked.posterior, problem=problem), delay_information=information)
+    posterior = replace(tracked.posterior, problem=problem)
+    used = before or own.information
+    sds = (*tracked.delay_sds, used**-0.5)[-MAX_DELAY_SDS:] if used > 0.0 else tracked.delay_sds
+    return replace(tracked, posterior=posterior, delay_information=information, delay_sds=sds, shift_by_delay=own.shift)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,6 +285,8 @@ class DelayScore:
     """To the best delay, s."""
     information: float
     """1/s²; less if the window is not explained."""
+    shift: tuple[float, ...]
+    """(free,) how far the best parameters move with the delay, per second."""
 
 
 def delay_score(fitted: Fit, signal: str) -> DelayScore:
@@ -260,8 +301,10 @@ def delay_score(fitted: Fit, signal: str) -> DelayScore:
     left = whole - basis @ (basis.T @ whole)
     size = float(left @ left)
     if size <= MIN_DELAY_SHARE * float(whole @ whole):
-        return DelayScore(0.0, 0.0)
-    return DelayScore(-float(left @ residuals) / size, size / max(fitted.cost, 1.0) ** 2)
+        return DelayScore(0.0, 0.0, (0.0,) * free)
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
+    shift = -np.linalg.lstsq(jacobian / scale, whole, rcond=None)[0] / scale
+    return DelayScore(-float(left @ residuals) / size, size / max(fitted.cost, 1.0) ** 2, tuple(shift[:free].tolist()))
 
 
 def complexity_penalty(predicted: Posterior, evidence: Evidence) -> float:
@@ -338,6 +381,8 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
         return tracked.hypothesis.name or str(tracked.type)
     if tracked.type is FaultType.TIMING:
         return _describe_delay(tracked)
+    if tracked.type is FaultType.NOISE:
+        return describe_noise(tracked.problem)
     problem, twin = tracked.problem, tracked.problem.base_model
     values = tracked.posterior.prior().mean
     if tracked.type is FaultType.SENSOR and problem.components:
@@ -349,6 +394,16 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
     return "; ".join(
         f"{component.site}: {equation(twin, component, values[indices(problem, slot)].tolist())}"
         for slot, component in enumerate(problem.components)
+    )
+
+
+def describe_noise(problem: Problem) -> str:
+    """Return which sensors are noisier than stated, with their noise."""
+    outputs = problem.base_model.outputs
+    return "; ".join(
+        f"{output.name} is noisier than stated: {noise:.2g} {output.unit} instead of {stated:.2g}"
+        for output, noise, stated in zip(outputs, problem.noise, problem.stated_noise, strict=False)
+        if noise > stated
     )
 
 

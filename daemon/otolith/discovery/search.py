@@ -23,6 +23,7 @@ from otolith.discovery.hypotheses import (
     with_candidate,
 )
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
+from otolith.discovery.noise_hypothesis import noisier_sensors
 from otolith.discovery.screening import (
     DECISIVE,
     Alternatives,
@@ -66,13 +67,12 @@ def _fitted(item: Proposal, window: Window) -> FittedHypothesis:
 
 def screening_test(fitted: Fit) -> ScreeningResult:
     """Return whether what ``fitted`` leaves of its window is worth a search, around the start of the fit."""
-    return with_threshold_test(screen_fit(fitted))
+    screening = screen_fit(fitted)
+    return with_threshold_test(screening) if screening.needs_threshold_test else screening
 
 
 def with_threshold_test(screening: ScreeningResult) -> ScreeningResult:
-    """Return the screening with what the threshold-like families gain if they are fitted, where it needs that."""
-    if not screening.needs_threshold_test:
-        return screening
+    """Return the screening with what the threshold-like families gain if they are fitted."""
     gain = _threshold_gain(screening.response) - DECISIVE
     return replace(screening, gain=max(screening.gain, gain), always_lacking=gain > 0.0)
 
@@ -109,6 +109,8 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     proposals += _one_parameter_moved(problem, prior, screening.response)
     proposals += [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
     fitted = fit_hypotheses(proposals, window)
+    noisier = noisier_sensors(fitted[0])
+    fitted += [] if noisier is None else [noisier]
     fitted += late_signals(fitted[0], screening.response)
     components = [item for item in fitted if item.type is FaultType.COMPONENT]
     best = min(components, key=_chi_square, default=None)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Window
+from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS, interchangeable, probabilities, without_duplicates
 from otolith.discovery.hypotheses import (
     FaultType,
     FittedHypothesis,
@@ -24,6 +25,7 @@ from otolith.discovery.hypotheses import (
     track,
     without_insignificant,
 )
+from otolith.discovery.noise_hypothesis import is_white, normalisation
 from otolith.discovery.screening import DECISIVE, ScreeningResult
 from otolith.discovery.search import fit_hypotheses, screening_test, search, search_from_onset
 from otolith.estimation.objective import EXPLAINED
@@ -77,9 +79,12 @@ class SequentialTest:
     @property
     def probabilities(self) -> list[float]:
         """Of each hypothesis."""
-        weights = np.exp(-0.5 * np.array([item.deviance for item in self.hypotheses]))
-        probabilities: list[float] = (weights / weights.sum()).tolist()
-        return probabilities
+        return probabilities(self.hypotheses)
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether hypotheses of several types explain the windows equally."""
+        return len({self.hypotheses[group[0]].type for group in interchangeable(self.hypotheses)}) > 1
 
     def probability(self, kind: FaultType) -> float:
         """Return the probability of all hypotheses of one type."""
@@ -99,13 +104,11 @@ class SequentialTest:
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
         data = [item.deviance - item.hypothesis.prior_deviance for item in self.hypotheses]
-        own = data[self.hypotheses.index(to)]
-        pairs = zip(self.hypotheses, self.probabilities, strict=True)
-        return [
-            pair
-            for pair, deviance in zip(pairs, data, strict=True)
-            if pair[0] is not to and abs(deviance - own) <= DECISIVE
-        ]
+        at = self.hypotheses.index(to)
+        equal = {group[0] for group in interchangeable(self.hypotheses)}
+        near = {other for other, deviance in enumerate(data) if abs(deviance - data[at]) <= DECISIVE}
+        chosen = sorted((near | equal if at in equal else near) - {at})
+        return [(self.hypotheses[other], self.probabilities[other]) for other in chosen]
 
 
 def continue_test(test: SequentialTest | None, predicted: Posterior, screening: ScreeningResult) -> SequentialTest:
@@ -126,14 +129,21 @@ def open_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Seque
     """Return a test of the ``fitted`` hypotheses; the first one is the null hypothesis."""
     fitted = [*fitted[:1], *(item for item in fitted[1:] if item.chi_square < DIVERGED)]
     count = fitted[0].fit.count
-    variance_factor = residual_variance_factor([item.chi_square for item in fitted], count)
+    variance_factor = residual_variance_factor([item.unexplained for item in fitted], count)
     deviances = [item.deviance(count, variance_factor) for item in fitted]
     order = np.argsort(deviances, kind="stable").tolist()
     least = deviances[order[0]]
+    least_misfit = min(item.chi_square for item in fitted)
+    misfits = [(item.chi_square - least_misfit) / variance_factor for item in fitted]
     kept = [at for at in order if deviances[at] <= least + MAX_DEVIANCE][:MAX_HYPOTHESES]
     always = (FaultType.NOTHING, FaultType.PARAMETER)
     kept += [at for at in order if fitted[at].type in always and at not in kept]
-    tracked = [track(fitted[at], predicted, min(deviances[at] - least, MAX_FIRST_EVIDENCE)) for at in kept]
+    tracked = [
+        track(
+            fitted[at], predicted, *(min(number, MAX_FIRST_EVIDENCE) for number in (deviances[at] - least, misfits[at]))
+        )
+        for at in kept
+    ]
     best = fitted[order[0]]
     last = FitSummary(best.chi_square, least - best.chi_square / variance_factor, count)
     reduced_chi_square = max(fitted[0].chi_square / max(count, 1.0), 1.0)
@@ -160,6 +170,8 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     if test.windows >= PRUNED_AFTER:
         tracked = prune(tracked, [deviance for _, deviance in kept])
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
+    if test.windows > MAX_OPEN_WINDOWS:
+        hypotheses = without_duplicates(hypotheses)
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     hypotheses = _screened(hypotheses, steps)
     return replace(test, hypotheses=hypotheses, leading=leading, last=last)
@@ -174,13 +186,27 @@ def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
         proposals.append(Proposal(replace(item.hypothesis, added=0), posterior.problem, prior, prior.mean))
     rows = list(zip(test.hypotheses, predicted, fit_hypotheses(proposals, window), strict=True))
     rows = [row for row in rows if row[2].chi_square < DIVERGED] or rows[:1]
-    return [HypothesisStep(item, posterior, fitted, fitted.fit.evidence()) for item, posterior, fitted in rows]
+    steps = [HypothesisStep(item, posterior, fitted, fitted.fit.evidence()) for item, posterior, fitted in rows]
+    return _with_noise(steps)
+
+
+def _with_noise(steps: list[HypothesisStep]) -> list[HypothesisStep]:
+    """Return the steps with the likelihood of a larger noise; one whose innovations are not white is dropped."""
+    stated = next((step.fitted.fit for step in steps if step.tracked.type is FaultType.NOTHING), None)
+    kept = []
+    for step in steps:
+        own = step.fitted
+        if step.tracked.type is not FaultType.NOISE:
+            kept.append(step)
+        elif stated is not None and is_white(own.fit):
+            kept.append(replace(step, fitted=replace(own, normalisation=normalisation(own.fit, stated))))
+    return kept
 
 
 def _with_deviances(steps: list[HypothesisStep]) -> tuple[list[HypothesisStep], FitSummary]:
     """Return the steps with their deviances, and a summary of the best."""
     count = steps[0].fitted.fit.count
-    variance_factor = residual_variance_factor([step.fitted.chi_square for step in steps], count)
+    variance_factor = residual_variance_factor([step.fitted.unexplained for step in steps], count)
     steps = [
         replace(
             step,
@@ -218,13 +244,19 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     known = {item.hypothesis.name for item in test.hypotheses}
     added = [item for item in fresh.hypotheses if item.hypothesis.name not in known]
     lead = min(gain, MAX_WINDOW_EVIDENCE)
-    hypotheses = _sorted([*(replace(item, deviance=item.deviance + lead) for item in test.hypotheses), *added])
+    hypotheses = _sorted([*(item.worse_by(lead, lead) for item in test.hypotheses), *added])
     leading = test.leading if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     return replace(test, hypotheses=hypotheses[: 2 * MAX_HYPOTHESES], leading=leading)
 
 
 def _sorted(tracked: list[TrackedHypothesis]) -> tuple[TrackedHypothesis, ...]:
-    """Return the hypotheses, the best first, with deviances relative to it."""
-    least = min(item.deviance for item in tracked)
-    ordered = sorted(tracked, key=lambda item: item.deviance)
-    return tuple(replace(item, deviance=min(item.deviance - least, MAX_TOTAL_DEVIANCE)) for item in ordered)
+    """Return the hypotheses, the best first, with deviances and misfits relative to the least."""
+    least, least_misfit = min(item.deviance for item in tracked), min(item.misfit for item in tracked)
+    return tuple(
+        replace(
+            item,
+            deviance=min(item.deviance - least, MAX_TOTAL_DEVIANCE),
+            misfit=min(item.misfit - least_misfit, MAX_TOTAL_DEVIANCE),
+        )
+        for item in sorted(tracked, key=lambda item: item.deviance)
+    )

@@ -82,6 +82,18 @@ class Posterior:
         mean, covariance = imm_filter.moment_match(self.belief)
         return Prior(mean * size, covariance * np.outer(size, size))
 
+    def held(self, predicted: "Posterior") -> Prior:
+        """Return what is known at the end of a window that adds nothing; ``predicted`` is the prediction of it.
+
+        Values stay; what the trends would have added counts as uncertainty. The phases of components advance.
+        """
+        before, after = self.prior(), predicted.prior()
+        mean, kept = after.mean.copy(), [not free.name.startswith("_") for free in self.problem.free]
+        values = np.flatnonzero(kept)
+        moved = np.zeros(len(mean))
+        moved[values] = mean[values] - before.mean[values]
+        return Prior(mean - moved, after.covariance + np.diag(moved**2))
+
     def start(self) -> Array:
         """Return the parameters (free,) at which a fit starts: the mean, within the bounds."""
         return np.clip(self.prior().mean[: len(self.problem.free)], *self.problem.bounds)

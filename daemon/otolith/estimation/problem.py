@@ -91,6 +91,8 @@ class Problem:
     """Parameters to estimate, with the nominal values and bounds of this machine."""
     noise: tuple[float, ...]
     """Standard deviation of the sensor of each output."""
+    stated_noise: tuple[float, ...] = ()
+    """The same as the machine file states it, where the windows have shown that it is larger; empty otherwise."""
     input_noise: tuple[float, ...] = ()
     """Standard deviation of each input; empty for none."""
     process_noise: tuple[float, ...] = ()

@@ -100,6 +100,8 @@ class Status(StrEnum):
     """No window has determined it yet; there is no value."""
     ESTIMATED = "estimated"
     """From this window and those before it."""
+    AMBIGUOUS = "ambiguous"
+    """The hypotheses that explain the windows differ in it; the interval holds all of them."""
     HELD = "held"
     """From earlier windows; this one adds nothing, and the reason says why."""
     INVALID = "invalid"

@@ -55,6 +55,8 @@ class WindowEvidence:
     """Consecutive windows, this one included, that did not update the posterior; bad data are not counted."""
     variance_ratio: float = 1.0
     """Variance between windows over the variance that they state."""
+    is_mixture: bool = False
+    """Whether what is known is the mixture of several hypotheses, each updated with the window."""
     reason: str = ""
     """About the window as a whole."""
 
@@ -104,11 +106,13 @@ def publish(
 def _status(
     known_now: MarginalPosterior, window: WindowEvidence, before: PreviousStatus, *, known: bool, required: float
 ) -> Status:
-    undecided = window.decision in (WindowDecision.SUSPECTED, WindowDecision.REFUSED)
-    if (window.contradictions >= INVALID_AFTER and undecided) or window.at_bound:
+    refused = window.decision is WindowDecision.REFUSED
+    if (window.contradictions >= INVALID_AFTER and refused) or window.at_bound:
         return Status.INVALID
     if not known:
         return Status.UNESTIMATED
+    if window.is_mixture:
+        return Status.ESTIMATED if QUANTILE * known_now.sd <= required else Status.AMBIGUOUS
     if not window.accepted or window.estimate is None:
         return Status.HELD
     if not before.known:

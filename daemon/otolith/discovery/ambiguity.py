@@ -1,0 +1,74 @@
+"""Hypotheses that the data cannot tell apart, and what is known of the parameters under all of them.
+
+Hypotheses of different types or places may explain the same windows: a resistance of the pipe that has risen, and a
+gain of the sensor of the throttle. Their prior weights and numbers of values must not decide between them. They form a
+class: the best hypothesis of each place has the same probability. What is published of a parameter is the mixture of
+all hypotheses. It is certain where they agree, and its interval holds all of them where they differ.
+``docs/explanation/discovery.md`` has the equations.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from otolith.acquisition.window import Array
+from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
+from otolith.discovery.screening import DECISIVE
+from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.problem import Problem
+
+MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
+WRONG_WINDOW = 0.5  # probability that the only window of a test is itself wrong: it cannot tell
+
+
+def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
+    """Return the indices of the hypotheses that explain the windows equally well, grouped by type and place.
+
+    The best of each group comes first. A component is in a group only if nothing with fewer values explains the windows
+    as well: otherwise evidence must pay for its values. The null hypothesis is contained in all others, so it is in no
+    group.
+    """
+    others = [at for at, item in enumerate(hypotheses) if item.type is not FaultType.NOTHING]
+    least = min((hypotheses[at].misfit for at in others), default=0.0)
+    equal = [at for at in others if hypotheses[at].misfit <= least + DECISIVE]
+    least_values = min((hypotheses[at].hypothesis.added for at in equal), default=0)
+    groups: dict[tuple[FaultType, tuple[str, ...]], list[int]] = {}
+    for at in sorted(equal, key=lambda at: hypotheses[at].deviance):
+        item = hypotheses[at]
+        if item.type is not FaultType.COMPONENT or item.hypothesis.added <= least_values:
+            groups.setdefault((item.type, item.places), []).append(at)
+    return list(groups.values())
+
+
+def probabilities(hypotheses: Sequence[TrackedHypothesis]) -> list[float]:
+    """Return the probability of each hypothesis; groups of interchangeable ones are equally probable."""
+    logs = -0.5 * np.array([item.deviance for item in hypotheses])
+    groups = interchangeable(hypotheses)
+    totals = [float(np.logaddexp.reduce(logs[group])) for group in groups]
+    for group, total in zip(groups, totals, strict=True):
+        logs[group] += max(totals) - total
+    weights = np.exp(logs - logs.max())
+    shares: list[float] = (weights / weights.sum()).tolist()
+    return shares
+
+
+def without_duplicates(hypotheses: tuple[TrackedHypothesis, ...]) -> tuple[TrackedHypothesis, ...]:
+    """Return the hypotheses with only the best of each group of interchangeable ones."""
+    worse = {at for group in interchangeable(hypotheses) for at in group[1:]}
+    return tuple(item for at, item in enumerate(hypotheses) if at not in worse)
+
+
+def mixture(hypotheses: Sequence[TrackedHypothesis], problem: Problem, windows: int, before: Prior) -> Prior:
+    """Return what is known of the free parameters of ``problem`` under all hypotheses, as one normal distribution.
+
+    After a single window, ``before`` it is as probable: the window itself may be wrong.
+    """
+    priors = [item.known(problem) for item in hypotheses]
+    weights = np.array(probabilities(hypotheses))
+    if windows == 1:
+        priors, weights = [*priors, before], np.append((1.0 - WRONG_WINDOW) * weights, WRONG_WINDOW)
+    means = np.array([prior.mean for prior in priors])
+    mean: Array = weights @ means
+    offsets = means - mean
+    covariances = np.array([prior.covariance for prior in priors]) + offsets[:, :, None] * offsets[:, None, :]
+    return Prior(mean, np.einsum("h,hij->ij", weights, covariances))

@@ -1,0 +1,60 @@
+"""Classes of hypotheses that the data cannot tell apart: equal probabilities, and intervals that hold all members."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from otolith.discovery.ambiguity import interchangeable, mixture, probabilities, without_duplicates
+from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
+from otolith.estimation.augmented import augment
+from otolith.estimation.problem import Component
+from tests.discovery.test_sequential_test import BARE, PERIODIC, hypothesis
+
+OFFSET = Component("sensor of i", "constant", "t", amplitude=0.01)
+NULL = replace(hypothesis(FaultType.NOTHING, BARE), deviance=60.0, misfit=60.0)
+
+
+def stated(
+    kind: FaultType, deviance: float, misfit: float, added: int, component: Component | None = None
+) -> TrackedHypothesis:
+    item = hypothesis(kind, BARE if component is None else augment(BARE, [component]), R_a=(7.0, 0.01))
+    return replace(item, deviance=deviance, misfit=misfit, hypothesis=replace(item.hypothesis, added=added))
+
+
+def test_a_sensor_and_several_moved_parameters_that_explain_the_same_are_equally_probable() -> None:
+    """The number of values of a hypothesis and its prior weight do not decide."""
+    moved, sensor = stated(FaultType.PARAMETER, 20.0, 0.0, 3), stated(FaultType.SENSOR, 0.0, 1.0, 1, OFFSET)
+    assert probabilities([sensor, moved, NULL]) == pytest.approx([0.5, 0.5, 0.0], abs=1e-6)
+    assert interchangeable([sensor, moved, NULL]) == [[0], [1]]
+
+
+def test_data_decide_between_a_sensor_and_moved_parameters() -> None:
+    moved, sensor = stated(FaultType.PARAMETER, 0.0, 0.0, 3), stated(FaultType.SENSOR, 15.0, 15.0, 1, OFFSET)
+    assert probabilities([moved, sensor, NULL])[0] > 0.99
+    assert interchangeable([moved, sensor, NULL]) == [[0]]
+
+
+def test_a_component_with_more_values_needs_evidence() -> None:
+    moved, component = stated(FaultType.PARAMETER, 0.0, 1.0, 1), stated(FaultType.COMPONENT, 12.0, 0.0, 3, PERIODIC)
+    assert probabilities([moved, component, NULL])[0] > 0.99
+
+
+def test_variants_of_one_hypothesis_share_its_probability() -> None:
+    several = [stated(FaultType.PARAMETER, 0.0, 0.0, 1), stated(FaultType.PARAMETER, 1.0, 0.0, 2)]
+    sensor = stated(FaultType.SENSOR, 9.0, 3.0, 1, OFFSET)
+    shares = probabilities([*several, sensor, NULL])
+    assert shares[0] + shares[1] == pytest.approx(0.5, abs=1e-6)
+    assert shares[0] / shares[1] == pytest.approx(np.exp(0.5))
+    assert without_duplicates((*several, sensor, NULL)) == (several[0], sensor, NULL)
+
+
+@pytest.mark.parametrize("windows", [1, 3])
+def test_the_mixture_holds_the_values_of_all_members(windows: int) -> None:
+    """After one window, what was known before is a member: the window itself may be wrong."""
+    moved, sensor = stated(FaultType.PARAMETER, 0.0, 0.0, 1), stated(FaultType.SENSOR, 0.0, 0.0, 1, OFFSET)
+    before = hypothesis(FaultType.NOTHING, BARE, R_a=(6.0, 0.01)).posterior.prior()
+    known = mixture([moved, sensor], BARE, windows, before)
+    sd = float(np.sqrt(known.covariance[0, 0]))
+    expected = (6.5, np.hypot(0.5, 0.01)) if windows == 1 else (7.0, 0.01)
+    assert (known.mean[0], sd) == pytest.approx(expected, rel=1e-6)
