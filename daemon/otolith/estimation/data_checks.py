@@ -199,7 +199,9 @@ def frozen_channels(predicted: Posterior, window: Window) -> list[str]:
 def _constant_runs(values: Array, present: Indices) -> list[Indices]:
     """Return the records of each run of one and the same value that is long enough, among the ``present`` ones."""
     ends = np.flatnonzero(np.diff(values[present]) != 0.0) + 1
-    return [run for run in np.split(present, ends) if len(run) >= MIN_FROZEN_RUN]
+    edges = np.concatenate([[0], ends, [len(present)]])
+    long = np.flatnonzero(np.diff(edges) >= MIN_FROZEN_RUN)
+    return [present[edges[run] : edges[run + 1]] for run in long]
 
 
 def _samples_in(runs: list[Indices]) -> int:
