@@ -23,7 +23,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.commissioning.identification import identify_noise
-from otolith.discovery.search import MAX_STEPS
+from otolith.discovery.search import ROUNDS, STEPS_OF_ROUND
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import Objective
@@ -103,7 +103,7 @@ def open_loop_error(state: AdaptationState, window: Window) -> float:
     problem, free = replace(state.problem, open_loop=True, noise=(POSITION_ERROR,)), len(state.problem.free)
     posterior = state.posterior.predict(window).prior()
     frozen = Prior(posterior.mean * (np.arange(2 * free) < free), FROZEN**2 * posterior.covariance)
-    fitted = fit(problem, window, frozen, frozen.mean, MAX_STEPS).result
+    fitted = fit(problem, window, frozen, frozen.mean, ROUNDS * STEPS_OF_ROUND).result
     objective = Objective(problem, window, fitted.guess[:free])
     predicted = objective.simulate(np.concatenate([fitted.guess[:free], fitted.guess[2 * free :]]))
     return float(objective.rmse(predicted)[0])

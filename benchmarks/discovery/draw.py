@@ -8,7 +8,7 @@ not those of its sensors.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,11 +17,11 @@ from benchmarks.discovery.setting import prior, problem, screen
 from benchmarks.discovery.truth import SHAFT, Truth, is_a_parameter
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidate_forms import CandidateForm
-from otolith.discovery.linear_response import BasisFunctions, LinearResponse
+from otolith.discovery.linear_response import LinearResponse, basis_functions
 from otolith.discovery.screening import DECISIVE, ScreeningResult, candidate_library
 from otolith.estimation.arrival_cost import Prior
 from otolith.twin.augmentation import sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
+from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind
 
 SECONDS = 2.0
 MIN_RATIO, MAX_RATIO = 3.0, 30.0  # of the detection limit
@@ -157,13 +157,8 @@ def detection_limit(structure: CandidateForm, inner: float, phase: float, landsc
 
 def _information(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:
     """Information about the amplitude: gain of the fit per squared amplitude, independent of the noise."""
-    curve = BasisFunctions(
-        np.array([family_code(structure.model.name)]),
-        np.array([structure.source]),
-        np.array([structure.site]),
-        np.array([inner]),
-        np.array([phase]),
-    )
+    at_phase = replace(structure, model=replace(structure.model, phases=(phase,)))
+    curve = basis_functions([(at_phase, inner)])
     gains = landscape.score_responses(landscape.responses(curve), np.zeros((1, 2), dtype=np.int64))
     amplitude: float = gains.amplitudes[0, 0]
     return float(gains.gain[0] / amplitude**2) if amplitude else 0.0

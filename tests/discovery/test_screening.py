@@ -9,8 +9,10 @@ import pytest
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
+from otolith.discovery.hypotheses import FaultType
 from otolith.discovery.linear_response import PROBES, LinearResponse, basis_functions
 from otolith.discovery.screening import COARSE, allowed_forms, inner_grid
+from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate_window
@@ -32,14 +34,19 @@ def drive(name: str, records: int) -> Array:
     return np.column_stack([voltage, np.full(records, 0.01)])
 
 
-def axis(name: str, count: int) -> tuple[Problem, list[Window]]:
-    """A healthy machine at 1 kHz, simulated with the nominal parameters of its twin, in ``count`` windows of 2 s."""
+def axis(name: str, count: int, extra: float = 0.0) -> tuple[Problem, list[Window]]:
+    """A machine at 1 kHz, simulated with the nominal parameters of its twin, in ``count`` windows of 2 s.
+
+    In the last window its first input is ``extra`` more than it shows, in the unit of the input.
+    """
     twin, random = find_twin(name), np.random.default_rng(1)
     nominal = np.array([parameter.nominal for parameter in twin.parameters])
     noise = tuple(output.noise for output in twin.outputs)
     inputs = drive(name, count * RECORDS)
     start = np.zeros((1, len(twin.states)))
-    outputs = kernel_of(twin).simulate(nominal[None], start, Excitation.uniform(inputs, PERIOD, substeps=4))[0]
+    true = inputs.copy()
+    true[(count - 1) * RECORDS :, 0] += extra
+    outputs = kernel_of(twin).simulate(nominal[None], start, Excitation.uniform(true, PERIOD, substeps=4))[0]
     values = np.hstack([inputs, outputs + random.normal(size=outputs.shape) * noise])
     free = tuple(item for item in twin.parameters if item.role is Role.ESTIMATED)
     known = tuple((item.name, item.nominal) for item in twin.parameters if item not in free)
@@ -78,7 +85,7 @@ def test_adjoint_is_the_transpose_of_the_response(name: str) -> None:
     kernel, model, present = linear._kernel, linear.objective.innovation_model, linear.objective.present
     adjoint = kernel.adjoint(linear._linear, model, present, signals)
     values = kernel.curves(curves.families, linear.x, curves.sources, curves.inner, curves.phases)
-    products = np.einsum("rc,rcs->cs", values, adjoint[:, curves.sites])
+    products = np.einsum("rc,rcs->cs", values[:, curves.shapes], adjoint[:, curves.sites])
     expected = responses.T @ signals
     assert np.abs(products - expected).max() < 1e-9 * np.abs(expected).max()
 
@@ -116,6 +123,18 @@ def test_healthy_windows_at_1_khz_are_not_searched(name: str) -> None:
     for window in windows[4:]:
         state, report = adapt(state, window)
         assert not report.document.cost.searched
+
+
+def test_a_force_that_appears_at_1_khz_is_an_offset() -> None:
+    """It is 200 times the noise of a position after 2 s, where 25 steps with one damping do not fit the offset."""
+    state, _ = adapted("servo_axis")
+    _, stepped = axis("servo_axis", 5, extra=3.0)
+    state, report = adapt(state, stepped[4])
+    assert report.document.cost.searched
+    assert state.test is not None
+    best = state.test.best
+    assert (best.type, best.hypothesis.name) == (FaultType.PARAMETER, "offset")
+    assert best.cost < EXPLAINED
 
 
 @pytest.mark.parametrize("name", ["dc_motor", "servo_axis"])

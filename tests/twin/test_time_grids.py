@@ -94,14 +94,14 @@ def test_sensitivities_are_differences_of_the_simulation() -> None:
 def test_linearised_model_equals_the_products_of_a_dense_one() -> None:
     """The transition over a step is the product of those in it; so is the effect of an input that is held for it."""
     merged, dense, records = merged_and_dense(5)
-    kernel, sites = kernel_of(AUGMENTED), len(AUGMENTED.inputs) - len(TWIN.inputs) - 1
+    kernel = kernel_of(AUGMENTED)
 
     def linear(drive: Excitation) -> tuple[Array, Array]:
         extra = np.zeros((len(drive.inputs), len(AUGMENTED.inputs) - 2))
         start = np.concatenate([INITIAL, np.zeros(len(AUGMENTED.states) - 2)])
         values = np.concatenate([PARAMETERS, np.zeros(len(AUGMENTED.parameters) - len(PARAMETERS))])
         free = replace(drive, inputs=np.hstack([drive.inputs, extra]), gain=None)
-        model = kernel.linearise(values, start, free, np.full(sites, 1e-3))
+        model = kernel.linearise(values, start, free)
         return model.transition, model.input_now + model.input_next
 
     transition, held = linear(merged)
@@ -113,6 +113,46 @@ def test_linearised_model_equals_the_products_of_a_dense_one() -> None:
             product = dense_transition[record] @ product
         assert transition[index] == pytest.approx(product, rel=1e-5, abs=1e-7)
         assert held[index] == pytest.approx(effect, rel=1e-4, abs=1e-6 * np.abs(dense_held).max())
+
+
+def test_wanted_columns_are_those_of_all_sensitivities() -> None:
+    merged, _, _ = merged_and_dense(6)
+    every = KERNEL.sensitivities(PARAMETERS, INITIAL, merged, drifts=True)
+    columns = [1, 4, 6, 8]  # two parameters, an initial state, a drift
+    some = KERNEL.sensitivities(PARAMETERS, INITIAL, merged, columns)
+    assert some.outputs == pytest.approx(every.outputs, rel=1e-12)
+    assert some.slopes == pytest.approx(every.slopes[:, :, columns], rel=1e-12)
+    assert some.last_slopes == pytest.approx(every.last_slopes[:, columns], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["dc_motor", "servo_axis", "pump"])
+def test_linearised_model_equals_differences_of_the_simulation(name: str) -> None:
+    """Each site in turn gets a random curve; additive and multiplicative sites, and sensors of outputs and inputs."""
+    base = find_twin(name)
+    twin, random, count = augmented_model(base), np.random.default_rng(7), 40
+    kernel, own = kernel_of(twin), len(base.inputs)
+    values = np.array([parameter.nominal for parameter in twin.parameters])
+    start = np.array([0.5 if index < len(base.states) else 0.0 for index in range(len(twin.states))])
+    grid = TimeGrid.at(np.cumsum(random.uniform(0.002, 0.01, count)) - 0.002, 0.5)
+    inputs = np.zeros((count, len(twin.inputs)))
+    inputs[:, :own] = random.uniform(0.5, 1.0, (count, own))
+    drive = Excitation(inputs, grid, substeps=4)
+    model = kernel.linearise(values, start, drive)
+    for site, index in enumerate(range(own + 1, len(twin.inputs))):
+        curve, size = random.standard_normal(count), 1e-5
+        shifted = []
+        for sign in (1.0, -1.0):
+            moved = inputs.copy()
+            moved[:, index] += sign * size * curve
+            shifted.append(kernel.simulate(values[None], start[None], replace(drive, inputs=moved))[0])
+        expected = (shifted[0] - shifted[1]) / (2.0 * size)
+        state, responses = np.zeros(len(twin.states)), []
+        for record in range(count):
+            responses.append(model.output[record] @ state + model.feedthrough[record, :, site] * curve[record])
+            following = curve[min(record + 1, count - 1)]
+            added = model.input_now[record, :, site] * curve[record] + model.input_next[record, :, site] * following
+            state = model.transition[record] @ state + added
+        assert np.array(responses) == pytest.approx(expected, rel=1e-4, abs=1e-5 * np.abs(expected).max() + 1e-12)
 
 
 def innovation_model(drive: Excitation, noise: NoiseModel) -> InnovationModel:

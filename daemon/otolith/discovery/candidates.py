@@ -1,7 +1,7 @@
-"""Candidates for components: all allowed forms, screened by the linear response, their inner parameters by swarms.
+"""Candidates for components: all allowed forms, screened by the linear response, then their inner parameters refined.
 
-Each form with an inner parameter has a particle swarm of its own; all swarms move together, so that a generation costs
-one call of a compiled kernel. Amplitudes enter linearly and need no search, so a swarm has one dimension.
+Amplitudes enter linearly and need no search, so each form has one dimension to search. The forms are refined together,
+so that a round costs one call of a compiled kernel.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ from otolith.discovery.screening import (
     ScoredGuess,
     Screening,
     allowed_forms,
+    grid_guesses,
+    highest_lines,
     inner_grid,
-    screen,
 )
-from otolith.estimation.particle_swarm import SwarmRule, particle_swarm
 from otolith.estimation.problem import Component, Problem
 from otolith.twin.augmentation import sites, sources
 
 FINE = 0.5  # spectral lines between two frequencies
-PARTICLES, GENERATIONS = 10, 12  # of the swarm of one form
-START_SPREAD = 0.5  # steps of the grid by which particles are scattered around their starts
-PEAKS = 3  # best grid points at which a swarm starts
-MAX_SWARMS = 16  # forms whose inner parameters are searched
+PEAKS = 3  # best grid points whose neighbourhood is searched
+OFFSETS = (0.0, -2.0 / 3.0, -1.0 / 3.0, 1.0 / 3.0, 2.0 / 3.0)  # steps of the grid: points around the best one
+REFINEMENTS, NARROWER = 4, 1.0 / 3.0  # of refining, and the ratio of the steps of two rounds
+MAX_REFINED = 16  # forms whose inner parameters are refined
 MAX_CANDIDATES, MIN_CANDIDATES = 10, 4  # candidates that are fitted
 AFFORDABLE_STEPS = 500  # integrator steps of a window up to which the largest number of candidates is fitted
 SCORE_MARGIN, SCORE_SHARE = 23.0, 0.3  # absolute (-2 log evidence) and relative error of the linear approximation
@@ -67,43 +67,57 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
 def _best_guesses(
     response: LinearResponse, forms: list[CandidateForm], alternatives: Alternatives
 ) -> list[ScoredGuess]:
-    """Return each form with its best inner parameter, the best form first; swarms run for the leading forms only."""
-    screening = screen(response, forms, FINE)
+    """Return each form with its best inner parameter, the best form first; only those of leading forms are refined."""
+    spectral = [form for form in forms if len(form.model.phases) > 1]
+    others = [form for form in forms if len(form.model.phases) == 1]
+    guesses = grid_guesses(response, others, FINE) + highest_lines(response, spectral, FINE)
+    screening = Screening.of(response, guesses, alternatives)
     by_form: dict[CandidateForm, list[int]] = {}
     for index in np.argsort(-screening.scores, kind="stable").tolist():
         by_form.setdefault(screening.guesses[index][0], []).append(index)
     best = [screening[order[0]] for form, order in by_form.items() if form.model.inner is None]
-    searched = [(form, order) for form, order in by_form.items() if form.model.inner is not None][:MAX_SWARMS]
+    searched = [(form, order) for form, order in by_form.items() if form.model.inner is not None][:MAX_REFINED]
     if searched:
-        starts = [(form, np.array([screening.guesses[at][1] for at in order[:PEAKS]])) for form, order in searched]
-        settled = Screening.of(response, search_inner_parameters(response, starts), alternatives)
+        starts = [(form, [screening.guesses[at][1] for at in order[:PEAKS]]) for form, order in searched]
+        settled = Screening.of(response, refine_inner_parameters(response, starts), alternatives)
         best += [settled[index] for index in range(len(searched))]
     return sorted(best, key=lambda guess: -guess.score)
 
 
-def search_inner_parameters(response: LinearResponse, starts: list[tuple[CandidateForm, Array]]) -> list[Guess]:
-    """Return each form with the inner parameter that its swarm finds from its ``starts`` (starts,)."""
+def refine_inner_parameters(response: LinearResponse, starts: list[tuple[CandidateForm, list[float]]]) -> list[Guess]:
+    """Return each form with the inner parameter of largest gain around its ``starts``, which are points of its grid.
+
+    Each round tries points on both sides of the best one so far, at shares of the distance to the next grid point, and
+    divides that distance. In the first round there are several best ones.
+    """
     forms = [form for form, _ in starts]
-    random = np.random.default_rng(response.problem.seed + response.window.index)
-    low, high = np.array([form.bounds for form in forms]).T[:, :, None, None]
-    steps = np.array([_grid_step(form, response.x) for form in forms])[:, None]
-    first = np.array([np.resize(values, PARTICLES) for _, values in starts])
-    offsets = START_SPREAD * steps * random.uniform(-1.0, 1.0, first.shape)
-    offsets[:, 0] = 0.0
-    positions = np.clip((first + offsets)[..., None], low, high)
+    best = [list(inner) for _, inner in starts]
+    scale = 1.0
+    for _ in range(REFINEMENTS):
+        guesses = [
+            (form, value)
+            for form, inner in zip(forms, best, strict=True)
+            for value in _around(form, response.x, np.array(inner), scale)
+        ]
+        gains = response.score(guesses).gain
+        leading: dict[CandidateForm, tuple[float, float]] = {}
+        for (form, value), gain in zip(guesses, gains.tolist(), strict=True):
+            if form not in leading or gain > leading[form][0]:
+                leading[form] = gain, value
+        best = [[leading[form][1]] for form in forms]
+        scale *= NARROWER
+    return [(form, inner) for form, (inner,) in zip(forms, best, strict=True)]
 
-    def cost(inner: Array) -> Array:
-        guesses = [(form, float(value)) for form, row in zip(forms, inner[..., 0], strict=True) for value in row]
-        return -response.score(guesses).gain.reshape(inner.shape[:2])
 
-    rule = SwarmRule(response.problem.swarm, GENERATIONS, GENERATIONS)
-    best = particle_swarm(cost, positions, (low, high), rule, random).positions[:, 0, 0].tolist()
-    return list(zip(forms, best, strict=True))
-
-
-def _grid_step(form: CandidateForm, x: Array) -> float:
+def _around(form: CandidateForm, x: Array, inner: Array, scale: float) -> list[float]:
+    """Return ``inner`` (starts,) and points beside each; a grid with a fixed number of points is geometric."""
     points = inner_grid(form, x, FINE)
-    return float(np.diff(points).min()) if len(points) > 1 else float(np.ptp(form.bounds))
+    offsets = scale * np.array(OFFSETS)[:, None]
+    if form.model.inner is not None and form.model.inner.points:
+        around: Array = inner * (points[1] / points[0]) ** offsets
+    else:
+        around = inner + (points[1] - points[0] if len(points) > 1 else np.ptp(form.bounds)) * offsets
+    return [float(value) for value in np.clip(around, *form.bounds).ravel()]
 
 
 def _without_parameters(

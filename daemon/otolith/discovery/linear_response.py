@@ -6,7 +6,7 @@ explain, with all that is known of them, is projected out of residual and respon
 therefore gains over "parameters only". ``docs/explanation/discovery.md`` has the equations.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,12 +18,10 @@ from otolith.estimation.information import orthonormal_basis
 from otolith.estimation.objective import input_matrix
 from otolith.estimation.timing.delay_response import delay_response
 from otolith.estimation.window_fit import Fit
-from otolith.twin.augmentation import augmented_model, sites, sources
+from otolith.twin.augmentation import augmented_model, sources
 from otolith.twin.component_families import family_code
-from otolith.twin.kernel import Excitation, Indices, LinearisedModel, kernel_of
+from otolith.twin.kernel import Indices, LinearisedModel, kernel_of
 
-PROBE_RECORDS = 6  # from which the size of the finite difference is found
-PROBE_EFFECT = 1e-4  # relative effect of the finite difference on a state
 MAX_DIFFERENCE = 10.0  # of χ²: less than that, and a window does not distinguish a component from a parameter
 SAME_DIRECTION = 1.0 - 1e-5  # cosine between the effects of a component and of a parameter that are the same
 MIN_INPUT_VARIATION = 5.0  # times the noise of an input: less variation is noise
@@ -39,30 +37,33 @@ Guess = tuple[CandidateForm, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BasisFunctions:
-    """Curves of components of unit amplitude; the curves of one guess are neighbours."""
+    """Curves of components of unit amplitude; the curves of one guess are neighbours, and sites share their shapes."""
 
     families: Array
-    """(curves,) codes."""
+    """(shapes,) codes."""
     sources: Indices
+    """(shapes,) indices."""
+    inner: Array
+    """(shapes,)."""
+    phases: Array
+    """(shapes,) rad."""
+    shapes: Indices
     """(curves,) indices."""
     sites: Indices
     """(curves,) indices."""
-    inner: Array
-    """(curves,)."""
-    phases: Array
-    """(curves,) rad."""
 
 
-def basis_functions(guesses: Iterator[Guess]) -> BasisFunctions:
+def basis_functions(guesses: Iterable[Guess]) -> BasisFunctions:
     """Return one curve for each guess, or two a quarter turn apart where the phase is free."""
-    rows = [
-        (family_code(form.model.name), form.source, form.site, inner, phase)
-        for form, inner in guesses
-        for phase in form.model.phases
-    ]
-    columns = np.array(rows, dtype=np.float64).reshape(-1, 5).T
-    families, source_indices, site_indices, inner, phases = columns
-    return BasisFunctions(families, source_indices.astype(np.int64), site_indices.astype(np.int64), inner, phases)
+    shapes: dict[tuple[float, int, float, float], int] = {}
+    curves = []
+    for form, inner in guesses:
+        code = family_code(form.model.name)
+        keys = [(code, form.source, inner, phase) for phase in form.model.phases]
+        curves += [(shapes.setdefault(key, len(shapes)), form.site) for key in keys]
+    families, source_indices, inners, phases = np.array(list(shapes), dtype=np.float64).reshape(-1, 4).T
+    of_curves, site_indices = np.array(curves, dtype=np.int64).reshape(-1, 2).T
+    return BasisFunctions(families, source_indices.astype(np.int64), inners, phases, of_curves, site_indices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,21 +104,10 @@ class LinearResponse:
         parameters, initial = _padded(values, len(slotted.parameters)), _padded(states, len(slotted.states))
         gain = np.pad(objective.innovation_model.gain, ((0, 0), (0, len(initial) - len(states)), (0, 0)))
         excitation = replace(objective.excitation, inputs=input_matrix(slotted, self.window), gain=gain)
-        differences = self._difference_sizes(parameters, initial, excitation)
-        linear = self._kernel.linearise(parameters, initial, excitation, differences)
+        linear = self._kernel.linearise(parameters, initial, excitation)
         self.x = self._sources([state.name for state in slotted.states], linear.trajectory, states)
         """(sources, records)."""
         self._linear = _without_angles(linear, len(states))
-
-    def _difference_sizes(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
-        """Return the size (sites,) of each finite difference: above rounding, and within what is linear."""
-        count = len(sites(self.problem.base_model))
-        trial = self._kernel.linearise(parameters, initial, excitation.until(PROBE_RECORDS), np.full(count, 1e-3))
-        size = np.maximum(np.abs(trial.trajectory).max(axis=0), 1e-3)[:, None]
-        effect = (np.abs(trial.input_now + trial.input_next).max(axis=0) / size).max(axis=0)
-        noise = self.objective.noise.outputs[:, None]
-        effect = np.maximum(effect, (np.abs(trial.feedthrough).max(axis=0) * PROBE_EFFECT / noise).max(axis=0))
-        return np.asarray(PROBE_EFFECT / np.maximum(effect, 1e-12))
 
     def _sources(self, state_names: list[str], trajectory: Array, initial: Array) -> Array:
         """Return the sources (sources, records): nothing, states, time, predicted outputs, or inputs."""
@@ -156,7 +146,7 @@ class LinearResponse:
         counts = np.array([len(form.model.phases) for form, _ in guesses], dtype=np.int64)
         first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
         pairs = np.column_stack([first, first + counts - 1])
-        return self.score_responses(self.responses(basis_functions(iter(guesses))), pairs)
+        return self.score_responses(self.responses(basis_functions(guesses)), pairs)
 
     def estimated_gains(self, source: int, frequencies: Array) -> Array:
         """Return about by how much χ² falls (sites, frequencies) by a sine of a source at each site of the machine.
@@ -230,17 +220,18 @@ class LinearResponse:
 
     def responses(self, curves: BasisFunctions) -> Array:
         """Return the responses (residuals, curves) of the whitened innovations."""
-        values = self._kernel.curves(curves.families, self.x, curves.sources, curves.inner, curves.phases)
+        shapes = self._kernel.curves(curves.families, self.x, curves.sources, curves.inner, curves.phases)
         model, present = self.objective.innovation_model, self.objective.present
-        return self._kernel.respond(self._linear, model, present, values, curves.sites)
+        return self._kernel.respond(self._linear, model, present, shapes.take(curves.shapes, axis=1), curves.sites)
 
     def _parameter_responses(self, names: list[str]) -> Array:
         """Return how each parameter changes the whitened innovations (residuals, parameters)."""
         objective, order = self.objective, [parameter.name for parameter in self.problem.twin.parameters]
         free = len(self.problem.free)
         parameters = objective.parameters(self._guess[None, :free])[0]
-        slopes = objective.kernel.sensitivities(parameters, self._guess[2 * free :], objective.excitation).slopes
-        columns = np.where(objective.present[..., None], slopes[:, :, [order.index(name) for name in names]], 0.0)
+        wanted, initial = [order.index(name) for name in names], self._guess[2 * free :]
+        slopes = objective.kernel.sensitivities(parameters, initial, objective.excitation, wanted).slopes
+        columns = np.where(objective.present[..., None], slopes, 0.0)
         return np.asarray(np.matmul(objective.whitening, columns).reshape(-1, len(names)))
 
     def score_responses(self, responses: Array, pairs: Array) -> ScoreStatistics:

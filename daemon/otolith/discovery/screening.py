@@ -3,6 +3,7 @@
 All allowed forms are scored by the linear response, on a grid of their inner parameters.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,13 +16,14 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, WindowEstimate, fit
 from otolith.twin.augmentation import MAX_COMPONENTS, sources
-from otolith.twin.component_families import ComponentFamily, SourceKind
+from otolith.twin.component_families import ComponentFamily, SourceKind, SourceRange
 from otolith.twin.definition import Definition
 
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
 COARSE = 1.5  # spectral lines between two frequencies
 ESTIMATE_SHARE = 0.3  # of the required gain: least estimated gain of a spectral line whose gain is computed
 MAX_LINES = 64  # of largest estimated gain, whose gain is computed
+PEAKS_OF_SPECTRUM = 8  # of largest estimated gain, whose gain a search computes
 MAX_AMPLITUDE = 1e9  # in the unit of the site
 MAX_RECORDS = 5000  # last records of a window that are searched
 THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
@@ -87,20 +89,21 @@ def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozen
 
     ``twin`` is the base model. Forms whose keys are ``taken`` are left out.
     """
+    ranges = [SourceRange.of(values) for values in x]
     bounds: dict[tuple[str, int], tuple[float, float] | None] = {}
     library = []
     for key, form in candidate_table(twin):
         shape = form.model.name, form.source
         if shape not in bounds:
-            bounds[shape] = _inner_bounds(form.model, x[form.source])
+            bounds[shape] = _inner_bounds(form.model, ranges[form.source])
         within = bounds[shape]
         if within is not None and key not in taken:
             library.append(CandidateForm(form.site, form.model, form.source, within))
     return library
 
 
-def _inner_bounds(model: ComponentFamily, x: Array) -> tuple[float, float] | None:
-    """Return the bounds of the inner parameter, or None if ``x`` (records,) does not single out the family."""
+def _inner_bounds(model: ComponentFamily, x: SourceRange) -> tuple[float, float] | None:
+    """Return the bounds of the inner parameter, or None if ``x`` does not single out the family."""
     if not model.valid(x):
         return None
     if model.fixed_inner is not None:
@@ -121,15 +124,16 @@ def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     return [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
 
 
-def screen(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> "Screening":
-    """Score all forms on a grid of inner parameters."""
-    guesses = grid_guesses(response, forms, fineness)
-    return Screening.of(response, guesses, Alternatives.among(response.problem, forms))
-
-
 def grid_guesses(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
-    """Return all forms with all inner parameters of their grids."""
-    return [(form, float(inner)) for form in forms for inner in inner_grid(form, response.x, fineness)]
+    """Return all forms with all inner parameters of their grids, which the sites of a machine share."""
+    grids: dict[tuple[str, int], list[float]] = {}
+    guesses = []
+    for form in forms:
+        shape = form.model.name, form.source
+        if shape not in grids:
+            grids[shape] = inner_grid(form, response.x, fineness).tolist()
+        guesses += [(form, inner) for inner in grids[shape]]
+    return guesses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,15 +266,33 @@ def promising_lines(response: LinearResponse, forms: list[CandidateForm], altern
     A line that gains enough is left out with probability 4e-6 (:meth:`LinearResponse.estimated_gains`).
     """
     lines: list[tuple[float, Guess]] = []
-    for source in dict.fromkeys(form.source for form in forms):
-        of_source = [form for form in forms if form.source == source]
-        grid = inner_grid(of_source[0], response.x, COARSE)
-        gains = response.estimated_gains(source, grid)[[form.site for form in of_source]]
-        for form, row in zip(of_source, gains, strict=True):
-            required = DECISIVE + _penalty(form, alternatives, response.objective.count)
-            lines += [(row[at], (form, float(grid[at]))) for at in np.flatnonzero(row > ESTIMATE_SHARE * required)]
+    for form, grid, gains in _spectra(response, forms, COARSE):
+        required = DECISIVE + _penalty(form, alternatives, response.objective.count)
+        lines += [(gains[at], (form, float(grid[at]))) for at in np.flatnonzero(gains > ESTIMATE_SHARE * required)]
     lines.sort(key=lambda line: -line[0])
     return [guess for _, guess in lines[:MAX_LINES]]
+
+
+def highest_lines(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
+    """Return the PEAKS_OF_SPECTRUM highest peaks of the spectrum of each form, by estimated gain."""
+    guesses: list[Guess] = []
+    for form, grid, gains in _spectra(response, forms, fineness):
+        walled = np.concatenate([[-np.inf], gains, [-np.inf]])
+        peaks = np.flatnonzero((gains >= walled[:-2]) & (gains > walled[2:]))
+        highest = peaks[np.argsort(-gains[peaks], kind="stable")[:PEAKS_OF_SPECTRUM]]
+        guesses += [(form, inner) for inner in grid[highest].tolist()]
+    return guesses
+
+
+def _spectra(
+    response: LinearResponse, forms: list[CandidateForm], fineness: float
+) -> Iterator[tuple[CandidateForm, Array, Array]]:
+    """Yield each of the periodic ``forms`` with its frequencies (lines,) and the estimated gains there (lines,)."""
+    for source in dict.fromkeys(form.source for form in forms):
+        of_source = [form for form in forms if form.source == source]
+        grid = inner_grid(of_source[0], response.x, fineness)
+        gains = response.estimated_gains(source, grid)
+        yield from ((form, grid, gains[form.site]) for form in of_source)
 
 
 def _penalty(form: CandidateForm, alternatives: Alternatives, count: float) -> float:

@@ -6,6 +6,7 @@ linear response, searches their inner parameters by swarms, and fits the best of
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -42,23 +43,35 @@ from otolith.estimation.timing.shifted_window import largest_delay, trial_delays
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.augmentation import MAX_COMPONENTS
 
-MAX_STEPS = 25  # of Gauss-Newton for a hypothesis
+ROUNDS, STEPS_OF_ROUND = 5, 5  # of Gauss-Newton for a hypothesis
+FAR_WORSE = 10.0  # times the least χ² of all candidates: one that leaves more after a round is not fitted further
 PARTS = 8  # of a window, fitted one after another to find an onset
 FAR_OFF = 20.0  # squared innovation in units of its variance: one record in a hundred thousand
 EXPECTED_SPREAD = 5.0  # standard deviations of χ² up to which a part of a window is as predicted
 MIN_RECORDS_AFTER = 60  # measured records after an onset from which its cause can be identified
 MAX_LATE, MIN_LATE_SHARE = 3, 0.1  # signals whose delays are tried, and their least share of the best gain
 DELAY_STEPS = 4  # of Gauss-Newton for a delay
+MIN_DELAY_GAIN = 0.1  # in -2 log evidence: a smaller step of a delay is not worth a fit
 MAX_MOVED, MIN_MOVED_SHARE = 3, 0.5  # parameters tried alone, and their least share of the best gain
 
 
-def fit_hypotheses(proposals: Iterable[Proposal], window: Window) -> list[FittedHypothesis]:
-    """Fit each proposal to ``window``."""
-    return [_fitted(item, window) for item in proposals]
+def fit_hypotheses(proposals: Iterable[Proposal], window: Window, far_worse: float = np.inf) -> list[FittedHypothesis]:
+    """Fit each proposal to ``window``, in rounds, each with the damping of a new start.
+
+    One whose χ² is ``far_worse`` times that of the best one, or more, is not fitted further.
+    """
+    fitted = [_first_round(item, window) for item in proposals]
+    for _ in range(1, ROUNDS):
+        limit = far_worse * min(map(_chi_square, fitted), default=0.0)
+        fitted = [
+            replace(item, fit=item.fit.continued(STEPS_OF_ROUND)) if item.chi_square <= limit else item
+            for item in fitted
+        ]
+    return fitted
 
 
-def _fitted(item: Proposal, window: Window) -> FittedHypothesis:
-    result = fit(item.problem, window, item.prior, item.start, MAX_STEPS)
+def _first_round(item: Proposal, window: Window) -> FittedHypothesis:
+    result = fit(item.problem, window, item.prior, item.start, STEPS_OF_ROUND)
     if not item.problem.delays:
         return FittedHypothesis(item.hypothesis, result)
     outputs = [window.missing_in(output.name) for output in item.problem.base_model.outputs]
@@ -107,17 +120,17 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     if len(problem.free) > 1:
         proposals.append(all_parameters_moved(problem, prior.mean))
     proposals += _one_parameter_moved(problem, prior, screening.response)
-    proposals += [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
-    fitted = fit_hypotheses(proposals, window)
+    candidates = [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
+    fitted = [*fit_hypotheses(proposals, window), *fit_hypotheses(candidates, window, FAR_WORSE)]
     noisier = noisier_sensors(fitted[0])
     fitted += [] if noisier is None else [noisier]
     fitted += late_signals(fitted[0], screening.response)
     components = [item for item in fitted if item.type is FaultType.COMPONENT]
     best = min(components, key=_chi_square, default=None)
-    while best is not None and len(best.problem.components) < MAX_COMPONENTS:
+    while best is not None and len(best.problem.components) < MAX_COMPONENTS and _convincing(fitted) in (None, best):
         best = _with_another_component(best)
         fitted += [] if best is None else [best]
-    if screening.always_lacking or not _is_convincing(fitted):
+    if screening.always_lacking or _convincing(fitted) is None:
         fitted += _always_lacking(fitted[0])
     return fitted
 
@@ -144,15 +157,21 @@ def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
         late = replace(problem, delays=((names[index], float(np.clip(delay, -limit, limit))),))
         return Proposal(stated, late, prior, prior.mean)
 
-    def unexplained(item: Proposal) -> float:
-        fitted = linearised(item.problem, window, prior, prior.mean)
+    delays = np.sort(trial_delays(window.sample_period, limit)).tolist()
+
+    @cache
+    def unexplained(at: int) -> float:
+        fitted = linearised(proposal(delays[at]).problem, window, prior, prior.mean)
         return chi_square_of_parameters(fitted) / fitted.count
 
-    trials = trial_delays(window.sample_period, limit).tolist()
-    best = _fitted(min(map(proposal, trials), key=unexplained), window)
+    at = min(range(0, len(delays), 2), key=unexplained)
+    at = min(range(max(at - 1, 0), min(at + 2, len(delays))), key=unexplained)
+    (best,) = fit_hypotheses([proposal(delays[at])], window)
     for _ in range(DELAY_STEPS):
-        ((signal, delay),) = best.problem.delays
-        trial = _fitted(proposal(delay + delay_score(best.fit, signal).step), window)
+        ((_, delay),), score = best.problem.delays, delay_score(best.fit, names[index])
+        if score.step**2 * score.information < MIN_DELAY_GAIN:
+            break
+        (trial,) = fit_hypotheses([proposal(delay + score.step)], window)
         if trial.chi_square >= best.chi_square:
             break
         best = trial
@@ -163,14 +182,14 @@ def _chi_square(fitted: FittedHypothesis) -> float:
     return fitted.chi_square
 
 
-def _is_convincing(fitted: list[FittedHypothesis]) -> bool:
-    """Whether one hypothesis with at most one component explains the window, decisively better than nothing."""
+def _convincing(fitted: list[FittedHypothesis]) -> FittedHypothesis | None:
+    """Return the best hypothesis if it explains the window decisively, with at most one component added."""
     null, count = fitted[0], fitted[0].fit.count
     variance_factor = residual_variance_factor(map(_chi_square, fitted), count)
     best = min(fitted, key=lambda item: item.deviance(count, variance_factor))
     gain = null.deviance(count, variance_factor) - best.deviance(count, variance_factor)
     added = len(best.problem.components) - len(null.problem.components)
-    return gain > DECISIVE and added <= 1 and best.chi_square <= EXPLAINED**2 * count
+    return best if gain > DECISIVE and added <= 1 and best.chi_square <= EXPLAINED**2 * count else None
 
 
 def _one_parameter_moved(problem: Problem, prior: Prior, response: LinearResponse) -> list[Proposal]:
@@ -209,7 +228,7 @@ def _with_another_component(best: FittedHypothesis) -> FittedHypothesis | None:
     proposals = [
         with_candidate(best.problem, best.fit.prior, candidate, best) for candidate in candidates[: MAX_CANDIDATES // 2]
     ]
-    further = min(fit_hypotheses(proposals, window), key=_chi_square, default=None)
+    further = min(fit_hypotheses(proposals, window, FAR_WORSE), key=_chi_square, default=None)
     if further is None:
         return None
     count = best.fit.count
@@ -226,7 +245,7 @@ def _always_lacking(null: FittedHypothesis) -> list[FittedHypothesis]:
         return []
     candidates = [candidate for candidate in find_candidates(screening.response) if not candidate.of_sensor]
     proposals = [with_candidate(problem, moved.fit.prior, candidate, moved) for candidate in candidates]
-    return fit_hypotheses(proposals, window)
+    return fit_hypotheses(proposals, window, FAR_WORSE)
 
 
 def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple[Posterior, list[FittedHypothesis]]:

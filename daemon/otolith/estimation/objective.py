@@ -166,10 +166,9 @@ class Objective:
     def _linearise(self, guess: Array, columns: list[int]) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
         with np.errstate(over="ignore", invalid="ignore"):
-            drifts = len(columns) > len(guess)
-            prediction = self.kernel.sensitivities(parameters, initial, self._excitation, drifts=drifts)
+            prediction = self.kernel.sensitivities(parameters, initial, self._excitation, columns)
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
-            slopes = np.where(self.present[..., None], prediction.slopes[:, :, columns], 0.0)
+            slopes = np.where(self.present[..., None], prediction.slopes, 0.0)
             jacobian = -np.matmul(self.whitening, slopes).reshape(len(residuals), -1)
         if all(np.abs(numbers).max(initial=0.0) <= PENALTY for numbers in (residuals, jacobian)):  # false for NaN
             return residuals, jacobian
@@ -184,9 +183,9 @@ class Objective:
         """Return prediction (records, outputs) and last state (states,) for a guess with trends."""
         free = self.free
         parameters = self.parameters(guess[None])[0]
-        prediction = self.kernel.sensitivities(parameters, guess[2 * free :], self._excitation, drifts=True)
+        prediction = self.kernel.sensitivities(parameters, guess[2 * free :], self._excitation, self._trend_columns)
         with np.errstate(over="ignore", invalid="ignore"):  # where the twin diverges
-            trends = prediction.slopes[:, :, self._trend_columns] @ guess[free : 2 * free]
+            trends = prediction.slopes @ guess[free : 2 * free]
             return prediction.outputs + trends, prediction.last
 
     def simulate(self, guess: Array) -> Array:

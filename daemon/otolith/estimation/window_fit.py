@@ -89,6 +89,14 @@ class Fit:
         initial = self.result.guess[2 * len(self.problem.free) :]
         return _fit(self.problem, self.window, self.prior, self.parameters, max_steps=0, initial=initial)
 
+    def continued(self, max_steps: int) -> "Fit":
+        """Return the fit after further steps, unless it has converged."""
+        if self.result.converged:
+            return self
+        result = gauss_newton(self.map_objective, self.result.guess, max_steps)
+        evaluations = self.result.evaluations + result.evaluations
+        return replace(self, result=replace(result, evaluations=evaluations, first=self.result.first))
+
     def advance(self) -> PhaseAdvance:
         """Return the advance of the components' phases to the next window."""
         last_state = self.objective.predict_with_trends(self.result.guess)[1]

@@ -13,8 +13,9 @@ from typing import Any
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
+from otolith.twin.augmentation import augmentation_inputs
 from otolith.twin.definition import Definition
-from otolith.twin.symbolic import system_of
+from otolith.twin.symbolic import COMPONENT_SLOPES, component, system_of
 
 DECORATOR = '@njit(error_model="numpy", fastmath={"contract"})'
 
@@ -48,9 +49,6 @@ class Printer(PythonCodePrinter):  # type: ignore[misc]  # sympy has no types
 
     def _print_component(self, expr: Any) -> str:
         return f"{expr.func.__name__}({', '.join(self._print(argument) for argument in expr.args)})"
-
-    # SymPy looks a method up by the exact name of the function's class.
-    _print_component_x = _print_component_a = _print_component_b = _print_component_c = _print_component
 
     def _print_Heaviside(self, expr: Any) -> str:  # noqa: N802
         return f"(1.0 if {self._print(expr.args[0])} > 0.0 else 0.0)"
@@ -172,27 +170,38 @@ class KernelCode:
         # dx/dt = f(x, u, p) and y = g(x, u, p): a = df/dx, b = df/dp, c = dg/dx, d = dg/dp.
         self.a, self.b = (SparseJacobian(system.rates, by) for by in (system.states, system.parameters))
         self.c, self.d = (SparseJacobian(system.outputs, by) for by in (system.states, system.parameters))
+        # By the inputs of the sites of an augmented twin: f = df/ds, g = dg/ds.
+        added = augmentation_inputs(definition.base) if definition.base is not None else ()
+        entering = [symbol for symbol, u in zip(system.inputs, definition.inputs, strict=True) if u.name in added]
+        self.f, self.g = (SparseJacobian(rows, entering) for rows in (system.rates, system.outputs))
+        self.sites = len(entering)
         self.rates = [hoist(expression) for expression in system.rates]
         self._outputs = [hoist(expression) for expression in system.outputs]
         self._rate_slopes = [hoist(value) for jacobian in (self.a, self.b) for value in jacobian.elements.values()]
         self._output_slopes = [hoist(value) for jacobian in (self.c, self.d) for value in jacobian.elements.values()]
+        of_sites = [[hoist(value) for value in part.elements.values()] for part in (self.a, self.f, self.c, self.g)]
+        self._site_slopes = [*self.rates, *of_sites[0], *of_sites[1]], [*self._outputs, *of_sites[2], *of_sites[3]]
         self.hoisted = hoist.assignments
         self.constants = [*self.p, *self.settings, *hoist.names]
         self.blocks = self._shared_blocks()
 
     def functions(self) -> list[str]:
         """The right sides, alone and with their Jacobians, as functions of scalars that the compiler inlines."""
+        of_rates, of_outputs = self._site_slopes
         return [
             *self._function("rates_", self.rates),
             *self._function("outputs_", self._outputs),
             *self._function("linearise_", [*self.rates, *self._rate_slopes]),
             *self._function("linearise_outputs_", [*self._outputs, *self._output_slopes]),
+            *(self._function("linearise_sites_", of_rates) if self.sites else []),
+            *(self._function("linearise_site_outputs_", of_outputs) if self.sites else []),
         ]
 
     def _function(self, name: str, expressions: list[sympy.Expr]) -> list[str]:
         """A function of states, inputs and constants; common subexpressions are computed once."""
+        lines, expressions = _with_slopes_of_components(expressions)
         shared, results = sympy.cse(expressions, symbols=sympy.numbered_symbols("t_", real=True), order="none")
-        lines = [f"{symbol.name} = {PRINTER.doprint(value)}" for symbol, value in shared]
+        lines += [f"{symbol.name} = {PRINTER.doprint(value)}" for symbol, value in shared]
         returned = ", ".join(PRINTER.doprint(result) for result in results)
         head = f"def {name}({self.arguments(self.x, self.u)}):"
         return [DECORATOR, head, *indent([*lines, f"return ({returned},)"]), "", ""]
@@ -264,6 +273,31 @@ class KernelCode:
             lines.append(f"{unpacked(results)} = {function}({self.arguments(stage.advanced(self.x, 'k'), inputs)})")
         return lines
 
+    def slopes_of_state(self, forced: SparseJacobian) -> Blocks:
+        """A substep of S = dx by all columns, the Runge-Kutta step differentiated.
+
+        q_j = A_j (s + length_j q_(j-1)) + F_j for each column s; F is zero in the rows that ``forced`` lacks.
+        """
+        states, forced_rows = range(len(self.x)), {row for row, _, _ in forced.named("f")}
+        stage_dx = []
+        for stage in STAGES:
+            s = stage.advanced(numbered("s", len(self.x)), "q")
+            for row in states:
+                terms = [
+                    f"{a} * {s[column] if stage.number == 1 else f'({s[column]})'}"
+                    for r, column, a in self.a.named(f"a{stage.number}")
+                    if r == row
+                ]
+                terms += [f"forcing[{stage.number - 1}, {row}, column]"] if row in forced_rows else []
+                stage_dx.append(f"q{stage.number}_{row} = {total(terms)}")
+        return {
+            "read_dx": [f"s_{row} = dx[{row}, column]" for row in states],
+            "stage_dx": stage_dx,
+            "advance_dx": [
+                f"dx[{r}, column] = s_{r} + sixth * (q1_{r} + 2.0 * q2_{r} + 2.0 * q3_{r} + q4_{r})" for r in states
+            ],
+        }
+
     def advanced(self, names: list[str], changed: Mapping[str, str]) -> str:
         """An assignment of the states at the next record to ``names``, with some arguments of ``advance_`` replaced."""
         given = [changed.get(name, name) for name in (*self.x, *self.u, *numbered("w", len(self.u)))]
@@ -281,6 +315,20 @@ class KernelCode:
                 *(f"{element.format(row, column)} = (up_{row} - down_{row}) / (2.0 * delta)" for row in states),
             ]
         return lines
+
+
+def _with_slopes_of_components(expressions: list[sympy.Expr]) -> tuple[list[str], list[sympy.Expr]]:
+    """Lines that evaluate each component whose derivative occurs, with all its derivatives; what is left."""
+    occurring = set().union(*(expression.atoms(component) for expression in expressions))
+    arguments = sorted({part.args for part in occurring if isinstance(part, COMPONENT_SLOPES)}, key=str)
+    lines: list[str] = []
+    values: dict[sympy.Expr, sympy.Symbol] = {}
+    for index, given in enumerate(arguments):
+        names = [f"v_{index}", *(f"v_{index}_{by}" for by in "xabc")]
+        lines.append(f"{unpacked(names)} = component_slopes({', '.join(map(PRINTER.doprint, given))})")
+        kinds = (component, *COMPONENT_SLOPES)
+        values |= {kind(*given): sympy.Symbol(name, real=True) for kind, name in zip(kinds, names, strict=True)}
+    return lines, [expression.xreplace(values) for expression in expressions]
 
 
 def fill(template: str, blocks: Blocks) -> list[str]:

@@ -37,14 +37,42 @@ class SourceKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class SourceRange:
+    """Which values a source takes in a window, in its unit."""
+
+    low: float
+    high: float
+    smallest: float
+    """Least magnitude."""
+    step: float
+    """Largest change from record to record."""
+
+    @classmethod
+    def of(cls, x: Array) -> "SourceRange":
+        """Return the range of ``x`` (records,)."""
+        step = float(np.abs(np.diff(x)).max(initial=0.0))
+        return cls(float(x.min()), float(x.max()), float(np.abs(x).min()), step)
+
+    @property
+    def width(self) -> float:
+        """From the lowest value to the highest."""
+        return self.high - self.low
+
+    @property
+    def largest(self) -> float:
+        """Largest magnitude."""
+        return max(-self.low, self.high)
+
+
+@dataclass(frozen=True, slots=True)
 class InnerParameter:
     """The parameter inside the shape of a family: the component is not linear in it, so a search has to find it."""
 
     meaning: str
     unit: str
     """``{x}`` stands for the unit of the source."""
-    bounds: Callable[[Array], tuple[float, float]]
-    """(records,) of the source -> lowest and highest value that such a window can show."""
+    bounds: Callable[[SourceRange], tuple[float, float]]
+    """Lowest and highest value that such a window can show."""
     points: int
     """Of the grid from which the search begins; 0 for one point per line of the spectrum."""
 
@@ -64,64 +92,63 @@ class ComponentFamily:
     """Where it is valid, in words."""
     inputs: frozenset[SourceKind]
     """Kinds of source that it may depend on."""
-    valid: Callable[[Array], bool]
-    """(records,) of the source -> whether the window can tell the family from others."""
+    valid: Callable[[SourceRange], bool]
+    """Whether the window can tell the family from others."""
     inner: InnerParameter | None = None
     threshold_like: bool = False
     """Whether it can hold what it depends on at zero, as dry friction does: a linear response then underrates it."""
-    fixed_inner: Callable[[Array], float] | None = None
-    """(records,) of the source -> the inner parameter of a family that does not search for it."""
+    fixed_inner: Callable[[SourceRange], float] | None = None
+    """The inner parameter of a family that does not search for it."""
     phases: tuple[float, ...] = (0.0,)
     """Phases (rad) of the basis functions; two for a free phase, since both amplitudes enter linearly."""
 
 
-def _largest(x: Array) -> float:
-    return max(float(np.abs(x).max()), MIN_MAGNITUDE)
+def _largest(x: SourceRange) -> float:
+    return max(x.largest, MIN_MAGNITUDE)
 
 
-def _varies(x: Array) -> bool:
-    return float(np.ptp(x)) > MIN_VARIATION * float(np.abs(x).max())
+def _varies(x: SourceRange) -> bool:
+    return x.width > MIN_VARIATION * x.largest
 
 
-def _keeps_sign(x: Array) -> bool:
-    return _varies(x) and (float(x.min()) > 0.0 or float(x.max()) < 0.0)
+def _keeps_sign(x: SourceRange) -> bool:
+    return _varies(x) and (x.low > 0.0 or x.high < 0.0)
 
 
-def _changes_sign(x: Array) -> bool:
-    return float(x.min()) < 0.0 < float(x.max())
+def _changes_sign(x: SourceRange) -> bool:
+    return x.low < 0.0 < x.high
 
 
-def _frequencies(x: Array) -> tuple[float, float]:
-    step = float(np.abs(np.diff(x)).max(initial=0.0))
-    return MIN_PERIODIC_ANGLE / max(float(np.ptp(x)), MIN_MAGNITUDE), MAX_ANGLE_PER_RECORD / max(step, MIN_MAGNITUDE)
+def _frequencies(x: SourceRange) -> tuple[float, float]:
+    return MIN_PERIODIC_ANGLE / max(x.width, MIN_MAGNITUDE), MAX_ANGLE_PER_RECORD / max(x.step, MIN_MAGNITUDE)
 
 
-def _has_frequencies(x: Array) -> bool:
+def _has_frequencies(x: SourceRange) -> bool:
     low, high = _frequencies(x)
     return high > low
 
 
-def _rates(x: Array) -> tuple[float, float]:
-    width = max(float(np.ptp(x)), MIN_MAGNITUDE)
+def _rates(x: SourceRange) -> tuple[float, float]:
+    width = max(x.width, MIN_MAGNITUDE)
     return MIN_BEND / width, min(MAX_BEND / width, MAX_EXPONENT / _largest(x))
 
 
-def _has_rates(x: Array) -> bool:
+def _has_rates(x: SourceRange) -> bool:
     low, high = _rates(x)
     return _varies(x) and high > low
 
 
-def _coulomb_transition(x: Array) -> float:
+def _coulomb_transition(x: SourceRange) -> float:
     """Width of the transition around zero; with a step a machine at rest would never come to rest."""
     return COULOMB_TRANSITION * _largest(x)
 
 
-def _stribeck_speeds(x: Array) -> tuple[float, float]:
-    low = max(MIN_STRIBECK_SPEED * _largest(x), HIDDEN_HUMP * float(np.abs(x).min()))
+def _stribeck_speeds(x: SourceRange) -> tuple[float, float]:
+    low = max(MIN_STRIBECK_SPEED * _largest(x), HIDDEN_HUMP * x.smallest)
     return low, MAX_STRIBECK_SPEED * _largest(x)
 
 
-def _has_stribeck_speeds(x: Array) -> bool:
+def _has_stribeck_speeds(x: SourceRange) -> bool:
     low, high = _stribeck_speeds(x)
     return _varies(x) and low < high
 

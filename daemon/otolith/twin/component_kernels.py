@@ -7,23 +7,25 @@ a whole spectrum of curves at the cost of a few.
 
 import sympy
 
-from otolith.twin.codegen import PRINTER, Blocks, KernelCode, fill, numbered, unpacked
+from otolith.twin.codegen import PRINTER, STAGES, Blocks, KernelCode, fill, unpacked
 from otolith.twin.component_families import COMPONENT_FAMILIES, family_code
 from otolith.twin.symbolic import absolute, sign
 
+# Columns of dx, the derivative of the next state: this state, the sites' inputs at this record, then at the next one.
 LINEARISE = """
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def linearise(parameters, initial, inputs, steps, counts, measured, gain, nudge):
+def linearise(parameters, initial, inputs, steps, counts, measured, gain):
     records = inputs.shape[0]
     trajectory, transition = np.zeros((records, $n_states)), np.zeros((records, $n_states, $n_states))
     input_now, input_next = np.zeros((2, records, $n_states, $n_sites))
     output, feedthrough = np.zeros((records, $n_outputs, $n_states)), np.zeros((records, $n_outputs, $n_sites))
+    dx, forcing = np.zeros(($n_states, $n_columns)), np.zeros((4, $n_states, $n_columns))
     correct = np.any(gain != 0.0)
     $read_parameters
     for record in range(records):
         $read_inputs
         $store_trajectory
-        $linearised_y = linearise_outputs_($arguments)
+        $linearised_y = linearise_site_outputs_($arguments)
         $store_output_matrix
         $store_feedthrough
         if correct:
@@ -33,53 +35,62 @@ def linearise(parameters, initial, inputs, steps, counts, measured, gain, nudge)
             break
         substeps = counts[record]
         step = steps[record] / substeps
-        $read_next_inputs
-        $next_state
-        $store_transition
+        half, sixth = step / 2.0, step / 6.0
+        $input_increments
+        dx[:] = 0.0
+        $initial_dx
+        for substep in range(substeps):
+            $inputs_at_stages
+            $linearised_stages
+            $advance_state
+            $forcing_of_sites
+            for column in range($n_columns):
+                $read_dx
+                $stage_dx
+                $advance_dx
+            $advance_inputs
+        transition[record] = dx[:, :$n_states]
         $store_input_matrices
-        $move_to_next
     return trajectory, transition, input_now, input_next, output, feedthrough
 """
 
 
-def linearise(code: KernelCode, site_inputs: list[int]) -> list[str]:
+def linearise(code: KernelCode) -> list[str]:
     """``linearise``: the linear time-varying system along a trajectory, its inputs those of the sites.
 
     ``state + input_now @ u[k] + input_next @ u[k + 1]`` to the next record, ``output @ state + feedthrough @ u[k]``.
     """
-    matrix = [f"output[record, {row}, {column}] = {c}" for row, column, c in code.c.named("c")]
+    states = len(code.x)
+    reaching = sorted({site for _, site, _ in code.f.named("f")})  # the sites that no output alone sees
+    column_of = {site: states + index for index, site in enumerate(reaching)}
     blocks: Blocks = {
-        "n_sites": str(len(site_inputs)),
+        "n_sites": str(code.sites),
+        "n_columns": str(states + 2 * len(reaching)),
         "store_trajectory": [f"trajectory[record, {row}] = {x}" for row, x in enumerate(code.x)],
-        "store_output_matrix": matrix,
-        "store_feedthrough": _feedthrough(code, site_inputs),
-        "store_transition": code.transition("transition[record, {}, {}]"),
-        "store_input_matrices": _input_matrices(code, site_inputs),
+        "linearised_y": unpacked([*code.y, *code.c.names("c"), *code.g.names("g")]),
+        "store_output_matrix": [f"output[record, {row}, {column}] = {c}" for row, column, c in code.c.named("c")],
+        "store_feedthrough": [f"feedthrough[record, {row}, {site}] = {g}" for row, site, g in code.g.named("g")],
+        "initial_dx": [f"dx[{row}, {row}] = 1.0" for row in range(states)],
+        "linearised_stages": code.stages("linearise_sites_", [("a", code.a), ("f", code.f)]),
+        "forcing_of_sites": _forcing(code, column_of),
+        "store_input_matrices": [
+            f"{matrix}[record, :, {site}] = dx[:, {column + shift}]"
+            for matrix, shift in (("input_now", 0), ("input_next", len(reaching)))
+            for site, column in column_of.items()
+        ],
     }
-    return fill(LINEARISE, code.blocks | blocks)
+    return fill(LINEARISE, code.blocks | code.slopes_of_state(code.f) | blocks)
 
 
-def _feedthrough(code: KernelCode, site_inputs: list[int]) -> list[str]:
-    """Outputs by the input of each site at the same record, by a forward difference of ``nudge``."""
+def _forcing(code: KernelCode, column_of: dict[int, int]) -> list[str]:
+    """F_j of a substep: df/ds at stage j times the share of each record in the input, which is interpolated."""
     lines = []
-    for site, index in enumerate(site_inputs):
-        nudged = [f"{u} + nudge[{site}]" if position == index else u for position, u in enumerate(code.u)]
-        lines += [
-            f"{unpacked(numbered('z', len(code.y)))} = outputs_({code.arguments(code.x, nudged)})",
-            *(f"feedthrough[record, {r}, {site}] = (z_{r} - y_{r}) / nudge[{site}]" for r in range(len(code.y))),
-        ]
-    return lines
-
-
-def _input_matrices(code: KernelCode, site_inputs: list[int]) -> list[str]:
-    """Next states by the input of each site at this record and at the next, by forward differences of ``nudge``."""
-    lines = []
-    for site, index in enumerate(site_inputs):
-        for matrix, nudged in (("input_now", code.u[index]), ("input_next", f"w_{index}")):
-            lines += [
-                code.advanced(numbered("z", len(code.x)), {nudged: f"{nudged} + nudge[{site}]"}),
-                *(f"{matrix}[record, {r}, {site}] = (z_{r} - n_{r}) / nudge[{site}]" for r in range(len(code.x))),
-            ]
+    for stage in STAGES:
+        lines.append(f"share = (substep + {stage.time}) / substeps")
+        for row, site, f in code.f.named(f"f{stage.number}"):
+            element = f"forcing[{stage.number - 1}, {row}, {{}}] = {{}} * {f}"
+            column = column_of[site]
+            lines += [element.format(column, "(1.0 - share)"), element.format(column + len(column_of), "share")]
     return lines
 
 
@@ -219,21 +230,25 @@ def curves(family, x, sources, b, c):
 
 
 def component_functions() -> list[str]:
-    """``component(family, x, a, b, c)`` and its derivatives by ``x``, ``a``, ``b`` and ``c``; then ``curves``."""
+    """``component(family, x, a, b, c)``; ``component_slopes``, which adds its derivatives; then ``curves``.
+
+    The derivatives by ``x``, ``a``, ``b`` and ``c`` share the exponentials of the component.
+    """
     arguments = sympy.symbols("x a b c", real=True)
     known = {symbol.name: symbol for symbol in arguments} | {"absolute": absolute, "sign": sign}
-    formulas = [(family_code(row.name), sympy.sympify(row.formula, locals=known)) for row in COMPONENT_FAMILIES]
-    lines = _by_family("component", formulas)
-    for symbol in arguments:
-        slopes = [(code, sympy.diff(formula, symbol)) for code, formula in formulas]
-        lines += _by_family(f"component_{symbol.name}", slopes)
-    return [*lines, *CURVES.strip().splitlines(), "", ""]
+    formulas = {family_code(row.name): sympy.sympify(row.formula, locals=known) for row in COMPONENT_FAMILIES}
+    slopes = {code: [formula, *(sympy.diff(formula, by) for by in arguments)] for code, formula in formulas.items()}
+    lines = _by_family("component", {code: [formula] for code, formula in formulas.items()})
+    return [*lines, *_by_family("component_slopes", slopes), *CURVES.strip().splitlines(), "", ""]
 
 
-def _by_family(name: str, formulas: list[tuple[float, sympy.Expr]]) -> list[str]:
-    """A function that evaluates the formula of the family whose code it is given, and 0 for any other code."""
-    branches = []
-    for code, formula in formulas:
-        if formula != 0:
-            branches += [f"    if family == {code!r}:", f"        return {PRINTER.doprint(formula)}"]
-    return ['@njit(error_model="numpy")', f"def {name}(family, x, a, b, c):", *branches, "    return 0.0", "", ""]
+def _by_family(name: str, rows: dict[float, list[sympy.Expr]]) -> list[str]:
+    """A function that evaluates the row of the family whose code it is given; of an empty slot, code 0, zeros."""
+    zeros = [sympy.Integer(0)] * len(next(iter(rows.values())))
+    lines = ['@njit(error_model="numpy")', f"def {name}(family, x, a, b, c):"]
+    for code, row in ({0.0: zeros} | rows).items():  # most slots are empty: they come first
+        shared, results = sympy.cse(row, symbols=sympy.numbered_symbols("t_", real=True), order="none")
+        lines.append(f"    if family == {code!r}:")
+        lines += [f"        {symbol.name} = {PRINTER.doprint(value)}" for symbol, value in shared]
+        lines.append(f"        return {', '.join(map(PRINTER.doprint, results))}")
+    return [*lines, f"    return {', '.join(map(PRINTER.doprint, zeros))}", "", ""]

@@ -7,7 +7,7 @@ Identification, 2nd ed., section 4.3). docs/explanation has the equations.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -141,11 +141,11 @@ class Sensitivities(NamedTuple):
     outputs: Array
     """(records, outputs)."""
     slopes: Array
-    """(records, outputs, parameters + states [+ parameters])."""
+    """(records, outputs, columns): parameters + states [+ parameters], or those of them that are wanted."""
     last: Array
     """(states,) at the last record, corrected by its measurement."""
     last_slopes: Array
-    """(states, parameters + states [+ parameters])."""
+    """(states, columns)."""
 
 
 class LinearisedModel(NamedTuple):
@@ -186,12 +186,27 @@ class Kernel:
         return predicted
 
     def sensitivities(
-        self, parameters: Array, initial: Array, excitation: Excitation, *, drifts: bool = False
+        self,
+        parameters: Array,
+        initial: Array,
+        excitation: Excitation,
+        columns: Sequence[int] | None = None,
+        *,
+        drifts: bool = False,
     ) -> Sensitivities:
-        """One prediction and its exact derivatives, with ``drifts`` also by those; (parameters,), (states,)."""
-        name = "drifting_sensitivities" if drifts else "sensitivities"
-        times = (np.ascontiguousarray(excitation.grid.before_last),) if drifts else ()
-        return Sensitivities(*self._call(name, parameters, initial, *self._arguments(excitation), *times))
+        """One prediction and its exact derivatives; (parameters,), (states,).
+
+        ``columns`` are the derivatives that are wanted, numbered as in :class:`Sensitivities`: by default all, those by
+        drifts if ``drifts``.
+        """
+        if columns is None:
+            of_parameters = len(self.definition.parameters) - self.definition.settings
+            columns = range(of_parameters * (1 + drifts) + len(self.definition.states))
+        wanted = np.array(columns, dtype=np.int64)
+        times = np.ascontiguousarray(excitation.grid.before_last)
+        return Sensitivities(
+            *self._call("sensitivities", parameters, initial, *self._arguments(excitation), times, wanted)
+        )
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
@@ -221,9 +236,9 @@ class Kernel:
         of_inputs = (np.ascontiguousarray(noise.inputs), np.ascontiguousarray(noise.held_inputs))
         return InnovationModel(*self._call("kalman", parameters, initial, *grid, measured, *variances, *of_inputs))
 
-    def linearise(self, parameters: Array, initial: Array, excitation: Excitation, nudge: Array) -> LinearisedModel:
-        """The linear system along a window, by differences of ``nudge`` (sites,) in the units of the sites."""
-        return LinearisedModel(*self._call("linearise", parameters, initial, *self._arguments(excitation), nudge))
+    def linearise(self, parameters: Array, initial: Array, excitation: Excitation) -> LinearisedModel:
+        """The linear system along a window, exact but for the error of the integrator; (parameters,), (states,)."""
+        return LinearisedModel(*self._call("linearise", parameters, initial, *self._arguments(excitation)))
 
     def curves(self, families: Array, x: Array, sources: Indices, inner: Array, phases: Array) -> Array:
         """(records, curves) of components of unit amplitude; ``x`` is (sources, records), all else (curves,)."""

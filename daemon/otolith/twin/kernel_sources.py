@@ -5,7 +5,6 @@ it, which :mod:`otolith.twin.expressions` has checked. The theory is in docs/exp
 predictor line by line, ``sensitivities.md`` derives the sensitivities, ``innovation-form.md`` the filter.
 """
 
-from otolith.twin.augmentation import augmentation_inputs
 from otolith.twin.codegen import PRINTER, STAGES, Blocks, KernelCode, fill, numbered, total, unpacked
 from otolith.twin.component_kernels import ADJOINT, RESPOND, SPREAD, component_functions, linearise
 from otolith.twin.definition import Definition
@@ -114,15 +113,20 @@ def _swarm(code: KernelCode) -> Blocks:
     }
 
 
-# dx is S, the derivative of the state, and dy is Y, that of the outputs; forcing[j - 1] is B at stage j.
+# dx is S, the derivative of the state, and dy is Y, that of the outputs; forcing[j - 1] is B at stage j. They hold the
+# columns that are asked for; the others share one more column, which nothing reads.
 SENSITIVITIES = """
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def $name(parameters, initial, inputs, steps, counts, measured, gain$before_last):
-    records = inputs.shape[0]
+def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, before_last, columns):
+    records, count = inputs.shape[0], len(columns)
+    position = np.full($n_columns, count)
+    for column in range(count):
+        position[columns[column]] = column
+    drifting = np.any(columns >= $n_constant)
     predicted = np.empty((records, $n_outputs))
-    dy = np.zeros((records, $n_outputs, $n_columns))
-    dx = np.zeros(($n_states, $n_columns))
-    forcing = np.zeros((4, $n_states, $n_columns))
+    dy = np.zeros((records, $n_outputs, count + 1))
+    dx = np.zeros(($n_states, count + 1))
+    forcing = np.zeros((4, $n_states, count + 1))
     $initial_dx
     correct = np.any(gain != 0.0)
     $read_parameters
@@ -130,14 +134,15 @@ def $name(parameters, initial, inputs, steps, counts, measured, gain$before_last
         $read_inputs
         $linearised_y = linearise_outputs_($arguments)
         $store
-        for column in range($n_columns):
+        time = before_last[record]
+        for column in range(count):
             $dy_through_state
         $dy_through_parameters
         $dy_through_drifts
         if correct:
             $innovations
             $correct_state
-            for column in range($n_columns):
+            for column in range(count):
                 $correct_dx
         if record + 1 == records:
             break
@@ -150,38 +155,40 @@ def $name(parameters, initial, inputs, steps, counts, measured, gain$before_last
             $linearised_stages
             $advance_state
             $forcing_of_parameters
-            $forcing_of_drifts
-            for column in range($n_columns):
+            if drifting:
+                $forcing_of_drifts
+            for column in range(count):
                 $read_dx
                 $stage_dx
                 $advance_dx
             $advance_inputs
     final = np.empty($n_states)
     $store_final
-    return predicted, dy, final, dx
+    return predicted, dy[:, :, :count], final, dx[:, :count]
 """
 
 
-def sensitivities(code: KernelCode, name: str, *, drifts: bool) -> list[str]:
+def sensitivities(code: KernelCode) -> list[str]:
     """The prediction and its forward sensitivities, as docs/explanation/sensitivities.md derives them.
 
-    Columns: each parameter, each initial state and, with ``drifts``, the drift of each parameter.
+    Columns: each parameter, each initial state, and the drift of each parameter.
     """
     parameters, states = len(code.p), len(code.x)
+    initial = [f"dx[{row}, position[{parameters + row}]] = 1.0" for row in range(states)]  # dx_0 by x_0: the identity
     blocks: Blocks = {
-        "name": name,
-        "before_last": ", before_last" if drifts else "",
-        "n_columns": str(parameters + states + parameters * drifts),
-        "initial_dx": [f"dx[{row}, {parameters + row}] = 1.0" for row in range(states)],  # dx_0 by x_0 is the identity
+        "n_columns": str(2 * parameters + states),
+        "n_constant": str(parameters + states),
+        "initial_dx": initial,
         "store": [f"predicted[record, {index}] = {y}" for index, y in enumerate(code.y)],
         "linearised_stages": code.stages("linearise_", [("a", code.a), ("b", code.b)]),
         "store_final": [f"final[{row}] = {x}" for row, x in enumerate(code.x)],
     }
-    steps = _output_slopes(code, drifts=drifts) | _forcing(code, drifts=drifts) | _state_slopes(code)
-    return fill(SENSITIVITIES, code.blocks | blocks | steps)
+    return fill(
+        SENSITIVITIES, code.blocks | blocks | _output_slopes(code) | _forcing(code) | code.slopes_of_state(code.b)
+    )
 
 
-def _output_slopes(code: KernelCode, *, drifts: bool) -> Blocks:
+def _output_slopes(code: KernelCode) -> Blocks:
     """Y = C S + D at a record, and the correction of the state, S -= K M Y with M = 0 for a missing measurement.
 
     The drift of a parameter moves it by the time since the last record, so its column has D times that time.
@@ -191,20 +198,20 @@ def _output_slopes(code: KernelCode, *, drifts: bool) -> Blocks:
         row: [f"{c} * dx[{column}, column]" for r, column, c in code.c.named("c") if r == row]
         for row in range(len(code.y))
     }
-    through_drifts = [f"dy[record, {row}, {base + column}] += time * {d}" for row, column, d in code.d.named("d")]
+    d = code.d.named("d")
     corrections = {
         row: total([f"gain[record, {row}, {i}] * m_{i} * dy[record, {i}, column]" for i in range(len(code.y))])
         for row in range(len(code.x))
     }
     return {
         "dy_through_state": [f"dy[record, {row}, column] = {total(terms)}" for row, terms in through_state.items()],
-        "dy_through_parameters": [f"dy[record, {row}, {column}] += {d}" for row, column, d in code.d.named("d")],
-        "dy_through_drifts": ["time = before_last[record]", *through_drifts] if drifts else [],
+        "dy_through_parameters": [f"dy[record, {row}, position[{at}]] += {value}" for row, at, value in d],
+        "dy_through_drifts": [f"dy[record, {row}, position[{base + at}]] += time * {value}" for row, at, value in d],
         "correct_dx": [f"dx[{row}, column] -= ({correction})" for row, correction in corrections.items()],
     }
 
 
-def _forcing(code: KernelCode, *, drifts: bool) -> Blocks:
+def _forcing(code: KernelCode) -> Blocks:
     """F_j of a substep: B_j in the columns of the parameters, B_j times the time of the stage in those of the drifts.
 
     The columns of the initial state keep their zeros.
@@ -213,33 +220,11 @@ def _forcing(code: KernelCode, *, drifts: bool) -> Blocks:
     of_parameters, of_drifts = [], ["start = time + substep * step"]
     for stage in STAGES:
         for row, column, b in code.b.named(f"b{stage.number}"):
-            of_parameters.append(f"forcing[{stage.number - 1}, {row}, {column}] = {b}")
+            element = f"forcing[{stage.number - 1}, {row}, position[{{}}]] = {{}}"
+            of_parameters.append(element.format(column, b))
             time = f"(start + {stage.time} * step)"
-            of_drifts.append(f"forcing[{stage.number - 1}, {row}, {base + column}] = {time} * {b}")
-    return {"forcing_of_parameters": of_parameters, "forcing_of_drifts": of_drifts if drifts else []}
-
-
-def _state_slopes(code: KernelCode) -> Blocks:
-    """A substep of S, the Runge-Kutta step differentiated: q_j = A_j (s + length_j q_(j-1)) + F_j for each column s."""
-    states, forced_rows = range(len(code.x)), {row for row, _, _ in code.b.named("b")}
-    stage_dx = []
-    for stage in STAGES:
-        s = stage.advanced(numbered("s", len(code.x)), "q")
-        for row in states:
-            terms = [
-                f"{a} * {s[column] if stage.number == 1 else f'({s[column]})'}"
-                for r, column, a in code.a.named(f"a{stage.number}")
-                if r == row
-            ]
-            terms += [f"forcing[{stage.number - 1}, {row}, column]"] if row in forced_rows else []
-            stage_dx.append(f"q{stage.number}_{row} = {total(terms)}")
-    return {
-        "read_dx": [f"s_{row} = dx[{row}, column]" for row in states],
-        "stage_dx": stage_dx,
-        "advance_dx": [
-            f"dx[{r}, column] = s_{r} + sixth * (q1_{r} + 2.0 * q2_{r} + 2.0 * q3_{r} + q4_{r})" for r in states
-        ],
-    }
+            of_drifts.append(element.format(base + column, f"{time} * {b}"))
+    return {"forcing_of_parameters": of_parameters, "forcing_of_drifts": of_drifts}
 
 
 # The measurement update by the Cholesky factor of the innovation covariance and its inverse, both lower triangular.
@@ -412,13 +397,9 @@ def kernel_source(definition: Definition) -> str:
     if definition.base is not None:
         lines += component_functions()
     lines += [*code.functions(), *advance(code), *blank, *simulate(code), *blank]
-    lines += [*sensitivities(code, "sensitivities", drifts=False), *blank]
-    lines += [*sensitivities(code, "drifting_sensitivities", drifts=True), *blank]
-    lines += [*kalman(code), *blank, *euler(code)]
+    lines += [*sensitivities(code), *blank, *kalman(code), *blank, *euler(code)]
     if definition.base is not None:
-        names = augmentation_inputs(definition.base)
-        site_inputs = [index for index, driven in enumerate(definition.inputs) if driven.name in names]
-        lines += [*blank, *linearise(code, site_inputs)]
+        lines += [*blank, *linearise(code)]
         for kernel in (RESPOND, ADJOINT, SPREAD):
             lines += [*blank, *kernel.strip().splitlines()]
     return HEAD + "\n".join(lines) + "\n"
