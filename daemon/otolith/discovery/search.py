@@ -1,7 +1,7 @@
 """Step 3 of the method: which component, moved parameter or faulty sensor explains what the twin leaves of a window.
 
 :mod:`otolith.discovery.screening` tests whether a window is worth a search. :func:`search` proposes hypotheses from the
-linear response, searches their inner parameters by swarms, and fits the best of them jointly with all parameters.
+linear response, refines their inner parameters, and fits the best of them jointly with all parameters.
 """
 
 from collections.abc import Iterable
