@@ -54,7 +54,7 @@ def test_the_mixture_holds_the_values_of_all_members(windows: int) -> None:
     """After one window, what was known before is a member: the window itself may be wrong."""
     moved, sensor = stated(FaultType.PARAMETER, 0.0, 0.0, 1), stated(FaultType.SENSOR, 0.0, 0.0, 1, OFFSET)
     before = hypothesis(FaultType.NOTHING, BARE, R_a=(6.0, 0.01)).posterior.prior()
-    known = mixture([moved, sensor], BARE, windows, before)
+    known = mixture([moved, sensor], [0.5, 0.5], BARE, before if windows == 1 else None)
     sd = float(np.sqrt(known.covariance[0, 0]))
     expected = (6.5, np.hypot(0.5, 0.01)) if windows == 1 else (7.0, 0.01)
     assert (known.mean[0], sd) == pytest.approx(expected, rel=1e-6)

@@ -158,7 +158,8 @@ def _keep_posterior(
     result = WindowResult.unchanged(state, predicted, outcome.decision, estimate=estimated, test=test)
     if outcome.decision is WindowDecision.REFUSED:
         return result
-    known = mixture(test.hypotheses, state.problem, test.windows, result.before)
+    before = result.before if test.windows == 1 else None
+    known = mixture(test.hypotheses, test.probabilities, state.problem, before)
     return replace(result, before=known, after=known)
 
 

@@ -163,7 +163,7 @@ class TrackedHypothesis:
     deviance: float
     """-2 log evidence of all windows so far, relative to the best hypothesis."""
     misfit: float
-    """The same from the data alone: without the prior weight, and without the complexity of the first fit."""
+    """The same from the data alone: without prior weight and complexity."""
     cost: float
     """RMSE of the last window in units of the noise."""
     delay_information: float = 0.0
@@ -219,19 +219,21 @@ class HypothesisStep:
     evidence: Evidence
     deviance: float = 0.0
     """-2 log evidence of this window."""
+    misfit: float = 0.0
+    """The same without the complexity."""
 
     @property
     def is_usable(self) -> bool:
         """Whether the prediction can be updated without losing all digits; always for the null hypothesis."""
         return is_usable(self.tracked.hypothesis, self.predicted, self.evidence)
 
-    def updated(self, excess: float) -> TrackedHypothesis | None:
-        """Return the hypothesis after the window; ``excess`` is added to its deviance and misfit.
+    def updated(self, deviance: float, misfit: float) -> TrackedHypothesis | None:
+        """Return the hypothesis after the window, with so much more deviance and misfit.
 
         None if the window contradicts the delay that it states.
         """
         posterior = self.predicted.update(self.evidence, self.fitted.fit.advance())
-        tracked = replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost).worse_by(excess, excess)
+        tracked = replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost).worse_by(deviance, misfit)
         return tracked if self.tracked.type is not FaultType.TIMING else _with_delay(tracked, self.fitted.fit)
 
 

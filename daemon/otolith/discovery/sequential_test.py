@@ -68,6 +68,8 @@ class SequentialTest:
     """Consecutive windows in which the best hypothesis was the best."""
     last: FitSummary = FitSummary()
     """Of the last window."""
+    was_ambiguous: bool = False
+    """Whether hypotheses of several types explained the windows before the last one equally."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
 
@@ -79,12 +81,17 @@ class SequentialTest:
     @property
     def probabilities(self) -> list[float]:
         """Of each hypothesis."""
-        return probabilities(self.hypotheses)
+        return probabilities(self.hypotheses, self.margin)
+
+    @property
+    def margin(self) -> float:
+        """Misfit up to which hypotheses are interchangeable: what was ambiguous must be told apart twice as clearly."""
+        return DECISIVE * (2.0 if self.was_ambiguous else 1.0)
 
     @property
     def is_ambiguous(self) -> bool:
         """Whether hypotheses of several types explain the windows equally."""
-        return len({self.hypotheses[group[0]].type for group in interchangeable(self.hypotheses)}) > 1
+        return len({self.hypotheses[group[0]].type for group in interchangeable(self.hypotheses, self.margin)}) > 1
 
     def probability(self, kind: FaultType) -> float:
         """Return the probability of all hypotheses of one type."""
@@ -105,7 +112,7 @@ class SequentialTest:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
         data = [item.deviance - item.hypothesis.prior_deviance for item in self.hypotheses]
         at = self.hypotheses.index(to)
-        equal = {group[0] for group in interchangeable(self.hypotheses)}
+        equal = {group[0] for group in interchangeable(self.hypotheses, self.margin)}
         near = {other for other, deviance in enumerate(data) if abs(deviance - data[at]) <= DECISIVE}
         chosen = sorted((near | equal if at in equal else near) - {at})
         return [(self.hypotheses[other], self.probabilities[other]) for other in chosen]
@@ -156,13 +163,21 @@ def open_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Seque
 
 def follow(test: SequentialTest, window: Window) -> SequentialTest:
     """Return the test after one more window: predict, fit and update every hypothesis, then compare them."""
-    test = replace(test, windows=test.windows + 1)
+    test = replace(test, windows=test.windows + 1, was_ambiguous=test.is_ambiguous)
     steps = [step for step in _steps(test, window) if step.is_usable]
     if not steps:
         return test
     steps, last = _with_deviances(steps)
-    least = min(step.deviance for step in steps)
-    updated = [(step.updated(min(step.deviance - least, MAX_WINDOW_EVIDENCE)), step.deviance) for step in steps]
+    least, least_misfit = min(step.deviance for step in steps), min(step.misfit for step in steps)
+    updated = [
+        (
+            step.updated(
+                min(step.deviance - least, MAX_WINDOW_EVIDENCE), min(step.misfit - least_misfit, MAX_WINDOW_EVIDENCE)
+            ),
+            step.deviance,
+        )
+        for step in steps
+    ]
     kept = [(item, deviance) for item, deviance in updated if item is not None]
     if not kept:
         return test
@@ -171,7 +186,7 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
         tracked = prune(tracked, [deviance for _, deviance in kept])
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     if test.windows > MAX_OPEN_WINDOWS:
-        hypotheses = without_duplicates(hypotheses)
+        hypotheses = without_duplicates(hypotheses, test.margin)
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     hypotheses = _screened(hypotheses, steps)
     return replace(test, hypotheses=hypotheses, leading=leading, last=last)
@@ -211,6 +226,7 @@ def _with_deviances(steps: list[HypothesisStep]) -> tuple[list[HypothesisStep], 
         replace(
             step,
             deviance=step.fitted.chi_square / variance_factor + complexity_penalty(step.predicted, step.evidence),
+            misfit=step.fitted.chi_square / variance_factor,
         )
         for step in steps
     ]
