@@ -77,7 +77,7 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
-    if state.test is None and _is_expected(predicted, estimated) and not screening.is_positive:
+    if state.test is None and _is_expected(state, predicted, estimated) and not screening.is_positive:
         return _update_filter(state, predicted, estimated)
     test = continue_test(state.test, predicted, screening)
     outcome = decide(test)
@@ -90,9 +90,13 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     return replace(result, searched=True)
 
 
-def _is_expected(predicted: Posterior, estimated: WindowEstimate) -> bool:
-    """Whether the residual counts as noise, and the normalised innovation squared is within its limit."""
-    return estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
+def _is_expected(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> bool:
+    """Whether the residual counts as noise, and the normalised innovation squared is within its limit.
+
+    The bounds of the machine file alone, before the first window, contradict nothing.
+    """
+    first = state.posterior.phase is None
+    return estimated.cost <= EXPLAINED and (first or predicted.expects(estimated.evidence))
 
 
 def _update_filter(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
