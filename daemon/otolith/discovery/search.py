@@ -70,6 +70,18 @@ def fit_hypotheses(proposals: Iterable[Proposal], window: Window, far_worse: flo
     return fitted
 
 
+def explained_again(fitted: FittedHypothesis, item: Proposal, window: Window, before: Posterior) -> FittedHypothesis:
+    """Return the fit of a hypothesis that explained the window ``before``, or the same from its last state, if better.
+
+    A state that is not measured starts at its nominal value, which may lie in the valley of another minimum.
+    """
+    if before.phase is None or not before.phase.last_state or item.problem.delays:
+        return fitted
+    steps = ROUNDS * STEPS_OF_ROUND
+    again = fit(item.problem, window, item.prior, item.start, steps, state=before.phase.last_state)
+    return replace(fitted, fit=again) if again.chi_square < fitted.fit.chi_square else fitted
+
+
 def _first_round(item: Proposal, window: Window) -> FittedHypothesis:
     result = fit(item.problem, window, item.prior, item.start, STEPS_OF_ROUND)
     if not item.problem.delays:

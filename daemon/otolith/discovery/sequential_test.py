@@ -27,7 +27,7 @@ from otolith.discovery.hypotheses import (
 )
 from otolith.discovery.noise_hypothesis import is_white, normalisation
 from otolith.discovery.screening import DECISIVE, ScreeningResult
-from otolith.discovery.search import fit_hypotheses, screening_test, search, search_from_onset
+from otolith.discovery.search import explained_again, fit_hypotheses, screening_test, search, search_from_onset
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
@@ -199,7 +199,11 @@ def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
     for item, posterior in zip(test.hypotheses, predicted, strict=True):
         prior = posterior.prior()
         proposals.append(Proposal(replace(item.hypothesis, added=0), posterior.problem, prior, prior.mean))
-    rows = list(zip(test.hypotheses, predicted, fit_hypotheses(proposals, window), strict=True))
+    fitted = [
+        explained_again(own, proposal, window, item.posterior) if own.fit.cost > EXPLAINED >= item.cost else own
+        for own, proposal, item in zip(fit_hypotheses(proposals, window), proposals, test.hypotheses, strict=True)
+    ]
+    rows = list(zip(test.hypotheses, predicted, fitted, strict=True))
     rows = [row for row in rows if row[2].chi_square < DIVERGED] or rows[:1]
     steps = [HypothesisStep(item, posterior, fitted, fitted.fit.evidence()) for item, posterior, fitted in rows]
     return _with_noise(steps)

@@ -33,6 +33,8 @@ class PhaseAdvance:
     """Unix seconds of the next window's first record, if no window is missing between."""
     by: tuple[float, ...]
     """Of each slot, in the unit of its source."""
+    last_state: tuple[float, ...] = ()
+    """State of the twin at the last record of the window; empty if it is not known."""
 
 
 def phase_advance(problem: Problem, window: Window, last_state: Array) -> PhaseAdvance:
@@ -48,7 +50,8 @@ def phase_advance(problem: Problem, window: Window, last_state: Array) -> PhaseA
             advance.append(float(last_state[names.index(symbol)] + speed * window.grid.steps[-1]))
         else:
             advance.append(0.0)
-    return PhaseAdvance(window.start, window.end, tuple(advance))
+    known = tuple(last_state[: len(problem.base_model.states)].tolist())
+    return PhaseAdvance(window.start, window.end, tuple(advance), known if np.isfinite(known).all() else ())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

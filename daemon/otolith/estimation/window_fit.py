@@ -103,14 +103,30 @@ class Fit:
         return phase_advance(self.problem, self.window, last_state)
 
 
-def fit(problem: Problem, window: Window, prior: Prior, start: Array, max_steps: int = MAX_STEPS) -> Fit:
+def fit(  # noqa: PLR0913 - the two parts of a start
+    problem: Problem,
+    window: Window,
+    prior: Prior,
+    start: Array,
+    max_steps: int = MAX_STEPS,
+    *,
+    state: tuple[float, ...] = (),
+) -> Fit:
     """Fit the free parameters to ``window`` under ``prior``; Gauss-Newton starts at ``start`` (free,).
 
-    The window of the fit is without the delays of the problem.
+    States of the twin that are not measured start at ``state`` (states,), if it is given. The window of the fit is
+    without the delays of the problem.
     """
     if problem.delays:
         window = shifted(problem.base_model, window, dict(problem.delays))
-    return _fit(problem, window, prior, start, max_steps)
+    initial = None
+    if state:
+        outputs = {output.name for output in problem.base_model.outputs}
+        initial = Objective(problem, window, start[: len(problem.free)]).guess(start[: len(problem.free)])
+        initial = initial[len(problem.free) :].copy()
+        for index, (own, value) in enumerate(zip(problem.base_model.states, state, strict=True)):
+            initial[index] = initial[index] if own.name in outputs else value
+    return _fit(problem, window, prior, start, max_steps, initial=initial)
 
 
 def _fit(  # noqa: PLR0913 - the two parts of a start
