@@ -3,14 +3,16 @@
 import json
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import click
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 
-from benchmarks.changes import classes, steps
-from benchmarks.changes.observe import observe_all
+from benchmarks.changes import calibration, classes, healthy, steps
+from benchmarks.changes.observe import in_processes, observe_all
 
 PROCESSES = 2
 FILE_WIDTH = 200  # columns, if the output is no terminal
@@ -94,6 +96,56 @@ def steps_command(
     _finish(documents, table, as_json=as_json)
 
 
+@main.command("healthy")
+@click.argument("names", nargs=-1)
+@click.option("--windows", default=25, show_default=True, help="Windows of each run.")
+@_options
+def healthy_command(
+    names: tuple[str, ...], windows: int, runs: int, seed: int, processes: int, *, as_json: bool
+) -> None:
+    """Healthy machines with ripple, quantisation, jitter or wear.
+
+    Only cases whose names contain one of NAMES; all by default. The exit code is 1 if a component is adopted or a
+    verdict stated.
+    """
+    cases = _selected(healthy.cases(windows), names, lambda case: case.name)
+    results = observe_all(cases, runs, seed, processes)
+    documents = [healthy.summarise(case, own) for case, own in zip(cases, results, strict=True)]
+    table = Table("case", "windows", "adopted", "verdicts", "per 1000", "open", "cost", "held", "met")
+    for own in documents:
+        held = ", ".join(f"{name} {share:.0%}" for name, share in own["held"].items())
+        rate = f"{1e3 * (own['adopted'] + own['verdicts']) / own['windows']:.1f}"
+        row = (own["case"], *(str(own[key]) for key in ("windows", "adopted", "verdicts")), rate, str(own["open"]))
+        table.add_row(*row, f"{own['cost']:.2f}", held, "yes" if own["met"] else "no")
+    _finish(documents, table, as_json=as_json)
+
+
+@main.command("calibration")
+@click.option("--list", "listed", is_flag=True, help="Print a line for each case.")
+@_options
+def calibration_command(runs: int, seed: int, processes: int, *, listed: bool, as_json: bool) -> None:
+    """Stated probabilities beside the shares that are right.
+
+    Each run is a random case. The exit code is 1 if hypotheses of 95 % and more are right in less than 90 %.
+    """
+    results = in_processes([partial(calibration.run_case, number, seed) for number in range(runs)], processes)
+    bins, decisions = calibration.table(results), calibration.decisions(results)
+    if as_json:
+        cases = [asdict(result) for result in results]
+        click.echo(json.dumps({"bins": bins, "decisions": decisions, "cases": cases}, indent=2))
+    else:
+        stated = Table("stated", "hypotheses", "mean", "right")
+        for row in bins:
+            ends = f"{row['low']:.0%} to {row['high']:.0%}"
+            stated.add_row(ends, str(row["count"]), f"{row['probability']:.1%}", f"{row['right']:.1%}")
+        kinds = Table("change", "decision", "cases", "most probable is right")
+        for row in decisions:
+            kinds.add_row(row["kind"], row["decision"], str(row["count"]), f"{row['right']:.0%}")
+        lines = [f"{'right' if result.right else 'wrong'}: {result.name}: {result.text}" for result in results]
+        _print(stated, kinds, *(lines if listed else ()))
+    sys.exit(0 if calibration.met(results) else 1)
+
+
 def _selected(items: list[Any], names: Sequence[str], name_of: Callable[[Any], str]) -> list[Any]:
     chosen = [item for item in items if not names or any(name in name_of(item) for name in names)]
     if not chosen:
@@ -107,8 +159,14 @@ def _finish(documents: list[dict[str, Any]], table: Table, *, as_json: bool) -> 
     if as_json:
         click.echo(json.dumps(documents, indent=2))
     else:
-        (Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)).print(table)
+        _print(table)
     sys.exit(0 if all(own["met"] for own in documents) else 1)
+
+
+def _print(*items: RenderableType) -> None:
+    console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
+    for item in items:
+        console.print(item, markup=False, highlight=False)
 
 
 if __name__ == "__main__":

@@ -101,15 +101,15 @@ def _pump() -> list[Trial]:
     members = (MOVED, Member("SENSOR", r"^u reads .*%"))
     k_v = PUMP.parameters["k_v"]
     head, constant = "h_0 / constant head", (MOVED, Member("COMPONENT", "^head(:|/constant)"))
-    flat = {"parameters": {"h_0": 0.88 * PUMP.parameters["h_0"]}}
+    step = Change(parameters={"h_0": 0.88 * PUMP.parameters["h_0"]})
     share = Change(terms={"head": Term("constant", amplitude=-0.12)})
     known = ("h_0", "T_c", "k_v")
     return [
         _trial(pair, "k_v +20 %", PUMP, Change(parameters={"k_v": 1.2 * k_v}), members, free, agreed),
         _trial(pair, "u reads 9 % less", PUMP, Change(gains={"u": math.sqrt(1.0 / 1.2)}), members, free, agreed),
-        _trial(head, "h_0 -12 %", FLAT_PUMP, Change(**flat), constant, known, ("T_c", "k_v")),
+        _trial(head, "h_0 -12 %", FLAT_PUMP, step, constant, known, ("T_c", "k_v")),
         _trial(head, "head -12 %", FLAT_PUMP, share, constant, known, ("T_c", "k_v")),
-        _trial(head, "h_0 -12 %, curved", PUMP, Change(**flat), constant[:1], known),
+        _trial(head, "h_0 -12 %, curved", PUMP, step, constant[:1], known),
         _trial(head, "head -12 %, curved", PUMP, share, constant[1:], known),
     ]
 
@@ -131,7 +131,6 @@ def _speed() -> list[Trial]:
     members = (MOVED, Member("SENSOR", r"^omega reads .*%"))
     old, gain = LAB_MOTOR.parameters, 1.15
     values = {"K": old["K"] / gain, "J": old["J"] / gain**2, "T_c": old["T_c"] / gain}
-    values["omega_s"] = old["omega_s"] * gain
     reads = Change(gains={"omega": gain})
     return [
         _trial(pair, "K, J and T_c", LAB_MOTOR, Change(parameters=values), members, free),
@@ -231,12 +230,9 @@ def states_class(trial: Trial, window: Observed) -> bool:
 
 
 def has_equal_members(trial: Trial, window: Observed) -> bool:
-    """Whether each member is among the hypotheses of the window, all with the same probability."""
-    best = [
-        max((item.probability for item in window.stated if member.states(item)), default=math.nan)
-        for member in trial.members
-    ]
-    return max(best) - min(best) <= EQUAL and not any(map(math.isnan, best))
+    """Whether each member is among the hypotheses of the window, all equally probable."""
+    shares = [sum(item.probability for item in window.stated if member.states(item)) for member in trial.members]
+    return min(shares) > 0.0 and max(shares) - min(shares) <= EQUAL
 
 
 def text_of(window: Observed) -> str:
@@ -281,9 +277,7 @@ def summarise(trial: Trial, runs: Sequence[Sequence[Observed]]) -> Summary:
         trial=trial,
         outcomes=tuple(judge(trial, run) for run in runs),
         coverage={name: sum(own is True for own in values) / len(values) for name, values in held.items()},
-        statuses={
-            name: Counter(window.parameters[name].status for window in after) for name in runs[0][0].parameters
-        },
+        statuses={name: Counter(window.parameters[name].status for window in after) for name in runs[0][0].parameters},
     )
 
 

@@ -3,13 +3,15 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
+from typing import TypeVar
 
 import numpy as np
 
 from benchmarks.changes.machines import in_twin_units, problem_of
-from benchmarks.changes.plants import HEALTHY, Change, Plant, cut, generator, simulate
+from benchmarks.changes.plants import HEALTHY, START, Change, Plant, cut, generator, simulate
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
@@ -17,6 +19,8 @@ from otolith.discovery.decision import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument
 
+Result = TypeVar("Result")
+Disturbance = Callable[[np.random.Generator, Plant, dict[str, Array]], None]
 HEALTHY_WINDOWS, CHANGED_WINDOWS = 12, 12
 RUNS_PER_JOB = 10  # runs that are simulated together
 BATCHES_PER_PROCESS = 4  # fewer runs per job if there are few: the last job is waited for
@@ -70,20 +74,20 @@ class Case:
     after: Change
     free: tuple[str, ...] = ()
     """Estimated parameters; by default those of the twin."""
-    known: Mapping[str, float] = field(default_factory=dict)
-    """Changed known parameters of the machine file; by default the true ones."""
     before: Change = HEALTHY
     healthy: int = HEALTHY_WINDOWS
     changed: int = CHANGED_WINDOWS
     noise: float = 1.0
     """Noise of the sensors over that of the machine file."""
-    disturb: Callable[[np.random.Generator, Plant, dict[str, Array]], None] | None = None
-    """Changes the measured signals (records,) of a run in place."""
+    disturb: Disturbance | None = None
+    """Changes the signals (records,) of a run in place, before noise is added."""
+    quantum: float = 0.0
+    """Step of the converters over the noise of the machine file; zero for none."""
 
     @property
     def problem(self) -> Problem:
         """What the machine file states."""
-        return problem_of(replace(self.plant, parameters={**self.plant.parameters, **self.known}), self.free)
+        return problem_of(self.plant, self.free)
 
 
 def observe(case: Case, runs: Sequence[int], seed: int) -> list[list[Observed]]:
@@ -107,6 +111,9 @@ def recordings(case: Case, problem: Problem, runs: Sequence[int], seed: int) -> 
             case.disturb(random, plant, own)
         for output in twin.outputs:
             own[output.name] += case.noise * output.noise * random.standard_normal(records)
+            if case.quantum:
+                step = case.quantum * output.noise
+                own[output.name] = step * np.round(own[output.name] / step)
         yield cut(plant, own, twin.signals)
 
 
@@ -118,6 +125,7 @@ def _reports(
     for window in windows:
         change = case.before if window.index < case.healthy else case.after
         values = {**case.plant.parameters, **change.parameters}
+        values |= {name: values[name] * (1.0 + rate * (window.end - START)) for name, rate in change.ramps.items()}
         state, report = adapt(state, window)
         truth = {free.name: in_twin_units(problem.twin, free.name, values[free.name]) for free in problem.free}
         yield report.document, truth
@@ -138,21 +146,23 @@ def observed(document: ReportDocument, truth: Mapping[str, float]) -> Observed:
 
 
 def observe_all(cases: Sequence[Case], runs: int, seed: int, processes: int) -> list[list[list[Observed]]]:
-    """Return the windows of each run of each case; progress goes to the standard error."""
+    """Return the windows of each run of each case."""
     size = min(RUNS_PER_JOB, max(1, runs * len(cases) // (processes * BATCHES_PER_PROCESS)))
     jobs = [
-        (number, list(range(first, min(first + size, runs))))
+        (number, range(first, min(first + size, runs)))
         for number in range(len(cases))
         for first in range(0, runs, size)
     ]
-    results: dict[tuple[int, int], list[list[Observed]]] = {}
+    done = in_processes([partial(observe, cases[number], own, seed) for number, own in jobs], processes)
+    parts = list(zip((number for number, _ in jobs), done, strict=True))
+    return [[run for of, part in parts if of == number for run in part] for number in range(len(cases))]
+
+
+def in_processes(jobs: Sequence[Callable[[], Result]], processes: int) -> list[Result]:
+    """Return the results of the jobs; progress goes to the standard error."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        pending = {pool.submit(observe, cases[number], own, seed): (number, own[0]) for number, own in jobs}
-        for done in as_completed(pending):
-            results[pending[done]] = done.result()
-            print(f"\r{len(results)} of {len(jobs)} parts", end="", file=sys.stderr, flush=True)
+        pending = [pool.submit(job) for job in jobs]
+        for count, _ in enumerate(as_completed(pending), 1):
+            print(f"\r{count} of {len(jobs)} parts", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    return [
-        [run for key in sorted(key for key in results if key[0] == number) for run in results[key]]
-        for number in range(len(cases))
-    ]
+    return [future.result() for future in pending]

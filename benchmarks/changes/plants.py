@@ -7,13 +7,14 @@ Commands are held from record to record; measured loads are linear between recor
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
 
-Values = Mapping[str, Array]
-"""Quantities by name, (runs,) each."""
+Values = Mapping[str, Any]
+"""Quantities by name: arrays (runs,), or numbers that all runs share."""
 START = 1e6  # s: Unix time of the first record
 
 
@@ -87,6 +88,8 @@ class Change:
     """Added to what sensors show."""
     terms: Mapping[str, Term] = field(default_factory=dict)
     """By site."""
+    ramps: Mapping[str, float] = field(default_factory=dict)
+    """Growth of parameters per second, as shares of their values at the first record."""
 
     def measured(self, name: str, values: Array) -> Array:
         """Return what the sensor of a signal shows without noise."""
@@ -106,7 +109,7 @@ def simulate(
     plant: Plant, randoms: Sequence[np.random.Generator], records: int, before: Change, after: Change, at: int
 ) -> dict[str, Array]:
     """Return each signal without noise, (runs, records), of one run for each generator; the change comes at ``at``."""
-    times = np.arange(records + 1) * plant.period
+    times = np.arange(records + 1, dtype=np.float64) * plant.period
     runs = [plant.operate(random, times) for random in randoms]
     given = {name: np.array([run[name] for run in runs]) for name in runs[0]}
     state = {name: np.full(len(runs), value) for name, value in plant.initial.items()}
@@ -156,8 +159,9 @@ def _advance(
 def _values(plant: Plant, change: Change, time: float, inputs: Values, state: Values) -> Values:
     """Return parameters, and the value of the term at each site."""
     signals = {**inputs, **state} if change.terms else {}
-    terms = {site: change.terms[site](time, signals) if site in change.terms else 0.0 for site in plant.sites}
-    return {**plant.parameters, **change.parameters, **terms}  # type: ignore[dict-item]
+    values = {**plant.parameters, **change.parameters, **dict.fromkeys(plant.sites, 0.0)}
+    values |= {name: values[name] * (1.0 + rate * time) for name, rate in change.ramps.items()}
+    return values | {site: term(time, signals) for site, term in change.terms.items()}
 
 
 def levels(random: np.random.Generator, times: Array, low: float, high: float, hold: float) -> Array:
