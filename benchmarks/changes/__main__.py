@@ -86,12 +86,20 @@ def steps_command(
     selected = _selected(steps.steps(healthy, changed), names, lambda step: step.case.name)
     results = observe_all([step.case for step in selected], runs, seed, processes)
     documents = [steps.summarise(step, own) for step, own in zip(selected, results, strict=True)]
-    table = Table("case", "held", "half-width", "sensor", "others", "statuses", "met")
+    table = Table("case", "held", "published", "half-width", "sensor", "others", "statuses", "met")
     for own in documents:
         others = ", ".join(f"{name} {share:.0%}" for name, share in own["others"].items())
         statuses = ", ".join(f"{count} {name}" for name, count in own["statuses"].items())
         width = "" if own["half_width"] is None else f"{own['half_width']:.2%}"
-        row = (own["case"], f"{own['held']:.1%}", width, f"{own['sensor']:.1%}", others, statuses)
+        row = (
+            own["case"],
+            f"{own['held']:.1%}",
+            f"{own['published']:.0%}",
+            width,
+            f"{own['sensor']:.1%}",
+            others,
+            statuses,
+        )
         table.add_row(*row, "yes" if own["met"] else "no")
     _finish(documents, table, as_json=as_json)
 
@@ -108,7 +116,7 @@ def healthy_command(
     Only cases whose names contain one of NAMES; all by default. The exit code is 1 if a component is adopted or a
     verdict stated.
     """
-    cases = _selected(healthy.cases(windows), names, lambda case: case.name)
+    cases = _selected(healthy.cases(windows, names), names, lambda case: case.name)
     results = observe_all(cases, runs, seed, processes)
     documents = [healthy.summarise(case, own) for case, own in zip(cases, results, strict=True)]
     table = Table("case", "windows", "adopted", "verdicts", "per 1000", "open", "cost", "held", "met")
@@ -149,8 +157,7 @@ def calibration_command(runs: int, seed: int, processes: int, *, listed: bool, a
 def _selected(items: list[Any], names: Sequence[str], name_of: Callable[[Any], str]) -> list[Any]:
     chosen = [item for item in items if not names or any(name in name_of(item) for name in names)]
     if not chosen:
-        every = ", ".join(map(name_of, items))
-        raise click.BadParameter(f"no case's name contains it; there are {every}", param_hint="NAMES")
+        raise click.BadParameter("no case's name contains one of them", param_hint="NAMES")
     return chosen
 
 

@@ -4,7 +4,7 @@ A change is a component of a family at a site of the twin, a gain or an offset o
 nothing. A component moves the most affected output by 1 to 30 times its noise; sensors and parameters change by 1 to
 30 %. The sensors have 0.3 to 4 times the noise of the machine file. Each hypothesis of the last report that has some
 counts with its probability; an adopted component counts with its probability at adoption. A hypothesis is right if it
-names type and place of the change. Components that equal a step of estimated parameters are not drawn.
+names type and place of the change. Components that equal a step of parameters are not drawn.
 """
 
 import re
@@ -39,12 +39,14 @@ BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
 SURE, RIGHT = 0.95, (0.90, 0.99)  # probability from which, and share within which, hypotheses must be right
 PARAMETERS = frozenset({
     *(("dc_motor", "shaft", "linear", "omega"), ("dc_motor", "winding", "linear", "i")),
-    *(("pump", "shaft", "constant", ""), ("pump", "head", "constant", "")),
+    *(("dc_motor", "shaft", "linear", "i"), ("dc_motor", "winding", "linear", "omega")),
+    *(("pump", "shaft", "constant", ""), ("pump", "head", "constant", ""), ("pump", "shaft", "power", "omega")),
+    *(("pump", "pipe", "constant", ""), ("servo_axis", "friction", "constant", "")),
     *(("servo_axis", "carriage", "constant", ""), ("servo_axis", "carriage", "linear", "v")),
-    *(("servo_axis", "carriage", "Coulomb", "v"), ("servo_axis", "friction", "constant", "")),
-    *(("two_mass", "load_side", "linear", "omega_l"), ("two_mass", "shaft", "constant", "")),
+    *(("servo_axis", "carriage", "Coulomb", "v"), ("two_mass", "load_side", "linear", "omega_l")),
+    *(("two_mass", "shaft", "constant", ""), ("two_mass", "motor_side", "linear", "omega_m")),
 })  # fmt: skip
-"""Components that equal a step of estimated parameters: twin, site, family and source."""
+"""Components that equal a step of parameters: twin, site, family and source."""
 
 
 @dataclass(frozen=True, slots=True)

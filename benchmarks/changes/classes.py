@@ -106,7 +106,7 @@ def _pump() -> list[Trial]:
     known = ("h_0", "T_c", "k_v")
     return [
         _trial(pair, "k_v +20 %", PUMP, Change(parameters={"k_v": 1.2 * k_v}), members, free, agreed),
-        _trial(pair, "u reads 9 % less", PUMP, Change(gains={"u": math.sqrt(1.0 / 1.2)}), members, free, agreed),
+        _trial(pair, "u reads 10 % more", PUMP, Change(gains={"u": math.sqrt(1.2)}), members, free, agreed),
         _trial(head, "h_0 -12 %", FLAT_PUMP, step, constant, known, ("T_c", "k_v")),
         _trial(head, "head -12 %", FLAT_PUMP, share, constant, known, ("T_c", "k_v")),
         _trial(head, "h_0 -12 %, curved", PUMP, step, constant[:1], known),

@@ -50,31 +50,35 @@ MACHINES = (
 )
 
 
-def cases(windows: int) -> list[Case]:
-    """Return each disturbance of each machine, in so many windows."""
-    return [case for machine in MACHINES for case in _cases(machine, windows)]
-
-
-def _cases(machine: Ageing, windows: int) -> list[Case]:
-    plant = machine.plant
-    plain = Case(f"{plant.name}: noise alone", plant, HEALTHY, healthy=windows, changed=0)
-    rate = DRIFT / (plant.records * plant.period)
-    made = [
-        plain,
-        replace(plain, name=f"{plant.name}: ripple", before=_ripple(machine)),
-        replace(plain, name=f"{plant.name}: quantisation", quantum=QUANTUM),
-        replace(plain, name=f"{plant.name}: jitter", disturb=jittered),
-        replace(plain, name=f"{plant.name}: {machine.wears} drifts", before=Change(ramps={machine.wears: rate})),
-    ]
-    if machine.load:
-        disturb = partial(with_load_noise, signal=machine.load, level=machine.load_noise)
-        made.append(replace(plain, name=f"{plant.name}: load noise", disturb=disturb))
+def cases(windows: int, names: Sequence[str] = ()) -> list[Case]:
+    """Return the cases whose names contain one of ``names``, or all, with so many windows."""
+    made = []
+    for machine in MACHINES:
+        plant = machine.plant
+        rate = DRIFT / (plant.records * plant.period)
+        plain = Case("noise alone", plant, HEALTHY, healthy=windows, changed=0)
+        own = [
+            plain,
+            replace(plain, name="ripple"),
+            replace(plain, name="quantisation", quantum=QUANTUM),
+            replace(plain, name="jitter", disturb=jittered),
+            replace(plain, name=f"{machine.wears} drifts", before=Change(ramps={machine.wears: rate})),
+        ]
+        if machine.load:
+            disturb = partial(with_load_noise, signal=machine.load, level=machine.load_noise)
+            own.append(replace(plain, name="load noise", disturb=disturb))
+        named = [replace(case, name=f"{plant.name}: {case.name}") for case in own]
+        chosen = [case for case in named if not names or any(name in case.name for name in names)]
+        made += [
+            replace(case, before=_ripple(machine)) if case.name.endswith("ripple") else case  # takes a simulation
+            for case in chosen
+        ]
     return made
 
 
 def _ripple(machine: Ageing) -> Change:
     """Return the ripple whose effect on the outputs of a window has the χ² that is allowed."""
-    plant, records, amplitude = machine.plant, 4 * machine.plant.records, 1e-6
+    plant, records, amplitude = machine.plant, 2 * machine.plant.records, 1e-6
     change = Change(terms={machine.ripple: Term("periodic", "t", amplitude, machine.rate)})
     without, rippled = (
         simulate(plant, [generator(1, plant.name, 0)], records, own, own, 0) for own in (HEALTHY, change)

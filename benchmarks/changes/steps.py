@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from benchmarks.changes.machines import LIBRARY_PLANTS
-from benchmarks.changes.observe import Case, Observed
+from benchmarks.changes.observe import Case, Observed, Published
 from benchmarks.changes.plants import Change
 from otolith.discovery.decision import WindowDecision
 
@@ -51,10 +51,7 @@ def summarise(step: Step, runs: Sequence[Sequence[Observed]]) -> dict[str, Any]:
     """Return the figures of the runs of a step as a document."""
     after = [run[step.case.healthy :] for run in runs]
     late = [window for run in after for window in run[FROM_WINDOW - 1 :]]
-    held = {
-        name: sum(window.parameters[name].holds_truth is True for window in late) / len(late)
-        for name in late[0].parameters
-    }
+    held = {name: _held([window.parameters[name] for window in late]) for name in late[0].parameters}
     every = [window for run in after for window in run]
     sensor = sum(map(_is_sensor, every)) / len(every)
     moved = [window.parameters[step.parameter] for window in late]
@@ -67,8 +64,15 @@ def summarise(step: Step, runs: Sequence[Sequence[Observed]]) -> dict[str, Any]:
         "sensor": sensor,
         "statuses": dict(Counter(own.status for own in moved)),
         "decisions": [dict(Counter(run[number].decision.name for run in after)) for number in range(len(after[0]))],
+        "published": len(widths) / len(late),
         "met": held[step.parameter] >= HELD_AT_LEAST and sensor <= SENSOR_AT_MOST,
     }
+
+
+def _held(published: Sequence[Published]) -> float:
+    """Return the share of the published intervals that hold the truth; one without any."""
+    held = [own.holds_truth for own in published if own.holds_truth is not None]
+    return sum(held) / len(held) if held else 1.0
 
 
 def _is_sensor(window: Observed) -> bool:
