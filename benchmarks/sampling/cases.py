@@ -40,8 +40,8 @@ def _cases() -> dict[str, Schedule]:
         "sine held for 10 ms": Schedule(voltage="sine"),
         "inputs every 50 ms": Schedule(load_period=0.05, voltage="steps"),
         "load every 50 ms, commands on change": Schedule(load_period=0.05, commands_on_change=True),
-        "polled every 20 ms": polled(Timing(0.02)),
-        "polled every 20 ms, 30 % missing": polled(Timing(0.02, missing=0.3)),
+        "polled every 21 ms": polled(Timing(0.021)),
+        "polled every 21 ms, 30 % missing": polled(Timing(0.021, missing=0.3)),
         "each row twice": Schedule(rows=DENSE, copies=2),
         "renewed every fifth row": Schedule(rows=DENSE, i=STALE, omega=STALE),
     }
@@ -54,7 +54,10 @@ def both(timing: Timing) -> Schedule:
 
 
 def polled(timing: Timing) -> Schedule:
-    """Return the schedule of a device that is asked for all its values at such times."""
+    """Return the schedule of a device that is asked for all its values at such times.
+
+    Its changes come at all shares of the interval if that does not divide the time between them.
+    """
     return Schedule(i=timing, omega=timing, load_period=timing.period, voltage="steps", polled=True)
 
 

@@ -22,7 +22,7 @@ SHORT = (
     "rows 30 % missing, commands on change",
     "rows every 10.7 ms",
     "100 ms, 80 % missing",
-    "polled every 20 ms",
+    "polled every 21 ms",
 )
 FULL = (
     *SHORT,
@@ -34,7 +34,7 @@ FULL = (
     "20 ms, 80 % missing, jitter 50 %",
     "steps on change",
     "load every 50 ms, commands on change",
-    "polled every 20 ms, 30 % missing",
+    "polled every 21 ms, 30 % missing",
 )
 DEVIATIONS = 3.3  # standard deviations of a share or a spread by which a scenario may miss its target by chance
 TARGET, POOLED = 0.95, (0.93, 0.97)
