@@ -53,7 +53,8 @@ def predicted(problem: Problem, plant: Plant, rows: Mapping[str, Array], values:
     states = zip(plant.initial.values(), problem.base_model.states, strict=True)
     initial = np.zeros(len(twin.states))  # an augmented twin has the angle of the shaft as well
     initial[: len(plant.initial)] = [value / to_base(state.unit)[0] for value, state in states]
-    drive = Excitation.uniform(np.column_stack([rows[signal.name][0] for signal in twin.inputs]), plant.period)
+    still = np.zeros((1, plant.records))  # the inputs that an augmented twin adds: a constant has none
+    drive = Excitation.uniform(np.column_stack([rows.get(own.name, still)[0] for own in twin.inputs]), plant.period)
     kernel, noise = kernel_of(twin), np.array(problem.noise)
     drive = replace(drive, substeps=kernel.substeps(parameters, initial, drive, 1e-3 * noise))
     outputs: Array = kernel.simulate(parameters[None], initial[None], drive)[0]
