@@ -77,12 +77,16 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
-    if state.test is None and _is_expected(state, predicted, estimated) and not screening.is_positive:
+    is_tested, is_expected = state.test is not None, _is_expected(state, predicted, estimated)
+    if not is_tested and is_expected and not screening.is_positive:
         return _update_filter(state, predicted, estimated)
     test = continue_test(state.test, predicted, screening)
     outcome = decide(test)
     if outcome.update is PosteriorUpdate.HYPOTHESIS:
         result = _adopt_hypothesis(state, estimated, test, outcome)
+    elif outcome.update is PosteriorUpdate.FILTER and not is_tested and not is_expected:
+        # A change in the last records is left to the next window: no other hypothesis was compared.
+        result = WindowResult.unchanged(state, predicted, WindowDecision.SUSPECTED, estimate=estimated)
     elif outcome.update is PosteriorUpdate.FILTER and estimated.cost <= MAX_COST:
         result = _update_filter(state, predicted, estimated)
     else:
