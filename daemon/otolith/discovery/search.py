@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.discovery.candidates import MAX_CANDIDATES, Candidate, component_of, find_candidates, threshold_like
+from otolith.discovery.candidates import MAX_CANDIDATES, Candidate, components_of, find_candidates, threshold_like
 from otolith.discovery.hypotheses import (
     FaultHypothesis,
     FaultType,
@@ -113,8 +113,8 @@ def _threshold_gain(response: LinearResponse) -> float:
     screening = Screening.of(response, guesses, alternatives)
     readable = [guess for guess in map(screening.__getitem__, range(len(guesses))) if guess.is_readable]
     proposals = [
-        with_candidate(problem, fresh, Candidate(component_of(response, guess), alternatives.of(guess.form), False))
-        for guess in threshold_like(problem, readable)
+        with_candidate(problem, fresh, Candidate(component, alternatives.of(guess.form), False))
+        for guess, component in components_of(response, threshold_like(problem, readable))
     ]
     best = -np.inf
     for fitted in fit_hypotheses(proposals, response.window):

@@ -82,8 +82,9 @@ def _free_values(twin: Definition, slot: int, component: Component) -> list[Para
     amplitude, inner, phase = component_parameters(slot)
     unit, model = site_of(twin, component.site).unit, component.model
     reach = AMPLITUDE_BOUND * abs(component.amplitude)
-    low = 0.0 if component.periodic else -reach
-    values = [Parameter(amplitude, unit, component.amplitude, low, reach, f"amplitude of {component.key}")]
+    low = max(0.0 if component.periodic else -reach, component.amplitude_low)
+    high = min(reach, component.amplitude_high)
+    values = [Parameter(amplitude, unit, component.amplitude, low, high, f"amplitude of {component.key}")]
     if model.inner is not None:
         unit = model.inner.unit.format(x=source_of(twin, component.source).unit)
         bounds = max(component.low, component.inner / INNER_BOUND), min(component.high, component.inner * INNER_BOUND)
