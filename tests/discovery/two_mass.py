@@ -1,6 +1,6 @@
 """A simulated machine of two masses with dry friction on the load, for the tests of discovery.
 
-The equations are integrated here with short Euler steps, independently of the twin.
+The equations are integrated here with short steps of the symplectic Euler method, independently of the twin.
 """
 
 import math
@@ -57,10 +57,10 @@ def simulate(seconds: float, friction: DryFriction, seed: int = 1) -> list[Windo
         measured[record] = torque, 0.0, motor, load
         for _ in range(STEPS):
             step = PERIOD / STEPS
-            shaft = K_S * twist + D_S * (motor - load)
             twist += step * (motor - load)
+            shaft = K_S * twist + D_S * (motor - load)
             motor += step * (torque - shaft - D_M * motor) / J_M
-            load += step * (K_S * twist + D_S * (motor - load) - D_L * load - friction.at(time, load)) / J_L
+            load += step * (shaft - D_L * load - friction.at(time, load)) / J_L
     measured[:, 2:] += NOISE * random.standard_normal((records, 2))
     return windows(measured)
 

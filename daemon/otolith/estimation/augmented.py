@@ -73,8 +73,7 @@ def _settings(twin: Definition, slot: int, component: Component) -> dict[str, fl
     at = [site.name for site in sites(twin)].index(component.site)
     settings = {family_setting(slot): family_code(component.family), site_setting(slot, at): 1.0}
     source = [source.name for source in sources(twin)].index(component.source)
-    given = {component_parameters(slot)[1]: component.inner} if component.model.fixed_inner is not None else {}
-    return settings | given | ({source_setting(slot, source): 1.0} if source else {})
+    return settings | ({source_setting(slot, source): 1.0} if source else {})
 
 
 def _free_values(twin: Definition, slot: int, component: Component) -> list[Parameter]:
@@ -126,5 +125,6 @@ def equation(twin: Definition, component: Component, values: Sequence[float]) ->
     rest = [*values[1:], 0.0, 0.0]
     phase = f"{'−' if rest[1] < 0.0 else '+'} {abs(rest[1]):.2f}"
     text = component.model.equation.format(a=f"{values[0]:.4g}", b=f"{rest[0]:.4g}", c=phase, x=component.source)
+    text = text.replace("−-", "")  # exp(−-0.1·x) is exp(0.1·x)
     unit = site_of(twin, component.site).unit
     return text if unit == "1" else f"{text} {unit}"

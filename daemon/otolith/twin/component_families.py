@@ -22,6 +22,8 @@ MIN_BEND, MAX_BEND = 0.3, 12.0  # exponent of an exponential over the range of x
 MAX_EXPONENT = 30.0  # exponent of an exponential at the largest |x|: the amplitude at zero stays a readable number
 MIN_POWER, MAX_POWER = 0.3, 4.0  # exponent of a power
 COULOMB_TRANSITION = 0.005  # of the largest |x|: width of the transition of dry friction around zero
+WIDEST_TRANSITION = 10.0  # times that width: dry friction that rounds off
+MIN_HUMP = 5.0  # widths of the transition of dry friction: beside it, a narrower hump would only correct its rounding
 MIN_STRIBECK_SPEED, MAX_STRIBECK_SPEED = 0.02, 0.5  # of the largest |x|: a wider hump does not decay in the window
 HIDDEN_HUMP = 0.5  # of the smallest |x|: a narrower hump lies outside the window and could be of any height
 
@@ -99,8 +101,6 @@ class ComponentFamily:
     inner: InnerParameter | None = None
     threshold_like: bool = False
     """Whether it can hold what it depends on at zero, as dry friction does: a linear response then underrates it."""
-    fixed_inner: Callable[[SourceRange], float] | None = None
-    """The inner parameter of a family that does not search for it."""
     threshold_at_rest: bool = False
     """Whether its magnitude at zero is the amplitude although a window may show its tail only."""
     dissipates: bool = False
@@ -144,9 +144,10 @@ def _has_rates(x: SourceRange) -> bool:
     return _varies(x) and high > low
 
 
-def _coulomb_transition(x: SourceRange) -> float:
-    """Width of the transition around zero; with a step a machine at rest would never come to rest."""
-    return COULOMB_TRANSITION * _largest(x)
+def _coulomb_transitions(x: SourceRange) -> tuple[float, float]:
+    """Widths of the transition around zero; with a step a machine at rest would never come to rest."""
+    width = COULOMB_TRANSITION * _largest(x)
+    return width, WIDEST_TRANSITION * width
 
 
 def _stribeck_speeds(x: SourceRange) -> tuple[float, float]:
@@ -186,7 +187,8 @@ COMPONENT_FAMILIES: tuple[ComponentFamily, ...] = (
                     frozenset({SourceKind.TIME, SourceKind.PLACE}), _has_frequencies,
                     InnerParameter("frequency", "rad/{x}", _frequencies, 0), phases=(0.0, 0.5 * math.pi)),
     ComponentFamily("Coulomb", "a*tanh(x/b)", "{a}·sign({x})", "dry friction", "inputs that change their sign",
-                    MOTION, _changes_sign, threshold_like=True, fixed_inner=_coulomb_transition, dissipates=True),
+                    MOTION, _changes_sign, InnerParameter("transition", "{x}", _coulomb_transitions, 2),
+                    threshold_like=True, dissipates=True),
     ComponentFamily("Stribeck", f"a*tanh(x/({COULOMB_TRANSITION}*b))*exp(-(x/b)**2)",
                     "{a}·sign({x})·exp(−({x}/{b})²)", "friction that falls with the speed",
                     "inputs that come near zero", MOTION, _has_stribeck_speeds,
