@@ -16,7 +16,7 @@ from benchmarks.discovery.motor import Faults, simulate_motor, windows
 from benchmarks.discovery.setting import prior, problem, screen
 from benchmarks.discovery.truth import SHAFT, Truth, is_a_parameter
 from otolith.acquisition.window import Array, Window
-from otolith.discovery.candidate_forms import CandidateForm
+from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange
 from otolith.discovery.linear_response import LinearResponse, basis_functions
 from otolith.discovery.screening import DECISIVE, ScreeningResult, candidate_library
 from otolith.estimation.arrival_cost import Prior
@@ -105,7 +105,10 @@ def _chosen(
     candidates: dict[int, list[CandidateForm]] = {}
     for candidate in candidate_library(twin, landscape.x):
         source = sources(twin)[candidate.source]
-        is_constant = kind == "constant" and source.kind is SourceKind.SIGNAL  # only its noise changes
+        is_constant = kind == "constant" and source.kind in (
+            SourceKind.SIGNAL,
+            SourceKind.SPEED,
+        )  # only its noise changes
         own = candidate.model is model and candidate.site < len(twin.sites)
         if own and not is_constant and not is_a_parameter(sites(twin)[candidate.site].name, model.name, source.name):
             candidates.setdefault(candidate.site, []).append(candidate)
@@ -129,7 +132,10 @@ def _inner(structure: CandidateForm, random: np.random.Generator) -> float:
 def _truth(
     structure: CandidateForm, times: float, landscape: LinearResponse, random: np.random.Generator
 ) -> Truth | None:
-    """A component with ``times`` the amplitude of the detection limit, or None if its effect would be too large."""
+    """A component with ``times`` the amplitude of the detection limit.
+
+    None if its effect would be too large, or if no machine could have it: friction that drives.
+    """
     twin, model = problem().base_model, structure.model
     two = len(model.phases) > 1
     inner, phase = _inner(structure, random), float(random.uniform(-np.pi, np.pi)) if two else 0.0
@@ -143,7 +149,9 @@ def _truth(
         return None
     if model.name == "Stribeck":  # its effect at rest; a window far from rest shows only the tail
         largest = abs(truth.amplitude)
-    return truth if largest <= MAX_EFFECT[truth.site == SHAFT] else None
+    moments, parameters = landscape.window.grid.offsets, landscape.parameters
+    low, high = PhysicalRange(twin, landscape.x, moments, parameters).amplitudes(structure, inner)
+    return truth if largest <= MAX_EFFECT[truth.site == SHAFT] and low <= truth.amplitude <= high else None
 
 
 def detection_limit(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:

@@ -17,7 +17,7 @@ R_A, J = TWIN.parameter("R_a"), TWIN.parameter("J")
 KNOWN = tuple((parameter.name, parameter.nominal) for parameter in TWIN.parameters if parameter is not R_A)
 BARE = Problem(TWIN, KNOWN, (R_A,), (0.005, 0.02))
 PERIODIC = Component("shaft", "periodic", "t", 0.004, 10.0, 1.0, 20.0)
-COULOMB = Component("shaft", "Coulomb", "omega", -0.003)
+COULOMB = Component("shaft", "Coulomb", "omega", -0.003, 0.1, 0.0, 0.1, 1.0)
 
 
 def hypothesis(kind: FaultType, problem: Problem, **certain: tuple[float, float]) -> TrackedHypothesis:

@@ -110,6 +110,20 @@ def test_truth_outside_the_bounds_is_reported_as_invalid(scenario: MotorScenario
     assert "bound" in resistance.reason
 
 
+def test_a_value_that_presses_on_its_bound_is_at_bound_however_wide_its_interval(
+    scenario: MotorScenario, windows: Cut
+) -> None:
+    """An accuracy far beyond what a window gives made of the bound a "weak" value."""
+    window, _ = windows(scenario, 5)[-1]
+    problem = problem_for("R_a")
+    bounded = replace(problem.free[0], nominal=8.0, low=7.0, high=9.0)
+    _, report = adapt(initial_state("motor", "here", replace(problem, free=(bounded,), determined_within=1e-6)), window)
+    resistance = report.document.parameters["R_a"]
+    assert resistance.identifiability is Identifiability.AT_BOUND
+    assert resistance.status is Status.INVALID
+    assert "at its bound 7 ohm" in resistance.reason
+
+
 def test_unexplained_window_does_not_update_the_posterior(scenario: MotorScenario, windows: Cut) -> None:
     (first, _), (second, _) = windows(scenario, 6)[-2:]
     state, _ = adapt(state_for("R_a"), first)

@@ -99,6 +99,17 @@ def test_status_has_hysteresis_at_its_limit() -> None:
     assert publish_after(3.0, kept=0.5, before=held)[1].status is Status.ESTIMATED
 
 
+@pytest.mark.parametrize("value", [RESISTANCE.low, RESISTANCE.low - 1.0, RESISTANCE.high])
+def test_a_known_value_at_its_bound_is_invalid_and_never_estimated(value: float) -> None:
+    """The window alone may lie inside the bounds, or determine too little for a word on them."""
+    estimate = ParameterEstimate("R_a", 6.0, 0.1, Identifiability.DETERMINED, "")
+    evidence = WindowEvidence(estimate, WindowDecision.LEARNED)
+    _, document = publish(RESISTANCE, ALLOWED, MarginalPosterior(value, 0.1, 0.0, 1e-6), evidence, PreviousStatus())
+    assert document.status is Status.INVALID
+    assert document.identifiability is Identifiability.AT_BOUND
+    assert document.reason.startswith("at its bound ")
+
+
 def test_status_is_held_then_invalid_after_contradictions() -> None:
     before = PreviousStatus(True, Status.ESTIMATED)
     assert publish_after(0.1, decision=WindowDecision.REFUSED, contradictions=1, before=before)[1].status is Status.HELD

@@ -15,8 +15,8 @@ from otolith.machine import find_twin
 from otolith.runtime.state_store import StateStore, WriterThread
 from tests.waiting import PATIENCE, wait_for, within
 
-FRICTION = Component("shaft", "Coulomb", "omega", -0.004)
-SAVED = (ComponentRecord(AdoptedComponent(FRICTION, 5.0), (-0.004,), (1e-5,)),)
+FRICTION = Component("shaft", "Coulomb", "omega", -0.004, inner=0.1, low=0.05, high=1.0)
+SAVED = (ComponentRecord(AdoptedComponent(FRICTION, 5.0), (-0.004, 0.1), (1e-5, 1e-3)),)
 IMMEDIATELY = within(0.1)  # s: far less than a disk that does not answer
 
 
@@ -42,7 +42,7 @@ def writer(store: StateStore) -> Iterator[WriterThread]:
 
 def test_the_latest_components_are_on_disk_after_stop(store: StateStore, writer: WriterThread) -> None:
     for amplitude in (-0.001, -0.002, -0.003, -0.004):
-        writer.save((ComponentRecord(AdoptedComponent(FRICTION, 5.0), (amplitude,), (1e-5,)),))
+        writer.save((ComponentRecord(AdoptedComponent(FRICTION, 5.0), (amplitude, 0.1), (1e-5, 1e-3)),))
     writer.stop(PATIENCE)
     assert store.components() == SAVED
 

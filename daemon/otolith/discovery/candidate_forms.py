@@ -1,14 +1,31 @@
-"""The candidate library of a twin: which component families may enter at which of its sites, driven by which source."""
+"""The candidate library of a twin: which component families may enter at which of its sites, and how large.
 
+A component adds c·a·f to the rate of a state, c being the coefficient of its site. The equation is a balance, so that
+in a window |c·a·f| is at most the sum of the magnitudes of the other terms and of the rate itself. Friction takes power
+from the machine: with the friction that the twin has, it opposes the speed. ``docs/explanation/discovery.md`` has the
+equations.
+"""
+
+import ast
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
-from otolith.estimation.problem import key_of
-from otolith.twin.augmentation import ComponentSource, sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind
+import numpy as np
+
+from otolith.acquisition.window import Array
+from otolith.estimation.problem import UNLIMITED, key_of
+from otolith.twin.augmentation import ComponentSource, augmented_model, sites, sources
+from otolith.twin.component_families import COMPONENT_FAMILIES, ComponentFamily, SourceKind, family_code
 from otolith.twin.definition import Definition
+from otolith.twin.expressions import evaluate, names_in, parse, terms
+from otolith.twin.kernel import kernel_of
+from otolith_drivers.units import to_base
 
 SENSOR_FAMILIES = frozenset({"constant", "linear"})  # the errors of a sensor: an offset and a gain
+BALANCE_MARGIN = 2.0  # times the terms of the site's equation: parameters and inputs may be off
+FRICTION_SPEEDS = np.geomspace(0.02, 1.0, 12)  # of the largest speed: where friction is compared with the twin's own
+PROBE = 1e-3  # in the unit of a site: difference that gives its coefficient; components enter linearly
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,3 +62,137 @@ def _is_sensor_error(model: ComponentFamily, source: ComponentSource, signal: st
     if model.name not in SENSOR_FAMILIES:
         return False
     return source.kind is SourceKind.NOTHING or source.name == signal
+
+
+@lru_cache(maxsize=64)
+def _equations(base: Definition) -> tuple[list[tuple[str, ast.expr]], dict[str, float]]:
+    """Return definitions and rates as trees, each after those that it uses, and the scale of every quantity."""
+    pending = {name: parse(text) for name, text, _ in base.definitions}
+    ordered: list[tuple[str, ast.expr]] = []
+    while pending:
+        ready = [name for name, tree in pending.items() if not names_in(tree) & (pending.keys() - {name})]
+        ordered += [(name, pending.pop(name)) for name in ready]
+    ordered += [(left, parse(text)) for left, text in base.equations if left.startswith("der(")]
+    return ordered, {name: to_base(unit)[0] for name, unit in base.units().items()}
+
+
+def rate_terms(base: Definition, columns: Mapping[str, Array], site: int = 0, entering: float = 0.0) -> list[Array]:
+    """Return for each state the terms (terms, records) of its rate, in its unit per second.
+
+    ``columns`` has every input, state and parameter, (records,) or one value, in its own unit; ``entering`` is added at
+    ``site``.
+    """
+    ordered, scales = _equations(base)
+    entered = base.sites[site]
+    values = {name: [np.asarray(column) * scales[name]] for name, column in columns.items()}
+    values |= {fixed.name: [np.array([fixed.value * scales[fixed.name]])] for fixed in base.constants}
+    with np.errstate(all="ignore"):
+        for name, tree in ordered:
+            values[name] = terms(tree, values)
+            if entering and entered.into == name and entered.mode == "multiplicative":
+                values[name] = [(1.0 + entering) * term for term in values[name]]
+            elif entering and entered.into == name:
+                through = evaluate(parse(entered.through), values)
+                values[name] = [*values[name], through * entering * to_base(entered.unit)[0]]
+    return [_rows(values[f"der({state.name})"], scales[state.name]) for state in base.states]
+
+
+def _rows(summands: list[Array], scale: float) -> Array:
+    rows = np.array(np.broadcast_arrays(*summands)) / scale
+    return np.asarray(np.nan_to_num(rows, nan=0.0, posinf=UNLIMITED, neginf=-UNLIMITED))
+
+
+class PhysicalRange:
+    """The amplitudes that the equations of a twin allow in one window."""
+
+    def __init__(self, base: Definition, x: Array, times: Array, parameters: Mapping[str, float]) -> None:
+        """``base`` has no slots; ``x`` (sources, records) at ``times`` (records,), s."""
+        self._base, self._x, self._times = base, x, times
+        self._sources = sources(base)
+        rows = {source.name: row for source, row in zip(self._sources, x, strict=True)}
+        kinds = {source.name: source.kind for source in self._sources}
+        self._speeds = {state.name for state in base.states if kinds[state.name] is SourceKind.SPEED}
+        self._moving = [*(state.name for state in base.states), *(driven.name for driven in base.inputs)]
+        self._columns = {name: rows[name] for name in self._moving}
+        self._columns |= {each.name: np.array([parameters[each.name]]) for each in base.parameters}
+        rates = np.array([np.abs(np.diff(rows[each.name]) / np.diff(times)).max(initial=0.0) for each in base.states])
+        drives = [{}, *self._declared_inputs()]
+        self._balances = rates + np.array([self._largest_sums(inputs) for inputs in drives])
+        """(3, states): the largest sum of all magnitudes in a balance, inputs observed, lowest, highest."""
+        self._coefficients = [self._coefficients_of(site) for site in range(len(base.sites))]
+
+    def amplitudes(self, form: CandidateForm, inner: float) -> tuple[float, float]:
+        """Return the lowest and the highest amplitude of a form with that inner parameter, or ±UNLIMITED."""
+        if form.site >= len(self._base.sites):
+            return -UNLIMITED, UNLIMITED
+        reach, low, high = UNLIMITED, -UNLIMITED, UNLIMITED
+        for state, coefficient in self._coefficients[form.site].items():
+            reach = min(reach, self._balanced(state, coefficient, form, inner))
+            if form.model.dissipates and self._is_force_at_speed(state, form):
+                low, high = self._dissipating(state, float(np.median(coefficient)), form, inner)
+        return max(low, -reach), min(high, reach)
+
+    def _coefficients_of(self, site: int) -> dict[int, Array]:
+        """Return the states into whose rates a site enters, and its coefficients (records,) there."""
+        more, less = (rate_terms(self._base, self._columns, site, sign * PROBE) for sign in (1.0, -1.0))
+        slopes = [(a.sum(axis=0) - b.sum(axis=0)) / (2.0 * PROBE) for a, b in zip(more, less, strict=True)]
+        return {state: slope for state, slope in enumerate(slopes) if slope.any()}
+
+    def _balanced(self, state: int, coefficient: Array, form: CandidateForm, inner: float) -> float:
+        """Return the largest amplitude whose effect on the rate of a state the other terms can balance."""
+        effect = float(np.abs(coefficient * self._shape(form, inner, self._x[form.source])).max())
+        reach = BALANCE_MARGIN * float(self._balances[0, state]) / effect if effect > 0.0 else UNLIMITED
+        if not form.model.threshold_at_rest:
+            return reach
+        # At rest the shape is one, which the window need not show: what the inputs can move bounds it there.
+        available = float(self._balances[:, state].max())
+        return min(reach, BALANCE_MARGIN * available / float(np.abs(coefficient).max()))
+
+    def _largest_sums(self, inputs: Mapping[str, Array]) -> list[float]:
+        """Return for each state the largest sum of the magnitudes of the terms of its rate, with these inputs."""
+        return [float(np.abs(rows).sum(axis=0).max()) for rows in rate_terms(self._base, {**self._columns, **inputs})]
+
+    def _declared_inputs(self) -> list[dict[str, Array]]:
+        """Return all inputs at the lower, then at the upper ends of their ranges."""
+        ends = ("low", "high")
+        return [{driven.name: np.array([getattr(driven, end)]) for driven in self._base.inputs} for end in ends]
+
+    def _shape(self, form: CandidateForm, inner: float, x: Array) -> Array:
+        """Return the magnitude (values,) of a component of unit amplitude where its source is ``x`` (values,)."""
+        count = len(form.model.phases)
+        codes, phases = np.full(count, family_code(form.model.name)), np.array(form.model.phases)
+        first = np.zeros(count, dtype=np.int64)
+        values = kernel_of(augmented_model(self._base)).curves(codes, x[None], first, np.full(count, inner), phases)
+        return np.asarray(np.hypot.reduce(values, axis=1))
+
+    def _is_force_at_speed(self, state: int, form: CandidateForm) -> bool:
+        """Whether the source is the speed that the site's force accelerates: their product is a power."""
+        source, site = self._sources[form.source], self._base.sites[form.site]
+        name = self._base.states[state].name
+        return name in self._speeds and source.name == name and site.mode == "additive"
+
+    def _dissipating(self, state: int, coefficient: float, form: CandidateForm, inner: float) -> tuple[float, float]:
+        """Return the amplitudes with which the component and the twin's own friction oppose the speed together."""
+        speeds = FRICTION_SPEEDS * float(np.abs(self._columns[self._base.states[state].name]).max())
+        shape = abs(coefficient) * self._shape(form, inner, speeds)
+        visible = shape > 0.0
+        if not visible.any():
+            return -UNLIMITED, UNLIMITED
+        driving = max(float((self._own_friction(state, speeds)[visible] / shape[visible]).min()), 0.0)
+        return (-UNLIMITED, driving) if coefficient > 0.0 else (-driving, UNLIMITED)
+
+    def _own_friction(self, state: int, speeds: Array) -> Array:
+        """Return by how much the twin's own friction reduces the rate at ``speeds`` (speeds,).
+
+        It is the odd part of the rate, as a function of this speed alone or of all speeds together: two speeds that are
+        equal have no damping between them. The smaller counts.
+        """
+        name, odd = self._base.states[state].name, []
+        rest = dict.fromkeys(self._moving, np.zeros(1))
+        for moving in ({name}, self._speeds):
+            forward, backward = (
+                rate_terms(self._base, self._columns | rest | dict.fromkeys(moving, sign * speeds))[state].sum(axis=0)
+                for sign in (1.0, -1.0)
+            )
+            odd.append(0.5 * (backward - forward))
+        return np.asarray(np.minimum(*odd))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.discovery.candidate_forms import CandidateForm
+from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange
 from otolith.discovery.linear_response import Guess, LinearResponse, basis_functions
 from otolith.discovery.screening import (
     DECISIVE,
@@ -57,10 +57,10 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     least = max(best - SCORE_MARGIN - SCORE_SHARE * abs(best), -DECISIVE)
     kept = [guess for guess in guesses if guess.score > least][: _affordable(response)]
     kept += threshold_like(problem, guesses[len(kept) :]) if kept else []
+    components = components_of(response, kept)
     return [
-        Candidate(component_of(response, guess), alternatives.of(guess.form), alternatives.is_sensor(guess.form))
-        for guess in kept
-        if guess.is_readable
+        Candidate(component, alternatives.of(guess.form), alternatives.is_sensor(guess.form))
+        for guess, component in components
     ]
 
 
@@ -150,19 +150,37 @@ def threshold_like(problem: Problem, guesses: list[ScoredGuess]) -> list[ScoredG
     return list(best.values())
 
 
-def component_of(response: LinearResponse, guess: ScoredGuess) -> Component:
-    """Return the component of a guess with the amplitude of the linear response."""
+def components_of(response: LinearResponse, guesses: list[ScoredGuess]) -> list[tuple[ScoredGuess, Component]]:
+    """Return the guesses that are readable and physically possible, each with its component."""
+    times, parameters = response.window.grid.offsets, response.parameters
+    possible = PhysicalRange(response.problem.base_model, response.x, times, parameters)
+    pairs = ((guess, _component_of(response, guess, possible)) for guess in guesses if guess.is_readable)
+    return [(guess, component) for guess, component in pairs if component is not None]
+
+
+def _component_of(response: LinearResponse, guess: ScoredGuess, possible: PhysicalRange) -> Component | None:
+    """Return the component of a guess with the amplitude of the linear response, within its physical range.
+
+    None if the physical range excludes even the sign.
+    """
     twin, form = response.problem.base_model, guess.form
     first, second = map(float, guess.amplitudes)
     periodic = len(form.model.phases) > 1
+    amplitude = float(np.hypot(first, second)) if periodic else first
+    low, high = possible.amplitudes(form, guess.inner)
+    limited = min(max(amplitude, low), high)
+    if limited * amplitude <= 0.0:
+        return None
     return Component(
         site=sites(twin)[form.site].name,
         family=form.model.name,
         source=sources(twin)[form.source].name,
-        amplitude=float(np.hypot(first, second)) if periodic else first,
+        amplitude=limited,
         inner=guess.inner,
         phase=float(np.arctan2(second, first)) if periodic else 0.0,
         low=form.bounds[0],
         high=form.bounds[1],
+        amplitude_low=low,
+        amplitude_high=high,
         origin=response.window.start,
     )

@@ -5,6 +5,7 @@ from enum import Enum, StrEnum
 
 from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
+from otolith.discovery.screening import DECISIVE
 from otolith.discovery.sequential_test import SequentialTest
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
@@ -94,5 +95,22 @@ def decide(test: SequentialTest) -> WindowOutcome:
     probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY
     alone = test.windows >= MAX_OPEN_WINDOWS or not test.alternatives(best)
     if leads and probable and alone:
-        return WindowOutcome(WindowDecision.DISCOVERED, best)
+        best = _without_undecided_terms(test)
+        if best.type is FaultType.COMPONENT:
+            return WindowOutcome(WindowDecision.DISCOVERED, best)
     return WindowOutcome(WindowDecision.SUSPECTED, best)
+
+
+def _without_undecided_terms(test: SequentialTest) -> TrackedHypothesis:
+    """Return the hypothesis with the fewest components of the best one from which evidence does not set it apart.
+
+    Each component needs decisive evidence of its own, whichever others came with it. The null hypothesis has none.
+    """
+    own = _components(test.best)
+    smaller = [item for item in test.hypotheses if item.type in (FaultType.COMPONENT, FaultType.NOTHING)]
+    equal = [item for item in smaller if _components(item) <= own and item.deviance <= DECISIVE]
+    return min(equal, key=lambda item: len(_components(item)), default=test.best)
+
+
+def _components(hypothesis: TrackedHypothesis) -> frozenset[str]:
+    return frozenset(component.key for component in hypothesis.problem.components)

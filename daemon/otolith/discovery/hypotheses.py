@@ -17,7 +17,7 @@ from otolith.estimation.arrival_cost import Evidence, Prior, extend_prior, initi
 from otolith.estimation.augmented import amplitude_indices, augment, equation, indices, site_of
 from otolith.estimation.information import QUANTILE, orthonormal_basis
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Component, Problem
 from otolith.estimation.timing.delay_response import delay_response, delayable
 from otolith.estimation.window_fit import Fit
 
@@ -26,6 +26,7 @@ SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero
 MAX_DELAY_CHANGE = 5.0  # standard deviations: a delay that differs more between windows is no delay
 MAX_DELAY_SDS = 100  # windows whose delays count for the parameters
 MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less shows no delay
+NARROWEST = 1.01  # of the least width of a hump: as narrow as its range allows
 MS = 1e3  # ms in a second
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 
@@ -145,6 +146,31 @@ def with_candidate(
     return Proposal(stated, wider, extended, start)
 
 
+def is_possible(problem: Problem, values: Array) -> bool:
+    """Whether the components of ``problem`` lie within their physical ranges where the free parameters are ``values``.
+
+    At the end of its range a component stands for something else. Beside dry friction, a hump at rest that is as narrow
+    as its range allows stands for how the friction rounds off.
+    """
+    friction = {(item.site, item.source) for item in problem.components if item.model.threshold_like}
+    for slot, component in enumerate(problem.components):
+        amplitude, *rest = (float(values[at]) for at in indices(problem, slot))
+        if not component.amplitude_low < amplitude < component.amplitude_high:
+            return False
+        is_hump = component.model.threshold_at_rest and (component.site, component.source) in friction
+        if is_hump and rest[0] <= NARROWEST * component.low:
+            return False
+    return True
+
+
+def with_components(base: Problem, prior: Prior, components: Sequence[Component], alternatives: float) -> Proposal:
+    """Return the hypothesis of ``base`` with several more components of the machine, all at once."""
+    wider = augment(base, components)
+    extended = extend_prior(prior, base, wider)
+    stated = FaultHypothesis(FaultType.COMPONENT, _names(wider), len(wider.free) - len(base.free), alternatives)
+    return Proposal(stated, wider, extended, extended.mean)
+
+
 def _names(problem: Problem) -> str:
     return " and ".join(component.key for component in problem.components)
 
@@ -230,10 +256,12 @@ class HypothesisStep:
     def updated(self, deviance: float, misfit: float) -> TrackedHypothesis | None:
         """Return the hypothesis after the window, with so much more deviance and misfit.
 
-        None if the window contradicts the delay that it states.
+        None if the window contradicts the delay that it states, or a component leaves its physical range.
         """
         posterior = self.predicted.update(self.evidence, self.fitted.fit.advance())
         tracked = replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost).worse_by(deviance, misfit)
+        if self.tracked.type is FaultType.COMPONENT and not is_possible(posterior.problem, posterior.prior().mean):
+            return None
         return tracked if self.tracked.type is not FaultType.TIMING else _with_delay(tracked, self.fitted.fit)
 
 

@@ -218,6 +218,12 @@ class LinearResponse:
         within = (low <= now + step) & (now + step <= high)
         return np.asarray(((cosine > SAME_DIRECTION) & (difference < MAX_DIFFERENCE) & within).any(axis=0))
 
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The values of the twin's parameters around which it is linearised."""
+        values = self.objective.parameters(self._guess[None, : len(self.problem.free)])[0]
+        return dict(zip((parameter.name for parameter in self.problem.twin.parameters), values.tolist(), strict=True))
+
     def responses(self, curves: BasisFunctions) -> Array:
         """Return the responses (residuals, curves) of the whitened innovations."""
         shapes = self._kernel.curves(curves.families, self.x, curves.sources, curves.inner, curves.phases)

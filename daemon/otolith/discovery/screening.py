@@ -13,10 +13,10 @@ from otolith.discovery.candidate_forms import CandidateForm, candidate_table
 from otolith.discovery.linear_response import Guess, LinearResponse
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, WindowEstimate, fit
-from otolith.twin.augmentation import MAX_COMPONENTS, sources
-from otolith.twin.component_families import ComponentFamily, SourceKind, SourceRange
+from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
+from otolith.twin.component_families import MIN_HUMP, ComponentFamily, SourceKind, SourceRange
 from otolith.twin.definition import Definition
 
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
@@ -26,6 +26,7 @@ MAX_LINES = 64  # of largest estimated gain, whose gain is computed
 PEAKS_OF_SPECTRUM = 8  # of largest estimated gain, whose gain a search computes
 MAX_AMPLITUDE = 1e9  # in the unit of the site
 MAX_RECORDS = 5000  # last records of a window that are searched
+SAME_SIGN = 0.8  # mean product of the signs of two sources that change their signs together
 THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear response underrates are fitted
 
 
@@ -106,8 +107,6 @@ def _inner_bounds(model: ComponentFamily, x: SourceRange) -> tuple[float, float]
     """Return the bounds of the inner parameter, or None if ``x`` does not single out the family."""
     if not model.valid(x):
         return None
-    if model.fixed_inner is not None:
-        return model.fixed_inner(x), model.fixed_inner(x)
     return (0.0, 0.0) if model.inner is None else model.inner.bounds(x)
 
 
@@ -121,7 +120,32 @@ def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     if len(problem.components) >= MAX_COMPONENTS:
         return []
     taken = problem.excluded | {component.key for component in problem.components}
-    return [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
+    forms = [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
+    friction = [component for component in problem.components if component.model.threshold_like]
+    return [bounded for form in forms if (bounded := _beside_friction(twin, form, x, friction)) is not None]
+
+
+def _beside_friction(
+    twin: Definition, form: CandidateForm, x: Array, friction: list[Component]
+) -> CandidateForm | None:
+    """Return the form, or None if it would only correct dry friction that the twin has at the same site.
+
+    That is a hump no wider than the transition of the friction, and a threshold of a source that changes its sign with
+    the friction's source, of which it is a measure.
+    """
+    if not (form.model.threshold_like or form.model.threshold_at_rest):
+        return form
+    names = [source.name for source in sources(twin)]
+    low, high = form.bounds
+    for component in friction:
+        if sites(twin)[form.site].name != component.site:
+            continue
+        source = names.index(component.source)
+        if source == form.source:
+            low = max(low, MIN_HUMP * component.inner)
+        elif abs(float((np.sign(x[source]) * np.sign(x[form.source])).mean())) > SAME_SIGN:
+            return None
+    return replace(form, bounds=(low, high)) if low <= high else None
 
 
 def grid_guesses(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.discovery.candidates import MAX_CANDIDATES, Candidate, component_of, find_candidates, threshold_like
+from otolith.discovery.candidates import MAX_CANDIDATES, Candidate, components_of, find_candidates, threshold_like
 from otolith.discovery.hypotheses import (
     FaultHypothesis,
     FaultType,
@@ -19,9 +19,11 @@ from otolith.discovery.hypotheses import (
     Proposal,
     all_parameters_moved,
     delay_score,
+    is_possible,
     nothing_happened,
     residual_variance_factor,
     with_candidate,
+    with_components,
 )
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
 from otolith.discovery.noise_hypothesis import noisier_sensors
@@ -113,8 +115,8 @@ def _threshold_gain(response: LinearResponse) -> float:
     screening = Screening.of(response, guesses, alternatives)
     readable = [guess for guess in map(screening.__getitem__, range(len(guesses))) if guess.is_readable]
     proposals = [
-        with_candidate(problem, fresh, Candidate(component_of(response, guess), alternatives.of(guess.form), False))
-        for guess in threshold_like(problem, readable)
+        with_candidate(problem, fresh, Candidate(component, alternatives.of(guess.form), False))
+        for guess, component in components_of(response, threshold_like(problem, readable))
     ]
     best = -np.inf
     for fitted in fit_hypotheses(proposals, response.window):
@@ -133,7 +135,7 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
         proposals.append(all_parameters_moved(problem, prior.mean))
     proposals += _one_parameter_moved(problem, prior, screening.response)
     candidates = [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
-    fitted = [*fit_hypotheses(proposals, window), *fit_hypotheses(candidates, window, FAR_WORSE)]
+    fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
     noisier = noisier_sensors(fitted[0])
     fitted += [] if noisier is None else [noisier]
     fitted += late_signals(fitted[0], screening.response)
@@ -141,7 +143,7 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     best = min(components, key=_chi_square, default=None)
     while best is not None and len(best.problem.components) < MAX_COMPONENTS and _convincing(fitted) in (None, best):
         best = _with_another_component(best)
-        fitted += [] if best is None else [best]
+        fitted += [] if best is None else [best, *_sub_structures(best, fitted)]
     if screening.always_lacking or _convincing(fitted) is None:
         fitted += _always_lacking(fitted[0])
     return fitted
@@ -240,12 +242,36 @@ def _with_another_component(best: FittedHypothesis) -> FittedHypothesis | None:
     proposals = [
         with_candidate(best.problem, best.fit.prior, candidate, best) for candidate in candidates[: MAX_CANDIDATES // 2]
     ]
-    further = min(fit_hypotheses(proposals, window, FAR_WORSE), key=_chi_square, default=None)
+    further = min(_possible(fit_hypotheses(proposals, window, FAR_WORSE)), key=_chi_square, default=None)
     if further is None:
         return None
     count = best.fit.count
     gain = best.deviance(count, 1.0) - further.deviance(count, 1.0)
     return further if gain / residual_variance_factor([further.chi_square], count) > DECISIVE else None
+
+
+def _sub_structures(whole: FittedHypothesis, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
+    """Fit the hypotheses that lack one component of ``whole`` and are not among ``fitted``.
+
+    They compete with it, so that each component needs evidence of its own.
+    """
+    null, window = fitted[0], whole.fit.window
+    known = {component.key for component in null.problem.components}
+    added = [component for component in whole.problem.components if component.key not in known]
+    present = {frozenset(component.key for component in item.problem.components) for item in fitted}
+    smaller = [[component for component in added if component is not lacking] for lacking in added]
+    alternatives = whole.hypothesis.alternatives ** (1.0 - 1.0 / max(len(added), 1))
+    proposals = [
+        with_components(null.problem, null.fit.prior, rest, alternatives)
+        for rest in smaller
+        if frozenset((*known, *(component.key for component in rest))) not in present
+    ]
+    return _possible(fit_hypotheses(proposals, window, FAR_WORSE))
+
+
+def _possible(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
+    """Return the hypotheses whose components lie within their physical ranges."""
+    return [item for item in fitted if is_possible(item.problem, item.fit.parameters)]
 
 
 def _always_lacking(null: FittedHypothesis) -> list[FittedHypothesis]:
@@ -257,7 +283,7 @@ def _always_lacking(null: FittedHypothesis) -> list[FittedHypothesis]:
         return []
     candidates = [candidate for candidate in find_candidates(screening.response) if not candidate.of_sensor]
     proposals = [with_candidate(problem, moved.fit.prior, candidate, moved) for candidate in candidates]
-    return fit_hypotheses(proposals, window, FAR_WORSE)
+    return _possible(fit_hypotheses(proposals, window, FAR_WORSE))
 
 
 def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple[Posterior, list[FittedHypothesis]]:

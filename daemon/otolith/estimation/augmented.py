@@ -73,8 +73,7 @@ def _settings(twin: Definition, slot: int, component: Component) -> dict[str, fl
     at = [site.name for site in sites(twin)].index(component.site)
     settings = {family_setting(slot): family_code(component.family), site_setting(slot, at): 1.0}
     source = [source.name for source in sources(twin)].index(component.source)
-    given = {component_parameters(slot)[1]: component.inner} if component.model.fixed_inner is not None else {}
-    return settings | given | ({source_setting(slot, source): 1.0} if source else {})
+    return settings | ({source_setting(slot, source): 1.0} if source else {})
 
 
 def _free_values(twin: Definition, slot: int, component: Component) -> list[Parameter]:
@@ -82,8 +81,9 @@ def _free_values(twin: Definition, slot: int, component: Component) -> list[Para
     amplitude, inner, phase = component_parameters(slot)
     unit, model = site_of(twin, component.site).unit, component.model
     reach = AMPLITUDE_BOUND * abs(component.amplitude)
-    low = 0.0 if component.periodic else -reach
-    values = [Parameter(amplitude, unit, component.amplitude, low, reach, f"amplitude of {component.key}")]
+    low = max(0.0 if component.periodic else -reach, component.amplitude_low)
+    high = min(reach, component.amplitude_high)
+    values = [Parameter(amplitude, unit, component.amplitude, low, high, f"amplitude of {component.key}")]
     if model.inner is not None:
         unit = model.inner.unit.format(x=source_of(twin, component.source).unit)
         bounds = max(component.low, component.inner / INNER_BOUND), min(component.high, component.inner * INNER_BOUND)
@@ -125,5 +125,6 @@ def equation(twin: Definition, component: Component, values: Sequence[float]) ->
     rest = [*values[1:], 0.0, 0.0]
     phase = f"{'−' if rest[1] < 0.0 else '+'} {abs(rest[1]):.2f}"
     text = component.model.equation.format(a=f"{values[0]:.4g}", b=f"{rest[0]:.4g}", c=phase, x=component.source)
+    text = text.replace("−-", "")  # exp(−-0.1·x) is exp(0.1·x)
     unit = site_of(twin, component.site).unit
     return text if unit == "1" else f"{text} {unit}"

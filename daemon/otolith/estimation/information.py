@@ -13,7 +13,9 @@ MIN_SINGULAR = 1e-8  # relative singular value below which a direction is not ob
 MIN_BASIS_SINGULAR = 1e-10  # relative singular value of the directions that are projected out
 MAX_BLIND_SHARE = 1e-4  # share in an unobserved direction above which a parameter is not observed
 MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
-PUSHED = 2.0  # times the required interval: a wider one does not tell on which side of a bound the value lies
+PUSHED = 2.0  # times the required interval: a wider one alone does not tell on which side of a bound the value lies
+PRESSED = 3.0  # standard deviations beyond a bound to which a further step would lead: the value lies beyond it
+AT_THE_BOUND = "at its bound {:.4g} {}: widen the bounds in [parameters], or check the equations of the twin"
 TRADED = 0.95  # correlation above which two parameters cannot be distinguished
 MIN_INFLATED_COST = 1.1  # cost above which the residual is tested for autocorrelation: noise alone hardly reaches it
 MAX_LAG = 0.25  # share of a window: largest lag of the autocorrelation
@@ -129,6 +131,10 @@ class AccuracyTarget:
     """Largest half-width of the 95 % interval of a determined parameter."""
     unit: str
     at_bound: bool
+    value: float = 0.0
+    """The best value."""
+    pressure: float = 0.0
+    """How far beyond the bound a further step would lead, in standard deviations."""
 
 
 def classify(
@@ -136,11 +142,8 @@ def classify(
 ) -> tuple[Identifiability, str]:
     """Return the identifiability of parameter ``index``, and the reason as a sentence."""
     reach = QUANTILE * uncertainty.sd[index]
-    if target.at_bound and reach <= PUSHED * target.half_width:
-        return (
-            Identifiability.AT_BOUND,
-            "the best value lies at the bound: widen the bounds in [parameters], or check the equations of the twin",
-        )
+    if target.at_bound and (reach <= PUSHED * target.half_width or target.pressure > PRESSED):
+        return Identifiability.AT_BOUND, AT_THE_BOUND.format(target.value, target.unit)
     if reach <= target.half_width:
         return Identifiability.DETERMINED, ""
     correlations = np.abs(uncertainty.correlation[index]).copy()
@@ -151,4 +154,6 @@ def classify(
     if correlations[partner] > TRADED:
         partners = f"it can be traded with {names[partner]} (correlation {correlations[partner]:.3f})"
         return Identifiability.TRADED, partners
-    return Identifiability.WEAK, f"the window determines it to ±{reach:.3g} {target.unit} only: too little excitation"
+    bound = "; its best value lies at its bound" if target.at_bound else ""
+    weak = f"the window determines it to ±{reach:.3g} {target.unit} only: too little excitation"
+    return Identifiability.WEAK, weak + bound

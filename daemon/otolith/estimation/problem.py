@@ -9,6 +9,7 @@ from otolith.acquisition.window import Array
 from otolith.twin.component_families import ComponentFamily, family_of
 from otolith.twin.definition import Definition, Parameter
 
+UNLIMITED = 1e30  # bound of an amplitude that nothing limits; any finite number would do
 MIN_SCALE = 0.01  # share of the width of the bounds: the size of a parameter whose nominal value is about zero
 
 
@@ -30,6 +31,10 @@ class Component:
     """Lower bound of the inner parameter."""
     high: float = 0.0
     """Upper bound of the inner parameter."""
+    amplitude_low: float = -UNLIMITED
+    """Lower bound of the amplitude, in the unit of the site."""
+    amplitude_high: float = UNLIMITED
+    """Upper bound of the amplitude."""
     origin: float = 0.0
     """Unix seconds at which a source ``t`` that is not periodic counts zero."""
 

@@ -9,11 +9,12 @@ from enum import Enum
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior
 from otolith.estimation.augmented import amplitude_indices
 from otolith.estimation.gauss_newton import MAX_STEPS, FitResult, gauss_newton
 from otolith.estimation.information import (
+    MIN_SINGULAR,
     AccuracyTarget,
     Identifiability,
     Information,
@@ -343,12 +344,32 @@ def _parameter_estimates(both: _BothFits, outcome: Outcome) -> tuple[ParameterEs
     width = objective.high - objective.low
     at_bound = (guess <= objective.low + AT_BOUND * width) | (guess >= objective.high - AT_BOUND * width)
     required = problem.determined_within * problem.scale
+    pressure = _pressure(both, at_bound)
     estimates = []
     for index, parameter in enumerate(problem.free):
-        target = AccuracyTarget(float(required[index]), parameter.unit, bool(at_bound[index]))
+        value, bounded = float(guess[index]), bool(at_bound[index])
+        target = AccuracyTarget(float(required[index]), parameter.unit, bounded, value, float(pressure[index]))
         identifiability, reason = classify(both.information, index, objective.names, target)
         if outcome is Outcome.AMBIGUOUS and identifiability is Identifiability.DETERMINED:
             identifiability, reason = Identifiability.WEAK, outcome.value
         sd = float(both.information.sd[index])
-        estimates.append(ParameterEstimate(parameter.name, float(guess[index]), sd, identifiability, reason))
+        estimates.append(ParameterEstimate(parameter.name, value, sd, identifiability, reason))
     return tuple(estimates)
+
+
+def _pressure(both: _BothFits, at_bound: Mask) -> Array:
+    """Return how far beyond its bound a Gauss-Newton step would lead each value (guess,), in standard deviations.
+
+    They are inflated by the residual that this step would leave: what the bound causes is no noise.
+    """
+    objective, alone = both.fit.objective, both.alone
+    pressure = np.zeros(len(alone.guess))
+    if at_bound.any():
+        width = objective.high - objective.low
+        residuals = alone.residuals.ravel()
+        step = -width * np.linalg.lstsq(alone.jacobian * width, residuals, rcond=MIN_SINGULAR)[0]
+        left = np.linalg.norm(residuals + alone.jacobian @ step) / np.sqrt(objective.count)
+        sd = both.information.sd / both.inflation * max(float(left), 1.0)
+        outward = np.where(alone.guess - objective.low < objective.high - alone.guess, -step, step)
+        pressure[at_bound] = np.maximum(outward, 0.0)[at_bound] / sd[at_bound]
+    return pressure

@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
-from otolith.estimation.information import QUANTILE, Identifiability, ParameterEstimate
+from otolith.estimation.information import AT_THE_BOUND, QUANTILE, Identifiability, ParameterEstimate
+from otolith.estimation.window_fit import AT_BOUND
 from otolith.health.schema import ParameterDocument, Status
 from otolith.twin.definition import Parameter
 
@@ -78,12 +79,15 @@ def publish(
     reach = QUANTILE * known_now.sd
     width = parameter.high - parameter.low
     known = reach <= required or (before.known and reach <= FORGOTTEN * width)
-    status = _status(known_now, window, before, known=known, required=required)
+    value = min(max(known_now.value, parameter.low), parameter.high)
+    at_bound = known and min(value - parameter.low, parameter.high - value) <= AT_BOUND * width
+    status = Status.INVALID if at_bound else _status(known_now, window, before, known=known, required=required)
     estimate, reason = window.estimate, window.reason
-    if estimate is not None and (window.accepted or window.at_bound):
+    if at_bound and not window.at_bound:
+        reason = "; ".join(filter(None, (AT_THE_BOUND.format(value, parameter.unit), reason)))
+    elif estimate is not None and (window.accepted or window.at_bound):
         reason = "; ".join(filter(None, (estimate.reason, reason)))
     alone = estimate if estimate is not None and _is_informative(estimate, width) else None
-    value = min(max(known_now.value, parameter.low), parameter.high)
     shown = known and math.isfinite(value + reach + HOUR * (known_now.trend + known_now.trend_sd))
     return PreviousStatus(known, status), ParameterDocument(
         value=value if shown else None,
@@ -98,7 +102,11 @@ def publish(
         trend_sd_per_hour=HOUR * known_now.trend_sd if shown else None,
         status=status,
         progress=_progress(reach, required, width),
-        identifiability=None if estimate is None else estimate.identifiability,
+        identifiability=Identifiability.AT_BOUND
+        if at_bound
+        else None
+        if estimate is None
+        else estimate.identifiability,
         reason=reason or _default_reason(status),
     )
 

@@ -49,13 +49,29 @@ def sources(base: Definition) -> tuple[ComponentSource, ...]:
         ComponentSource("", "1", SourceKind.NOTHING, ""),
         ComponentSource("t", "s", SourceKind.TIME, ELAPSED),
         *(ComponentSource(f"angle({name})", unit, SourceKind.PLACE, _angle(name)) for name, unit in _speeds(base)),
-        *(ComponentSource(driven.name, driven.unit, SourceKind.SIGNAL, driven.name) for driven in base.inputs),
+        *(ComponentSource(driven.name, driven.unit, _input_kind(driven.unit), driven.name) for driven in base.inputs),
         *(ComponentSource(quantity.name, quantity.unit, _kind(quantity.unit), quantity.name) for quantity in shown),
     )
 
 
+def _input_kind(unit: str) -> SourceKind:
+    """Return the kind of an input: a place that is given is an ordinary signal."""
+    return SourceKind.SPEED if _integral_unit(unit) else SourceKind.SIGNAL
+
+
 def _kind(unit: str) -> SourceKind:
-    return SourceKind.PLACE if unit in ("rad", "m") else SourceKind.SIGNAL
+    if unit in ("rad", "m"):
+        return SourceKind.PLACE
+    return SourceKind.SPEED if _integral_unit(unit) else SourceKind.SIGNAL
+
+
+def _integral_unit(unit: str) -> str:
+    """Return the unit of the integral of a speed; empty if ``unit`` is that of no speed."""
+    for speed, integral in INTEGRAL_UNITS.items():
+        # 1/s has the dimension of an angular speed too, but may be the rate of anything.
+        if dimension_of(unit) == dimension_of(speed) and (speed == "m/s" or "rad" in unit or "rpm" in unit):
+            return integral
+    return ""
 
 
 def _angle(speed: str) -> str:
@@ -66,13 +82,9 @@ def _speeds(base: Definition) -> list[tuple[str, str]]:
     """States that are speeds, with the unit of their integral; without those whose integral is a state already."""
     integrated = {text.strip() for left, text in base.equations if left.startswith("der(")}
     return [
-        (state.name, unit)
+        (state.name, _integral_unit(state.unit))
         for state in base.states
-        for speed, unit in INTEGRAL_UNITS.items()
-        if dimension_of(state.unit) == dimension_of(speed)
-        # 1/s has the dimension of an angular speed too, but may be the rate of anything.
-        and (speed == "m/s" or "rad" in state.unit or "rpm" in state.unit)
-        and state.name not in integrated
+        if state.name not in integrated and _integral_unit(state.unit)
     ]
 
 

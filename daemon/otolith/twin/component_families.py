@@ -22,6 +22,8 @@ MIN_BEND, MAX_BEND = 0.3, 12.0  # exponent of an exponential over the range of x
 MAX_EXPONENT = 30.0  # exponent of an exponential at the largest |x|: the amplitude at zero stays a readable number
 MIN_POWER, MAX_POWER = 0.3, 4.0  # exponent of a power
 COULOMB_TRANSITION = 0.005  # of the largest |x|: width of the transition of dry friction around zero
+WIDEST_TRANSITION = 10.0  # times that width: dry friction that rounds off
+MIN_HUMP = 5.0  # widths of the transition of dry friction: beside it, a narrower hump would only correct its rounding
 MIN_STRIBECK_SPEED, MAX_STRIBECK_SPEED = 0.02, 0.5  # of the largest |x|: a wider hump does not decay in the window
 HIDDEN_HUMP = 0.5  # of the smallest |x|: a narrower hump lies outside the window and could be of any height
 
@@ -33,6 +35,8 @@ class SourceKind(StrEnum):
     TIME = "time"
     PLACE = "place"
     """An angle or a position: a machine repeats itself in it."""
+    SPEED = "speed"
+    """Of a rotation or a motion: force times speed is a power."""
     SIGNAL = "signal"
 
 
@@ -97,8 +101,10 @@ class ComponentFamily:
     inner: InnerParameter | None = None
     threshold_like: bool = False
     """Whether it can hold what it depends on at zero, as dry friction does: a linear response then underrates it."""
-    fixed_inner: Callable[[SourceRange], float] | None = None
-    """The inner parameter of a family that does not search for it."""
+    threshold_at_rest: bool = False
+    """Whether its magnitude at zero is the amplitude although a window may show its tail only."""
+    dissipates: bool = False
+    """Whether it takes power from the machine where its source is a speed and its site the force there: friction."""
     phases: tuple[float, ...] = (0.0,)
     """Phases (rad) of the basis functions; two for a free phase, since both amplitudes enter linearly."""
 
@@ -138,9 +144,10 @@ def _has_rates(x: SourceRange) -> bool:
     return _varies(x) and high > low
 
 
-def _coulomb_transition(x: SourceRange) -> float:
-    """Width of the transition around zero; with a step a machine at rest would never come to rest."""
-    return COULOMB_TRANSITION * _largest(x)
+def _coulomb_transitions(x: SourceRange) -> tuple[float, float]:
+    """Widths of the transition around zero; with a step a machine at rest would never come to rest."""
+    width = COULOMB_TRANSITION * _largest(x)
+    return width, WIDEST_TRANSITION * width
 
 
 def _stribeck_speeds(x: SourceRange) -> tuple[float, float]:
@@ -153,20 +160,25 @@ def _has_stribeck_speeds(x: SourceRange) -> bool:
     return _varies(x) and low < high
 
 
-ANY = frozenset({SourceKind.TIME, SourceKind.PLACE, SourceKind.SIGNAL})
+MOTION = frozenset({SourceKind.PLACE, SourceKind.SPEED, SourceKind.SIGNAL})
+ANY = MOTION | {SourceKind.TIME}
+GROWTH = ANY - {SourceKind.SPEED}  # no effect of a machine grows exponentially with its speed
 RATE = InnerParameter("rate", "1/{x}", _rates, 2)
 
 COMPONENT_FAMILIES: tuple[ComponentFamily, ...] = (
     ComponentFamily("constant", "a", "{a}", "offset, constant load, leak", "everywhere",
                     frozenset({SourceKind.NOTHING}), lambda x: True),
-    ComponentFamily("linear", "a*x", "{a}·{x}", "friction, misalignment, backlash", "everywhere", ANY, _varies),
+    ComponentFamily("linear", "a*x", "{a}·{x}", "friction, misalignment, backlash", "everywhere", ANY, _varies,
+                    dissipates=True),
     ComponentFamily("exponential", "a*exp(b*x)", "{a}·exp({b}·{x})",
-                    "current leaking, deterioration, wear and tear, corrosion", "everywhere", ANY, _has_rates, RATE),
+                    "current leaking, deterioration, wear and tear, corrosion", "everywhere, but for speeds", GROWTH,
+                    _has_rates, RATE),
     ComponentFamily("negative exponential", "a*exp(-b*x)", "{a}·exp(−{b}·{x})",
-                    "ageing, degradation, fatigue, crack growth", "everywhere", ANY, _has_rates, RATE),
+                    "ageing, degradation, fatigue, crack growth", "everywhere, but for speeds", GROWTH,
+                    _has_rates, RATE),
     ComponentFamily("power", f"a*sign(x)*exp(b*log(Max(absolute(x), {MIN_MAGNITUDE})))", "{a}·{x}^{b}",
                     "hard stops, overloading, mechanical shock", "mirrored for negative inputs", ANY, _varies,
-                    InnerParameter("exponent", "1", lambda x: (MIN_POWER, MAX_POWER), 2)),
+                    InnerParameter("exponent", "1", lambda x: (MIN_POWER, MAX_POWER), 2), dissipates=True),
     ComponentFamily("logarithmic", f"a*log(Max(absolute(x), {MIN_MAGNITUDE}))", "{a}·ln({x})",
                     "saturation, memory effects, hysteresis", "inputs of one sign", ANY, _keeps_sign),
     ComponentFamily("periodic", "a*sin(b*x + c)", "{a}·sin({b}·{x} {c})",
@@ -175,12 +187,13 @@ COMPONENT_FAMILIES: tuple[ComponentFamily, ...] = (
                     frozenset({SourceKind.TIME, SourceKind.PLACE}), _has_frequencies,
                     InnerParameter("frequency", "rad/{x}", _frequencies, 0), phases=(0.0, 0.5 * math.pi)),
     ComponentFamily("Coulomb", "a*tanh(x/b)", "{a}·sign({x})", "dry friction", "inputs that change their sign",
-                    frozenset({SourceKind.PLACE, SourceKind.SIGNAL}), _changes_sign, threshold_like=True,
-                    fixed_inner=_coulomb_transition),
+                    MOTION, _changes_sign, InnerParameter("transition", "{x}", _coulomb_transitions, 2),
+                    threshold_like=True, dissipates=True),
     ComponentFamily("Stribeck", f"a*tanh(x/({COULOMB_TRANSITION}*b))*exp(-(x/b)**2)",
                     "{a}·sign({x})·exp(−({x}/{b})²)", "friction that falls with the speed",
-                    "inputs that come near zero", frozenset({SourceKind.PLACE, SourceKind.SIGNAL}),
-                    _has_stribeck_speeds, InnerParameter("Stribeck speed", "{x}", _stribeck_speeds, 4)),
+                    "inputs that come near zero", MOTION, _has_stribeck_speeds,
+                    InnerParameter("Stribeck speed", "{x}", _stribeck_speeds, 4), threshold_at_rest=True,
+                    dissipates=True),
 )  # fmt: skip
 FAMILY_NAMES = tuple(row.name for row in COMPONENT_FAMILIES)
 

@@ -9,8 +9,11 @@ import keyword
 import math
 import operator
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from otolith_drivers.errors import nearest
 
@@ -34,6 +37,14 @@ ARITHMETIC: dict[type[ast.operator], Callable[..., Any]] = {
     ast.Pow: operator.pow,
 }  # fmt: skip
 COMPARISONS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
+NUMERICAL: dict[str, Callable[..., Any]] = {
+    "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2, "min": np.minimum, "max": np.maximum,
+}  # fmt: skip
+"""Functions that NumPy names differently."""
+NUMERICAL_COMPARISONS: dict[type[ast.cmpop], Callable[..., Any]] = {
+    ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge,
+}  # fmt: skip
+Column = NDArray[np.float64]
 
 
 class ExpressionError(ValueError):
@@ -235,3 +246,49 @@ def _kind_of(node: ast.AST) -> str:
         ast.Call: "this kind of call",
     }  # fmt: skip
     return kinds.get(type(node), f"this ({type(node).__name__})")
+
+
+def terms(tree: ast.expr, values: Mapping[str, list[Column]]) -> list[Column]:
+    """Return the summands of an expression, each (records,), with products of sums expanded by their first sum.
+
+    ``values`` has the summands of every name.
+    """
+    match tree:
+        case ast.Name(id=name) if name in values:
+            return values[name]
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return [-term for term in terms(operand, values)]
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return [*terms(left, values), *terms(right, values)]
+        case ast.BinOp(left=left, op=ast.Sub(), right=right):
+            return [*terms(left, values), *(-term for term in terms(right, values))]
+        case ast.BinOp(left=left, op=ast.Mult(), right=right):
+            summands, factor = terms(left, values), terms(right, values)
+            if len(summands) < len(factor):
+                summands, factor = factor, summands
+            return [term * sum(factor) for term in summands]
+        case ast.BinOp(left=left, op=ast.Div(), right=right):
+            divisor = evaluate(right, values)
+            return [term / divisor for term in terms(left, values)]
+        case _:
+            return [evaluate(tree, values)]
+
+
+def evaluate(tree: ast.expr, values: Mapping[str, list[Column]]) -> Column:
+    """Return the value (records,) of an expression; ``values`` has the summands of every name."""
+    match tree:
+        case ast.Constant(value=value):
+            return np.array([float(str(value))])
+        case ast.Name(id=name):
+            return np.array([math.pi]) if name == "pi" else np.asarray(sum(values[name]))
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
+            return np.asarray(evaluate(left, values) ** float(constant(right) or 0.0))
+        case ast.Call(func=ast.Name(id="where"), args=[ast.Compare() as condition, then, otherwise]):
+            compare = NUMERICAL_COMPARISONS[type(condition.ops[0])]
+            test = compare(evaluate(condition.left, values), evaluate(condition.comparators[0], values))
+            return np.where(test, evaluate(then, values), evaluate(otherwise, values))
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            function = NUMERICAL.get(name) or getattr(np, name)
+            return np.asarray(function(*(evaluate(argument, values) for argument in arguments)))
+        case _:
+            return np.asarray(sum(terms(tree, values)))
