@@ -114,13 +114,21 @@ def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     """Return the forms that may be searched where the sources are ``x`` (sources, records).
 
     Components in the twin and excluded ones are left out, and all if the twin has no free slot. If discovery is off,
-    only errors of sensors remain.
+    only errors of sensors remain. Dry friction acts on what moves: on states. The sign of an input that has the sign of a
+    speed most of the time would be a noisy measure of it.
     """
     twin = problem.base_model
     if len(problem.components) >= MAX_COMPONENTS:
         return []
     taken = problem.excluded | {component.key for component in problem.components}
-    forms = [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
+    states = {state.name for state in twin.states}
+    names = [source.name for source in sources(twin)]
+    forms = [
+        form
+        for form in candidate_library(twin, x, taken)
+        if (problem.discover or form.site >= len(twin.sites))
+        and (names[form.source] in states or not form.model.threshold_like)
+    ]
     friction = [component for component in problem.components if component.model.threshold_like]
     return [bounded for form in forms if (bounded := _beside_friction(twin, form, x, friction)) is not None]
 
