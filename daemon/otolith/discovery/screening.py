@@ -114,8 +114,8 @@ def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     """Return the forms that may be searched where the sources are ``x`` (sources, records).
 
     Components in the twin and excluded ones are left out, and all if the twin has no free slot. If discovery is off,
-    only errors of sensors remain. Dry friction acts on what moves: on states. The sign of an input that has the sign of a
-    speed most of the time would be a noisy measure of it.
+    only errors of sensors remain. Dry friction acts on what moves: on states. The sign of an input that mostly has the
+    sign of a speed would be a noisy measure of it.
     """
     twin = problem.base_model
     if len(problem.components) >= MAX_COMPONENTS:
