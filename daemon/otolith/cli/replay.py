@@ -73,10 +73,11 @@ class ReplaySummary:
         yield from self._counts()
 
     def _parameters(self, last: ReportDocument) -> Table:
-        table = parameter_table("last window", *Status)
+        seen = [kind for kind in Status if any(self._statuses[name, kind] for name in last.parameters)]
+        table = parameter_table("last window", *seen)
         for name, parameter in last.parameters.items():
             status = Text(parameter.status, style=STYLES[parameter.status])
-            counts = (str(self._statuses[name, kind]) for kind in Status)
+            counts = (str(self._statuses[name, kind]) for kind in seen)
             table.add_row(name, *value_cells(parameter), status, *counts)
         return table
 
