@@ -21,16 +21,16 @@ MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothes
 WRONG_WINDOW = 0.5  # probability that the only window of a test is itself wrong: it cannot tell
 
 
-def interchangeable(hypotheses: Sequence[TrackedHypothesis], margin: float = DECISIVE) -> list[list[int]]:
+def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
     """Return the indices of the hypotheses that explain the windows equally well, grouped by type and place.
 
-    Their misfits are at most ``margin`` above the least. The best of each group comes first. A component is in a group
-    only if nothing with fewer values explains the windows as well: otherwise evidence must pay for its values. The null
-    hypothesis is contained in all others, so it is in no group.
+    Their misfits are at most ``DECISIVE`` above the least. The best of each group comes first. A component is in a
+    group only if nothing with fewer values explains the windows as well: otherwise evidence must pay for its values. The
+    null hypothesis is contained in all others, so it is in no group.
     """
     others = [at for at, item in enumerate(hypotheses) if item.type is not FaultType.NOTHING]
     least = min((hypotheses[at].misfit for at in others), default=0.0)
-    equal = [at for at in others if hypotheses[at].misfit <= least + margin]
+    equal = [at for at in others if hypotheses[at].misfit <= least + DECISIVE]
     least_values = min((hypotheses[at].hypothesis.added for at in equal), default=0)
     groups: dict[tuple[FaultType, tuple[str, ...]], list[int]] = {}
     for at in sorted(equal, key=lambda at: hypotheses[at].deviance):
@@ -40,10 +40,10 @@ def interchangeable(hypotheses: Sequence[TrackedHypothesis], margin: float = DEC
     return list(groups.values())
 
 
-def probabilities(hypotheses: Sequence[TrackedHypothesis], margin: float = DECISIVE) -> list[float]:
+def probabilities(hypotheses: Sequence[TrackedHypothesis]) -> list[float]:
     """Return the probability of each hypothesis; groups of interchangeable ones are equally probable."""
     logs = -0.5 * np.array([item.deviance for item in hypotheses])
-    groups = interchangeable(hypotheses, margin)
+    groups = interchangeable(hypotheses)
     totals = [float(np.logaddexp.reduce(logs[group])) for group in groups]
     for group, total in zip(groups, totals, strict=True):
         logs[group] += max(totals) - total
@@ -52,11 +52,9 @@ def probabilities(hypotheses: Sequence[TrackedHypothesis], margin: float = DECIS
     return shares
 
 
-def without_duplicates(
-    hypotheses: tuple[TrackedHypothesis, ...], margin: float = DECISIVE
-) -> tuple[TrackedHypothesis, ...]:
+def without_duplicates(hypotheses: tuple[TrackedHypothesis, ...]) -> tuple[TrackedHypothesis, ...]:
     """Return the hypotheses with only the best of each group of interchangeable ones."""
-    worse = {at for group in interchangeable(hypotheses, margin) for at in group[1:]}
+    worse = {at for group in interchangeable(hypotheses) for at in group[1:]}
     return tuple(item for at, item in enumerate(hypotheses) if at not in worse)
 
 

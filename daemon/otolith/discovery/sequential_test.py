@@ -37,6 +37,7 @@ MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is
 MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
 MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
 MAX_TOTAL_DEVIANCE = 60.0  # in -2 log evidence: a hypothesis can return when things change
+CLEAR_WINDOWS = 2  # after which one type must explain the windows best before a class counts as resolved
 PRUNED_AFTER = 3  # windows of a test after which a hypothesis must differ from the null hypothesis
 DIVERGED = 1e12  # χ² of a twin that explains nothing
 
@@ -68,8 +69,8 @@ class SequentialTest:
     """Consecutive windows in which the best hypothesis was the best."""
     last: FitSummary = FitSummary()
     """Of the last window."""
-    was_ambiguous: bool = False
-    """Whether hypotheses of several types explained the windows before the last one equally."""
+    clear: int = CLEAR_WINDOWS
+    """Consecutive windows after which one type of hypotheses explained all windows best."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
 
@@ -81,17 +82,12 @@ class SequentialTest:
     @property
     def probabilities(self) -> list[float]:
         """Of each hypothesis."""
-        return probabilities(self.hypotheses, self.margin)
-
-    @property
-    def margin(self) -> float:
-        """Misfit up to which hypotheses are interchangeable: what was ambiguous must be told apart twice as clearly."""
-        return DECISIVE * (2.0 if self.was_ambiguous else 1.0)
+        return probabilities(self.hypotheses)
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether hypotheses of several types explain the windows equally."""
-        return len({self.hypotheses[group[0]].type for group in interchangeable(self.hypotheses, self.margin)}) > 1
+        """Whether hypotheses of several types explain the windows equally, or did so one window before."""
+        return self.clear < CLEAR_WINDOWS or _are_ambiguous(self.hypotheses)
 
     def probability(self, kind: FaultType) -> float:
         """Return the probability of all hypotheses of one type."""
@@ -112,7 +108,7 @@ class SequentialTest:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
         data = [item.deviance - item.hypothesis.prior_deviance for item in self.hypotheses]
         at = self.hypotheses.index(to)
-        equal = {group[0] for group in interchangeable(self.hypotheses, self.margin)}
+        equal = {group[0] for group in interchangeable(self.hypotheses)}
         near = {other for other, deviance in enumerate(data) if abs(deviance - data[at]) <= DECISIVE}
         chosen = sorted((near | equal if at in equal else near) - {at})
         return [(self.hypotheses[other], self.probabilities[other]) for other in chosen]
@@ -163,7 +159,7 @@ def open_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Seque
 
 def follow(test: SequentialTest, window: Window) -> SequentialTest:
     """Return the test after one more window: predict, fit and update every hypothesis, then compare them."""
-    test = replace(test, windows=test.windows + 1, was_ambiguous=test.is_ambiguous)
+    test = replace(test, windows=test.windows + 1)
     steps = [step for step in _steps(test, window) if step.is_usable]
     if not steps:
         return test
@@ -186,10 +182,15 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
         tracked = prune(tracked, [deviance for _, deviance in kept])
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     if test.windows > MAX_OPEN_WINDOWS:
-        hypotheses = without_duplicates(hypotheses, test.margin)
+        hypotheses = without_duplicates(hypotheses)
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     hypotheses = _screened(hypotheses, steps)
-    return replace(test, hypotheses=hypotheses, leading=leading, last=last)
+    clear = 0 if _are_ambiguous(hypotheses) else test.clear + 1
+    return replace(test, hypotheses=hypotheses, leading=leading, clear=clear, last=last)
+
+
+def _are_ambiguous(hypotheses: Sequence[TrackedHypothesis]) -> bool:
+    return len({hypotheses[group[0]].type for group in interchangeable(hypotheses)}) > 1
 
 
 def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
