@@ -84,11 +84,11 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     outcome = decide(test)
     if outcome.update is PosteriorUpdate.HYPOTHESIS:
         result = _adopt_hypothesis(state, estimated, test, outcome)
-    elif outcome.update is PosteriorUpdate.FILTER and not is_tested and not is_expected:
-        # A change in the last records is left to the next window: no other hypothesis was compared.
-        result = WindowResult.unchanged(state, predicted, WindowDecision.SUSPECTED, estimate=estimated)
     elif outcome.update is PosteriorUpdate.FILTER and estimated.cost <= MAX_COST:
-        result = _update_filter(state, predicted, estimated)
+        if is_tested or is_expected:
+            result = _update_filter(state, predicted, estimated)
+        else:  # a change in the last records is left to the next window: no other hypothesis was compared
+            result = WindowResult.unchanged(state, predicted, WindowDecision.SUSPECTED, estimate=estimated)
     else:
         result = _keep_posterior(state, predicted, estimated, test, outcome)
     return replace(result, searched=True)
