@@ -16,9 +16,9 @@ ROOT = Path(__file__).parents[1]
 LINTER = Path(sys.executable).with_name("lint-imports")
 SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root).rglob("*.py"))
 MAX_FILE_LINES = 600
-# 20 000 lines and 130 modules before windows had records at their own times; new features are new files.
+# Room for about one feature: what is added beyond it must replace something.
 MAX_SOURCE_LINES = 24_000  # that are not blank, in daemon and drivers
-MAX_MODULES = 150  # in daemon and drivers
+MAX_MODULES = 145  # in daemon and drivers
 MAX_MODULES_IN_A_FOLDER = 12
 MAX_LAYERS = 12
 
