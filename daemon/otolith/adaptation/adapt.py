@@ -81,6 +81,8 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     if not is_tested and is_expected and not screening.is_positive:
         return _update_filter(state, predicted, estimated)
     test = continue_test(state.test, predicted, screening)
+    if not is_tested and is_expected and test.is_null_possible:
+        return replace(_update_filter(state, predicted, estimated), searched=True)
     outcome = decide(test)
     if outcome.update is PosteriorUpdate.HYPOTHESIS:
         result = _adopt_hypothesis(state, estimated, test, outcome)

@@ -104,6 +104,12 @@ class SequentialTest:
         """Whether a hypothesis of another type explains the windows as well."""
         return any(item.type is not self.best.type for item, _ in self.alternatives(self.best))
 
+    @property
+    def is_null_possible(self) -> bool:
+        """Whether no hypothesis explains the windows decisively better than that nothing has happened."""
+        null = min((item.deviance for item in self.hypotheses if item.type is FaultType.NOTHING), default=np.inf)
+        return null <= DECISIVE
+
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
         data = [item.deviance - item.hypothesis.prior_deviance for item in self.hypotheses]
