@@ -94,7 +94,7 @@ def test_coulomb_friction_is_selected_over_similar_forms() -> None:
     _, documents = run(initial("R_a", "D"), simulated("reversing", 16, Faults(torque=torque, since=5.0)))
     (component,) = documents[-1].components
     assert (component.family, component.input) == ("Coulomb", "omega")
-    assert (component.conditions, component.domain) == ("dry friction", "states that change their sign")
+    assert (component.conditions, component.domain) == ("dry friction", "inputs that change their sign")
     assert component.values["amplitude"].value == pytest.approx(-0.004, rel=0.02)
 
 

@@ -20,6 +20,7 @@ from otolith.twin.component_families import MIN_HUMP, ComponentFamily, SourceKin
 from otolith.twin.definition import Definition
 
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
+FRICTION_OF_INPUT = 100.0  # how much less probable than of a state: 9.2 in -2 log evidence, just below DECISIVE
 COARSE = 1.5  # spectral lines between two frequencies
 ESTIMATE_SHARE = 0.3  # of the required gain: least estimated gain of a spectral line whose gain is computed
 MAX_LINES = 64  # of largest estimated gain, whose gain is computed
@@ -38,17 +39,29 @@ class Alternatives:
     """Index of the first site that is a sensor."""
     of_machine: float
     of_sensors: float
+    states: frozenset[int]
+    """Indices of the sources that are states."""
 
     @classmethod
     def among(cls, problem: Problem, forms: list[CandidateForm]) -> "Alternatives":
         """Count ``forms``."""
-        first = len(problem.base_model.sites)
+        twin = problem.base_model
+        first = len(twin.sites)
         sensors = sum(form.site >= first for form in forms)
-        return cls(first, float(max(len(forms) - sensors, 1)), float(max(sensors, 1)))
+        names = {state.name for state in twin.states}
+        states = frozenset(index for index, source in enumerate(sources(twin)) if source.name in names)
+        return cls(first, float(max(len(forms) - sensors, 1)), float(max(sensors, 1)), states)
 
     def of(self, form: CandidateForm) -> float:
-        """Return the number of forms of the same kind."""
-        return self.of_sensors if self.is_sensor(form) else self.of_machine
+        """Return the number of forms of the same kind.
+
+        Dry friction acts on what moves. The sign of an input, which mostly has the sign of a speed, is a noisy measure
+        of it, and must explain the window clearly better.
+        """
+        if self.is_sensor(form):
+            return self.of_sensors
+        of_input = form.model.threshold_like and form.source not in self.states
+        return self.of_machine * (FRICTION_OF_INPUT if of_input else 1.0)
 
     def is_sensor(self, form: CandidateForm) -> bool:
         """Whether the form is the error of a sensor."""
@@ -114,21 +127,13 @@ def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     """Return the forms that may be searched where the sources are ``x`` (sources, records).
 
     Components in the twin and excluded ones are left out, and all if the twin has no free slot. If discovery is off,
-    only errors of sensors remain. Dry friction acts on what moves: on states. The sign of an input that mostly has the
-    sign of a speed would be a noisy measure of it.
+    only errors of sensors remain.
     """
     twin = problem.base_model
     if len(problem.components) >= MAX_COMPONENTS:
         return []
     taken = problem.excluded | {component.key for component in problem.components}
-    states = {state.name for state in twin.states}
-    names = [source.name for source in sources(twin)]
-    forms = [
-        form
-        for form in candidate_library(twin, x, taken)
-        if (problem.discover or form.site >= len(twin.sites))
-        and (names[form.source] in states or not form.model.threshold_like)
-    ]
+    forms = [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
     friction = [component for component in problem.components if component.model.threshold_like]
     return [bounded for form in forms if (bounded := _beside_friction(twin, form, x, friction)) is not None]
 

@@ -239,13 +239,17 @@ def _with_another_component(best: FittedHypothesis) -> FittedHypothesis | None:
     if not screening.is_positive:
         return None
     candidates = [candidate for candidate in find_candidates(screening.response) if not candidate.of_sensor]
-    proposals = [
-        with_candidate(best.problem, best.fit.prior, candidate, best) for candidate in candidates[: MAX_CANDIDATES // 2]
-    ]
-    further = min(_possible(fit_hypotheses(proposals, window, FAR_WORSE)), key=_chi_square, default=None)
+    half = MAX_CANDIDATES // 2
+    chosen = candidates[:half] + [item for item in candidates[half:] if item.component.model.threshold_like]
+    proposals = [with_candidate(best.problem, best.fit.prior, candidate, best) for candidate in chosen]
+    count = best.fit.count
+    further = min(
+        _possible(fit_hypotheses(proposals, window, FAR_WORSE)),
+        key=lambda item: item.deviance(count, 1.0),
+        default=None,
+    )
     if further is None:
         return None
-    count = best.fit.count
     gain = best.deviance(count, 1.0) - further.deviance(count, 1.0)
     return further if gain / residual_variance_factor([further.chi_square], count) > DECISIVE else None
 

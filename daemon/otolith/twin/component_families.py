@@ -186,7 +186,7 @@ COMPONENT_FAMILIES: tuple[ComponentFamily, ...] = (
                     "time, angles and positions: a sine of anything else could fit almost any signal",
                     frozenset({SourceKind.TIME, SourceKind.PLACE}), _has_frequencies,
                     InnerParameter("frequency", "rad/{x}", _frequencies, 0), phases=(0.0, 0.5 * math.pi)),
-    ComponentFamily("Coulomb", "a*tanh(x/b)", "{a}·sign({x})", "dry friction", "states that change their sign",
+    ComponentFamily("Coulomb", "a*tanh(x/b)", "{a}·sign({x})", "dry friction", "inputs that change their sign",
                     MOTION, _changes_sign, InnerParameter("transition", "{x}", _coulomb_transitions, 2),
                     threshold_like=True, dissipates=True),
     ComponentFamily("Stribeck", f"a*tanh(x/({COULOMB_TRANSITION}*b))*exp(-(x/b)**2)",
