@@ -7,11 +7,12 @@ from hypothesis import strategies as st
 
 from otolith.acquisition.bridging import (
     BridgedInput,
+    InputKind,
     InputSamples,
     LostIntervals,
     OtherSamples,
     bridge,
-    is_recorded_on_change,
+    kind_of,
     line_variance,
     lost_samples,
 )
@@ -30,14 +31,17 @@ WITHIN = 4.0 * np.sqrt(2.0 / DRAWS)  # of a variance: four standard deviations o
 
 def bridged(times: Array, values: Array, plan: SignalPlan, at: Array, steps: Array) -> BridgedInput:
     series = Series(times, values)
-    own = interval_of(times)
-    others = OtherSamples(times, own)
-    return bridge(InputSamples(series, plan, own, lost_samples(series, plan, own, others)), at, steps)
+    return bridged_among(series, kind_of(plan, values), OtherSamples(times, interval_of(times)), at, steps)
+
+
+def bridged_among(series: Series, kind: InputKind, others: OtherSamples, at: Array, steps: Array) -> BridgedInput:
+    own = interval_of(series.times)
+    return bridge(InputSamples(series, kind, 0.0, own, lost_samples(series, kind, own, others)), at, steps)
 
 
 def variance_of_integral(result: BridgedInput, steps: Array) -> float:
     """Return that of independent errors of the records."""
-    return float(np.sum(result.held_variance * steps**2))
+    return float(np.sum(result.error.held_variance * steps**2))
 
 
 @pytest.mark.parametrize("lost", [1, 2, 9])
@@ -50,17 +54,15 @@ def test_the_variance_of_a_lost_command_is_that_of_random_change_instants(lost: 
     records = 29 * PERIOD + at * PERIOD
     steps = np.full(lost + 1, PERIOD)
     if plan is COMMAND:  # its samples are those at which it changes, and the other signals have gaps
-        own = np.array([0.0, after]), np.array([1.0, 4.0])
-        series = Series(*own)
+        series = Series(np.array([0.0, after]), np.array([1.0, 4.0]))
         others = OtherSamples(times, interval_of(times))
-        lost_in = lost_samples(series, plan, interval_of(own[0]), others)
-        result = bridge(InputSamples(series, plan, interval_of(own[0]), lost_in), records, steps)
+        result = bridged_among(series, InputKind.ON_CHANGE, others, records, steps)
     else:
         result = bridged(times, values, plan, records, steps)
     changes = np.random.default_rng(1).integers(1, lost + 2, DRAWS)
     truth = np.where(at[None, :] >= changes[:, None], 4.0, 1.0)
     assert result.values == pytest.approx(truth.mean(axis=0), abs=4.0 * 1.5 / np.sqrt(DRAWS))
-    assert result.variance == pytest.approx(truth.var(axis=0), abs=9.0 * WITHIN)
+    assert result.error.variance == pytest.approx(truth.var(axis=0), abs=9.0 * WITHIN)
     integral = ((truth - result.values) * steps).sum(axis=1)
     assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=2.0 * WITHIN)
 
@@ -78,18 +80,29 @@ def test_a_polled_command_may_change_at_any_instant_between_two_readings(records
     means = 1.0 + 3.0 * np.clip((within[None, :] + step - changes[:, None]) / step, 0.0, 1.0)  # over each step
     assert result.values == pytest.approx(means.mean(axis=0), abs=4.0 * 1.5 / np.sqrt(DRAWS))
     at_record = np.where(changes[:, None] <= within[None, :], 4.0, 1.0)
-    assert result.variance == pytest.approx(np.mean((at_record - result.values) ** 2, axis=0), rel=2.0 * WITHIN)
+    assert result.error.variance == pytest.approx(np.mean((at_record - result.values) ** 2, axis=0), rel=2.0 * WITHIN)
     integral = ((means - result.values) * steps).sum(axis=1)
     assert variance_of_integral(result, steps) == pytest.approx(integral.var(), rel=2.0 * WITHIN)
-    assert result.values - result.expected_change == pytest.approx(np.ones(records))
+    assert result.values - result.error.expected_change == pytest.approx(np.ones(records))
 
 
 def test_a_polled_command_that_keeps_its_value_is_exact() -> None:
     polls = ramp(20) * PERIOD
     result = bridged(polls, np.where(ramp(20) < 10, 1.0, 4.0), POLLED, polls[:9], np.full(9, PERIOD))
     assert (result.values == 1.0).all()
-    assert not result.variance.any()
-    assert not result.held_variance.any()
+    assert not result.error.variance.any()
+    assert not result.error.held_variance.any()
+
+
+def test_a_polled_command_is_exact_where_both_readings_are_equal() -> None:
+    """However long the step of a record is, and before the first reading no change is expected."""
+    polls = ramp(20) * PERIOD
+    values = np.where(ramp(20) < 15, 1.0, 4.0)
+    result = bridged(polls, values, POLLED, np.array([2.0, 12.0]) * PERIOD, np.array([10.0, 1.0]) * PERIOD)
+    assert not result.error.held_variance.any()
+    early = bridged(polls[14:], values[14:], POLLED, polls[10:13], np.full(3, PERIOD))
+    assert (early.values == 1.0).all()
+    assert not early.error.expected_change.any()
 
 
 def test_the_variance_of_a_lost_command_that_always_changes_is_that_of_a_random_walk() -> None:
@@ -103,7 +116,9 @@ def test_the_variance_of_a_lost_command_that_always_changes_is_that_of_a_random_
     values[400:] += values[399] - values[400]  # the walk comes back to where it was: its ends show no change
     steps = np.full(lost + 1, PERIOD)
     result = bridged(times, values, SAMPLED, (399 + ramp(lost + 1)) * PERIOD, steps)
-    assert result.variance[1:] == pytest.approx(truth.var(axis=0)[1:], rel=0.25)  # of the walk's own scale: 800 samples
+    assert result.error.variance[1:] == pytest.approx(
+        truth.var(axis=0)[1:], rel=0.25
+    )  # of the walk's own scale: 800 samples
     integral = (truth * steps).sum(axis=1)
     assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=0.25)
 
@@ -123,8 +138,10 @@ def test_the_variance_of_a_line_through_a_random_walk(between: int) -> None:
     steps = np.full(between, PERIOD)
     result = bridged(times, walk[::between], MEASURED, at, steps)
     truth = bridges(random, between)
-    assert result.variance[0] == 0.0
-    assert result.variance[1:] == pytest.approx(truth.var(axis=0)[1:], rel=0.15)  # of a walk's scale from 2000 samples
+    assert result.error.variance[0] == 0.0
+    assert result.error.variance[1:] == pytest.approx(
+        truth.var(axis=0)[1:], rel=0.15
+    )  # of a walk's scale from 2000 samples
     integral = (truth * steps).sum(axis=1)
     assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=0.2)
 
@@ -151,7 +168,7 @@ def test_the_variance_after_the_last_sample_is_that_of_a_random_walk(late: int) 
     result = bridged(ramp(4000) * PERIOD, values, MEASURED, at, steps)
     walks = np.concatenate([np.zeros((DRAWS, 1)), np.cumsum(random.normal(size=(DRAWS, late - 1)), axis=1)], axis=1)
     assert np.array_equal(result.values, np.full(late, values[-1]))
-    assert result.variance == pytest.approx(walks.var(axis=0), rel=0.1, abs=1e-9)
+    assert result.error.variance == pytest.approx(walks.var(axis=0), rel=0.1, abs=1e-9)
     integral = (walks * steps).sum(axis=1)
     assert variance_of_integral(result, steps) == pytest.approx(np.mean(integral**2), rel=0.15)
 
@@ -163,7 +180,7 @@ def test_before_its_first_sample_an_input_is_uncertain() -> None:
     for plan in (MEASURED, SAMPLED, COMMAND):
         result = bridged(ramp(4000) * PERIOD, values, plan, at, steps)
         assert np.array_equal(result.values, np.full(40, values[0]))
-        assert result.variance == pytest.approx(40.0 - np.arange(40.0), rel=0.15)
+        assert result.error.variance == pytest.approx(40.0 - np.arange(40.0), rel=0.15)
 
 
 def test_the_noise_of_samples_that_are_far_apart_lasts_longer() -> None:
@@ -174,8 +191,8 @@ def test_the_noise_of_samples_that_are_far_apart_lasts_longer() -> None:
     noise = random.normal(size=(DRAWS, len(times)))
     integrals = np.array([np.sum(np.interp(at, times, row) * steps) for row in noise[:4000]])
     result = bridged(times, np.zeros(len(times)), MEASURED, at, steps)
-    assert result.noise_ratio == pytest.approx(between)
-    assert np.sum(result.noise_ratio * steps**2) == pytest.approx(np.var(integrals), rel=0.1)
+    assert result.error.noise_ratio == pytest.approx(between)
+    assert np.sum(result.error.noise_ratio * steps**2) == pytest.approx(np.var(integrals), rel=0.1)
 
 
 def test_a_command_that_is_recorded_on_change_is_exact_while_it_holds() -> None:
@@ -183,20 +200,21 @@ def test_a_command_that_is_recorded_on_change_is_exact_while_it_holds() -> None:
     series = Series(np.array([0.0, 0.5, 1.5]), np.array([1.0, 2.0, 0.5]))
     at = np.arange(0.0, 2.0, PERIOD)
     others = OtherSamples(at, Interval(PERIOD, 1.5 * PERIOD))
-    assert is_recorded_on_change(COMMAND, series.values)
+    assert kind_of(COMMAND, series.values) is InputKind.ON_CHANGE
     for other in (others, NO_OTHERS, OtherSamples(at[::7] + 0.003, Interval(0.07, 0.1))):
-        lost = lost_samples(series, COMMAND, interval_of(series.times), other)
-        result = bridge(InputSamples(series, COMMAND, interval_of(series.times), lost), at, np.full(len(at), PERIOD))
+        result = bridged_among(series, InputKind.ON_CHANGE, other, at, np.full(len(at), PERIOD))
         assert np.array_equal(result.values, np.where(at < 0.5, 1.0, np.where(at < 1.5, 2.0, 0.5)))
-        assert not result.variance.any()
-        assert not result.held_variance.any()
+        assert not result.error.variance.any()
+        assert not result.error.held_variance.any()
 
 
 def test_the_machine_file_says_whether_a_command_is_recorded_on_change() -> None:
     repeated = np.array([1.0, 1.0, 2.0])
-    assert not is_recorded_on_change(COMMAND, repeated)
-    assert is_recorded_on_change(SignalPlan("u", "zoh", on_change=True), repeated)
-    assert not is_recorded_on_change(SAMPLED, np.array([1.0, 2.0]))
+    assert kind_of(COMMAND, repeated) is InputKind.SAMPLED
+    for sampling in Sampling:
+        assert kind_of(SignalPlan("u", "zoh", sampling, on_change=True), repeated) is InputKind.ON_CHANGE
+    assert kind_of(SAMPLED, np.array([1.0, 2.0])) is InputKind.SAMPLED
+    assert kind_of(POLLED, np.array([1.0, 2.0])) is InputKind.POLLED
 
 
 @given(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=8, unique=True), st.floats(-1.0, 11.0), st.floats(0.0, 3.0))

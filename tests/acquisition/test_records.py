@@ -216,6 +216,19 @@ def test_the_grid_follows_a_clock_whose_signals_are_all_delayed() -> None:
         assert window.column("x") == pytest.approx(expected, abs=2.0 * drift * RECORDS * PERIOD + 1e-3)
 
 
+def test_a_polled_command_may_change_after_its_last_reading_in_a_window() -> None:
+    """The first reading after the window differs; outputs come with requests of their own."""
+    polls, outputs = ramp(300) * 0.02, ramp(300) * 0.02 + 0.007
+    command = np.where(polls < SPAN.length + 0.001, 1.0, 4.0)
+    series = {"u": Series(polls, command), "x": Series(outputs, np.sin(outputs))}
+    plans = {"u": SignalPlan("u", "zoh", sampling=Sampling.POLLED), "x": SignalPlan("x", sampling=Sampling.POLLED)}
+    records = make_records(series, plans, GridSpan(SPAN.start + 0.01, SPAN.records, SPAN.period))
+    last = float(polls[command == 1.0][-1])
+    assert np.abs(records.grid.offsets + SPAN.start + 0.01 - last).min() < 1e-9
+    assert records.bridge_error is not None
+    assert records.bridge_error.expected_change[-1, 0] > 0.0
+
+
 @pytest.mark.parametrize("read", [2, 5])
 def test_a_polled_command_is_recorded_as_it_was_read(read: int) -> None:
     """The value of a record allows for a change before the next reading; the reading is kept."""

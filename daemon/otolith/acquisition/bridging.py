@@ -9,12 +9,13 @@ itself: a sample against the line through its neighbours, at two spacings, gives
 """
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
 from otolith.acquisition.alignment import Indices
 from otolith.acquisition.samples import Interval, Series, SignalPlan
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, BridgeError
 from otolith_drivers.base import Sampling
 
 LINE_NOISE = 1.5  # variance of a sample about the line through its neighbours, in variances of the noise of a sample
@@ -22,6 +23,35 @@ NORMAL_SQUARE_MEDIAN = 0.455  # of the square of a standard normal deviate
 EXPONENTS = (1.0, 4.0)  # of the variance of a line, by its length: a random walk, and a smooth curve
 MIN_STEP = 1e-9  # s; against division by the step between two equal times
 ROUNDING = 1e-6  # usual intervals: rounding of the times of lost instants
+
+
+class InputKind(StrEnum):
+    """What an input does between its samples."""
+
+    LINE = "line"
+    """A measured quantity: near the line between two samples."""
+    SAMPLED = "sampled"
+    """A command that changes at its samples only."""
+    ON_CHANGE = "on change"
+    """A command that is recorded when it changes, and holds until then."""
+    POLLED = "polled"
+    """A command that may change at any time between two readings."""
+
+
+def kind_of(plan: SignalPlan, values: Array) -> InputKind:
+    """Return the kind of an input with samples ``values`` (n,).
+
+    Without ``on_change`` in the machine file, a command is recorded on change if no value is repeated. A polled command
+    that keeps its value is exact between its readings.
+    """
+    if plan.hold != "zoh":
+        return InputKind.LINE
+    changes = np.diff(values) != 0.0
+    if plan.on_change is None and plan.sampling is not Sampling.POLLED:
+        return InputKind.ON_CHANGE if changes.all() else InputKind.SAMPLED
+    if plan.on_change:
+        return InputKind.ON_CHANGE
+    return InputKind.POLLED if plan.sampling is Sampling.POLLED and changes.any() else InputKind.SAMPLED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,16 +84,17 @@ class OtherSamples:
     """Of the signal that comes most often."""
 
 
-def lost_samples(series: Series, plan: SignalPlan, own: Interval, others: OtherSamples) -> LostIntervals:
+def lost_samples(series: Series, kind: InputKind, own: Interval, others: OtherSamples) -> LostIntervals:
     """Return where samples of an input were lost.
 
     A command that is recorded when it changes has no sample while it holds, although other signals have theirs. Its
-    changes are lost only with the samples of all others, and never if they are recorded apart from the others.
+    changes are lost only with the samples of all others, and never if they are recorded apart from the others. A polled
+    command may change at all times, so that a lost reading adds no instant.
     """
     starts, ends, usual = series.times[:-1], series.times[1:], own.usual
-    if may_change_unseen(plan, series.values):
+    if kind is InputKind.POLLED:
         long = np.zeros(len(starts), dtype=np.bool_)
-    elif plan.hold != "zoh" or not is_recorded_on_change(plan, series.values):
+    elif kind is not InputKind.ON_CHANGE:
         long = ends - starts > own.longest
     elif np.isin(series.times, others.times).all():
         last = np.searchsorted(others.times, ends) - 1
@@ -74,28 +105,14 @@ def lost_samples(series: Series, plan: SignalPlan, own: Interval, others: OtherS
     return LostIntervals(starts[long], ends[long], np.full(int(long.sum()), usual))
 
 
-def is_recorded_on_change(plan: SignalPlan, values: Array) -> bool:
-    """Whether a command is recorded only when it changes: as the machine file has it, else if no value is repeated."""
-    if plan.on_change is not None:
-        return plan.on_change
-    return plan.sampling is not Sampling.POLLED and bool((np.diff(values) != 0.0).all())
-
-
-def may_change_unseen(plan: SignalPlan, values: Array) -> bool:
-    """Whether an input is a command that may change between two readings, and does change in ``values``."""
-    polled = plan.hold == "zoh" and plan.sampling is Sampling.POLLED and not is_recorded_on_change(plan, values)
-    return polled and bool((np.diff(values) != 0.0).any())
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class BridgedInput:
-    """An input at the records of a window, (records,) each; see :class:`otolith.acquisition.window.BridgeError`."""
+    """An input at the records of a window."""
 
     values: Array
-    noise_ratio: Array
-    variance: Array
-    held_variance: Array
-    expected_change: Array
+    """(records,)."""
+    error: BridgeError
+    """Of this input: (records,) each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,14 +120,11 @@ class InputSamples:
     """The samples of an input, at least one, and where some were lost."""
 
     series: Series
-    plan: SignalPlan
+    kind: InputKind
+    noise: float
+    """Standard deviation of the noise of a sample."""
     interval: Interval
     lost: LostIntervals
-
-    @property
-    def is_held(self) -> bool:
-        """Whether the input keeps its value until the next sample, however late that comes."""
-        return self.plan.hold == "zoh" and is_recorded_on_change(self.plan, self.series.values)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,21 +146,21 @@ def bridge(samples: InputSamples, times: Array, steps: Array) -> BridgedInput:
     length = series.times[after] - series.times[before]
     ended = after == before
     spacing = np.where(ended, usual if np.isfinite(usual) else steps, length)
-    none = np.zeros(len(times))
-    if samples.plan.hold == "zoh":
-        values, error = _hold(samples, times, before)
-    else:
+    if samples.kind is InputKind.LINE:
         values, error = _line(samples, times, before, after)
+    else:
+        values, error = _hold(samples, times, before)
     outdated = _outdated(samples, times)
     variance = error.variance + outdated.variance
     duration = np.where(outdated.variance > 0.0, outdated.duration, error.duration)
     held_variance = variance * np.maximum(1.0, duration / steps)
-    expected_change = none
-    if may_change_unseen(samples.plan, series.values):
+    expected_change = np.zeros(len(times))
+    if samples.kind is InputKind.POLLED:
         unseen = _unseen_change(samples, times, steps, before, after)
         values, expected_change = values + unseen.expected, unseen.expected
         variance, held_variance = variance + unseen.variance, held_variance + unseen.held_variance
-    return BridgedInput(values, np.maximum(spacing, steps) / steps, variance, held_variance, expected_change)
+    noise_ratio = np.maximum(spacing, steps) / steps
+    return BridgedInput(values, BridgeError(noise_ratio, variance, held_variance, expected_change))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,18 +174,18 @@ class _UnseenChange:
 
 
 def _unseen_change(samples: InputSamples, times: Array, steps: Array, before: Indices, after: Indices) -> _UnseenChange:
-    """Return what a command may have changed since its last reading; each instant until the next one is as likely."""
+    """Return what a command may have changed since its last reading; each instant until the next one is as likely.
+
+    Where readings were lost, it may also have wandered and come back.
+    """
     series = samples.series
-    length = np.maximum(series.times[after] - series.times[before], steps)
-    change = series.values[after] - series.values[before]
-    wander = np.where(
-        length > samples.interval.longest,
-        _usual_change(series, samples.interval) * length / samples.interval.usual,
-        0.0,
-    )
-    share = np.clip((times - series.times[before]) / length, 0.0, 1.0)
-    half_step = np.where(after > before, 0.5 * steps / length, 0.0)
-    squared = np.where(after > before, np.maximum(change**2, wander), 0.0)
+    interval, since = series.times[after] - series.times[before], times - series.times[before]
+    length = np.maximum(interval, steps)
+    between = (interval > 0.0) & (since >= -ROUNDING * steps)
+    change = np.where(between, series.values[after] - series.values[before], 0.0)
+    wander = _usual_change(series, samples.interval) * interval / samples.interval.usual
+    squared = np.maximum(change**2, np.where(between & (interval > samples.interval.longest), wander, 0.0))
+    share, half_step = np.clip(since / length, 0.0, 1.0), 0.5 * steps / length
     return _UnseenChange(
         change * (share + half_step),
         squared * (share * (1.0 - share) + half_step**2),
@@ -214,7 +228,7 @@ def _line(samples: InputSamples, times: Array, before: Indices, after: Indices) 
     inside = spread > ROUNDING
     if not inside.any():
         return values, _Error(none, none)
-    middle = line_variance(series, samples.plan.noise)
+    middle = line_variance(series, samples.noise)
     return values, _Error(np.where(inside, middle(length) * spread, 0.0), 0.5 * length)
 
 
@@ -259,14 +273,14 @@ def _outdated(samples: InputSamples, times: Array) -> _Error:
     """Return the error before the first and after the last sample, which grows with the distance in time."""
     series, none = samples.series, np.zeros(len(times))
     early, late = np.maximum(series.times[0] - times, 0.0), np.maximum(times - series.times[-1], 0.0)
-    if samples.is_held:
+    if samples.kind is InputKind.ON_CHANGE:
         late = none
-    elif samples.plan.hold == "zoh" and samples.plan.sampling is not Sampling.POLLED:
+    elif samples.kind is InputKind.SAMPLED:
         late = np.where(late > samples.interval.longest, late, 0.0)
     away = early + late
     if not away.any() or len(series.times) < 2:
         return _Error(none, none)
     with np.errstate(over="ignore", invalid="ignore"):
-        change = float(np.mean(np.diff(series.values) ** 2)) - 2.0 * samples.plan.noise**2
+        change = float(np.mean(np.diff(series.values) ** 2)) - 2.0 * samples.noise**2
     change = max(change, 0.0) if np.isfinite(change) else 0.0
     return _Error(change * away / samples.interval.usual, away)

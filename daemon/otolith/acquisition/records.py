@@ -13,13 +13,13 @@ import numpy as np
 from otolith.acquisition.alignment import Indices
 from otolith.acquisition.bridging import (
     BridgedInput,
+    InputKind,
     InputSamples,
     LostIntervals,
     OtherSamples,
     bridge,
-    is_recorded_on_change,
+    kind_of,
     lost_samples,
-    may_change_unseen,
 )
 from otolith.acquisition.samples import Check, Interval, Series, SignalPlan, interval_of, stale_repeats
 from otolith.acquisition.time_grid import GridSpan, TimeGrid
@@ -29,6 +29,7 @@ from otolith.acquisition.window import Array, BridgeError, Mask
 ON_GRID = 1e-3  # sample periods: distance of a true time from the grid that is rounding
 EARLY = 2.0 * ON_GRID  # sample periods before the window that belong to its first record: rounding on both sides
 SAME_TIME = 1e-6  # s below which two samples belong to one record
+NO_OTHERS = OtherSamples(np.zeros(0), Interval(np.inf, np.inf))
 MAX_LOST_RECORDS = 4  # records of the grid: more lost instants of an input than that get no records
 
 
@@ -86,41 +87,47 @@ def make_records(series: Mapping[str, Series], plans: Mapping[str, SignalPlan], 
     whole = (samples.within(start - early, span.end - early) for samples in series.values())
     stale = sum(len(samples.times) for samples in whole) - sum(len(samples.times) for samples in inside.values())
     on_grid = all(lies_on_grid(samples.times, start, period) for samples in inside.values())
+    kinds = {
+        name: kind_of(plan, fresh[name].values)
+        for name, plan in plans.items()
+        if plan.hold is not None and len(fresh[name].times)
+    }
     incomplete = [
         name
-        for name, plan in plans.items()
-        if plan.hold is not None
-        and len(fresh[name].times)
-        and not (
-            on_grid and len(inside[name].times) == span.records and not may_change_unseen(plan, fresh[name].values)
-        )
+        for name, kind in kinds.items()
+        if kind is InputKind.POLLED or not on_grid or len(inside[name].times) != span.records
     ]
     intervals = {name: interval_of(samples.times) for name, samples in fresh.items()} if incomplete else {}
     lost = {
-        name: lost_samples(fresh[name], plans[name], intervals[name], _others(name, fresh, intervals))
+        name: lost_samples(
+            fresh[name],
+            kinds[name],
+            intervals[name],
+            _others(name, fresh, intervals) if kinds[name] is InputKind.ON_CHANGE else NO_OTHERS,
+        )
         for name in incomplete
     }
-    grid = TimeGrid.uniform(span.records, period) if on_grid else _own_times(inside, plans, lost.values(), span)
+    grid = (
+        TimeGrid.uniform(span.records, period)
+        if on_grid
+        else _own_times(fresh, kinds, lost.values(), span, start - early)
+    )
     values, missing = np.zeros((grid.records, len(plans))), np.ones((grid.records, len(plans)), dtype=np.bool_)
     bridged: dict[int, BridgedInput] = {}
     for column, (name, plan) in enumerate(plans.items()):
         at = _records_of(inside[name].times - start, grid, period)
         missing[at, column] = False
+        values[at, column] = inside[name].values
         if name in lost:
-            samples = InputSamples(fresh[name], plan, intervals[name], lost[name])
+            samples = InputSamples(fresh[name], kinds[name], plan.noise, intervals[name], lost[name])
             bridged[column] = bridge(samples, start + grid.offsets, grid.steps)
-            values[:, column] = bridged[column].values
+            values[:, column] = np.where(missing[:, column], bridged[column].values, values[:, column])
+            values[at, column] += bridged[column].error.expected_change[at]
         elif len(at) < grid.records:
-            values[:, column] = _filled(fresh[name], start + grid.offsets)
-        if column in bridged and bridged[column].expected_change.any():
-            values[at, column] = inside[name].values + bridged[column].expected_change[at]
-        else:
-            values[at, column] = inside[name].values
-    held = frozenset(
-        name
-        for name in incomplete
-        if plans[name].hold == "zoh" and is_recorded_on_change(plans[name], fresh[name].values)
-    )
+            values[:, column] = np.where(
+                missing[:, column], _filled(fresh[name], start + grid.offsets), values[:, column]
+            )
+    held = frozenset(name for name in incomplete if kinds[name] is InputKind.ON_CHANGE)
     unknown = frozenset(name for name, plan in plans.items() if plan.hold is not None and not len(fresh[name].times))
     return Records(grid, values, missing, _bridge_error(bridged, values.shape), stale, held, unknown)
 
@@ -136,17 +143,25 @@ def _others(name: str, series: Mapping[str, Series], intervals: Mapping[str, Int
 
 
 def _own_times(
-    inside: Mapping[str, Series], plans: Mapping[str, SignalPlan], lost: Iterable[LostIntervals], span: GridSpan
+    series: Mapping[str, Series],
+    kinds: Mapping[str, InputKind],
+    lost: Iterable[LostIntervals],
+    span: GridSpan,
+    begin: float,
 ) -> TimeGrid:
-    """Return the grid of all times at which something is measured or an input may change."""
+    """Return the grid of all times from ``begin`` (s) on at which something is measured or an input may change.
+
+    A polled command may change after a reading that the next one differs from.
+    """
     times = [np.array([span.start])]
-    for name, samples in inside.items():
+    for name, samples in series.items():
+        first, last = np.searchsorted(samples.times, (begin, begin + span.length))
         changed = np.ones(len(samples.times), dtype=np.bool_)
-        if plans[name].hold == "zoh":
+        if kinds.get(name, InputKind.LINE) is not InputKind.LINE:
             changed[1:] = np.diff(samples.values) != 0.0
-            if may_change_unseen(plans[name], samples.values):
+            if kinds[name] is InputKind.POLLED:
                 changed[:-1] |= changed[1:]
-        times.append(samples.times[changed])
+        times.append(samples.times[first:last][changed[first:last]])
     times += [intervals.instants(span.start, span.end, MAX_LOST_RECORDS * span.records) for intervals in lost]
     offsets = np.maximum(np.sort(np.concatenate(times)) - span.start, 0.0)
     apart = np.concatenate([[True], np.diff(offsets) > SAME_TIME])
@@ -177,8 +192,8 @@ def _bridge_error(bridged: Mapping[int, BridgedInput], shape: tuple[int, ...]) -
         return None
     error = BridgeError(np.ones(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
     for column, item in bridged.items():
-        error.noise_ratio[:, column] = item.noise_ratio
-        error.variance[:, column] = item.variance
-        error.held_variance[:, column] = item.held_variance
-        error.expected_change[:, column] = item.expected_change
+        error.noise_ratio[:, column] = item.error.noise_ratio
+        error.variance[:, column] = item.error.variance
+        error.held_variance[:, column] = item.error.held_variance
+        error.expected_change[:, column] = item.error.expected_change
     return error

@@ -56,7 +56,7 @@ class SignalPlan:
     @property
     def needs_next_sample(self) -> bool:
         """Whether its value between two samples depends on the second one."""
-        return self.hold == "foh" or (self.hold == "zoh" and self.sampling is Sampling.POLLED)
+        return self.hold == "foh" or (self.hold == "zoh" and self.sampling is Sampling.POLLED and not self.on_change)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

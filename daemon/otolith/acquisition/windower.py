@@ -16,7 +16,7 @@ from otolith.acquisition.window import Window
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 GRACE_PERIOD = 0.1  # s after its end that a window waits for late samples, at least,
-SLOW_GRACE = 1.5  # or so many intervals of the slowest measured input, at most a window's length
+SLOW_GRACE = 1.5  # or so many intervals of the slowest input that needs its next sample, at most a window's length
 
 
 @dataclass(slots=True)
