@@ -54,6 +54,8 @@ class RecordedMachine:
     """Those that are estimated."""
     sampling: Sampling
     """Meaning of the times of its samples."""
+    delays: Mapping[str, float]
+    """Of its signals, s: they are subtracted from the times of the records."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +94,8 @@ class LoadedMachine:
 
     def recorded(self, sampling: Sampling) -> RecordedMachine:
         """Return what a recording has beside the reports; ``sampling`` is the meaning of the times of the source."""
-        return RecordedMachine(self.title, self.twin, self.problem.free, sampling)
+        delays = {name: self.signal_tables[name].delay for name in self.twin.signals}
+        return RecordedMachine(self.title, self.twin, self.problem.free, sampling, delays)
 
     @property
     def limits(self) -> QualityLimits:

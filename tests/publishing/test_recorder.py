@@ -78,6 +78,26 @@ def test_a_replayed_recording_gives_the_same_reports(
     assert "windows that were bad when they were recorded, left out: 1" in summed_up(path, capsys)
 
 
+def test_the_delay_of_a_signal_is_subtracted_once(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The recording has corrected times; a bad window is left out by them, not by the times of the readings."""
+    late = tmp_path / "late.toml"
+    late.write_text(
+        MACHINE.read_text(encoding="utf-8") + '\n[signals]\nomega = { delay = "30 ms" }\n', encoding="utf-8"
+    )
+    for row in rows[RECORDS : 2 * RECORDS]:
+        row[3:5] = "", ""
+    delayed = [[row[0], *row[1:4], rows[index - 3][4] if index >= 3 else ""] for index, row in enumerate(rows)]
+    path = tmp_path / "late.rrd"
+    replay(late, [written(tmp_path, delayed)], path, as_json=True, stopped=lambda: False)
+    replay(late, [path], None, as_json=True, stopped=lambda: False)
+    lines = [ReportDocument.from_json(line) for line in capsys.readouterr().out.splitlines()]
+    first, again = lines[: len(lines) // 2], lines[len(lines) // 2 :]
+    assert len(first) >= 4
+    assert_same(first, again, share=0.1)
+
+
 def test_two_replays_of_a_recording_are_identical(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -151,7 +151,7 @@ def test_the_recorder_ends_before_the_disk_is_full(tmp_path: Path, monkeypatch: 
     usage = namedtuple("usage", ["total", "used", "free"])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(1 << 40, 1 << 40, 1 << 20))
     twin = find_twin("dc_motor")
-    recorder.main(Pipe(), tmp_path / "full.rrd", RecordedMachine("full", twin, twin.parameters[:1], Sampling.TRUE))
+    recorder.main(Pipe(), tmp_path / "full.rrd", RecordedMachine("full", twin, twin.parameters[:1], Sampling.TRUE, {}))
     assert not (tmp_path / "full.rrd").exists()
 
 

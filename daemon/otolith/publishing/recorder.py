@@ -5,6 +5,7 @@ entity and window; an output's entity carries measured and predicted side by sid
 so that it can be replayed.
 """
 
+import json
 import logging
 import math
 import re
@@ -27,7 +28,7 @@ log = logging.getLogger(__name__)
 
 APPLICATION = "otolith"
 TIMELINE = "time"
-SAMPLING = "sampling"  # entity with the meaning of the times, for otolith_drivers.replay.recording
+TIMES = "times"  # entity with the meaning of the times, for otolith_drivers.replay.recording
 MIN_FREE_BYTES = 100 << 20  # kept free on the disk, see docs/reference/thresholds-runtime.md
 MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
 
@@ -62,7 +63,8 @@ class Recording:
         self._stream.set_log_time_enabled(False)
         self._stream.save(path, default_blueprint=blueprint(twin, parameters))
         self._stream.send_recording_name(source.title)
-        self._stream.log(SAMPLING, rr.TextDocument(source.sampling), static=True)
+        times = json.dumps({"sampling": source.sampling, "delays": dict(source.delays)})
+        self._stream.log(TIMES, rr.TextDocument(times), static=True)
         for signal in twin.inputs:
             self._style(f"signals/{signal.name}", [f"{signal.name} measured [{signal.unit}]"], [MEASURED])
         for output in twin.outputs:

@@ -2,9 +2,10 @@
 
 A missing record is NaN in the file and no reading in the replay. The records of a cyclic source have the times of its
 clock, not those of the arrivals; a window may have been bad because of when its samples came. So the records of bad
-windows are left out.
+windows are left out. Delays that the machine file declared are added again, because a replay subtracts them.
 """
 
+import json
 import re
 import subprocess
 import sys
@@ -31,7 +32,7 @@ MAX_NS, MIN_NS = np.iinfo(np.int64).max, np.iinfo(np.int64).min
 # The layout of otolith.publishing.recorder.
 APPLICATION, TIMELINE = "otolith", "time"
 VALUES, NAMES = "Scalars:scalars", "SeriesLines:names"
-FOLDER, WINDOWS, SAMPLING = "/signals/", "/windows", "/sampling"
+FOLDER, WINDOWS, TIMES = "/signals/", "/windows", "/times"
 TEXT = "TextDocument:text"
 READ_ALL = "import sys; from rerun.chunk import RrdReader; [None for _ in RrdReader(sys.argv[1]).stream()]"
 NAME = re.compile(r".* measured \[(.*)\]")  # of a series; the group is the unit
@@ -72,6 +73,7 @@ class RecordingReader(Reader):
             self._file = self._guarded(RrdReader, path)
         self._closed = not raised
         self._bad_windows: list[tuple[float, float]] = []  # ns; from the first record to before the next window
+        self._delays: dict[str, int] = {}  # ns; subtracted from the recorded times, so that the readings came later
         self._units, self._chunks = units, dict.fromkeys(units, 0)
         written = self._scan()
         self._scales = {name: self._scale(name, unit, written) for name, unit in units.items()}
@@ -119,11 +121,17 @@ class RecordingReader(Reader):
                 units[name] = written[1] if written else ""
             elif name in self._chunks:
                 self._chunks[name] += 1
-            elif str(chunk.entity_path) == SAMPLING:
-                self.sampling = Sampling(chunk.to_record_batch().column(TEXT).to_pylist()[0][0])
+            elif str(chunk.entity_path) == TIMES:
+                self._guarded(self._note_times, chunk.to_record_batch().column(TEXT).to_pylist()[0][0])
             elif str(chunk.entity_path) == WINDOWS and not chunk.is_static:
                 self._note_windows(chunk.to_record_batch().column(VALUES).to_pylist())
         return units
+
+    def _note_times(self, text: str) -> None:
+        """Note what the times mean; an unknown text is a ``ValueError``."""
+        written = json.loads(text)
+        self.sampling = Sampling(written["sampling"])
+        self._delays = {name: round(1e9 * delay) for name, delay in written["delays"].items()}
 
     def _note_windows(self, windows: list[Any]) -> None:
         for window in windows:
@@ -173,7 +181,9 @@ class RecordingReader(Reader):
             self.bad += len(times)
             return times[:0], numbers[:0]
         scale, offset = self._scales[name]
-        return times, scale * numbers.reshape(len(times), width)[:, 0] + offset
+        values = scale * numbers.reshape(len(times), width)[:, 0] + offset
+        values[self._in_bad_window(times)] = np.nan
+        return times + self._delays.get(name, 0), values
 
     def _rows(self, buffers: dict[str, "_SignalBuffer"], until: int) -> Iterator[Rows]:
         """The rows up to ``until`` (ns), one for each time at which any signal has a reading."""
@@ -181,23 +191,22 @@ class RecordingReader(Reader):
         grid = np.unique(np.concatenate([times for times, _ in parts.values()]))
         if not len(grid):
             return
-        left_out = self._in_bad_window(grid)
         columns = {}
         for name, (times, values) in parts.items():
             column = np.full(len(grid), np.nan)
             column[np.searchsorted(grid, times)] = values
-            columns[name] = np.where(left_out, np.nan, column)
+            columns[name] = column
         first = self._records + 1
         self._records += len(grid)
         numbers = np.arange(first, self._records + 1)
         yield Rows(grid / 1e9, columns, numbers, np.full(len(grid), self.bad, dtype=np.int64))
 
-    def _in_bad_window(self, grid: Integers) -> Mask:
-        first, last = float(grid[0]), float(grid[-1])
-        inside: Mask = np.zeros(len(grid), dtype=np.bool_)
-        for begin, end in self._bad_windows:
-            if begin <= last and end > first:
-                inside |= (grid >= begin) & (grid < end)
+    def _in_bad_window(self, times: Integers) -> Mask:
+        if not self._bad_windows:
+            return np.zeros(len(times), dtype=np.bool_)
+        begins, ends = np.array(sorted(self._bad_windows)).T
+        at = np.searchsorted(begins, times, side="right") - 1
+        inside: Mask = (at >= 0) & (times < ends[at])
         return inside
 
     def describe(self) -> list[str]:
