@@ -135,6 +135,14 @@ def test_rows_in_reversed_order_are_an_error_before_any_report(
     assert capsys.readouterr().out == ""
 
 
+def test_each_file_of_a_replay_is_checked(tmp_path: Path, scenario: MotorScenario) -> None:
+    rows = recorded(scenario)
+    first = written(tmp_path, rows).rename(tmp_path / "first.csv")
+    second = written(tmp_path, rows[::-1]).rename(tmp_path / "second.csv")
+    with pytest.raises(ConfigurationError, match=r"second\.csv: time decreases from row to row"):
+        replay(MACHINE, [first, second], None, as_json=True, stopped=lambda: False)
+
+
 def test_rows_that_are_reversed_in_small_groups_are_sorted(
     tmp_path: Path, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
 ) -> None:

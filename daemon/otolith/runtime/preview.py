@@ -7,7 +7,7 @@ right as the noise levels of the machine file.
 import math
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -17,7 +17,7 @@ import numpy as np
 
 from otolith.acquisition.quality import ReasonCounts
 from otolith.acquisition.recording_statistics import RecordingStatistics, SignalSampling
-from otolith.acquisition.samples import Check
+from otolith.acquisition.samples import Check, SignalPlan
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.estimation.information import QUANTILE, AccuracyTarget, Identifiability, classify, information
@@ -26,7 +26,6 @@ from otolith.estimation.problem import Problem, WindowOptions
 from otolith.machine import MIN_WINDOW_RECORDS, LoadedMachine
 from otolith.runtime.replay import Replay, Stopped, open_recorded
 from otolith.runtime.worker import perform, warm_up
-from otolith_drivers.base import Sampling
 from otolith_drivers.errors import counted
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
@@ -197,7 +196,7 @@ def preview_recording(
         is_partial=max_rows is not None,
         computing_s=median(seconds) if seconds else None,
         longest_computing_s=max(seconds, default=None),
-        remarks=tuple(_remarks(machine, statistics, samplings)),
+        remarks=tuple(_remarks(survey.plans, statistics, samplings)),
     )
 
 
@@ -207,6 +206,7 @@ class _Survey:
 
     machine: LoadedMachine
     sources: tuple[str, ...]
+    plans: tuple[SignalPlan, ...]
     statistics: RecordingStatistics
     windows: WindowPreview
     chosen: list[Window]
@@ -256,7 +256,7 @@ def _survey(
         refusals=tuple(f"{count} like: {example}" for count, example in refusals.most_frequent()),
         parameters=expected_accuracy(machine.problem, chosen),
     )
-    return _Survey(machine, sources, run.statistics, preview, chosen)
+    return _Survey(machine, sources, machine.plans(reader.sampling), run.statistics, preview, chosen)
 
 
 def _moves(problem: Problem, window: Window) -> bool:
@@ -393,7 +393,7 @@ def _signal(unit: str, sampling: SignalSampling) -> SignalPreview:
 
 
 def _remarks(
-    machine: LoadedMachine, statistics: RecordingStatistics, samplings: dict[str, SignalSampling]
+    plans: Iterable[SignalPlan], statistics: RecordingStatistics, samplings: dict[str, SignalSampling]
 ) -> Iterator[str]:
     """Yield what a user should know of the rows, a sentence each; signals with the same remark share it."""
     if statistics.first_step_back is not None:
@@ -402,7 +402,7 @@ def _remarks(
         first = ", the first" if statistics.steps_back > 1 else ""
         yield f"{count}{first} in line {line}: t = {time:.12g} after t = {before:.12g}"
     shared: dict[str, list[str]] = {}
-    for plan in machine.plans(Sampling.TRUE):
+    for plan in plans:
         sampling = samplings[plan.name]
         remarks = [*_signal_remarks(sampling)]
         if plan.hold != "zoh" and Check.STALE in plan.checks:  # a command repeats what it holds

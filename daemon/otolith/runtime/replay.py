@@ -161,12 +161,13 @@ class Replay:
         Raises:
             ConfigurationError: as :meth:`reports`.
         """
-        counts = self._playback.counts
         before, begun, rows = 0.0, 0.0, None  # the shares of the file above the next and the present chunk
+        checked: Path | None = None
         for rows in self._data.chunks():
             if self._stopped():
                 return
-            if not counts.rows:
+            if self._data.file != checked:
+                checked = self._data.file
                 self._check_times(rows)
             self.statistics.add(rows)
             begun, before = before, self._data.progress
@@ -185,25 +186,25 @@ class Replay:
             yield window
 
     def _check_times(self, rows: Rows) -> None:
-        """Raise an error if the first rows show that the times of the file cannot be meant.
+        """Raise an error if the first rows of a file show that its times cannot be meant.
 
         Time runs backwards if most rows that differ from the row above are before it, and the last before the first.
         """
         times, steps = rows.times, np.diff(rows.times)
         if len(times) > 2 and times[-1] < times[0] and 2 * np.count_nonzero(steps < 0.0) > np.count_nonzero(steps):
-            raise ConfigurationError(f"{self._data.path}: time decreases from row to row: sort the rows by t")
+            raise ConfigurationError(f"{self._data.file}: time decreases from row to row: sort the rows by t")
         step = median_step(times)
         if not self._data.is_table or math.isinf(step) or step * MIN_ROWS_PER_WINDOW <= self._length:
             return
         mean = float(steps[steps > 0.0].sum()) / len(steps)  # smaller if times repeat
         if mean * MIN_ROWS_PER_WINDOW <= self._length:
             remedy = "write t with all its digits, or remove rows that repeat"
-            raise ConfigurationError(f"{self._data.path}: {_standstill(rows)}: {remedy}")
+            raise ConfigurationError(f"{self._data.file}: {_standstill(rows)}: {remedy}")
         rate = f"one row every {step:.6g} s, but windows of {self._length:g} s"
         remedy = "if t is not in seconds, name the column 't [ms]' or the like"
         if 2 * np.count_nonzero(steps == 0.0) > len(steps):
             remedy += f"; {_standstill(rows)}, so write t with all its digits"
-        raise ConfigurationError(f"{self._data.path}: {rate}: {remedy}")
+        raise ConfigurationError(f"{self._data.file}: {rate}: {remedy}")
 
     def _adapt(self, window: Window) -> Report | None:
         """Return the report of a window, or None if the adaptation failed, which costs this window only."""

@@ -43,6 +43,11 @@ class JoinedReader(Reader):
         return (self._finished + present) / len(self._readers)
 
     @property
+    def file(self) -> Path:
+        """See :attr:`Reader.file`."""
+        return self._readers[min(self._finished, len(self._readers) - 1)].path
+
+    @property
     def bad(self) -> int:
         """See :attr:`Reader.bad`."""
         return sum(reader.bad for reader in self._readers)

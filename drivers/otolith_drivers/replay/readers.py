@@ -107,6 +107,11 @@ class Reader(ABC):
         return 0.0 if self._data is None else self._data.progress
 
     @property
+    def file(self) -> Path:
+        """The file that the last rows are from."""
+        return self.path
+
+    @property
     @abstractmethod
     def bad(self) -> int:
         """Number of rows, cells, frames or records that could not be used."""
