@@ -28,7 +28,7 @@ from otolith.cli.common import INTERRUPTED, drain
 from otolith.cli.live_table import LiveTable
 from otolith.health.schema import ComponentDocument, ReportDocument, Status
 from otolith.health.text import half_width_text, summary
-from otolith.machine import load_machine
+from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import REPORT, Listener
 from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
@@ -134,11 +134,29 @@ def compare_unbalance(fault: Unbalance, inertia: float, components: Sequence[Com
     return UnbalanceComparison(source, inner, fault.acceleration * inertia, min(periodic, key=distance, default=None))
 
 
+def transport_of(machine: LoadedMachine) -> str:
+    """Return how the simulated machine must send what ``machine`` receives.
+
+    Raises:
+        ConfigurationError: the machine is read in a way that no simulated machine offers.
+    """
+    driver = machine.file.driver
+    kind, is_tcp = driver.get("type"), driver.get("framing", "tcp") == "tcp"
+    if kind == "can":
+        return "can"
+    if kind == "modbus" and ("serial" in driver or is_tcp):
+        return "modbus-rtu" if "serial" in driver else "modbus-tcp"
+    raise ConfigurationError(
+        f'{machine.path}: the demo simulates a machine on a CAN bus or on Modbus, but [driver] has type = "{kind}"'
+    )
+
+
 class Demo:
     """One run of the demonstration."""
 
     def __init__(self, machine: Path, scenario: Path, duration: float, *, as_json: bool) -> None:
         self._machine, self._scenario = load_machine(machine), load_scenario(scenario)
+        self._transport = transport_of(self._machine)
         self._scenario_file, self._duration, self._as_json = scenario, duration, as_json
         stamp = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
         self._folder = writable(state_directory() / "demo" / f"{stamp}-{os.getpid()}")
@@ -159,14 +177,15 @@ class Demo:
         key = REPORT.under(names.site, names.name)
         machine, scenario = str(self._machine.path), str(self._scenario_file)
         self._print(f"machine {machine}, scenario {scenario}, {self._duration:.0f} s")
-        self._print(f"frames on {self._machine.driver.describe()[0]}; reports on {endpoints[0]}, key {key}")
+        self._print(f"signals on {self._machine.driver.describe()[0]}; reports on {endpoints[0]}, key {key}")
         _refuse_busy(endpoints)
         self._compile(stopped)
         if stopped():
             return INTERRUPTED
         try:
             self._start("daemon", "run", machine, "--recording", str(self._recording))
-            self._start("plant", "plant", scenario, "--truth", str(self._folder / "truth.csv"))
+            truth = str(self._folder / "truth.csv")
+            self._start("plant", "plant", scenario, "--as", self._transport, "--truth", truth)
             self._watch(endpoints, key, stopped)
         finally:
             self._end()
