@@ -35,6 +35,7 @@ from otolith.estimation.window_length import WindowExcitation, next_records
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
 
+QUIET_WINDOWS = 8  # consecutive windows after which a test is closed that none of them supports
 UNUSED = "window not estimated from: "
 
 
@@ -77,13 +78,19 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
-    is_tested, is_expected = state.test is not None, _is_expected(state, predicted, estimated)
-    if not is_tested and is_expected and not screening.is_positive:
+    is_tested, is_expected = state.test is not None, _is_expected(predicted, estimated)
+    is_calm = is_expected and not screening.is_positive
+    if not is_tested and is_calm:
         return _update_filter(state, predicted, estimated)
     test = continue_test(state.test, predicted, screening)
-    if not is_tested and is_expected and test.is_null_possible:
+    if is_tested:
+        test = test.beside(estimated.fit)
+    if is_tested and is_calm and not test.is_confirmed:
+        return _go_on_beside(test, _update_filter(state, predicted, estimated))
+    if is_expected and not is_tested and test.is_null_possible:
         return replace(_update_filter(state, predicted, estimated), searched=True)
-    outcome = decide(test)
+    test = replace(test, quiet=0)
+    outcome = decide(test, state.learned)
     if outcome.update is PosteriorUpdate.HYPOTHESIS:
         result = _adopt_hypothesis(state, estimated, test, outcome)
     elif outcome.update is PosteriorUpdate.FILTER and estimated.cost <= MAX_COST:
@@ -96,19 +103,25 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     return replace(result, searched=True)
 
 
-def _is_expected(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> bool:
-    """Whether the residual counts as noise, and the normalised innovation squared is within its limit.
+def _is_expected(predicted: Posterior, estimated: WindowEstimate) -> bool:
+    """Whether the residual counts as noise, and the normalised innovation squared is within its limit."""
+    return estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
 
-    The bounds of the machine file alone, before the first window, contradict nothing.
+
+def _go_on_beside(test: SequentialTest, updated: WindowResult) -> WindowResult:
+    """Return the result of a window that shows nothing of what opened the test.
+
+    The windows that opened it may have been wrong, so that the filter goes on. But those of a machine at rest say
+    nothing against its hypotheses, so it is closed only after several of them.
     """
-    first = state.posterior.phase is None
-    return estimated.cost <= EXPLAINED and (first or predicted.expects(estimated.evidence))
+    test = replace(test, quiet=test.quiet + 1)
+    return replace(updated, test=test if test.quiet < QUIET_WINDOWS else None, searched=True)
 
 
 def _update_filter(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
     """Return the result of a window that updates the filter; a faded component that it does not need is removed."""
     before = predicted.prior()
-    if state.test is not None:  # the windows before were wrong for an unknown reason
+    if state.test is not None and state.test.quiet == 0:  # the windows before were wrong for an unknown reason
         predicted = predicted.inflate_variance(state.test.null_reduced_chi_square)
     posterior = predicted.update(estimated.evidence, estimated.advance)
     result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), (), estimate=estimated)
@@ -178,13 +191,14 @@ def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str
     if result.estimate is None:  # data that are not used are evidence neither for a hypothesis nor against one
         test, contradictions = state.test, state.contradictions + (result.decision is not WindowDecision.BAD)
     elif result.is_accepted:
-        test, contradictions = None, 0
+        test, contradictions = result.test if result.decision is WindowDecision.LEARNED else None, 0
     else:
         test, contradictions = result.test, state.contradictions + 1
     return replace(
         state,
         posterior=result.posterior,
         test=test,
+        learned=state.learned + result.is_accepted,
         contradictions=contradictions,
         adopted=result.adopted,
         noisier_since=result.noisier_since(state),

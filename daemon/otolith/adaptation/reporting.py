@@ -72,7 +72,8 @@ class WindowResult:
     estimate: WindowEstimate | None = None
     """None for a window that was not estimated from."""
     test: SequentialTest | None = None
-    """The sequential test that is open, or that this window decided."""
+    """The sequential test that is open, or that this window decided; with an updated filter, one that may still close.
+    """
     reason: str = ""
     """Why the window was not estimated from."""
     notes: tuple[str, ...] = ()

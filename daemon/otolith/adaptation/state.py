@@ -30,6 +30,8 @@ class AdaptationState:
     """Of the next window."""
     test: SequentialTest | None = None
     """The competing hypotheses, while they are undecided."""
+    learned: int = 0
+    """Windows that updated the posterior."""
     contradictions: int = 0
     """Consecutive windows that did not update the posterior; windows with bad data are not counted."""
     restricted: frozenset[str] = frozenset()

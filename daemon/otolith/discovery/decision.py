@@ -7,12 +7,14 @@ from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.screening import DECISIVE
 from otolith.discovery.sequential_test import SequentialTest
+from otolith.estimation.objective import EXPLAINED
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
 COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # the same for a component
 TIMING_WINDOWS = 2  # windows that must agree on a late signal
 EXCLUDING_PROBABILITY = 0.5  # of a faulty sensor or a late signal, if no other type explains the windows as well
+YOUNG_WINDOWS = 3  # learned windows that do not outweigh more windows that agree with each other
 AMBIGUOUS_WINDOWS = 3  # windows that several types of hypotheses explain equally
 
 
@@ -71,23 +73,30 @@ class WindowOutcome:
         return UPDATES[self.decision]
 
 
-def decide(test: SequentialTest) -> WindowOutcome:
-    """Return the decision that the evidence so far allows."""
+def decide(test: SequentialTest, learned: int) -> WindowOutcome:
+    """Return the decision that the evidence so far allows, where the filter had ``learned`` windows before the test."""
     best = test.best
+    if 0 < learned <= YOUNG_WINDOWS and test.windows > learned and (anew := _all_moved(test)) is not None:
+        return WindowOutcome(WindowDecision.STEPPED, anew)
     if best.type is FaultType.NOTHING:
         return WindowOutcome(WindowDecision.LEARNED, best)
     if best.cost > MAX_COST:
         return WindowOutcome(WindowDecision.REFUSED, best)
-    own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
-    agreed = test.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
-    moved = best.type is FaultType.PARAMETER and not test.is_ambiguous
-    if moved and agreed and own <= known:  # fewer if a component became insignificant
-        return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
     if test.is_ambiguous:
         several = test.windows >= AMBIGUOUS_WINDOWS
         return WindowOutcome(WindowDecision.AMBIGUOUS if several else WindowDecision.SUSPECTED, best)
+    agreed = test.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
     if best.type is FaultType.NOISE and agreed:
         return WindowOutcome(WindowDecision.NOISIER, best)
+    own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
+    if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
+        return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
+    return _exclude_or_discover(test)
+
+
+def _exclude_or_discover(test: SequentialTest) -> WindowOutcome:
+    """Return the decision where neither parameters nor noise are accepted."""
+    best = test.best
     for kind, (decision, windows) in EXCLUDING.items():
         if test.probability(kind) >= EXCLUDING_PROBABILITY and test.leading >= windows:
             return WindowOutcome(decision, next(item for item in test.hypotheses if item.type is kind))
@@ -99,6 +108,20 @@ def decide(test: SequentialTest) -> WindowOutcome:
         if best.type is FaultType.COMPONENT:
             return WindowOutcome(WindowDecision.DISCOVERED, best)
     return WindowOutcome(WindowDecision.SUSPECTED, best)
+
+
+def _all_moved(test: SequentialTest) -> TrackedHypothesis | None:
+    """Return the hypothesis that nothing was known of any parameter, if it explains the windows as well as the best."""
+    free = len(test.problem.free)
+    return next(
+        (
+            item
+            for item in test.hypotheses
+            if item.type is FaultType.PARAMETER and item.hypothesis.added == free == len(item.problem.free)
+            if item.misfit <= DECISIVE and item.cost <= EXPLAINED
+        ),
+        None,
+    )
 
 
 def _without_undecided_terms(test: SequentialTest) -> TrackedHypothesis:

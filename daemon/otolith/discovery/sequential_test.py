@@ -31,6 +31,7 @@ from otolith.discovery.search import explained_again, fit_hypotheses, screening_
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import Fit
 
 MAX_HYPOTHESES = 7  # that are tracked after a search
 MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is not tracked
@@ -71,6 +72,11 @@ class SequentialTest:
     """Of the last window."""
     clear: int = CLEAR_WINDOWS
     """Consecutive windows after which one type of hypotheses explained all windows best."""
+    quiet: int = 0
+    """Consecutive windows, up to the last, that the filter expected, and that did not confirm the test."""
+    behind: float = -MAX_WINDOW_EVIDENCE
+    """Evidence against the filter, in -2 log likelihood, of the windows after the one that opened the test; without
+    that one, they alone must pay for the complexity of a hypothesis."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
 
@@ -109,6 +115,22 @@ class SequentialTest:
         """Whether no hypothesis explains the windows decisively better than that nothing has happened."""
         null = min((item.deviance for item in self.hypotheses if item.type is FaultType.NOTHING), default=np.inf)
         return null <= DECISIVE
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether windows after the one that opened the test speak decisively against the filter."""
+        return self.behind > DECISIVE
+
+    def beside(self, filtered: Fit) -> "SequentialTest":
+        """Return the test after its last window, of which the filter leaves ``filtered``.
+
+        The evidence against the filter is a cumulative sum (E. S. Page, Biometrika 41, 1954) with decisive evidence as
+        its reference value. It falls in windows that give less, so that it is forgotten if it does not go on.
+        """
+        last = self.last
+        more = (filtered.chi_square - last.chi_square) / residual_variance_factor([last.chi_square], last.count)
+        behind = self.behind + float(np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE))
+        return replace(self, behind=float(np.clip(behind, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)))
 
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""

@@ -1,0 +1,83 @@
+"""A window that was itself wrong: what it seems to show is given up when the windows after it do not confirm it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from otolith.acquisition.window import Array, Window
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import initial_state
+from otolith.discovery.decision import WindowDecision
+from otolith.estimation.problem import Problem
+from otolith.health.schema import ReportDocument, Status
+from otolith.machine import find_twin
+from otolith_drivers.plant.dc_motor import MotorScenario
+
+Cut = Callable[..., list[tuple[Window, float]]]
+MOTOR = find_twin("dc_motor")
+TRUTH = {parameter.name: parameter.nominal for parameter in MOTOR.parameters}
+WINDOWS = 12
+DOUBTED = 3  # windows, the wrong one included, that may publish what the wrong one suggests
+SDS = 5.0  # of an estimate, in which the truth lies: one window in a million is outside by chance
+
+
+def late_current(values: Array) -> Array:
+    """The current of some samples is that of the sample before, as where a device refreshes its registers late."""
+    values[70:150, 2] = values[69:149, 2]
+    return values
+
+
+def low_voltage(values: Array) -> Array:
+    values[90:, 0] *= 0.93
+    return values
+
+
+def offset_load(values: Array) -> Array:
+    values[60:, 1] += 0.002
+    return values
+
+
+def offset_voltage(values: Array) -> Array:
+    values[100:, 0] += 0.2
+    return values
+
+
+def late_voltage(values: Array) -> Array:
+    values[1:, 0] = values[:-1, 0]
+    return values
+
+
+WRONG = (late_current, low_voltage, offset_load, offset_voltage, late_voltage)
+
+
+def reports(windows: list[Window], free: tuple[str, ...]) -> list[ReportDocument]:
+    known = tuple(pair for pair in TRUTH.items() if pair[0] not in free)
+    estimated = tuple(parameter for parameter in MOTOR.parameters if parameter.name in free)
+    problem = Problem(MOTOR, known, estimated, (0.005, 0.02), input_noise=(0.0, 0.0002))
+    state, documents = initial_state("motor", "bench", problem), []
+    for window in windows:
+        state, report = adapt(state, window)
+        documents.append(report.document)
+    return documents
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.__name__)
+@pytest.mark.parametrize("free", [("R_a",), ("R_a", "D"), ("R_a", "L_a", "J", "D")], ids=len)
+@pytest.mark.parametrize("at", [0, 1, 5])
+def test_a_wrong_window_is_given_up(
+    wrong: Callable[[Array], Array], free: tuple[str, ...], at: int, scenario: MotorScenario, windows: Cut
+) -> None:
+    """The machine starts from rest: nothing is known before the first window, so that it can mislead most."""
+    cut = [window for window, _ in windows(scenario.model_copy(update={"faults": ()}), WINDOWS)]
+    cut[at] = replace(cut[at], values=wrong(cut[at].values.copy()))
+    documents = reports(cut, free)
+    assert not any(document.components for document in documents)
+    for document in documents[at + DOUBTED :]:
+        assert document.decision is WindowDecision.LEARNED
+        for name, parameter in document.parameters.items():
+            if parameter.status in (Status.ESTIMATED, Status.HELD):
+                assert parameter.value is not None
+                assert parameter.sd is not None
+                assert abs(parameter.value - TRUTH[name]) <= SDS * parameter.sd, document.window.index
+    assert documents[-1].parameters["R_a"].status is Status.ESTIMATED
