@@ -5,9 +5,8 @@ the start of the window, which is a nuisance without a prior. Inputs that the sa
 as well: noise of the load torque, the load torque as a random walk between its samples, and the time of a voltage
 change whose row is missing. Their effect on the outputs is a dense covariance beside the noise of the sensors.
 
-A slow load torque is a straight line between its samples, but the samples do not show whether they are joined by lines
-or by a smooth curve. Where an output is sampled between them, either is equally probable. One unknown share of the
-deviation of the curve from the lines is therefore a nuisance as well, with the variance 1/4 of a fair choice.
+A slow load torque is a straight line between its samples. The bound uses this, though the samples do not show it:
+``cases.WIDER_SPREAD`` lists the scenarios in which no estimate can therefore reach it.
 """
 
 from collections.abc import Sequence
@@ -23,8 +22,6 @@ from otolith.acquisition.window import Array, Mask
 STEP = 1e-4  # relative step of the numerical derivatives
 KNOWN_LOAD = 1e-9  # N·m: standard deviation of a sample without noise
 UNKNOWN_LEVEL = 1.0  # N·m: standard deviation of the load torque before its samples
-UNKNOWN_SHAPE = 0.5  # standard deviation of a choice between two shapes, in units of their difference
-SAME_AREA = 4.0 / 3.0  # height of a triangle with the area of a parabola of height one
 
 
 def lower_bounds(recording: Recording, start: float, end: float, free: Sequence[str]) -> Array:
@@ -81,32 +78,11 @@ def _times_of(recording: Recording, start: float, end: float) -> list[Array]:
 def _load_covariance(recording: Recording, times: Sequence[Array], start: float, end: float) -> Array | float:
     """Return the covariance of the outputs from what the samples leave open of the load torque."""
     if not recording.load_noise and not recording.walk:
-        effect = UNKNOWN_SHAPE * _effect_of_a_curve(recording, times, start, end)
-        return np.outer(effect, effect) if effect.any() else 0.0
+        return 0.0
     knots = recording.inputs.load_times
     near = (knots >= start - 0.1) & (knots <= end + 0.1)
     effect = load_effect(recording.motor, knots[near], times, start)
     return np.asarray(effect @ _knot_covariance(recording, knots[near]) @ effect.T)
-
-
-def _effect_of_a_curve(recording: Recording, times: Sequence[Array], start: float, end: float) -> Array:
-    """Return the change of the outputs (outputs,) if a smooth curve, instead of lines, joins the samples of the load.
-
-    In the middle of an interval, a curve is off the line by its second derivative times the squared length over eight.
-    """
-    sample = recording.samples["T_load"]
-    near = (sample.times >= start - 0.1) & (sample.times <= end + 0.1)
-    at, lengths = sample.times[near], np.diff(sample.times[near])
-    curvature = np.gradient(np.gradient(sample.values[near], at), at)
-    height = SAME_AREA * 0.5 * (curvature[1:] + curvature[:-1]) * lengths**2 / 8.0
-    outputs = np.concatenate(times)
-    interval = np.searchsorted(at, outputs, side="right") - 1
-    inside = np.setdiff1d(interval[~np.isin(outputs, at)], [-1, len(at) - 1])
-    if not len(inside):
-        return np.zeros(len(outputs))
-    knots = np.sort(np.concatenate([at, at[inside] + 0.5 * lengths[inside]]))
-    middle = np.searchsorted(knots, at[inside] + 0.5 * lengths[inside])
-    return np.asarray(load_effect(recording.motor, knots, times, start)[:, middle] @ height[inside])
 
 
 def load_effect(motor: Motor, knots: Array, times: Sequence[Array], start: float) -> Array:
