@@ -1,6 +1,6 @@
 """Time of discovery: an explained window, a full search, a window of a sequential test; all families and inputs.
 
-Times are those of the processor, and targets are those of an idle one.
+Processor time is measured. The targets hold on a computer that runs nothing else.
 """
 
 import sys

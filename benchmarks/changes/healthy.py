@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.changes.classes import VERDICTS, text_of
 from benchmarks.changes.machines import DC_MOTOR, PUMP, SERVO_AXIS, TWO_MASS, twin_of
-from benchmarks.changes.observe import Case, Observed
+from benchmarks.changes.observe import Case, Observed, coverage
 from benchmarks.changes.plants import HEALTHY, Change, Plant, Term, generator, simulate
 from otolith.acquisition.window import Array
 
@@ -121,8 +121,7 @@ def summarise(case: Case, runs: Sequence[Sequence[Observed]]) -> dict[str, Any]:
         "decisions": dict(Counter(window.decision.name for window in windows)),
         "cost": float(np.mean([window.cost for window in windows if window.cost is not None])),
         "held": {
-            name: float(np.mean([window.parameters[name].holds_truth is not False for window in windows]))
-            for name in windows[0].parameters
+            name: coverage([window.parameters[name] for window in windows]).held for name in windows[0].parameters
         },
         "examples": [text_of(window) for window in (verdicts or open_windows)[:EXAMPLES]],
         "met": adopted == 0 and not verdicts,

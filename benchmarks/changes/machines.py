@@ -40,23 +40,14 @@ def _reversing_operation(random: Random, times: Array) -> Values:
     }
 
 
-def _shown(x: Values, u: Values, q: Values) -> Values:
-    """Return the outputs of a machine whose sensors show its states."""
-    return x
-
-
 _DC_MOTOR = {"R_a": 6.5, "L_a": 0.673, "J": 0.001171, "K_e": 0.038, "K_t": 0.038, "D": 0.00143}
 DC_MOTOR = Plant(
     name="dc_motor",
     twin="dc_motor",
-    period=0.01,
-    records=200,
-    steps=5,
     parameters={**_DC_MOTOR, "T_c": 0.0, "V_b": 0.0, "omega_s": 1.0, "i_s": 1.0},
     sites=("shaft", "winding", "friction"),
     initial={"i": 1.0, "omega": 10.0},
     rates=_motor_rates,
-    outputs=_shown,
     operate=_motor_operation,
     held=("V_a",),
 )
@@ -83,14 +74,10 @@ def _lab_operation(random: Random, times: Array) -> Values:
 LAB_MOTOR = Plant(
     name="lab_motor",
     twin="lab_motor",
-    period=0.01,
-    records=200,
-    steps=5,
     parameters={"K": 0.046, "J": 0.0004, "T_c": 0.012, "R": 2.6, "omega_s": 0.5},
     sites=("shaft",),
     initial={"omega": 0.0},
     rates=_lab_rates,
-    outputs=_shown,
     operate=_lab_operation,
     held=("V",),
 )
@@ -112,14 +99,10 @@ def _mass_control(x: Values, u: Values) -> Values:
 ONE_MASS = Plant(
     name="one_mass",
     twin="one_mass",
-    period=0.01,
-    records=200,
-    steps=5,
     parameters={"J": 0.12, "T_c": 0.6, "D": 0.0, "omega_s": 0.05},
     sites=("shaft",),
     initial={"omega": 0.0},
     rates=_mass_rates,
-    outputs=_shown,
     operate=_mass_operation,
     control=_mass_control,
     held=("T", "speed"),
@@ -214,7 +197,6 @@ _AXIS = Plant(
     sites=("carriage", "friction"),
     initial={"x": 0.0, "v": 0.0},
     rates=_axis_rates,
-    outputs=_shown,
     operate=_axis_operation,
     control=_axis_control,
     held=("F", "x_set", "v_set", "a_set"),
@@ -252,13 +234,11 @@ TWO_MASS = Plant(
     name="two_mass",
     twin="two_mass",
     period=0.005,
-    records=200,
     steps=4,
     parameters={"J_m": 0.01, "J_l": 0.04, "k_s": 60.0, "d_s": 0.05, "D_m": 0.005, "D_l": 0.01},
     sites=("motor_side", "load_side", "shaft"),
     initial={"omega_m": 30.0, "omega_l": 30.0, "twist": 0.0},
     rates=_masses_rates,
-    outputs=_shown,
     operate=_masses_operation,
     held=("T_m",),
 )
@@ -287,12 +267,10 @@ PMSM = Plant(
     twin="pmsm",
     period=0.002,
     records=250,
-    steps=5,
     parameters={"R_s": 1.2, "L_d": 8.5e-3, "L_q": 9.5e-3, "psi": 0.175, "n_p": 4.0, "J": 0.008, "D": 0.002},
     sites=("shaft", "torque"),
     initial={"i_d": 0.0, "i_q": 0.0, "omega": 40.0},
     rates=_pmsm_rates,
-    outputs=_shown,
     operate=_pmsm_operation,
     held=("v_d", "v_q"),
 )
@@ -326,7 +304,6 @@ HYDRAULIC_ACTUATOR = Plant(
     name="hydraulic_actuator",
     twin="hydraulic_actuator",
     period=0.05,
-    records=200,
     steps=2,
     parameters={
         "D": 100.0,

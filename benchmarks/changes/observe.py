@@ -1,17 +1,14 @@
 """Runs of a machine with a change, adapted to window by window, and what each report states."""
 
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
-from typing import TypeVar
 
 import numpy as np
 
 from benchmarks.changes.machines import in_twin_units, problem_of
 from benchmarks.changes.plants import HEALTHY, START, Change, Plant, cut, generator, simulate
+from benchmarks.command_line import in_processes
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
@@ -19,9 +16,9 @@ from otolith.discovery.decision import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument
 
-Result = TypeVar("Result")
 Disturbance = Callable[[np.random.Generator, Plant, dict[str, Array]], None]
 HEALTHY_WINDOWS, CHANGED_WINDOWS = 12, 12
+PUBLISHED_AT_LEAST = 0.95  # share of the windows that must have an interval
 RUNS_PER_JOB = 10  # runs that are simulated together
 BATCHES_PER_PROCESS = 4  # fewer runs per job if there are few: the last job is waited for
 
@@ -145,6 +142,26 @@ def observed(document: ReportDocument, truth: Mapping[str, float]) -> Observed:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """How often the intervals of a parameter hold the truth."""
+
+    published: float
+    """Share of the windows with an interval."""
+    held: float | None
+    """Share of these intervals that hold the truth; None without any."""
+
+    def reaches(self, share: float) -> bool:
+        """Whether that share of the intervals holds the truth, and nearly all windows have one."""
+        return self.held is not None and self.held >= share and self.published >= PUBLISHED_AT_LEAST
+
+
+def coverage(published: Sequence[Published]) -> Coverage:
+    """Return the shares of one parameter over windows."""
+    held = [own.holds_truth for own in published if own.holds_truth is not None]
+    return Coverage(len(held) / len(published), sum(held) / len(held) if held else None)
+
+
 def observe_all(cases: Sequence[Case], runs: int, seed: int, processes: int) -> list[list[list[Observed]]]:
     """Return the windows of each run of each case."""
     size = min(RUNS_PER_JOB, max(1, runs * len(cases) // (processes * BATCHES_PER_PROCESS)))
@@ -156,13 +173,3 @@ def observe_all(cases: Sequence[Case], runs: int, seed: int, processes: int) -> 
     done = in_processes([partial(observe, cases[number], own, seed) for number, own in jobs], processes)
     parts = list(zip((number for number, _ in jobs), done, strict=True))
     return [[run for of, part in parts if of == number for run in part] for number in range(len(cases))]
-
-
-def in_processes(jobs: Sequence[Callable[[], Result]], processes: int) -> list[Result]:
-    """Return the results of the jobs; progress goes to the standard error."""
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        pending = [pool.submit(job) for job in jobs]
-        for count, _ in enumerate(as_completed(pending), 1):
-            print(f"\r{count} of {len(jobs)} parts", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    return [future.result() for future in pending]

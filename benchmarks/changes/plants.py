@@ -18,6 +18,11 @@ Values = Mapping[str, Any]
 START = 1e6  # s: Unix time of the first record
 
 
+def states(x: Values, u: Values, q: Values) -> Values:
+    """Return the outputs of a machine whose sensors show its states."""
+    return x
+
+
 @dataclass(frozen=True, slots=True)
 class Plant:
     """A machine, its operation and its sampling."""
@@ -25,12 +30,6 @@ class Plant:
     name: str
     twin: str
     """Of the library, or of the folder ``twins``."""
-    period: float
-    """s, of the records."""
-    records: int
-    """Per window."""
-    steps: int
-    """Of the integrator, per record."""
     parameters: Mapping[str, float]
     sites: tuple[str, ...]
     """Places at which a term enters; its value is zero in a healthy machine."""
@@ -38,11 +37,18 @@ class Plant:
     """State at the first record."""
     rates: Callable[[Values, Values, Values], Values]
     """Derivatives of the states, from states, inputs and parameters with the terms."""
-    outputs: Callable[[Values, Values, Values], Values]
     operate: Callable[[np.random.Generator, Array], Mapping[str, Array]]
     """Inputs and set-points of one run at the times of its records."""
     held: tuple[str, ...]
     """Inputs that are held from record to record; the others are linear between records."""
+    outputs: Callable[[Values, Values, Values], Values] = states
+    """What the sensors show, from the same; by default the states."""
+    period: float = 0.01
+    """s, of the records."""
+    records: int = 200
+    """Per window."""
+    steps: int = 5
+    """Of the integrator, per record."""
     control: Callable[[Values, Values], Values] | None = None
     """Held inputs from states and set-points at a record."""
 
@@ -68,9 +74,7 @@ SHAPES: Mapping[str, Callable[[Array | float, float], Array | float]] = {
     "constant": lambda x, b: 1.0,
     "linear": lambda x, b: x,
     "exponential": lambda x, b: np.exp(b * x),
-    "negative exponential": lambda x, b: np.exp(-b * x),
     "power": lambda x, b: np.sign(x) * np.abs(x) ** b,
-    "logarithmic": lambda x, b: np.log(np.maximum(np.abs(x), 1e-9)),
     "periodic": lambda x, b: np.sin(b * x),
     "Coulomb": lambda x, b: np.tanh(x / b),
 }

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.command_line import show_progress
 from benchmarks.estimators.cases import BOUNDS_FACTOR, Case, cases, start, windows
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.arrival_cost import initial_prior
@@ -119,8 +120,7 @@ def ablate(case: Case, starts: int, seed: int) -> Row:
         for method, attempt in zip(METHODS_COMPARED, attempts(case.problem, window, begin), strict=True):
             times[method][index] = attempt.seconds
             costs[method][index] = judges[index % len(dealt)].chi_square(attempt.values)
-        if (index + 1) % max(1, starts // 10) == 0:
-            print(f"{case.name}: {index + 1} of {starts} starts", file=sys.stderr)
+        show_progress(index + 1, starts, f"starts of {case.name}")
     everything = np.stack(list(costs.values()))
     which = np.arange(starts) % len(dealt)
     best = np.array([min(judge.best, everything[:, which == k].min()) for k, judge in enumerate(judges)])[which]
