@@ -1,9 +1,9 @@
 """Changes that the data cannot distinguish, and the same changes where they can.
 
 Each pair has two changes that give the same signals. A run is right if no window after the change states a verdict, and
-the last one states the class: hypotheses of both changes, which the decision calls ``AMBIGUOUS`` or which have the same
-probability.
-Where the data can distinguish, the right verdict must come within five windows.
+the last one states the class: hypotheses of both changes, one of them the most probable. They have the same
+probability, or the decision is ``AMBIGUOUS``. Where the data can distinguish, the right verdict must come within five
+windows.
 """
 
 import math
@@ -48,13 +48,18 @@ class Member:
         if self.reason == "COMPONENT":
             adopted = any(re.search(self.pattern, item.text) for item in window.components)
             return window.decision is WindowDecision.DISCOVERED and adopted
-        leads = bool(window.stated) and any(
-            self.states(item) for item in window.stated if item.probability >= window.stated[0].probability - EQUAL
-        )
-        return window.decision is WindowDecision.SENSOR and leads
+        return window.decision is WindowDecision.SENSOR and any(map(self.states, most_probable(window)))
 
 
-MOVED = Member("PARAMETER")
+def most_probable(window: Observed) -> list[Stated]:
+    """Return the hypotheses of the window than which none is more probable."""
+    highest = max((item.probability for item in window.stated), default=0.0)
+    return [item for item in window.stated if item.probability >= highest - EQUAL]
+
+
+def _moved(*names: str) -> Member:
+    """Return the change of these parameters, and perhaps of others."""
+    return Member("PARAMETER", "".join(rf"(?=.*\b{name}\b)" for name in names))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +104,9 @@ def _trials() -> list[Trial]:
 
 def _pump() -> list[Trial]:
     pair, free, agreed = "k_v / gain of u", ("h_0", "h_2", "T_c", "k_v"), ("h_0", "h_2", "T_c")
-    members = (MOVED, Member("SENSOR", r"^u reads .*%"))
+    members = (_moved("k_v"), Member("SENSOR", r"^u reads .*%"))
     k_v = PUMP.parameters["k_v"]
-    head, constant = "h_0 / constant head", (MOVED, Member("COMPONENT", "^head(:|/constant)"))
+    head, constant = "h_0 / constant head", (_moved("h_0"), Member("COMPONENT", "^head(:|/constant)"))
     step = Change(parameters={"h_0": 0.88 * PUMP.parameters["h_0"]})
     share = Change(terms={"head": Term("constant", amplitude=-0.12)})
     known = ("h_0", "T_c", "k_v")
@@ -129,7 +134,7 @@ def _load() -> list[Trial]:
 
 def _speed() -> list[Trial]:
     pair, free = "K, J, T_c / gain of omega", ("K", "J", "T_c")
-    members = (MOVED, Member("SENSOR", r"^omega reads .*%"))
+    members = (_moved("K", "J", "T_c"), Member("SENSOR", r"^omega reads .*%"))
     old, gain = LAB_MOTOR.parameters, 1.15
     values = {"K": old["K"] / gain, "J": old["J"] / gain**2, "T_c": old["T_c"] / gain}
     reads = Change(gains={"omega": gain})
@@ -137,7 +142,7 @@ def _speed() -> list[Trial]:
         _trial(pair, "K, J and T_c", LAB_MOTOR, Change(parameters=values), members, free),
         _trial(pair, "omega reads 15 % more", LAB_MOTOR, reads, members, free),
         _trial(pair, "gain, current measured", DC_MOTOR, reads, members[1:], ("R_a", "D", "J")),
-        _trial(pair, "J alone +20 %", LAB_MOTOR, Change(parameters={"J": 1.2 * old["J"]}), members[:1], free),
+        _trial(pair, "J alone +20 %", LAB_MOTOR, Change(parameters={"J": 1.2 * old["J"]}), [_moved("J")], free),
     ]
 
 
@@ -158,7 +163,7 @@ def _brushes() -> list[Trial]:
 
 def _current() -> list[Trial]:
     pair, free, gain = "R_a, L_a, K_t / gain of i", ("R_a", "L_a", "K_t", "D"), 1.12
-    members = (MOVED, Member("SENSOR", r"^i reads .*%"))
+    members = (_moved("R_a", "L_a", "K_t"), Member("SENSOR", r"^i reads .*%"))
     old = DC_MOTOR.parameters
     moved = Change(parameters={name: old[name] / gain for name in ("R_a", "L_a", "K_t")})
     reads = Change(gains={"i": gain})
@@ -166,13 +171,13 @@ def _current() -> list[Trial]:
         _trial(pair, "R_a, L_a and K_t", DC_MOTOR, moved, members, free, ("D",)),
         _trial(pair, "i reads 12 % more", DC_MOTOR, reads, members, free, ("D",)),
         _trial(pair, "gain, L_a known", DC_MOTOR, reads, members[1:], ("R_a", "K_t", "D")),
-        _trial(pair, "R_a alone +20 %", DC_MOTOR, Change(parameters={"R_a": 1.2 * old["R_a"]}), members[:1], free),
+        _trial(pair, "R_a alone +20 %", DC_MOTOR, Change(parameters={"R_a": 1.2 * old["R_a"]}), [_moved("R_a")], free),
     ]
 
 
 def _inertia() -> list[Trial]:
     pair, free = "J / gain of omega", ("J", "T_c")
-    members = (MOVED, Member("SENSOR", r"^omega reads .*%"))
+    members = (_moved("J"), Member("SENSOR", r"^omega reads .*%"))
     step = {"J": 0.8 * ONE_MASS.parameters["J"]}
     damped = replace(ONE_MASS, name="one_mass, damped", parameters={**ONE_MASS.parameters, "D": 0.02})
     reads = Change(gains={"omega": 1.25})
@@ -226,9 +231,11 @@ def judge(trial: Trial, run: Sequence[Observed]) -> Outcome:
 
 
 def states_class(trial: Trial, window: Observed) -> bool:
-    """Whether the window states all members, as ambiguous or as equally probable."""
-    ambiguous = window.decision is WindowDecision.AMBIGUOUS and min(_shares(trial, window)) > 0.0
-    return ambiguous or has_equal_members(trial, window)
+    """Whether the window states all members, one of them first, as equally probable or as ambiguous."""
+    complete = min(_shares(trial, window)) > 0.0
+    leads = any(member.states(item) for item in most_probable(window) for member in trial.members)
+    undecided = window.decision is WindowDecision.AMBIGUOUS or has_equal_members(trial, window)
+    return complete and leads and undecided
 
 
 def has_equal_members(trial: Trial, window: Observed) -> bool:

@@ -3,7 +3,7 @@
 Every recording has another motor, starts cold and has ten windows. A scenario meets its target if the intervals of
 single windows hold the truth in 93 to 97 % of the windows, for each of R_a, D and J, if at least 95 % of the windows
 are estimated whose bound allows the interval that is asked for, and if the errors are at most 1.1 times the bound
-(1.15 times where the load is sampled every 50 ms: the samples do not show that it is straight between them).
+(R_a: 1.15 times where the load is sampled every 50 ms; the samples do not show that it is straight between them).
 """
 
 import json
@@ -65,7 +65,7 @@ def document(case: str, summary: Summary) -> dict[str, object]:
         "estimated": summary.estimated if summary.allowed else None,
         **{key: by_name(getattr(summary, key)) for key in keys},
         "reasons": dict(summary.reasons),
-        "max_spread": max_spread(case),
+        "max_spread": by_name(max_spread(case)),
         "met": meets_target(case, summary),
     }
 
@@ -93,7 +93,7 @@ def _show(summaries: Mapping[str, Summary]) -> None:
             _percent(summary.raw_coverage),
             _percent(summary.published_coverage),
             " ".join(f"{value:.2f}" for value in summary.spread),
-            f"{max_spread(case):.2f}",
+            " ".join(f"{value:.2f}" for value in max_spread(case)),
             " ".join(f"{value:+.2f}" for value in summary.bias),
             " ".join(f"{value:.2%}" for value in summary.bound),
             "yes" if meets_target(case, summary) else "no",

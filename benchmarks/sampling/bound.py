@@ -6,7 +6,7 @@ as well: noise of the load torque, the load torque as a random walk between its 
 change whose row is missing. Their effect on the outputs is a dense covariance beside the noise of the sensors.
 
 A slow load torque is a straight line between its samples. The bound uses this, though the samples do not show it:
-``cases.WIDER_SPREAD`` lists the scenarios in which no estimate can therefore reach it.
+``cases.WIDER_SPREAD`` lists the parameters of which no estimate can therefore reach it.
 """
 
 from collections.abc import Sequence
