@@ -70,7 +70,7 @@ class Trial:
     truth: str
     case: Case
     members: tuple[Member, ...]
-    """The class; one member if the data can tell."""
+    """The class; one member if the data can distinguish it."""
     agreed: tuple[str, ...] = ()
     """Parameters that have the same value under all members."""
 
