@@ -40,6 +40,32 @@ R_th = { unit = "K/W", nominal = 0.9, bounds = [0.2, 4], role = "estimated", mea
 heat = { into = "der(theta)", mode = "additive", through = "1/C", unit = "W", meaning = "heat" }
 """
 
+LAB_MOTOR = """[twin]
+name = "lab_motor"
+title = "lab motor"
+source = "own"
+[states]
+i = { unit = "A", meaning = "current", bounds = [-50, 50] }
+omega = { unit = "rad/s", meaning = "speed", bounds = [-500, 500] }
+[inputs]
+V = { unit = "V", hold = "zoh", range = [-24, 24], meaning = "voltage" }
+[outputs]
+i = { unit = "A", noise = "5 mA", meaning = "current" }
+omega = { unit = "rad/s", noise = "0.05 rad/s", meaning = "speed" }
+[parameters]
+R = { unit = "ohm", nominal = 2.0, bounds = [0.5, 6], meaning = "resistance" }
+L = { unit = "H", nominal = 0.002, bounds = [0.0005, 0.01], meaning = "inductance" }
+K_e = { unit = "V*s/rad", nominal = 0.05, bounds = [0.01, 0.2], role = "estimated", meaning = "emf constant" }
+K_t = { unit = "N*m/A", nominal = 0.05, bounds = [0.01, 0.2], role = "estimated", meaning = "torque constant" }
+J = { unit = "kg*m^2", nominal = 1e-4, bounds = [2e-5, 5e-4], meaning = "inertia" }
+B = { unit = "N*m*s/rad", nominal = 1e-4, bounds = [0, 1e-3], role = "estimated", meaning = "damping" }
+T_c = { unit = "N*m", nominal = 0.01, bounds = [0, 0.1], role = "estimated", meaning = "dry friction" }
+w_s = { unit = "rad/s", nominal = 0.5, bounds = [0.1, 2], meaning = "transition" }
+[equations]
+"der(i)" = "(V - R*i - K_e*omega) / L"
+"der(omega)" = "(K_t*i - B*omega - T_c*tanh(omega/w_s)) / J"
+"""
+
 DBC = """VERSION "1"
 BU_: Drive Monitor
 BO_ 387 Thermal: 8 Drive
@@ -104,12 +130,33 @@ def with_second(page: str, line: str) -> str:
 
 def test_parameters_that_act_together_are_named(tmp_path: Path) -> None:
     """Only R/C and R_th*C act: one of the three can be estimated if another is given."""
-    assert all(reason.startswith("only together with") for reason in reasons(tmp_path, PAGE).values())
+    unknown = PAGE.replace("bounds = [0.5, 5],", 'bounds = [0.5, 5], role = "estimated",')
+    names = {"R": "C, R_th", "C": "R, R_th", "R_th": "R, C"}
+    assert reasons(tmp_path, unknown) == {name: f"only together with {others}" for name, others in names.items()}
     assert reasons(tmp_path, KNOWN_HEAT) == {"C": "", "R_th": ""}
 
 
+def test_a_given_parameter_makes_the_others_estimable(tmp_path: Path) -> None:
+    """The role of R is not to be estimated, so it is given."""
+    assert reasons(tmp_path, PAGE) == {"R": "only together with C, R_th", "C": "", "R_th": ""}
+
+
+def test_a_small_partner_is_named(tmp_path: Path) -> None:
+    """Torques are not measured: their constant, inertia, damping and dry friction have one scale in common."""
+    known = reasons(tmp_path, LAB_MOTOR)
+    assert known == dict.fromkeys(known, "") | {"J": "only together with K_t, B, T_c"}
+    scaled = reasons(
+        tmp_path, LAB_MOTOR.replace("bounds = [2e-5, 5e-4],", 'bounds = [2e-5, 5e-4], role = "estimated",')
+    )
+    scale = ("K_t", "J", "B", "T_c")
+    assert scaled == {
+        name: f"only together with {', '.join(other for other in scale if other != name)}" if name in scale else ""
+        for name in known
+    }
+
+
 def test_resistances_in_series_are_one(tmp_path: Path) -> None:
-    second = 'R_2 = { unit = "K/W", nominal = 0.4, bounds = [0.1, 2], meaning = "second resistance" }'
+    second = 'R_2 = { unit = "K/W", nominal = 0.4, bounds = [0.1, 2], role = "estimated", meaning = "second" }'
     result = reasons(tmp_path, with_second(KNOWN_HEAT, second).replace("theta/R_th", "theta/(R_th + R_2)"))
     assert result == {"C": "", "R_th": "only together with R_2", "R_2": "only together with R_th"}
 
@@ -142,8 +189,8 @@ u = { unit = "V", hold = "zoh", range = [0, 10], meaning = "input" }
 [outputs]
 v = { unit = "V", noise = 0.01, meaning = "voltage" }
 [parameters]
-R = { unit = "ohm", nominal = 10, bounds = [1, 100], meaning = "resistance" }
-C = { unit = "nF", nominal = 100, bounds = [10, 1000], meaning = "capacitance" }
+R = { unit = "ohm", nominal = 10, bounds = [1, 100], role = "estimated", meaning = "resistance" }
+C = { unit = "nF", nominal = 100, bounds = [10, 1000], role = "estimated", meaning = "capacitance" }
 [equations]
 "der(v)" = "(u - v)/(R*C)"
 """,

@@ -5,12 +5,13 @@ combination of the others' cannot be estimated in any such experiment, whatever 
 identifiability; E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data, 1997, chapter 2).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.twin.definition import Definition
+from otolith.twin.definition import Definition, Role
 from otolith.twin.kernel import Excitation, kernel_of
 
 # Decisions. docs/reference/thresholds-twin.md gives the origin of each and the test that guards it.
@@ -23,9 +24,9 @@ PARAMETER_SPREAD = 0.1  # of the width of the bounds, around the nominal values
 MAX_STEP_ERROR = 1e-4  # of an output's range: change of the prediction between the two numbers of substeps
 MIN_SENSITIVITY = 1e-9  # of the largest column norm: below it no output depends on the parameter
 MIN_INDEPENDENT_PART = 1e-5  # of a column's norm: the part that no combination of other columns explains
-MIN_PARTNER_SHARE = 0.05  # of the largest coefficient in such a combination: which parameters to name
 
 DEAD = "no output depends on it"
+AMONG_SEVERAL = "several combinations of the others act as it does"
 THRESHOLD = "it acts as a threshold only, without a slope that an estimation could follow"
 NOT_FINITE = "the equations are not finite, or not smooth, around the nominal values and the initial state"
 
@@ -41,7 +42,10 @@ class StructuralIdentifiability:
 
 
 def structural_identifiability(definition: Definition, seed: int = 1) -> list[StructuralIdentifiability]:
-    """Whether each parameter could be estimated if all parameters and the initial state were unknown."""
+    """Whether each parameter could be estimated beside those whose role is estimated, and the initial state.
+
+    The others are given, as without a machine file that says otherwise.
+    """
     random = np.random.default_rng(seed)
     trials: list[list[StructuralIdentifiability]] = []
     for period in PERIODS:
@@ -109,19 +113,29 @@ def _excitation(definition: Definition, period: float, random: np.random.Generat
 
 
 def _judge(definition: Definition, columns: Array, index: int) -> StructuralIdentifiability:
-    """Whether the column of a parameter is long enough and independent of the others."""
-    name = definition.parameters[index].name
+    """Whether the column of a parameter is long enough and independent of those of the unknown numbers."""
+    parameters = definition.parameters
+    name = parameters[index].name
     lengths = np.linalg.norm(columns, axis=0)
     if lengths[index] <= MIN_SENSITIVITY * lengths.max():
         return _not_identifiable(name, DEAD)
     unit = columns / np.where(lengths > 0.0, lengths, 1.0)
-    others = np.delete(unit, index, axis=1)
-    shares, *_ = np.linalg.lstsq(others, unit[:, index], rcond=1e-12)
-    if np.linalg.norm(unit[:, index] - others @ shares) > MIN_INDEPENDENT_PART:
+    states = range(len(parameters), unit.shape[1])
+    estimated = [at for at, parameter in enumerate(parameters) if parameter.role is Role.ESTIMATED and at != index]
+    others = [*estimated, *states]
+    if _independent_part(unit, index, others) > MIN_INDEPENDENT_PART:
         return StructuralIdentifiability(name, identifiable=True, reason="")
-    names = [parameter.name for parameter in definition.parameters]
-    names += [f"initial {state.name}" for state in definition.states]
-    del names[index]
-    weights = abs(shares)
-    partners = [n for n, weight in zip(names, weights, strict=True) if weight > MIN_PARTNER_SHARE * weights.max()]
-    return _not_identifiable(name, f"only together with {', '.join(partners)}")
+    names = [parameter.name for parameter in parameters] + [f"initial {state.name}" for state in definition.states]
+    partners = [
+        names[other]
+        for other in others
+        if _independent_part(unit, index, [at for at in others if at != other]) > MIN_INDEPENDENT_PART
+    ]
+    return _not_identifiable(name, f"only together with {', '.join(partners)}" if partners else AMONG_SEVERAL)
+
+
+def _independent_part(unit: Array, index: int, others: Sequence[int]) -> float:
+    """Return the norm of what no combination of the columns ``others`` explains of the column ``index``."""
+    columns = unit[:, list(others)]
+    shares, *_ = np.linalg.lstsq(columns, unit[:, index], rcond=1e-12)
+    return float(np.linalg.norm(unit[:, index] - columns @ shares))
