@@ -1,4 +1,4 @@
-"""Classes of hypotheses that the data cannot tell apart: equal probabilities, and intervals that hold all members."""
+"""Classes of hypotheses that the data cannot distinguish: equal probabilities, and intervals that hold all members."""
 
 from dataclasses import replace
 

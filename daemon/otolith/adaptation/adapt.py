@@ -111,8 +111,8 @@ def _is_expected(predicted: Posterior, estimated: WindowEstimate) -> bool:
 def _go_on_beside(test: SequentialTest, updated: WindowResult) -> WindowResult:
     """Return the result of a window that shows nothing of what opened the test.
 
-    The windows that opened it may have been wrong, so that the filter goes on. But those of a machine at rest say
-    nothing against its hypotheses, so it is closed only after several of them.
+    The windows that opened it may have been wrong, so that the filter goes on. But windows of a machine at rest
+    are no evidence against its hypotheses, so it is closed only after several of them.
     """
     test = replace(test, quiet=test.quiet + 1)
     return replace(updated, test=test if test.quiet < QUIET_WINDOWS else None, searched=True)

@@ -54,7 +54,7 @@ UNDECIDED = frozenset({WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS, Windo
 OPEN_CONDITION = "the data do not yet decide between the hypotheses"
 NOISE_CONDITION = "the innovations are white, but larger than [noise] allows"
 NOISE_ADVICE = "if it has always been so, correct [noise]; otherwise inspect the sensor, its cable and its supply"
-AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot tell them apart"
+AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot distinguish them"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

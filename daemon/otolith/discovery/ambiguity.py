@@ -1,4 +1,4 @@
-"""Hypotheses that the data cannot tell apart, and what is known of the parameters under all of them.
+"""Hypotheses that the data cannot distinguish, and what is known of the parameters under all of them.
 
 Hypotheses of different types or places may explain the same windows: a resistance of the pipe that has risen, and a
 gain of the sensor of the throttle. Their prior weights and numbers of values must not decide between them. They form a
@@ -18,7 +18,7 @@ from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.problem import Problem
 
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
-WRONG_WINDOW = 0.5  # probability that the only window of a test is itself wrong: it cannot tell
+WRONG_WINDOW = 0.5  # probability that the only window of a test is itself wrong
 
 
 def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:

@@ -28,8 +28,8 @@ class WindowDecision(StrEnum):
     FADED = "a component is no longer there"
     NOISIER = "two windows agree that a sensor is noisier than stated"
     AMBIGUOUS = "several hypotheses explain the windows equally well: what they agree on is estimated"
-    SENSOR = "a sensor is wrong: the window does not update the estimates"
-    TIMING = "a signal is late: the window does not update the estimates"
+    SENSOR = "a sensor is wrong: its error does not count as a change of a parameter"
+    TIMING = "a signal is late: its delay does not count as a change of a parameter"
     BAD = "the window is not good enough: it does not update the estimates"
     REFUSED = "nothing explains the window, neither parameters nor components: it does not update the estimates"
 

@@ -108,7 +108,7 @@ class MapObjective:
         return fit.residuals[: -len(self._mean)]
 
     def evidence(self, fit: FitResult, inflation: float) -> Evidence:
-        """Return what the window says around ``fit``; ``inflation`` multiplies its standard deviations."""
+        """Return the evidence of the window around ``fit``; ``inflation`` multiplies its standard deviations."""
         count = len(self._mean)
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
         constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])

@@ -42,7 +42,7 @@ MIN_FROZEN_RUN = 5  # records of one value
 MAX_FROZEN_SHARE = 0.05  # share of records above which the channel is rejected
 FROZEN_MOVEMENT = 6.0  # standard deviations that the prediction must move while the channel stands still
 FROZEN_STEPS = 2.0  # steps of the converter that it must move beside that
-RESOLVED_NOISE = 2.0  # steps of a converter from which on noise can be told from motion over coarse steps
+RESOLVED_NOISE = 2.0  # steps of a converter from which on noise can be distinguished from motion over coarse steps
 CHANCE = 1e-9  # probability of equal readings of a noisy sensor below which they are no chance
 MIN_REPEATED_RUN = 10  # records
 COARSE_REPEATS = 0.3  # share of the other records in which a coarse sensor repeats its value
@@ -54,7 +54,7 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class CheckedWindow:
-    """A window without faulty records, and what the checks say of it."""
+    """A window without faulty records, and the results of the checks."""
 
     window: Window
     notes: tuple[str, ...] = ()

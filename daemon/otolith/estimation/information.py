@@ -1,4 +1,4 @@
-"""What one window can tell about each parameter: Fisher information from the sensitivities of the prediction."""
+"""The information of one window about each parameter: Fisher information from the sensitivities of the prediction."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ MIN_SINGULAR = 1e-8  # relative singular value below which a direction is not ob
 MIN_BASIS_SINGULAR = 1e-10  # relative singular value of the directions that are projected out
 MAX_BLIND_SHARE = 1e-4  # share in an unobserved direction above which a parameter is not observed
 MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
-PUSHED = 2.0  # times the required interval: a wider one alone does not tell on which side of a bound the value lies
+PUSHED = 2.0  # times the required interval: a wider one leaves open on which side of a bound the value lies
 PRESSED = 3.0  # standard deviations beyond a bound to which a further step would lead: the value lies beyond it
 AT_THE_BOUND = "at its bound {:.4g} {}: widen the bounds in [parameters], or check the equations of the twin"
 TRADED = 0.95  # correlation above which two parameters cannot be distinguished
@@ -23,7 +23,7 @@ CORRELATED = 2.0  # long-run variance over variance above which an autocorrelati
 
 
 class Identifiability(StrEnum):
-    """What a window tells about a parameter."""
+    """How well a window determines a parameter."""
 
     DETERMINED = "determined"
     WEAK = "weak"
@@ -49,19 +49,19 @@ class Information:
     """Uncertainty of every entry of a guess from one window alone."""
 
     sd: Array
-    """(guess,) standard deviation; infinite where the window says nothing."""
+    """(guess,) standard deviation; infinite where the window has no information."""
     correlation: Array
     """(guess, guess)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterEstimate:
-    """What one window alone says about one parameter."""
+    """The estimate of one parameter from one window alone."""
 
     name: str
     value: float
     sd: float
-    """Standard deviation; infinite where the window says nothing."""
+    """Standard deviation; infinite where the window has no information."""
     identifiability: Identifiability
     reason: str
 

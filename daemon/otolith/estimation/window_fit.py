@@ -1,7 +1,7 @@
 """Step 2 of the method: from one window to parameters with their uncertainty.
 
-:func:`fit` is the one fit of a window under a prior; hypotheses use it as well. :func:`estimate` adds what the window
-says alone, and searches with a particle swarm where the prediction does not lead to an explanation.
+:func:`fit` is the one fit of a window under a prior; hypotheses use it as well. :func:`estimate` adds the fit
+of the window alone, and searches with a particle swarm where the prediction does not lead to an explanation.
 """
 
 from dataclasses import dataclass, replace

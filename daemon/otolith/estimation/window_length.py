@@ -1,7 +1,7 @@
 """The length of the next window: long enough for its noise, short enough for what drifts within it.
 
-The paper leaves this open (section 6). What a window alone says of a parameter is about its middle: against the value
-at its end it is off by trend * length / 2, and its variance falls with its length. The sum of squared bias and variance
+The paper leaves this open (section 6). The estimate from a window alone is about its middle: against the value at its end
+it is off by trend * length / 2, and its variance falls with its length. The sum of squared bias and variance
 is least where length³ = 2 * variance * length now / trend².
 """
 

@@ -68,7 +68,7 @@ class ComponentDocument(StrictModel):
     onset: float
     """Unix seconds."""
     alternatives: tuple[AlternativeDocument, ...] = ()
-    """Hypotheses that the data could not tell from it."""
+    """Hypotheses that the data did not distinguish from it."""
 
 
 class Severity(StrEnum):
@@ -103,9 +103,9 @@ class Status(StrEnum):
     AMBIGUOUS = "ambiguous"
     """The hypotheses that explain the windows differ in it; the interval holds all of them."""
     HELD = "held"
-    """From earlier windows; this one adds nothing, and the reason says why."""
+    """From earlier windows; this one adds nothing; why is in the reason."""
     INVALID = "invalid"
-    """The windows contradict the twin or the bounds, and the reason says how; the value is the last that did not."""
+    """The windows contradict the twin or the bounds, how is in the reason; the value is the last that did not."""
 
 
 class QualityDocument(StrictModel):

@@ -20,7 +20,7 @@ HOUR = 3600.0  # s
 
 @dataclass(frozen=True, slots=True)
 class MarginalPosterior:
-    """What all windows together say of a parameter at the end of the last one."""
+    """The estimate of a parameter from all windows, at the end of the last one."""
 
     value: float
     sd: float
@@ -33,7 +33,7 @@ class MarginalPosterior:
 
 @dataclass(frozen=True, slots=True)
 class PreviousStatus:
-    """What the report before said of a parameter."""
+    """The status of a parameter in the report before."""
 
     known: bool = False
     """Whether it has been determined."""
@@ -47,7 +47,7 @@ def some_parameter_is_determined(previous: Mapping[str, PreviousStatus]) -> bool
 
 @dataclass(frozen=True, slots=True)
 class WindowEvidence:
-    """What one window says of a parameter."""
+    """What one window adds about a parameter."""
 
     estimate: ParameterEstimate | None = None
     """None for a window that was not estimated from."""
