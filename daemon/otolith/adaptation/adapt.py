@@ -18,6 +18,7 @@ from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, kee
 from otolith.discovery.ambiguity import mixture
 from otolith.discovery.decision import (
     MAX_COST,
+    UPDATES,
     PosteriorUpdate,
     WindowDecision,
     WindowOutcome,
@@ -189,17 +190,15 @@ def _keep_posterior(
 def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus]) -> AdaptationState:
     """Return the state for the next window."""
     if result.estimate is None:  # data that are not used are evidence neither for a hypothesis nor against one
-        test, contradictions = state.test, state.contradictions + (result.decision is not WindowDecision.BAD)
-    elif result.is_accepted:
-        test, contradictions = result.test if result.decision is WindowDecision.LEARNED else None, 0
-    else:
-        test, contradictions = result.test, state.contradictions + 1
+        test = state.test
+    else:  # the test that led to another posterior is closed
+        test = None if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS else result.test
     return replace(
         state,
         posterior=result.posterior,
         test=test,
         learned=state.learned + result.is_accepted,
-        contradictions=contradictions,
+        contradictions=result.contradictions(state),
         adopted=result.adopted,
         noisier_since=result.noisier_since(state),
         previous=previous,

@@ -45,12 +45,13 @@ from otolith.health.status import (
 )
 from otolith.twin.component_families import SourceKind
 
-MAX_VARIANCE_RATIO = 3.0  # ratio of variances above which windows disagree with each other
+DISAGREEING_RATIO = 3.0  # ratio of variances above which windows disagree with each other
 DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
 UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
-EXCLUDED = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
-UNDECIDED = frozenset({WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS, WindowDecision.REFUSED}) | EXCLUDED
+DATA_FAULTS = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
+OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
+"""Decisions after which the hypotheses of a test go on, and their mixture is published."""
 OPEN_CONDITION = "the data do not yet decide between the hypotheses"
 NOISE_CONDITION = "the innovations are white, but larger than [noise] allows"
 NOISE_ADVICE = "if it has always been so, correct [noise]; otherwise inspect the sensor, its cable and its supply"
@@ -101,6 +102,15 @@ class WindowResult:
         """Whether the window updated the posterior."""
         return self.decision in ACCEPTED
 
+    @property
+    def is_mixture(self) -> bool:
+        """Whether ``after`` is the mixture of the hypotheses of an open test."""
+        return self.test is not None and self.decision in OPEN
+
+    def contradictions(self, state: AdaptationState) -> int:
+        """Return how many windows in a row, with this one, did not update the posterior; bad data are not counted."""
+        return 0 if self.is_accepted else state.contradictions + (self.decision is not WindowDecision.BAD)
+
     def noisier_since(self, state: AdaptationState) -> float | None:
         """Return from when on sensors are noisier than stated, Unix seconds; None if they are not."""
         return self.test.onset if self.decision is WindowDecision.NOISIER and self.test else state.noisier_since
@@ -116,7 +126,7 @@ def make_report(
     previous, parameters = _parameters(state, result)
     _add_advice(parameters, result, situation)
     components = _component_documents(problem, result.after, result.adopted)
-    undecided = result.test if result.decision in UNDECIDED else None
+    undecided = None if result.is_accepted else result.test
     explanations = _explanations(undecided)
     document = ReportDocument(
         machine=state.machine,
@@ -152,8 +162,7 @@ def _parameters(
     documents: dict[str, ParameterDocument] = {}
     previous: dict[str, PreviousStatus] = {}
     required = problem.determined_within * problem.scale
-    contradictions = _contradictions(state, result)
-    is_mixture = result.test is not None and result.decision in UNDECIDED - {WindowDecision.REFUSED}
+    contradictions, is_mixture = result.contradictions(state), result.is_mixture
     variance_ratio, reason = result.posterior.belief.variance_ratio, _reason(state, result)
     for index, (parameter, marginal) in enumerate(zip(problem.free, _marginals(result), strict=True)):
         alone = None if estimated is None else estimated.parameters[index]
@@ -163,13 +172,6 @@ def _parameters(
         if not parameter.name.startswith("_"):
             documents[parameter.name] = document
     return previous, documents
-
-
-def _contradictions(state: AdaptationState, result: WindowResult) -> int:
-    """Return consecutive windows, this one included, that contradict the posterior."""
-    if result.is_accepted:
-        return 0
-    return state.contradictions + (result.decision is not WindowDecision.BAD)
 
 
 def _marginals(result: WindowResult) -> list[MarginalPosterior]:
@@ -197,13 +199,13 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     reasons = [*result.notes]
     if decision is not WindowDecision.LEARNED:
         reasons.append(decision.value)
-    if test is not None and decision in EXCLUDED | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}:
+    if test is not None and decision in OPEN:
         others = [f"or {other.text} ({other.probability:.0%})" for other in alternatives_of(test, test.best)[:2]]
         reasons.append("; ".join([f"{describe_hypothesis(test.best)} ({test.probabilities[0]:.0%})", *others]))
     if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:
         reasons.append(UNEXPLAINED)
     variance_ratio = result.posterior.belief.variance_ratio
-    if variance_ratio > MAX_VARIANCE_RATIO:
+    if variance_ratio > DISAGREEING_RATIO:
         reasons.append(DISAGREEMENT.format(variance_ratio**0.5))
     if decision is WindowDecision.REFUSED and not some_parameter_is_determined(state.previous):
         reasons.append(NEVER_EXPLAINED)
@@ -348,7 +350,7 @@ def _findings(
         findings.append(
             FindingDocument(
                 id="undecided",
-                severity=Severity.FAULT if decision in EXCLUDED else Severity.WARNING,
+                severity=Severity.FAULT if decision in DATA_FAULTS else Severity.WARNING,
                 condition=AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION,
                 text=f"{best.reason}: {best.text} ({best.probability:.0%}){others}",
                 since=test.onset,

@@ -13,7 +13,7 @@ MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accept
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
 COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # the same for a component
 TIMING_WINDOWS = 2  # windows that must agree on a late signal
-EXCLUDING_PROBABILITY = 0.5  # of a faulty sensor or a late signal, if no other type explains the windows as well
+DATA_FAULT_PROBABILITY = 0.5  # of a faulty sensor or a late signal, if no other type explains the windows as well
 YOUNG_WINDOWS = 3  # learned windows that do not outweigh more windows that agree with each other
 AMBIGUOUS_WINDOWS = 3  # windows that several types of hypotheses explain equally
 
@@ -55,8 +55,8 @@ UPDATES = {
     WindowDecision.BAD: PosteriorUpdate.NONE,
     WindowDecision.REFUSED: PosteriorUpdate.NONE,
 }
-EXCLUDING = {FaultType.SENSOR: (WindowDecision.SENSOR, 0), FaultType.TIMING: (WindowDecision.TIMING, TIMING_WINDOWS)}
-"""The decision on a window that a type of hypothesis explains, and how many windows must agree."""
+DATA_FAULTS = {FaultType.SENSOR: (WindowDecision.SENSOR, 0), FaultType.TIMING: (WindowDecision.TIMING, TIMING_WINDOWS)}
+"""For each type of hypothesis that blames the data: its decision, and how many windows must agree."""
 ACCEPTED = frozenset(decision for decision, update in UPDATES.items() if update is not PosteriorUpdate.NONE)
 
 
@@ -91,14 +91,14 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
     if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
-    return _exclude_or_discover(test)
+    return _data_fault_or_component(test)
 
 
-def _exclude_or_discover(test: SequentialTest) -> WindowOutcome:
+def _data_fault_or_component(test: SequentialTest) -> WindowOutcome:
     """Return the decision where neither parameters nor noise are accepted."""
     best = test.best
-    for kind, (decision, windows) in EXCLUDING.items():
-        if test.probability(kind) >= EXCLUDING_PROBABILITY and test.leading >= windows:
+    for kind, (decision, windows) in DATA_FAULTS.items():
+        if test.probability(kind) >= DATA_FAULT_PROBABILITY and test.leading >= windows:
             return WindowOutcome(decision, next(item for item in test.hypotheses if item.type is kind))
     leads = best.type is FaultType.COMPONENT and test.leading >= COMPONENT_WINDOWS
     probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY

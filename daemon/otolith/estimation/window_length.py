@@ -1,8 +1,8 @@
 """The length of the next window: long enough for its noise, short enough for what drifts within it.
 
-The paper leaves this open (section 6). The estimate from a window alone is about its middle: against the value at its end
-it is off by trend * length / 2, and its variance falls with its length. The sum of squared bias and variance
-is least where length³ = 2 * variance * length now / trend².
+The paper leaves this open (section 6). The estimate from a window alone is about its middle: against the value at its
+end it is off by trend * length / 2, and its variance falls with its length. The sum of squared bias and variance is
+least where length³ = 2 * variance * length now / trend².
 """
 
 from dataclasses import dataclass

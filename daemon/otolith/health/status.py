@@ -87,6 +87,7 @@ def publish(
         reason = "; ".join(filter(None, (AT_THE_BOUND.format(value, parameter.unit), reason)))
     elif estimate is not None and (window.accepted or window.at_bound):
         reason = "; ".join(filter(None, (estimate.reason, reason)))
+    identifiability = None if estimate is None else estimate.identifiability
     alone = estimate if estimate is not None and _is_informative(estimate, width) else None
     shown = known and math.isfinite(value + reach + HOUR * (known_now.trend + known_now.trend_sd))
     return PreviousStatus(known, status), ParameterDocument(
@@ -102,11 +103,7 @@ def publish(
         trend_sd_per_hour=HOUR * known_now.trend_sd if shown else None,
         status=status,
         progress=_progress(reach, required, width),
-        identifiability=Identifiability.AT_BOUND
-        if at_bound
-        else None
-        if estimate is None
-        else estimate.identifiability,
+        identifiability=Identifiability.AT_BOUND if at_bound else identifiability,
         reason=reason or _default_reason(status),
     )
 
