@@ -1,5 +1,6 @@
 """Classes of hypotheses that the data cannot distinguish: equal probabilities, and intervals that hold all members."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,31 +23,36 @@ def stated(
     return replace(item, deviance=deviance, misfit=misfit, hypothesis=replace(item.hypothesis, added=added))
 
 
+def shares_of(hypotheses: Sequence[TrackedHypothesis]) -> list[float]:
+    return probabilities(hypotheses, interchangeable(hypotheses))
+
+
 def test_a_sensor_and_several_moved_parameters_that_explain_the_same_are_equally_probable() -> None:
     """The number of values of a hypothesis and its prior weight do not decide."""
     moved, sensor = stated(FaultType.PARAMETER, 20.0, 0.0, 3), stated(FaultType.SENSOR, 0.0, 1.0, 1, OFFSET)
-    assert probabilities([sensor, moved, NULL]) == pytest.approx([0.5, 0.5, 0.0], abs=1e-6)
+    assert shares_of([sensor, moved, NULL]) == pytest.approx([0.5, 0.5, 0.0], abs=1e-6)
     assert interchangeable([sensor, moved, NULL]) == [[0], [1]]
 
 
 def test_data_decide_between_a_sensor_and_moved_parameters() -> None:
     moved, sensor = stated(FaultType.PARAMETER, 0.0, 0.0, 3), stated(FaultType.SENSOR, 15.0, 15.0, 1, OFFSET)
-    assert probabilities([moved, sensor, NULL])[0] > 0.99
+    assert shares_of([moved, sensor, NULL])[0] > 0.99
     assert interchangeable([moved, sensor, NULL]) == [[0]]
 
 
 def test_a_component_with_more_values_needs_evidence() -> None:
     moved, component = stated(FaultType.PARAMETER, 0.0, 1.0, 1), stated(FaultType.COMPONENT, 12.0, 0.0, 3, PERIODIC)
-    assert probabilities([moved, component, NULL])[0] > 0.99
+    assert shares_of([moved, component, NULL])[0] > 0.99
 
 
 def test_variants_of_one_hypothesis_share_its_probability() -> None:
     several = [stated(FaultType.PARAMETER, 0.0, 0.0, 1), stated(FaultType.PARAMETER, 1.0, 0.0, 2)]
     sensor = stated(FaultType.SENSOR, 9.0, 3.0, 1, OFFSET)
-    shares = probabilities([*several, sensor, NULL])
+    members = (*several, sensor, NULL)
+    shares = shares_of(members)
     assert shares[0] + shares[1] == pytest.approx(0.5, abs=1e-6)
     assert shares[0] / shares[1] == pytest.approx(np.exp(0.5))
-    assert without_duplicates((*several, sensor, NULL)) == (several[0], sensor, NULL)
+    assert without_duplicates(members, interchangeable(members)) == (several[0], sensor, NULL)
 
 
 @pytest.mark.parametrize("windows", [1, 3])

@@ -26,7 +26,7 @@ from otolith.discovery.decision import (
 )
 from otolith.discovery.screening import screen_window
 from otolith.discovery.search import with_threshold_test
-from otolith.discovery.sequential_test import SequentialTest, continue_test
+from otolith.discovery.sequential_test import SequentialTest, continue_test, open_test
 from otolith.estimation.augmented import slot_of
 from otolith.estimation.data_checks import CheckedWindow, check_window
 from otolith.estimation.objective import EXPLAINED
@@ -79,44 +79,51 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
-    is_tested, is_expected = state.test is not None, _is_expected(predicted, estimated)
+    is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
     is_calm = is_expected and not screening.is_positive
-    if not is_tested and is_calm:
+    if state.test is not None:
+        test = continue_test(state.test, predicted, screening).beside(estimated.fit)
+        goes_on = is_calm and not test.is_confirmed
+        result = (_go_on_beside if goes_on else _apply_decision)(state, predicted, estimated, test)
+    elif is_calm:
         return _update_filter(state, predicted, estimated)
-    test = continue_test(state.test, predicted, screening)
-    if is_tested:
-        test = test.beside(estimated.fit)
-    if is_tested and is_calm and not test.is_confirmed:
-        return _go_on_beside(test, _update_filter(state, predicted, estimated))
-    if is_expected and not is_tested and test.is_null_possible:
-        return replace(_update_filter(state, predicted, estimated), searched=True)
-    test = replace(test, quiet=0)
-    outcome = decide(test, state.learned)
-    if outcome.update is PosteriorUpdate.HYPOTHESIS:
-        result = _adopt_hypothesis(state, estimated, test, outcome)
-    elif outcome.update is PosteriorUpdate.FILTER and estimated.cost <= MAX_COST:
-        if is_tested or is_expected:
-            result = _update_filter(state, predicted, estimated)
-        else:  # a change in the last records is left to the next window: no other hypothesis was compared
-            result = WindowResult.unchanged(state, predicted, WindowDecision.SUSPECTED, estimate=estimated)
     else:
-        result = _keep_posterior(state, predicted, estimated, test, outcome)
+        test = open_test(predicted, screening)
+        if is_expected and test.is_null_possible:
+            result = _update_filter(state, predicted, estimated)
+        else:
+            result = _apply_decision(state, predicted, estimated, test)
     return replace(result, searched=True)
 
 
-def _is_expected(predicted: Posterior, estimated: WindowEstimate) -> bool:
-    """Whether the residual counts as noise, and the normalised innovation squared is within its limit."""
-    return estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
+def _apply_decision(
+    state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, test: SequentialTest
+) -> WindowResult:
+    """Return the result of a window that the filter does not expect, or that shows what the twin lacks."""
+    test = replace(test, quiet=0)
+    outcome = decide(test, state.learned)
+    if outcome.update is PosteriorUpdate.HYPOTHESIS:
+        return _adopt_hypothesis(state, estimated, test, outcome)
+    if outcome.update is PosteriorUpdate.NONE:
+        return _keep_posterior(state, predicted, estimated, test, outcome.decision)
+    if estimated.cost > MAX_COST:  # the null hypothesis leads, but does not explain the whole window
+        return WindowResult.unchanged(state, predicted, WindowDecision.REFUSED, estimate=estimated)
+    if state.test is None:  # a change in the last records is left to the next window: nothing else was compared
+        return WindowResult.unchanged(state, predicted, WindowDecision.SUSPECTED, estimate=estimated)
+    return _update_filter(state, predicted, estimated)
 
 
-def _go_on_beside(test: SequentialTest, updated: WindowResult) -> WindowResult:
-    """Return the result of a window that shows nothing of what opened the test.
+def _go_on_beside(
+    state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, test: SequentialTest
+) -> WindowResult:
+    """Update the filter with a window that shows nothing of what opened the test.
 
     The windows that opened it may have been wrong, so that the filter goes on. But windows of a machine at rest
     are no evidence against its hypotheses, so it is closed only after several of them.
     """
     test = replace(test, quiet=test.quiet + 1)
-    return replace(updated, test=test if test.quiet < QUIET_WINDOWS else None, searched=True)
+    still_open = test if test.quiet < QUIET_WINDOWS else None
+    return replace(_update_filter(state, predicted, estimated), test=still_open)
 
 
 def _update_filter(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
@@ -171,20 +178,15 @@ def _keep_posterior(
     predicted: Posterior,
     estimated: WindowEstimate,
     test: SequentialTest,
-    outcome: WindowOutcome,
+    decision: WindowDecision,
 ) -> WindowResult:
-    """Return the result of a window that does not update the posterior.
-
-    The test stays open unless the null hypothesis leads.
-    """
-    if outcome.decision is WindowDecision.LEARNED:  # the null hypothesis leads, but does not explain the whole window
-        return WindowResult.unchanged(state, predicted, WindowDecision.REFUSED, estimate=estimated)
-    result = WindowResult.unchanged(state, predicted, outcome.decision, estimate=estimated, test=test)
-    if outcome.decision is WindowDecision.REFUSED:
+    """Return the result of a window that leaves the test open: the posterior stays, the mixture is published."""
+    result = WindowResult.unchanged(state, predicted, decision, estimate=estimated, test=test)
+    if not result.is_mixture:
         return result
     before = result.before if test.windows == 1 else None
-    known = mixture(test.hypotheses, test.probabilities, state.problem, before)
-    return replace(result, before=known, after=known)
+    mixed = mixture(test.hypotheses, test.probabilities, state.problem, before)
+    return replace(result, before=mixed, after=mixed)
 
 
 def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus]) -> AdaptationState:

@@ -40,21 +40,22 @@ def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
     return list(groups.values())
 
 
-def probabilities(hypotheses: Sequence[TrackedHypothesis]) -> list[float]:
-    """Return the probability of each hypothesis; groups of interchangeable ones are equally probable."""
+def probabilities(hypotheses: Sequence[TrackedHypothesis], groups: Sequence[Sequence[int]]) -> list[float]:
+    """Return the probability of each hypothesis; ``groups`` of interchangeable ones are equally probable."""
     logs = -0.5 * np.array([item.deviance for item in hypotheses])
-    groups = interchangeable(hypotheses)
-    totals = [float(np.logaddexp.reduce(logs[group])) for group in groups]
+    totals = [float(np.logaddexp.reduce(logs[list(group)])) for group in groups]
     for group, total in zip(groups, totals, strict=True):
-        logs[group] += max(totals) - total
+        logs[list(group)] += max(totals) - total
     weights = np.exp(logs - logs.max())
     shares: list[float] = (weights / weights.sum()).tolist()
     return shares
 
 
-def without_duplicates(hypotheses: tuple[TrackedHypothesis, ...]) -> tuple[TrackedHypothesis, ...]:
-    """Return the hypotheses with only the best of each group of interchangeable ones."""
-    worse = {at for group in interchangeable(hypotheses) for at in group[1:]}
+def without_duplicates(
+    hypotheses: tuple[TrackedHypothesis, ...], groups: Sequence[Sequence[int]]
+) -> tuple[TrackedHypothesis, ...]:
+    """Return the hypotheses with only the best of each of the ``groups`` of interchangeable ones."""
+    worse = {at for group in groups for at in group[1:]}
     return tuple(item for at, item in enumerate(hypotheses) if at not in worse)
 
 

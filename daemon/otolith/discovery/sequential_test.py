@@ -8,6 +8,7 @@ the equations.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -54,7 +55,7 @@ class FitSummary:
     """Measured values of all outputs."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots: probabilities are computed once
 class SequentialTest:
     """The competing hypotheses. Plain: it pickles."""
 
@@ -85,30 +86,29 @@ class SequentialTest:
         """The most probable hypothesis."""
         return self.hypotheses[0]
 
-    @property
+    @cached_property
+    def groups(self) -> list[list[int]]:
+        """Indices of the hypotheses that explain the windows equally well, grouped by type and place."""
+        return interchangeable(self.hypotheses)
+
+    @cached_property
     def probabilities(self) -> list[float]:
         """Of each hypothesis."""
-        return probabilities(self.hypotheses)
+        return probabilities(self.hypotheses, self.groups)
+
+    @property
+    def has_equal_types(self) -> bool:
+        """Whether hypotheses of several types explain the windows equally."""
+        return len({self.hypotheses[group[0]].type for group in self.groups}) > 1
 
     @property
     def is_ambiguous(self) -> bool:
         """Whether hypotheses of several types explain the windows equally, or did so one window before."""
-        return self.clear < CLEAR_WINDOWS or _are_ambiguous(self.hypotheses)
+        return self.clear < CLEAR_WINDOWS or self.has_equal_types
 
     def probability(self, kind: FaultType) -> float:
         """Return the probability of all hypotheses of one type."""
         return sum(share for share, item in zip(self.probabilities, self.hypotheses, strict=True) if item.type is kind)
-
-    @property
-    def doubts_parameters(self) -> bool:
-        """Whether moved parameters are among the hypotheses that the data do not distinguish from the best."""
-        near = [self.best, *(item for item, _ in self.alternatives(self.best))]
-        return any(item.type is FaultType.PARAMETER for item in near)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether a hypothesis of another type explains the windows as well."""
-        return any(item.type is not self.best.type for item, _ in self.alternatives(self.best))
 
     @property
     def is_null_possible(self) -> bool:
@@ -136,27 +136,30 @@ class SequentialTest:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
         data = [item.deviance - item.hypothesis.prior_deviance for item in self.hypotheses]
         at = self.hypotheses.index(to)
-        equal = {group[0] for group in interchangeable(self.hypotheses)}
+        equal = {group[0] for group in self.groups}
         near = {other for other, deviance in enumerate(data) if abs(deviance - data[at]) <= DECISIVE}
         chosen = sorted((near | equal if at in equal else near) - {at})
         return [(self.hypotheses[other], self.probabilities[other]) for other in chosen]
 
 
-def continue_test(test: SequentialTest | None, predicted: Posterior, screening: ScreeningResult) -> SequentialTest:
-    """Return the test after the screened window; None opens a new one.
+def open_test(predicted: Posterior, screening: ScreeningResult) -> SequentialTest:
+    """Return the test that the screened window opens."""
+    predicted, fitted = search_from_onset(predicted, screening)
+    return new_test(fitted, predicted)
+
+
+def continue_test(test: SequentialTest, predicted: Posterior, screening: ScreeningResult) -> SequentialTest:
+    """Return the test after the screened window.
 
     Where the tracked hypotheses do not explain the window, a new search adds others: something may have begun since.
     """
-    if test is None:
-        predicted, fitted = search_from_onset(predicted, screening)
-        return open_test(fitted, predicted)
     test = follow(test, screening.fitted.window)
     if test.best.explains_all and test.best.cost <= EXPLAINED:
         return test
-    return join(test, open_test(search(screening), predicted))
+    return join(test, new_test(search(screening), predicted))
 
 
-def open_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> SequentialTest:
+def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> SequentialTest:
     """Return a test of the ``fitted`` hypotheses; the first one is the null hypothesis."""
     fitted = [*fitted[:1], *(item for item in fitted[1:] if item.chi_square < DIVERGED)]
     count = fitted[0].fit.count
@@ -169,12 +172,8 @@ def open_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Seque
     kept = [at for at in order if deviances[at] <= least + MAX_DEVIANCE][:MAX_HYPOTHESES]
     always = (FaultType.NOTHING, FaultType.PARAMETER)
     kept += [at for at in order if fitted[at].type in always and at not in kept]
-    tracked = [
-        track(
-            fitted[at], predicted, *(min(number, MAX_FIRST_EVIDENCE) for number in (deviances[at] - least, misfits[at]))
-        )
-        for at in kept
-    ]
+    first = [[min(value, MAX_FIRST_EVIDENCE) for value in (deviances[at] - least, misfits[at])] for at in kept]
+    tracked = [track(fitted[at], predicted, *evidence) for at, evidence in zip(kept, first, strict=True)]
     best = fitted[order[0]]
     last = FitSummary(best.chi_square, least - best.chi_square / variance_factor, count)
     reduced_chi_square = max(fitted[0].chi_square / max(count, 1.0), 1.0)
@@ -210,15 +209,10 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
         tracked = prune(tracked, [deviance for _, deviance in kept])
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     if test.windows > MAX_OPEN_WINDOWS:
-        hypotheses = without_duplicates(hypotheses)
+        hypotheses = without_duplicates(hypotheses, interchangeable(hypotheses))
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
-    hypotheses = _screened(hypotheses, steps)
-    clear = 0 if _are_ambiguous(hypotheses) else test.clear + 1
-    return replace(test, hypotheses=hypotheses, leading=leading, clear=clear, last=last)
-
-
-def _are_ambiguous(hypotheses: Sequence[TrackedHypothesis]) -> bool:
-    return len({hypotheses[group[0]].type for group in interchangeable(hypotheses)}) > 1
+    followed = replace(test, hypotheses=_screened(hypotheses, steps), leading=leading, last=last)
+    return replace(followed, clear=0 if followed.has_equal_types else test.clear + 1)
 
 
 def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
