@@ -69,7 +69,7 @@ def attempts(problem: Problem, window: Window, start: Array) -> tuple[Attempt, .
 
     alone = refined(start)
     begin = time.perf_counter()
-    values = search_parameters(objective, problem.swarm, start, problem.seed + window.index).positions[0, 0]
+    values = search_parameters(objective, problem.swarm, start, problem.seed + window.index).positions[0]
     swarm = Attempt(values, time.perf_counter() - begin + made)
     after = refined(values)
     begin = time.perf_counter()

@@ -1,6 +1,7 @@
 """The particle swarm: its update rule, and its minima compared with those of pymoo on the same objectives."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from pymoo.optimize import minimize
 
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import SwarmRule, particle_swarm, search_parameters, spread_starts
+from otolith.estimation.particle_swarm import particle_swarm, search_parameters, spread_starts
 from otolith.estimation.problem import Problem, SwarmOptions
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
@@ -38,9 +39,8 @@ def rastrigin(x: Array) -> Array:
 
 def otolith_minimum(cost: Callable[[Array], Array], seed: int, generations: int) -> float:
     random = np.random.default_rng(seed)
-    positions = random.uniform(-2.0, 2.0, (1, OPTIONS.size, 2))
-    rule = SwarmRule(OPTIONS, inertia_generations=60, max_generations=generations)
-    return float(particle_swarm(cost, positions, (np.full(2, -2.0), np.full(2, 2.0)), rule, random).costs[0, 0])
+    positions, options = random.uniform(-2.0, 2.0, (OPTIONS.size, 2)), replace(OPTIONS, generations=generations)
+    return float(particle_swarm(cost, positions, (np.full(2, -2.0), np.full(2, 2.0)), options, random).costs[0])
 
 
 def pymoo_minimum(cost: Callable[[Array], Array], seed: int, generations: int) -> float:
@@ -63,25 +63,24 @@ def test_particle_swarm_is_no_worse_than_pymoo(cost: Callable[[Array], Array]) -
 
 
 def test_particle_swarm_follows_equations_1_and_2() -> None:
-    start = np.array([[[0.0], [1.0], [-1.0]]])
+    start = np.array([[0.0], [1.0], [-1.0]])
     bounds = (np.array([-10.0]), np.array([10.0]))
-    rule = SwarmRule(OPTIONS, inertia_generations=10, max_generations=2)
-    result = particle_swarm(sphere, start, bounds, rule, np.random.default_rng(4))
+    result = particle_swarm(sphere, start, bounds, replace(OPTIONS, generations=2), np.random.default_rng(4))
     random = np.random.default_rng(4)
     own, common = random.random(start.shape), random.random(start.shape)
     velocity = OPTIONS.cognitive * own * 0.0 + OPTIONS.social * common * (0.0 - start)
     second = start + velocity
     best = np.minimum(sphere(start), sphere(second))
-    assert result.costs[0] == pytest.approx(np.sort(best[0]))
+    assert result.costs == pytest.approx(np.sort(best))
 
 
-def test_parallel_swarms_are_independent() -> None:
+@pytest.mark.parametrize(("low", "high", "best"), [(-2.0, 2.0, 0.3), (-1.0, 0.0, 0.0), (0.5, 2.0, 0.5)])
+def test_particle_swarm_stays_within_its_bounds(low: float, high: float, best: float) -> None:
     random = np.random.default_rng(1)
-    starts = random.uniform(-2.0, 2.0, (3, OPTIONS.size, 1))
-    low, high = np.array([[[-2.0]], [[-1.0]], [[0.5]]]), np.array([[[2.0]], [[0.0]], [[2.0]]])
-    rule = SwarmRule(OPTIONS, inertia_generations=12, max_generations=60)
-    best = particle_swarm(sphere, np.clip(starts, low, high), (low, high), rule, random).positions[:, 0, 0]
-    assert best == pytest.approx([0.3, 0.0, 0.5], abs=1e-2)
+    starts, bounds = random.uniform(low, high, (OPTIONS.size, 1)), (np.array([low]), np.array([high]))
+    result = particle_swarm(sphere, starts, bounds, replace(OPTIONS, generations=60), random)
+    assert result.positions[0] == pytest.approx(best, abs=1e-2)
+    assert ((low <= result.positions) & (result.positions <= high)).all()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -99,7 +98,7 @@ def test_cold_start_converges_near_the_true_parameters(seed: int) -> None:
     objective = Objective(problem, window, np.array([parameter.high for parameter in free]))
     result = search_parameters(objective, OPTIONS, np.array([parameter.high for parameter in free]), seed)
     assert result.converged
-    assert result.positions[0, 0] == pytest.approx([NOMINAL["R_a"], NOMINAL["J"]], rel=0.1)
+    assert result.positions[0] == pytest.approx([NOMINAL["R_a"], NOMINAL["J"]], rel=0.1)
 
 
 def test_spread_starts_cover_each_order_of_magnitude() -> None:

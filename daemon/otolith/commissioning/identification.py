@@ -183,7 +183,7 @@ def _first_fits(
         if not fits and fit.cost > POOR_FIT:
             objective = Objective(with_levels(problem, levels), window, problem.nominal)
             swarm = search_parameters(objective, problem.swarm, problem.nominal, problem.seed)
-            fit = likelihood.fit(levels, window, [*starts, swarm.positions[0, 0]])
+            fit = likelihood.fit(levels, window, [*starts, swarm.positions[0]])
         fits.append(fit)
         starts = [problem.nominal, fit.guess[: len(problem.free)]]
     return fits

@@ -69,7 +69,7 @@ class SwarmOptions:
     cognitive: float = 2.0
     social: float = 2.0
     tolerance: float = 0.1
-    """The swarm has converged when the best positions of its particles differ by less than this share of χ²: then all
+    """The swarm has converged when χ² at the best positions of its particles differs by at most this share: then all
     lie in one valley, and Gauss-Newton finds its minimum."""
 
 

@@ -300,7 +300,7 @@ def _refine(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[FitResult, int]
     """
     objective, problem = fitted.objective, fitted.problem
     count = min(REFINED_STARTS, REFINED_STARTS * AFFORDABLE_STEPS // max(objective.integrator_steps, 1))
-    starts = (*swarm.positions[0, : REFINED_PARTICLES if count else 1], *spread_starts(*problem.bounds, count, seed))
+    starts = (*swarm.positions[: REFINED_PARTICLES if count else 1], *spread_starts(*problem.bounds, count, seed))
     results = [gauss_newton(objective, objective.guess(start), TRIAL_STEPS) for start in starts]
     best, free = min(results, key=lambda result: result.chi_square), objective.free
     final = gauss_newton(fitted.map_objective, fitted.map_objective.guess(best.guess[:free], best.guess[free:]))
