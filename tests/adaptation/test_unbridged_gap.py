@@ -57,7 +57,7 @@ def test_a_gap_of_the_voltage_is_named_with_time_length_and_remedy(tmp_path: Pat
     refused = documents[2]
     assert refused.decision is WindowDecision.BAD
     reason = refused.parameters["R_a"].reason
-    assert "V_a has no sample for 1.93 s from t = 4.03 s" in reason
+    assert f"V_a has no sample for {LENGTH} s from t = {START} s" in reason
     assert "look at its source" in reason
     assert all(document.decision in ACCEPTED for index, document in enumerate(documents) if index != 2)
 

@@ -60,7 +60,7 @@ def assess_quality(
     slots = span.records
     present = {name: ~records.missing[:, column] for column, name in enumerate(plans)}
     expected = [name for name in plans if name not in records.held]
-    gaps = {name: _longest_gap(present[name], records.grid, span) for name in expected}
+    gaps = {name: longest_gap(present[name], records.grid, span.start, span.period) for name in expected}
     missing = {name: max(0.0, 1.0 - float(present[name].sum()) / max(slots, 1)) for name in expected}
     jitters = {name: _rms(item.lateness) for name, item in cyclic.items()}
     offsets = [float(np.median(item.lateness)) for item in cyclic.values() if len(item.lateness)]
@@ -125,9 +125,11 @@ def _beyond(values: Mapping[str, float], limit: float, text: str) -> list[str]:
     return [text.format(name, values[name], limit)] if name and values[name] > limit else []
 
 
-def _longest_gap(present: Mask, grid: TimeGrid, span: GridSpan) -> Gap:
-    """Return the longest time without a sample of a signal; one period without a sample is no gap."""
-    start, period = span.start, span.period
+def longest_gap(present: Mask, grid: TimeGrid, start: float, period: float) -> Gap:
+    """Return the longest time without a sample of a signal, from a ``period`` (s) after the sample before.
+
+    ``present`` (records,) marks the records with a sample; the first record of ``grid`` is at ``start`` (s).
+    """
     if grid.period is not None:
         edges = np.flatnonzero(np.diff(np.concatenate(([False], ~present, [False])).astype(np.int8)))
         runs = edges[1::2] - edges[::2]
@@ -136,7 +138,7 @@ def _longest_gap(present: Mask, grid: TimeGrid, span: GridSpan) -> Gap:
     times = np.concatenate([[0.0], grid.offsets[present], [grid.length]])
     lengths = np.diff(times) - period * (np.arange(len(times) - 1) > 0)
     at = int(np.argmax(lengths))
-    return Gap(start + float(times[at]), max(float(lengths[at]), 0.0))
+    return Gap(start + float(times[at]) + period * (at > 0), max(float(lengths[at]), 0.0))
 
 
 def _rms(lateness: Array) -> float:

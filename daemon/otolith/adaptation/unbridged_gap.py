@@ -6,12 +6,9 @@ no parameter, the window is refused and the gap is named.
 """
 
 from dataclasses import replace
-from itertools import pairwise
 
-import numpy as np
-
-from otolith.acquisition.quality import time_text
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.quality import Gap, longest_gap, time_text
+from otolith.acquisition.window import Window
 from otolith.estimation.information import QUANTILE, Identifiability, information
 from otolith.estimation.objective import Objective
 from otolith.estimation.window_fit import WindowEstimate
@@ -28,29 +25,24 @@ def unbridged_gap(estimated: WindowEstimate) -> str:
     if any(item.identifiability is Identifiability.DETERMINED for item in estimated.parameters):
         return ""
     gaps = {
-        source.name: _longest_gap(window, source.name, error.held_variance[:, window.signals.index(source.name)])
+        source.name: _longest_uncertain_gap(window, source.name)
         for source in problem.twin.inputs
         if source.name in window.signals
     }
-    name = max(gaps, key=lambda name: gaps[name][1], default="")
-    if not name or gaps[name][1] < MIN_SHARE * window.grid.length or not _determines_without(estimated):
+    name = max(gaps, key=lambda name: gaps[name].length, default="")
+    if not name or gaps[name].length < MIN_SHARE * window.grid.length or not _determines_without(estimated):
         return ""
-    start, length = gaps[name]
-    where = f"{name} has no sample for {length:.3g} s from {time_text(start)}"
+    where = f"{name} has no sample for {gaps[name].length:.4g} s from {time_text(gaps[name].start)}"
     remedy = "look at its source, or accept less with [estimation] determined_within"
     return f"{where}, and no parameter can be determined within what is asked for: {remedy}"
 
 
-def _longest_gap(window: Window, name: str, variance: Array) -> tuple[float, float]:
-    """Return start (Unix s) and length (s) of the longest gap in which the input is uncertain."""
-    offsets = np.append(window.grid.offsets, window.grid.length)
-    sampled = np.concatenate([[0], np.flatnonzero(~window.missing_in(name)), [window.records]])
-    longest = (0.0, 0.0)
-    for first, last in pairwise(sampled.tolist()):
-        length = float(offsets[last] - offsets[first])
-        if last > first + 1 and variance[first:last].any() and length > longest[1]:
-            longest = (window.start + float(offsets[first]), length)
-    return longest
+def _longest_uncertain_gap(window: Window, name: str) -> Gap:
+    """Return the longest time without a sample in which the input is uncertain."""
+    uncertain = window.missing_in(name)
+    if window.bridge_error is not None:
+        uncertain = uncertain & (window.bridge_error.held_variance[:, window.signals.index(name)] > 0.0)
+    return longest_gap(~uncertain, window.grid, window.start, window.sample_period)
 
 
 def _determines_without(estimated: WindowEstimate) -> bool:
