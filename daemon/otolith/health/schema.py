@@ -101,7 +101,7 @@ class Status(StrEnum):
     ESTIMATED = "estimated"
     """From this window and those before it."""
     AMBIGUOUS = "ambiguous"
-    """The hypotheses that explain the windows differ in it; the interval holds all of them."""
+    """The hypotheses that explain the windows differ in it by more than is required; the interval holds all of them."""
     HELD = "held"
     """From earlier windows; this one adds nothing; why is in the reason."""
     INVALID = "invalid"
