@@ -13,9 +13,9 @@ from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange
 from otolith.discovery.linear_response import Guess, LinearResponse, basis_functions
 from otolith.discovery.screening import (
     DECISIVE,
-    Alternatives,
+    CompetingForms,
     ScoredGuess,
-    Screening,
+    ScoredGuesses,
     allowed_forms,
     grid_guesses,
     highest_lines,
@@ -39,7 +39,7 @@ class Candidate:
     """A component worth a fit."""
 
     component: Component
-    alternatives: float
+    competing: float
     """Number of forms of its kind."""
     of_sensor: bool
 
@@ -48,38 +48,36 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     """Return the components worth a fit, the best first."""
     problem = response.problem
     forms = allowed_forms(problem, response.x)
-    alternatives = Alternatives.among(problem, forms)
-    guesses = _best_guesses(response, forms, alternatives)
+    competing = CompetingForms.among(problem, forms)
+    guesses = _best_guesses(response, forms, competing)
     if not guesses:
         return []
     best = guesses[0].score
-    guesses = _without_parameters(response, guesses, alternatives)
+    guesses = _without_parameters(response, guesses, competing)
     least = max(best - SCORE_MARGIN - SCORE_SHARE * abs(best), -DECISIVE)
     kept = [guess for guess in guesses if guess.score > least][: _affordable(response)]
     kept += threshold_like(problem, guesses[len(kept) :]) if kept else []
     components = components_of(response, kept)
     return [
-        Candidate(component, alternatives.of(guess.form), alternatives.is_sensor(guess.form))
+        Candidate(component, competing.of(guess.form), competing.is_sensor(guess.form))
         for guess, component in components
     ]
 
 
-def _best_guesses(
-    response: LinearResponse, forms: list[CandidateForm], alternatives: Alternatives
-) -> list[ScoredGuess]:
+def _best_guesses(response: LinearResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[ScoredGuess]:
     """Return each form with its best inner parameter, the best form first; only those of leading forms are refined."""
     spectral = [form for form in forms if len(form.model.phases) > 1]
     others = [form for form in forms if len(form.model.phases) == 1]
     guesses = grid_guesses(response, others, FINE) + highest_lines(response, spectral, FINE)
-    screening = Screening.of(response, guesses, alternatives)
+    scored = ScoredGuesses.of(response, guesses, competing)
     by_form: dict[CandidateForm, list[int]] = {}
-    for index in np.argsort(-screening.scores, kind="stable").tolist():
-        by_form.setdefault(screening.guesses[index][0], []).append(index)
-    best = [screening[order[0]] for form, order in by_form.items() if form.model.inner is None]
+    for index in np.argsort(-scored.scores, kind="stable").tolist():
+        by_form.setdefault(scored.guesses[index][0], []).append(index)
+    best = [scored[order[0]] for form, order in by_form.items() if form.model.inner is None]
     searched = [(form, order) for form, order in by_form.items() if form.model.inner is not None][:MAX_REFINED]
     if searched:
-        starts = [(form, [screening.guesses[at][1] for at in order[:PEAKS]]) for form, order in searched]
-        settled = Screening.of(response, refine_inner_parameters(response, starts), alternatives)
+        starts = [(form, [scored.guesses[at][1] for at in order[:PEAKS]]) for form, order in searched]
+        settled = ScoredGuesses.of(response, refine_inner_parameters(response, starts), competing)
         best += [settled[index] for index in range(len(searched))]
     return sorted(best, key=lambda guess: -guess.score)
 
@@ -121,16 +119,14 @@ def _around(form: CandidateForm, x: Array, inner: Array, scale: float) -> list[f
 
 
 def _without_parameters(
-    response: LinearResponse, guesses: list[ScoredGuess], alternatives: Alternatives
+    response: LinearResponse, guesses: list[ScoredGuess], competing: CompetingForms
 ) -> list[ScoredGuess]:
     """Return the guesses that no parameter would produce as well; errors of sensors stay."""
     curves = [len(guess.form.model.phases) for guess in guesses]
     amplitudes = np.concatenate([guess.amplitudes[:count] for guess, count in zip(guesses, curves, strict=True)])
     same = response.is_parameter(basis_functions((guess.form, guess.inner) for guess in guesses), amplitudes)
     first = np.cumsum([0, *curves[:-1]]).tolist()
-    return [
-        guess for guess, at in zip(guesses, first, strict=True) if alternatives.is_sensor(guess.form) or not same[at]
-    ]
+    return [guess for guess, at in zip(guesses, first, strict=True) if competing.is_sensor(guess.form) or not same[at]]
 
 
 def _affordable(response: LinearResponse) -> int:

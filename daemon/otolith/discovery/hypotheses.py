@@ -140,7 +140,7 @@ def with_candidate(
         for value, parameter in zip(before.fit.parameters, base.free, strict=True):
             start[order.index(parameter.name)] = value
     added = len(wider.free) - len(base.free) + (0 if before is None else before.hypothesis.added)
-    alternatives = candidate.alternatives * (1.0 if before is None else before.hypothesis.alternatives)
+    alternatives = candidate.competing * (1.0 if before is None else before.hypothesis.alternatives)
     kind = FaultType.SENSOR if candidate.of_sensor else FaultType.COMPONENT
     stated = FaultHypothesis(kind, _names(wider), added, alternatives)
     return Proposal(stated, wider, extended, start)

@@ -32,7 +32,7 @@ THRESHOLD_TEST_EVERY = 4  # windows: in one of them, families that the linear re
 
 
 @dataclass(frozen=True, slots=True)
-class Alternatives:
+class CompetingForms:
     """How many forms compete, by kind."""
 
     first_sensor: int
@@ -43,7 +43,7 @@ class Alternatives:
     """Indices of the sources that are states."""
 
     @classmethod
-    def among(cls, problem: Problem, forms: list[CandidateForm]) -> "Alternatives":
+    def among(cls, problem: Problem, forms: list[CandidateForm]) -> "CompetingForms":
         """Count ``forms``."""
         twin = problem.base_model
         first = len(twin.sites)
@@ -174,7 +174,7 @@ def grid_guesses(response: LinearResponse, forms: list[CandidateForm], fineness:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Screening:
+class ScoredGuesses:
     """Many guesses and their scores."""
 
     guesses: list[Guess]
@@ -184,14 +184,14 @@ class Screening:
     """(guesses,) gains in -2 log evidence over parameters only."""
 
     @classmethod
-    def of(cls, response: LinearResponse, guesses: list[Guess], alternatives: Alternatives) -> "Screening":
+    def of(cls, response: LinearResponse, guesses: list[Guess], competing: CompetingForms) -> "ScoredGuesses":
         """Score ``guesses`` by the linear response."""
         statistics = response.score(guesses)
         count = response.objective.count
         parameters = np.array([_parameter_count(form) for form, _ in guesses], dtype=np.float64)
-        competing = np.array([alternatives.of(form) for form, _ in guesses])
+        counts = np.array([competing.of(form) for form, _ in guesses])
         variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)
-        scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * competing)
+        scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * counts)
         return cls(guesses, statistics.amplitudes, np.asarray(scores))
 
     def __getitem__(self, index: int) -> ScoredGuess:
@@ -289,22 +289,22 @@ def screen_fit(fitted: Fit) -> ScreeningResult:
         for form in allowed_forms(problem, response.x)
         if problem.discover and (len(form.model.phases) == 1 or source_kinds[form.source] is kind)
     ]
-    alternatives = Alternatives.among(problem, forms)
+    competing = CompetingForms.among(problem, forms)
     spectral = [form for form in forms if len(form.model.phases) > 1]
     others = [form for form in forms if len(form.model.phases) == 1]
-    guesses = grid_guesses(response, others, COARSE) + promising_lines(response, spectral, alternatives)
-    gain = float(Screening.of(response, guesses, alternatives).scores.max(initial=-np.inf)) - DECISIVE
+    guesses = grid_guesses(response, others, COARSE) + promising_lines(response, spectral, competing)
+    gain = float(ScoredGuesses.of(response, guesses, competing).scores.max(initial=-np.inf)) - DECISIVE
     return ScreeningResult(gain, fitted, response)
 
 
-def promising_lines(response: LinearResponse, forms: list[CandidateForm], alternatives: Alternatives) -> list[Guess]:
+def promising_lines(response: LinearResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[Guess]:
     """Return the spectral lines whose estimated gain is not far below what a search requires, those of largest gain.
 
     A line that gains enough is left out with probability 4e-6 (:meth:`LinearResponse.estimated_gains`).
     """
     lines: list[tuple[float, Guess]] = []
     for form, grid, gains in _spectra(response, forms, COARSE):
-        required = DECISIVE + _penalty(form, alternatives, response.objective.count)
+        required = DECISIVE + _penalty(form, competing, response.objective.count)
         lines += [(gains[at], (form, float(grid[at]))) for at in np.flatnonzero(gains > ESTIMATE_SHARE * required)]
     lines.sort(key=lambda line: -line[0])
     return [guess for _, guess in lines[:MAX_LINES]]
@@ -332,6 +332,6 @@ def _spectra(
         yield from ((form, grid, gains[form.site]) for form in of_source)
 
 
-def _penalty(form: CandidateForm, alternatives: Alternatives, count: float) -> float:
+def _penalty(form: CandidateForm, competing: CompetingForms, count: float) -> float:
     """Return what is subtracted from the gain of a form, in -2 log evidence of ``count`` measured values."""
-    return float(_parameter_count(form) * np.log(count) + 2.0 * np.log(3.0 * alternatives.of(form)))
+    return float(_parameter_count(form) * np.log(count) + 2.0 * np.log(3.0 * competing.of(form)))

@@ -29,8 +29,8 @@ from otolith.discovery.linear_response import LinearResponse, chi_square_of_para
 from otolith.discovery.noise_hypothesis import noisier_sensors
 from otolith.discovery.screening import (
     DECISIVE,
-    Alternatives,
-    Screening,
+    CompetingForms,
+    ScoredGuesses,
     ScreeningResult,
     allowed_forms,
     linearised,
@@ -108,14 +108,12 @@ def _threshold_gain(response: LinearResponse) -> float:
     """Return what the threshold-like families would gain if nothing were known of the parameters; they are fitted."""
     problem, fresh = response.problem, initial_prior(response.problem)
     forms = allowed_forms(problem, response.x)
-    alternatives = Alternatives.among(problem, forms)
-    guesses = [
-        (form, form.bounds[0]) for form in forms if form.model.threshold_like and not alternatives.is_sensor(form)
-    ]
-    screening = Screening.of(response, guesses, alternatives)
-    readable = [guess for guess in map(screening.__getitem__, range(len(guesses))) if guess.is_readable]
+    competing = CompetingForms.among(problem, forms)
+    guesses = [(form, form.bounds[0]) for form in forms if form.model.threshold_like and not competing.is_sensor(form)]
+    scored = ScoredGuesses.of(response, guesses, competing)
+    readable = [guess for guess in map(scored.__getitem__, range(len(guesses))) if guess.is_readable]
     proposals = [
-        with_candidate(problem, fresh, Candidate(component, alternatives.of(guess.form), False))
+        with_candidate(problem, fresh, Candidate(component, competing.of(guess.form), False))
         for guess, component in components_of(response, threshold_like(problem, readable))
     ]
     best = -np.inf
