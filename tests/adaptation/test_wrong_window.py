@@ -7,8 +7,10 @@ import pytest
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
+from otolith.adaptation.reporting import OPEN
 from otolith.adaptation.state import initial_state
 from otolith.discovery.decision import WindowDecision
+from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
@@ -51,11 +53,25 @@ def late_voltage(values: Array) -> Array:
 WRONG = (late_current, low_voltage, offset_load, offset_voltage, late_voltage)
 
 
-def reports(windows: list[Window], free: tuple[str, ...]) -> list[ReportDocument]:
+def high_voltage(values: Array) -> Array:
+    values[:, 0] *= 1.05
+    return values
+
+
+def rough_speed(values: Array) -> Array:
+    """The speed only has steps of 25 times its noise."""
+    values[:, 3] = 0.5 * (values[:, 3] / 0.5).round()
+    return values
+
+
+def problem_of(free: tuple[str, ...]) -> Problem:
     known = tuple(pair for pair in TRUTH.items() if pair[0] not in free)
     estimated = tuple(parameter for parameter in MOTOR.parameters if parameter.name in free)
-    problem = Problem(MOTOR, known, estimated, (0.005, 0.02), input_noise=(0.0, 0.0002))
-    state, documents = initial_state("motor", "bench", problem), []
+    return Problem(MOTOR, known, estimated, (0.005, 0.02), input_noise=(0.0, 0.0002))
+
+
+def reports(windows: list[Window], free: tuple[str, ...]) -> list[ReportDocument]:
+    state, documents = initial_state("motor", "bench", problem_of(free)), []
     for window in windows:
         state, report = adapt(state, window)
         documents.append(report.document)
@@ -81,3 +97,30 @@ def test_a_wrong_window_is_given_up(
                 assert parameter.sd is not None
                 assert abs(parameter.value - TRUTH[name]) <= SDS * parameter.sd, document.window.index
     assert documents[-1].parameters["R_a"].status is Status.ESTIMATED
+
+
+@pytest.mark.parametrize("free", [("R_a",), ("R_a", "D")], ids=len)
+def test_windows_that_are_wrong_now_and_then_move_no_estimate(
+    free: tuple[str, ...], scenario: MotorScenario, windows: Cut
+) -> None:
+    """Each wrong window is a new contradiction, whatever the one before suggested."""
+    cut = [window for window, _ in windows(scenario.model_copy(update={"faults": ()}), WINDOWS + 5)]
+    for at in range(5, len(cut), 3):
+        cut[at] = replace(cut[at], values=high_voltage(cut[at].values.copy()))
+    for document in reports(cut, free)[:15]:
+        if document.decision is WindowDecision.LEARNED:
+            resistance = document.parameters["R_a"]
+            assert resistance.value is not None
+            assert resistance.sd is not None
+            assert abs(resistance.value - TRUTH["R_a"]) <= SDS * resistance.sd, document.window.index
+
+
+def test_nothing_is_estimated_from_what_no_hypothesis_explains(scenario: MotorScenario, windows: Cut) -> None:
+    state, unexplained = initial_state("motor", "bench", problem_of(("R_a", "D"))), 0
+    for window, _ in windows(scenario.model_copy(update={"faults": ()}), WINDOWS):
+        state, report = adapt(state, replace(window, values=rough_speed(window.values.copy())))
+        if state.test is not None and report.document.decision in OPEN and state.test.best.cost > EXPLAINED:
+            unexplained += 1
+            statuses = {parameter.status for parameter in report.document.parameters.values()}
+            assert Status.ESTIMATED not in statuses, window.index
+    assert unexplained > 0

@@ -24,6 +24,7 @@ from otolith.discovery.decision import (
     WindowOutcome,
     decide,
 )
+from otolith.discovery.hypotheses import FaultType
 from otolith.discovery.screening import screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, open_test
@@ -81,8 +82,10 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
         screening = with_threshold_test(screening)
     is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
     is_calm = is_expected and not screening.is_positive
-    if state.test is not None:
-        test = continue_test(state.test, predicted, screening).beside(estimated.fit)
+    test = None if state.test is None else continue_test(state.test, predicted, screening).beside(estimated.fit)
+    if test is not None and test.best.type is FaultType.NOTHING and not is_expected:
+        state, test = replace(state, test=None), None  # what the window shows is none of what opened the test
+    if test is not None:
         goes_on = is_calm and not test.is_confirmed
         result = (_go_on_beside if goes_on else _apply_decision)(state, predicted, estimated, test)
     elif is_calm:
@@ -184,7 +187,7 @@ def _keep_posterior(
     result = WindowResult.unchanged(state, predicted, decision, estimate=estimated, test=test)
     if not result.is_mixture:
         return result
-    before = result.before if test.windows == 1 else None
+    before = None if test.windows > 1 and result.is_explained else result.before
     mixed = mixture(test.hypotheses, test.probabilities, state.problem, before)
     return replace(result, before=mixed, after=mixed)
 

@@ -107,6 +107,11 @@ class WindowResult:
         """Whether ``after`` is the mixture of the hypotheses of an open test."""
         return self.test is not None and self.decision in OPEN
 
+    @property
+    def is_explained(self) -> bool:
+        """Whether the best hypothesis of an open test explains the window up to the noise."""
+        return self.test is None or self.test.best.cost <= EXPLAINED
+
     def contradictions(self, state: AdaptationState) -> int:
         """Return how many windows in a row, with this one, did not update the posterior; bad data are not counted."""
         return 0 if self.is_accepted else state.contradictions + (self.decision is not WindowDecision.BAD)
@@ -166,7 +171,9 @@ def _parameters(
     variance_ratio, reason = result.posterior.belief.variance_ratio, _reason(state, result)
     for index, (parameter, marginal) in enumerate(zip(problem.free, _marginals(result), strict=True)):
         alone = None if estimated is None else estimated.parameters[index]
-        evidence = WindowEvidence(alone, result.decision, contradictions, variance_ratio, is_mixture, reason)
+        evidence = WindowEvidence(
+            alone, result.decision, contradictions, variance_ratio, is_mixture, result.is_explained, reason
+        )
         before = state.previous.get(parameter.label, PreviousStatus())
         previous[parameter.label], document = publish(parameter, float(required[index]), marginal, evidence, before)
         if not parameter.name.startswith("_"):

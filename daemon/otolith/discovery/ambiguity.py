@@ -64,8 +64,8 @@ def mixture(
 ) -> Prior:
     """Return what is known of the free parameters of ``problem`` under all hypotheses, as one normal distribution.
 
-    ``shares`` are their probabilities. What was known ``before`` the only window of a test counts as much as all of
-    them: the window itself may be wrong.
+    ``shares`` are their probabilities. What was known ``before`` a window that may itself be wrong counts as much as
+    all of them.
     """
     priors, weights = [item.known(problem) for item in hypotheses], np.array(shares)
     if before is not None:

@@ -58,6 +58,8 @@ class WindowEvidence:
     """Variance between windows over the variance that they state."""
     is_mixture: bool = False
     """Whether what is known is the mixture of several hypotheses, each updated with the window."""
+    is_explained: bool = True
+    """Whether the best of these explains the window up to the noise."""
     reason: str = ""
     """About the window as a whole."""
 
@@ -117,7 +119,8 @@ def _status(
     if not known:
         return Status.UNESTIMATED
     if window.is_mixture:
-        return Status.ESTIMATED if QUANTILE * known_now.sd <= required else Status.AMBIGUOUS
+        is_agreed = window.is_explained and QUANTILE * known_now.sd <= required
+        return Status.ESTIMATED if is_agreed else Status.AMBIGUOUS
     if not window.accepted or window.estimate is None:
         return Status.HELD
     if not before.known:
