@@ -8,16 +8,36 @@ from pathlib import Path
 
 import pytest
 
-from otolith.adaptation.state import ComponentRecord, OperatorDecisions
+from otolith.adaptation.state import (
+    AdaptationState,
+    ComponentRecord,
+    OperatorDecisions,
+    component_records,
+    initial_state,
+    restore_components,
+)
 from otolith.discovery.adopted import AdoptedComponent
 from otolith.estimation.problem import Component
-from otolith.machine import find_twin
+from otolith.machine import load_machine
+from otolith.runtime import state_store
 from otolith.runtime.state_store import StateStore, WriterThread
+from otolith_drivers.errors import OtolithError, ServiceError
+from tests.cli.replays import MACHINE
 from tests.waiting import PATIENCE, wait_for, within
 
 FRICTION = Component("shaft", "Coulomb", "omega", -0.004, inner=0.1, low=0.05, high=1.0)
-SAVED = (ComponentRecord(AdoptedComponent(FRICTION, 5.0), (-0.004, 0.1), (1e-5, 1e-3)),)
+PROBLEM = load_machine(MACHINE, with_driver=False).problem
 IMMEDIATELY = within(0.1)  # s: far less than a disk that does not answer
+
+
+def with_friction(amplitude: float) -> AdaptationState:
+    """Return a state with dry friction of ``amplitude`` (N·m)."""
+    record = ComponentRecord(AdoptedComponent(FRICTION, 5.0), (amplitude, 0.1), (1e-5, 1e-3))
+    return restore_components(initial_state("motor", "here", PROBLEM), (record,))
+
+
+STATE = with_friction(-0.004)
+SAVED = component_records(STATE)
 
 
 def is_being_read(pipe: Path, descriptors: list[int]) -> bool:
@@ -29,7 +49,7 @@ def is_being_read(pipe: Path, descriptors: list[int]) -> bool:
 
 @pytest.fixture
 def store(tmp_path: Path) -> StateStore:
-    return StateStore("here", "motor", find_twin("dc_motor"), tmp_path / "components")
+    return StateStore("here", "motor", PROBLEM.base_model, tmp_path / "components")
 
 
 @pytest.fixture
@@ -42,7 +62,7 @@ def writer(store: StateStore) -> Iterator[WriterThread]:
 
 def test_the_latest_components_are_on_disk_after_stop(store: StateStore, writer: WriterThread) -> None:
     for amplitude in (-0.001, -0.002, -0.003, -0.004):
-        writer.save((ComponentRecord(AdoptedComponent(FRICTION, 5.0), (amplitude, 0.1), (1e-5, 1e-3)),))
+        writer.save(with_friction(amplitude))
     writer.stop(PATIENCE)
     assert store.components() == SAVED
 
@@ -68,7 +88,7 @@ def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> Non
     store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
     writer = WriterThread(store, store.decisions_time())
     writer.start()
-    writer.save(SAVED)
+    writer.save(STATE)
     wait_for(store.components_path.exists)
     writer.stop(PATIENCE)
     assert writer.new_decisions() is None
@@ -82,7 +102,7 @@ def test_callers_do_not_wait_for_a_disk_that_hangs(store: StateStore, writer: Wr
     descriptors: list[int] = []
     wait_for(lambda: is_being_read(store.decisions_path, descriptors))
     begun = time.monotonic()
-    writer.save(SAVED)
+    writer.save(STATE)
     assert writer.new_decisions() is None
     assert time.monotonic() - begun < IMMEDIATELY
     writer.stop(0.2)
@@ -98,9 +118,101 @@ def test_a_failed_write_is_tried_again_and_logged_once(
 ) -> None:
     folder = store.components_path.parent
     folder.write_text("a file where a folder should be", encoding="utf-8")
-    writer.save(SAVED)
-    wait_for(lambda: "components are not saved" in caplog.text)
+    writer.save(STATE)
+    wait_for(lambda: "what was learned is not saved" in caplog.text)
     folder.unlink()
     writer.stop(PATIENCE)
     assert store.components() == SAVED
-    assert caplog.text.count("components are not saved") == 1
+    assert caplog.text.count("what was learned is not saved") == 1
+
+
+def test_a_second_process_cannot_take_the_lock(store: StateStore) -> None:
+    other = StateStore("here", "motor", PROBLEM.base_model, store.components_path.parent)
+    with store.locked():
+        with pytest.raises(ServiceError, match=f"motor at here: process {os.getpid()} of Otolith already uses"):
+            other.lock()
+        with pytest.raises(ServiceError, match="already uses"):
+            other.save(STATE)
+        store.save(STATE)
+    other.lock()
+    other.unlock()
+    StateStore("here", "pump", PROBLEM.base_model, store.components_path.parent).lock()
+
+
+def test_a_lock_file_that_is_a_link_is_refused(store: StateStore, tmp_path: Path) -> None:
+    store.lock_path.parent.mkdir()
+    store.lock_path.symlink_to(tmp_path / "other")
+    with pytest.raises(ServiceError, match="cannot be locked"):
+        store.lock()
+    assert not (tmp_path / "other").exists()
+
+
+def test_root_gives_the_open_file_to_the_owner_of_the_folder_and_never_a_path(
+    store: StateStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The daemon's user owns the folder and replaces what root is writing by a link, just before the owner changes."""
+    victim, given = tmp_path / "victim", list[int]()
+    victim.write_text("of root", encoding="utf-8")
+    change_owner = os.fchown
+
+    def swap_and_give(handle: int, user: int, group: int) -> None:
+        for path in store.decisions_path.parent.glob("*.new"):
+            path.unlink()
+            path.symlink_to(victim)
+        given.append(os.fstat(handle).st_ino)
+        change_owner(handle, user, group)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr(os, "fchown", swap_and_give)
+    monkeypatch.setattr(os, "chown", refuse)
+    before = victim.stat()
+    store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
+    assert given
+    assert before.st_ino not in given
+    assert (victim.stat().st_uid, victim.read_text(encoding="utf-8")) == (before.st_uid, "of root")
+
+
+def test_nothing_is_written_through_a_folder_that_was_replaced_by_a_link(store: StateStore, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    store.components_path.parent.symlink_to(elsewhere)
+    with pytest.raises(ServiceError):
+        store.save_decisions(OperatorDecisions())
+    with pytest.raises(ServiceError):
+        store.save(STATE)
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_a_failed_write_leaves_the_file_as_it_was_and_nothing_else(
+    store: StateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store.save(STATE)
+    names, before = sorted(store.components_path.parent.iterdir()), store.components_path.read_bytes()
+
+    def fail(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(ServiceError, match="No space left"):
+        store.save(with_friction(-0.001))
+    assert sorted(store.components_path.parent.iterdir()) == names
+    assert store.components_path.read_bytes() == before
+
+
+def test_a_state_that_is_larger_than_what_is_read_is_not_written(
+    store: StateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_store, "MAX_STATE_BYTES", 100)
+    with pytest.raises(ServiceError, match="larger than 100 bytes"):
+        store.save(STATE)
+
+
+def test_decisions_of_a_newer_version_are_kept_and_refused(store: StateStore) -> None:
+    store.decisions_path.parent.mkdir()
+    store.decisions_path.write_text('{"version": 99, "approved": ["shaft/Coulomb/omega"]}', encoding="utf-8")
+    with pytest.raises(OtolithError, match="version 99"):
+        store.decisions()
+    assert "shaft/Coulomb/omega" in store.decisions_path.read_text(encoding="utf-8")

@@ -7,14 +7,17 @@ import numpy as np
 
 from otolith.discovery.adopted import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
-from otolith.estimation.augmented import augment, indices, slot_of
+from otolith.estimation.augmented import augment, indices, slot_of, without
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
+from otolith.health.schema import Status
 from otolith.health.status import PreviousStatus
 
 MIN_COARSE_RECORDS = 50  # records of a window on a coarser grid: fewer determine little, however long the sample period
 RESTART_FACTOR = 3.0  # on the standard deviations before a restart: nothing was observed meanwhile
 PHASE = 2  # position of the phase among the values of a component
+EVERYTHING = "*"
+"""Stands for all parameters, components and noise levels among the names of :attr:`OperatorDecisions.resets`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +45,13 @@ class AdaptationState:
     """The components in the twin."""
     noisier_since: float | None = None
     """Unix seconds from which on sensors are noisier than stated; None if they are not."""
+    resets: Mapping[str, float] = field(default_factory=dict)
+    """The :attr:`OperatorDecisions.resets` that have been applied."""
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether no window contradicts the twin or the bounds of a parameter."""
+        return all(before.status is not Status.INVALID for before in self.previous.values())
 
     @property
     def problem(self) -> Problem:
@@ -101,10 +111,16 @@ class OperatorDecisions:
     """They are no components, and discovery leaves them out."""
     forgotten: Mapping[str, float] = field(default_factory=dict)
     """Unix seconds: a component discovered before then has to be discovered again."""
+    resets: Mapping[str, float] = field(default_factory=dict)
+    """Unix seconds at which the operator reset a parameter, a component or everything, by name. Each is applied once.
+    """
 
 
 def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
     """Return the state after the operator's decisions."""
+    for name in sorted(decisions.resets):  # EVERYTHING comes first
+        if state.resets.get(name) != decisions.resets[name]:
+            state = _reset(state, name)
     for item in state.adopted:
         key = item.component.key
         if key in decisions.rejected or decisions.forgotten.get(key, -np.inf) > item.onset:
@@ -116,7 +132,26 @@ def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> Ada
     excluded = state.restricted | decisions.rejected
     if excluded != state.problem.excluded:  # an open test was searched with other exclusions
         state = replace(with_problem(state, replace(state.problem, excluded=excluded)), test=None)
-    return replace(state, adopted=adopted, approved=decisions.approved)
+    return replace(state, adopted=adopted, approved=decisions.approved, resets=dict(decisions.resets))
+
+
+def _reset(state: AdaptationState, name: str) -> AdaptationState:
+    """Return the state without what was learned of a parameter, a component or everything; an open test is dropped."""
+    if name == EVERYTHING:
+        problem = state.problem
+        for component in problem.components:
+            problem = without(problem, component)
+        problem = replace(problem, noise=problem.stated_noise or problem.noise, stated_noise=())
+        fresh = initial_state(state.machine, state.site, problem)
+        return replace(fresh, restricted=state.restricted, approved=state.approved)
+    for index, parameter in enumerate(state.problem.free):
+        if parameter.name == name:
+            previous = {**state.previous, parameter.label: PreviousStatus()}
+            return replace(state, posterior=state.posterior.reset_parameter(index), previous=previous, test=None)
+    for component in state.problem.components:
+        if component.key == name:
+            return without_component(state, component)
+    return state
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,14 +165,14 @@ class ComponentRecord:
 
 
 def component_records(state: AdaptationState) -> tuple[ComponentRecord, ...]:
-    """Return what is stored of the components in the twin."""
-    prior = state.posterior.prior()
-    deviations, records = np.sqrt(np.diag(prior.covariance)), []
-    for item in state.adopted:
-        slot = slot_of(state.problem, item.component)
-        if slot is not None:
-            at = indices(state.problem, slot)
-            records.append(ComponentRecord(item, tuple(prior.mean[at].tolist()), tuple(deviations[at].tolist())))
+    """Return what is stored of the components in the twin, in the order of their slots."""
+    prior, histories = state.posterior.prior(), {item.component.key: item for item in state.adopted}
+    deviations, records = np.sqrt(np.maximum(np.diag(prior.covariance), 0.0)), []
+    for slot, component in enumerate(state.problem.components):
+        item = histories.get(component.key, AdoptedComponent(component, component.origin))
+        at = indices(state.problem, slot)
+        values, sds = tuple(prior.mean[at].tolist()), tuple(deviations[at].tolist())
+        records.append(ComponentRecord(replace(item, component=component), values, sds))
     return tuple(records)
 
 

@@ -1,4 +1,4 @@
-"""``otolith components`` and ``otolith commission``: what the twin of a machine lacks, and what belongs to it."""
+"""``otolith components``, ``reset`` and ``commission``: what the twin of a machine lacks, and what belongs to it."""
 
 import json
 import math
@@ -148,6 +148,63 @@ def _decide(file: Path, component: str, decision: str, add: "Callable[[OperatorD
     click.echo(f"{component} is {decision}")
 
 
+@click.command()
+@MACHINE_FILE
+@click.argument("names", nargs=-1, metavar="[PARAMETER|COMPONENT]...")
+@click.option("--dry-run", is_flag=True, help="Only show what would be forgotten.")
+def reset(file: Path, names: tuple[str, ...], dry_run: bool) -> None:
+    """Forget what was learned of the machine in FILE.
+
+    Without names that is everything: parameters, components and accepted noise.
+    A running daemon starts anew with its next window, another one when it
+    starts. Approved and rejected components stay so.
+
+    \b
+    Examples:
+      otolith reset my-machine.toml --dry-run
+      otolith reset my-machine.toml R_a
+      otolith reset my-machine.toml R_a shaft/periodic/t
+      otolith reset my-machine.toml
+    """
+    from otolith.adaptation.state import EVERYTHING
+    from otolith_drivers.errors import ConfigurationError, nearest
+
+    machine, store = _store(file)
+    decisions, learned = store.decisions(), _learned_values(machine, store)
+    known = learned | dict.fromkeys(decisions.approved - learned.keys(), "nothing is saved of it")
+    for name in names:
+        if name not in known:
+            raise ConfigurationError(f"no parameter or component {name!r}: {nearest(name, sorted(known))}")
+    if not dry_run:
+        times = dict.fromkeys(names or (EVERYTHING,), time.time())
+        store.save_decisions(replace(decisions, resets={**decisions.resets, **times}))
+    for name in names or learned:
+        click.echo(f"{name} {'would be' if dry_run else 'is'} forgotten: {known[name]}")
+
+
+def _learned_values(machine: "LoadedMachine", store: "StateStore") -> dict[str, str]:
+    """The saved value of each parameter and component; a file that cannot be used has none."""
+    from otolith.adaptation.state import initial_state
+    from otolith.health.text import interval_text
+    from otolith.runtime.learned_state import restored
+    from otolith_drivers.errors import OtolithError
+
+    names, problem, values = machine.file.machine, machine.problem, dict[str, str]()
+    state = initial_state(names.name, names.site, problem)
+    try:
+        learned = store.learned()
+        state = state if learned is None else restored(learned, state, time.time())
+    except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
+        click.echo(f"what was saved cannot be shown: {error}", err=True)
+    prior = state.posterior.prior()
+    for index, parameter in enumerate(state.problem.free):
+        mean, sd = float(prior.mean[index]), float(prior.covariance[index, index]) ** 0.5
+        if not parameter.name.startswith("_"):
+            is_known = state.previous[parameter.label].known
+            values[parameter.name] = interval_text(mean, sd, parameter.unit) if is_known else "not determined so far"
+    return values | {item.component.key: f"a component since {local_time(item.onset)}" for item in state.adopted}
+
+
 def _store(file: Path) -> "tuple[LoadedMachine, StateStore]":
     from otolith.machine import load_machine
     from otolith.runtime.state_store import StateStore
@@ -167,17 +224,22 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
     Searches DATA, recorded from the healthy machine, for components that the twin lacks, and identifies the noise
     levels. You decide for each component whether
-    it belongs to the machine; afterwards only a change is a finding. The daemon reads approvals when it starts.
+    it belongs to the machine; afterwards only a change is a finding. Stop the daemon before: it starts with the result.
 
     \b
     Examples:
       otolith commission my-machine.toml monday.csv
       otolith commission my-machine.toml monday.csv --yes
     """
-    from otolith.cli.noise import identified_noise, noise_lines
-
     signal.signal(signal.SIGINT, signal.default_int_handler)
     machine, store = _store(file)
+    with store.locked():
+        _commission(machine, store, data, windows, approve_all=yes)
+
+
+def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windows: int, *, approve_all: bool) -> None:
+    from otolith.cli.noise import identified_noise, noise_lines
+
     state = _replayed(machine, data)
     _, identified = identified_noise(machine, data, windows)
     if not state.adopted:  # the file's noise levels may have hidden a component, so search again with these
@@ -187,7 +249,7 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
         click.echo("# this process noise contains the components below: keep that of the file if you approve them")
     else:
         click.echo("# put these tables into the machine file in place of its own", err=True)
-    _review(machine, store, state, approve_all=yes)
+    _review(machine, store, state, approve_all=approve_all)
 
 
 def _replayed(machine: "LoadedMachine", data: Path) -> "AdaptationState":
@@ -213,6 +275,8 @@ def _review(machine: "LoadedMachine", store: "StateStore", state: "AdaptationSta
         click.echo(f"found {_key(record)}: {_equation(machine, record)}", err=True)
         (approved if approve_all or _is_healthy() else rejected).add(_key(record))
     decisions = store.decisions()
+    if store.components_path.exists():
+        click.echo(f"what was learned before is kept as {store.set_aside()}", err=True)
     store.save_components(tuple(record for record in records if _key(record) in approved))
     rejected = {*decisions.rejected, *rejected} - approved
     store.save_decisions(replace(decisions, approved=decisions.approved | approved, rejected=frozenset(rejected)))

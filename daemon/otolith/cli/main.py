@@ -22,7 +22,7 @@ from otolith.cli.common import (
     examples_directory,
     log_to_stderr,
 )
-from otolith.cli.components import commission, components
+from otolith.cli.components import commission, components, reset
 from otolith.cli.noise import noise
 from otolith.cli.probe import probe
 from otolith.cli.twin import twin
@@ -280,5 +280,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, components, noise, probe, twin):
+for command in (commission, components, noise, probe, reset, twin):
     cli.add_command(command)

@@ -144,6 +144,14 @@ class Posterior:
         scale = self.problem.scale[index]
         return replace(self, belief=imm_filter.reset_marginal(self.belief, index, sd / scale, value / scale))
 
+    def reset_parameter(self, index: int) -> "Posterior":
+        """Return the same with the initial prior for one parameter and its trend."""
+        belief, prior, size = self.belief, initial_prior(self.problem), _size(self.problem)
+        for at in (index, index + len(self.problem.free)):
+            sd, value = float(np.sqrt(prior.covariance[at, at]) / size[at]), float(prior.mean[at] / size[at])
+            belief = imm_filter.reset_marginal(belief, at, sd, value)
+        return replace(self, belief=belief)
+
     def forget_phase(self, index: int) -> "Posterior":
         """Return the same with the phase at ``index`` unknown."""
         return replace(self, belief=_forget_phase(self.belief, self.problem, index))

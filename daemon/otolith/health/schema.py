@@ -241,6 +241,8 @@ class ReportDocument(StrictModel):
     counters: CountersDocument | None = None
     driver: DriverDocument | None = None
     """None in a replay."""
+    notes: tuple[str, ...] = ()
+    """About the daemon since its start: which saved state it could not use, and why."""
 
     def to_json(self) -> str:
         """Return the published JSON: ``schema`` first, absent keys where there is no content."""

@@ -21,14 +21,7 @@ from types import FrameType
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
-from otolith.adaptation.state import (
-    OperatorDecisions,
-    apply_decisions,
-    component_records,
-    initial_state,
-    restore_components,
-    with_sample_grid,
-)
+from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
 from otolith.health.schema import CountersDocument, DriverDocument, Report
 from otolith.health.text import summary
 from otolith.machine import LoadedMachine
@@ -52,7 +45,7 @@ RECORDER_ROOM = 32  # windows that wait for the recorder
 RECORDER_FLUSH, WRITER_FLUSH = 1.5, 0.5  # s to finish writing at the end
 STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths; the watchdog is not fed afterwards
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
-SAVE_INTERVAL = 300.0  # s between two saves of components that have only become more precise
+SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
 
 
@@ -70,21 +63,15 @@ class Service:
         delay = max(plan.delay for plan in plans)
         self._rings = Rings(machine.twin.signals, RING_RATE * (RING_WINDOWS * longest + math.ceil(delay / period)))
         self._windower = Windower(plans, machine.records, period, machine.limits)
-        store = StateStore(
+        self._store = StateStore(
             file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
         )
-        self._writer = WriterThread(store, store.decisions_time())
+        self._writer = WriterThread(self._store, self._store.decisions_time())
+        self._notes: tuple[str, ...] = ()
+        self._saved: tuple[str, ...] = ()
+        self._saved_at = -math.inf
         state = initial_state(file.machine.name, file.machine.site, machine.problem)
-        decisions = OperatorDecisions()
-        try:
-            state, decisions = restore_components(state, store.components()), store.decisions()
-        except OtolithError as error:  # an unreadable file must not keep the machine from being monitored
-            log.warning("started without saved components: %s", error)
-        self._saved, self._saved_at = tuple(known.component.key for known in state.adopted), 0.0
-        if self._saved:
-            remedy = "'otolith components forget' removes those that no longer exist"
-            log.info("started with saved components: %s; %s", ", ".join(self._saved), remedy)
-        self._supervisor = Supervisor(apply_decisions(state, decisions), longest * period)
+        self._supervisor = Supervisor(state, longest * period)
         self._recorder = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
         self._recording = recording
         self._publisher: Publisher | None = None
@@ -98,7 +85,7 @@ class Service:
 
         Raises:
             DeviceError: the machine's bus cannot be opened.
-            ServiceError: a port or folder of this computer is not available.
+            ServiceError: a port or folder of this computer is not available, or another daemon runs for the machine.
         """
         for number in SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
@@ -116,6 +103,9 @@ class Service:
 
     def _start(self) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL)
+        self._store.lock()
+        self._supervisor.state = self._restored(self._supervisor.state)
+        self._windower.records = self._supervisor.records
         identity, driver = self._machine.file.machine, self._machine.driver
         self._publisher = Publisher(identity.site, identity.name, self._listen, self._machine.file.zenoh.connect)
         driver.open(self._rings.deliver)
@@ -130,6 +120,7 @@ class Service:
     def _stop(self) -> None:
         """Stop every part, even if stopping another one fails; the last callback runs first."""
         with contextlib.ExitStack() as steps:
+            steps.callback(self._store.unlock)
             steps.callback(self._notifier.close)
             if self._publisher is not None:
                 steps.callback(self._publisher.close)
@@ -137,8 +128,28 @@ class Service:
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
             steps.callback(self._supervisor.worker.kill)
             steps.callback(self._machine.driver.close)
-            self._save_components(math.inf)
+            self._save(math.inf)
             self._notifier.send("STOPPING=1")
+
+    def _restored(self, state: AdaptationState) -> AdaptationState:
+        """Return ``state`` with what was saved and decided; an unreadable file must not prevent monitoring."""
+        state, note = self._store.restore(state, time.time())
+        notes = [note] if note else []
+        try:
+            state = apply_decisions(state, self._store.decisions())
+        except OtolithError as error:
+            notes.append(f"started without the operator's decisions: {error}")
+        for text in notes:
+            log.warning("%s", text)
+        self._notes, self._saved = tuple(notes), tuple(known.component.key for known in state.adopted)
+        if math.isfinite(end := state.posterior.belief.end):
+            log.info(
+                "started with what was learned up to %s", datetime.fromtimestamp(end, UTC).isoformat(" ", "seconds")
+            )
+        if self._saved:
+            remedy = "'otolith components forget' removes those that no longer exist"
+            log.info("started with saved components: %s; %s", ", ".join(self._saved), remedy)
+        return state
 
     def _step(self) -> None:
         """Cut due windows, hand them to the worker, publish finished reports, supervise the processes."""
@@ -150,7 +161,7 @@ class Service:
         for report, seconds in self._supervisor.poll(time.monotonic()):
             self._publish(report, seconds)
             self._windower.records = self._supervisor.records
-            self._save_components(time.monotonic())
+            self._save(time.monotonic())
         self._feed_watchdog(time.monotonic())
         if self._machine.file.recording.enabled:
             self._supervise_recorder(time.monotonic())
@@ -195,7 +206,9 @@ class Service:
             worker_restarts=self._supervisor.restarts,
             recordings_dropped=self._recordings_dropped,
         )
-        document = document.model_copy(update={"cost": cost, "counters": counters, "driver": driver})
+        document = document.model_copy(
+            update={"cost": cost, "counters": counters, "driver": driver, "notes": self._notes}
+        )
         if self._publisher is not None:
             self._publisher.publish(document)
         if self._machine.file.recording.enabled:
@@ -205,12 +218,16 @@ class Service:
         self._notifier.send(f"STATUS={line}")
         log.info("%s", line)
 
-    def _save_components(self, now: float) -> None:
-        """Request a save if components were added or removed, or the last save is ``SAVE_INTERVAL`` ago."""
+    def _save(self, now: float) -> None:
+        """Request a save if components were added or removed, or the last save is ``SAVE_INTERVAL`` ago.
+
+        A state that windows contradict is not saved: it might not be restored as what it was.
+        """
         state = self._supervisor.state
         keys = tuple(known.component.key for known in state.adopted)
-        if keys != self._saved or (keys and now - self._saved_at >= SAVE_INTERVAL):
-            self._writer.save(component_records(state))
+        is_due = keys != self._saved or now - self._saved_at >= SAVE_INTERVAL
+        if self._supervisor.finished and state.is_valid and is_due:
+            self._writer.save(state)
             self._saved, self._saved_at = keys, now
 
     def _feed_watchdog(self, now: float) -> None:

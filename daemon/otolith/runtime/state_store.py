@@ -1,24 +1,35 @@
-"""Components and operator decisions on disk, and the writer thread that accesses the disk for the daemon.
+"""What was learned of a machine and what its operator decided, on disk; and the thread that writes for the daemon.
 
-Each file has one writer: the daemon writes components, the command line writes operator decisions.
+Each file has one writer: the daemon writes the learned state under a lock, the command line writes operator decisions.
 """
 
 import contextlib
+import fcntl
 import logging
-import math
 import os
-import tempfile
 import threading
 import time
 from collections import deque
+from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, TypeVar
 
 from pydantic import Field, ValidationError
 
-from otolith.adaptation.state import ComponentRecord, OperatorDecisions
-from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
-from otolith.twin.component_families import FAMILY_NAMES
+from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
+from otolith.runtime.learned_state import (
+    VERSION,
+    LearnedState,
+    StateRefusedError,
+    check_components,
+    check_version,
+    configuration_fingerprint,
+    first_error,
+    learned_state,
+    restored,
+    twin_fingerprint,
+)
 from otolith.twin.definition import Definition
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
@@ -26,81 +37,192 @@ from otolith_drivers.user_dirs import state_directory, writable
 
 log = logging.getLogger(__name__)
 
-VERSION = 1
+DECISIONS_VERSION = 2
+REMEDY = "move the file away to start without it"
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+MAX_STATE_BYTES = 8 * 1024 * 1024
+PROCESS_ID_BYTES = 20
 DECISIONS_INTERVAL = 0.5  # s between two checks for new operator decisions
 WRITE_RETRY = 30.0  # s after which a failed write is tried again
 
 StateModel = TypeVar("StateModel", bound=StrictModel)
 
 
-class _ComponentsFile(StrictModel):
-    """The components of one machine, written by the daemon."""
-
-    version: int = VERSION
-    twin: str
-    signal_fingerprint: str = ""
-    """See :attr:`otolith.machine.LoadedMachine.signal_fingerprint`."""
-    components: tuple[ComponentRecord, ...] = ()
-
-
 class _DecisionsFile(StrictModel):
-    """The operator's decisions, written by ``otolith components`` and ``otolith commission``."""
+    """The operator's decisions, written by the command line."""
 
-    version: int = VERSION
+    version: int = DECISIONS_VERSION
     approved: tuple[str, ...] = ()
     rejected: tuple[str, ...] = ()
     forgotten: Annotated[dict[str, float], Field(default_factory=dict)]
+    resets: Annotated[dict[str, float], Field(default_factory=dict)]
 
 
 class StateStore:
-    """The two state files of one machine."""
+    """The two state files of one machine, and the lock of its daemon."""
 
     def __init__(
         self, site: str, machine: str, twin: Definition, folder: Path | None = None, signal_fingerprint: str = ""
     ) -> None:
-        """Components found in signals with another ``signal_fingerprint`` are not loaded."""
-        self._twin = twin
+        """State that was learned from signals with another ``signal_fingerprint`` is refused."""
+        self._site, self._machine, self._twin = site, machine, twin
         self._signal_fingerprint = signal_fingerprint
         folder = folder or state_directory() / "components"
         self.components_path = folder / f"{site}.{machine}.json"
         self.decisions_path = folder / f"{site}.{machine}.decisions.json"
+        self.lock_path = folder / f"{site}.{machine}.lock"
+        self._lock: int | None = None
+        self._is_blocked = False
+
+    def lock(self) -> None:
+        """Take the lock of this machine, which this process keeps until :meth:`unlock` or its end.
+
+        Raises:
+            ServiceError: another process has it, or the lock file cannot be written.
+        """
+        if self._lock is not None:
+            return
+        handle = -1
+        try:
+            with _opened(self.lock_path.parent) as folder:
+                handle = os.open(self.lock_path.name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600, dir_fd=folder)
+                _give_to_owner(handle, folder)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.read(handle, PROCESS_ID_BYTES).decode("ascii", "replace").strip()
+            os.close(handle)
+            used = f"machine {self._machine} at {self._site}: process {holder} of Otolith already uses its state"
+            raise ServiceError(f"{used}: stop it, or give this machine another name") from error
+        except OSError as error:
+            raise ServiceError(f"{self.lock_path}: cannot be locked: {error.strerror}") from error
+        with contextlib.suppress(OSError):  # a full disk: only the message to others lacks the process
+            os.pwrite(handle, str(os.getpid()).ljust(PROCESS_ID_BYTES).encode(), 0)
+        self._lock = handle
+
+    def unlock(self) -> None:
+        """Release the lock."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep the lock meanwhile, and afterwards if this process had it before; raises as :meth:`lock`."""
+        had = self._lock is not None
+        self.lock()
+        try:
+            yield
+        finally:
+            if not had:
+                self.unlock()
+
+    def learned(self) -> LearnedState | None:
+        """Return what was saved of this twin in these signals; None if nothing was, or of other ones.
+
+        Raises:
+            ConfigurationError: the file is unreadable or damaged.
+        """
+        learned = _read(self.components_path, LearnedState, VERSION)
+        if learned is not None and (reason := self._other_origin(learned)):
+            log.warning("%s: not used: %s", self.components_path, reason)
+            return None
+        return learned
 
     def components(self) -> tuple[ComponentRecord, ...]:
-        """Return the saved components that this twin can have, if they were found in the same signals.
+        """Return the saved components; raises as :meth:`learned`."""
+        learned = self.learned()
+        if learned is None:
+            return ()
+        try:
+            check_components(learned.components, self._twin)
+        except StateRefusedError as error:
+            raise ConfigurationError(f"{self.components_path}: {error}: {REMEDY}") from error
+        return learned.components
+
+    def _other_origin(self, learned: LearnedState) -> str:
+        """Return why ``learned`` is about something else; empty if it is not."""
+        if learned.version > 1 and (learned.machine, learned.site) != (self._machine, self._site):
+            return f"it is of machine {learned.machine} at {learned.site}"
+        if learned.twin != self._twin.name or learned.twin_fingerprint not in ("", twin_fingerprint(self._twin)):
+            return "the twin has changed since it was saved"
+        if learned.signal_fingerprint and self._signal_fingerprint not in ("", learned.signal_fingerprint):
+            return "[signals] have changed since it was saved"
+        return ""
+
+    def restore(self, state: AdaptationState, now: float) -> tuple[AdaptationState, str]:
+        """Return the initial ``state`` with what was saved, and why not all of it was used; empty if it was.
+
+        A file that is not used as a whole is kept under another name. Requires the lock; ``now`` in Unix s.
+        """
+        try:
+            learned = _read(self.components_path, LearnedState, VERSION)
+            if learned is None:
+                return state, ""
+            warm, reason = self._restored(learned, state, now)
+        except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
+            warm, reason = state, str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")
+        if not reason:
+            return warm, ""
+        note = f"{self.components_path}: {'only components are used' if warm.adopted else 'not used'}: {reason}"
+        try:
+            return warm, f"{note}; the file is kept as {self.set_aside().name}"
+        except OtolithError as error:
+            return warm, f"{note}; {error}"
+
+    def _restored(self, learned: LearnedState, state: AdaptationState, now: float) -> tuple[AdaptationState, str]:
+        """Return the restored state, and why not all of ``learned`` was used."""
+        if reason := self._other_origin(learned):
+            return state, reason
+        if learned.configuration_fingerprint in ("", configuration_fingerprint(state.problem)):
+            return restored(learned, state, now), ""
+        reason = "parameters or noise in the machine file have changed since it was saved"
+        return restored(learned.model_copy(update={"filter": None}), state, now), reason
+
+    def set_aside(self) -> Path:
+        """Rename the file with what was learned, and return its new path.
 
         Raises:
-            ConfigurationError: the file is unreadable or not a components file.
+            ServiceError: it cannot be renamed; it is not overwritten then.
         """
-        file = _read(self.components_path, _ComponentsFile)
-        if file is None or file.twin != self._twin.name:
-            return ()
-        if file.signal_fingerprint and self._signal_fingerprint and file.signal_fingerprint != self._signal_fingerprint:
-            log.warning("started without the saved components: [signals] have changed since they were found")
-            return ()
-        return tuple(record for record in file.components if self._is_possible(record))[:MAX_COMPONENTS]
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")
+        kept = self.components_path.with_name(f"{self.components_path.stem}.{stamp}.kept.json")
+        try:
+            self.components_path.rename(kept)
+        except OSError as error:
+            self._is_blocked = True
+            raise ServiceError(f"{self.components_path}: cannot be renamed to {kept.name}: {error.strerror}") from error
+        return kept
 
-    def _is_possible(self, record: ComponentRecord) -> bool:
-        """Return whether this version and this twin can have the component."""
-        component = record.adopted.component
-        if component.family not in FAMILY_NAMES or component.amplitude == 0.0:
-            return False
-        numbers = 1 + (component.model.inner is not None) + component.periodic
-        return (
-            component.site in {site.name for site in sites(self._twin)}
-            and component.source in {source.name for source in sources(self._twin)}
-            and len(record.values) == len(record.deviations) == numbers
-            and all(map(math.isfinite, (*record.values, *record.deviations)))
-        )
+    def save(self, state: AdaptationState) -> None:
+        """Write what was learned, all or nothing.
+
+        Raises:
+            ServiceError: the file cannot be written, another process has the lock, or the state is not plausible.
+        """
+        try:
+            learned = learned_state(state, self._signal_fingerprint, time.time())
+        except (ValueError, ArithmeticError) as error:
+            raise ServiceError(f"{self.components_path}: kept as it was: {error}") from error
+        self._write_learned(learned)
 
     def save_components(self, components: tuple[ComponentRecord, ...]) -> None:
-        """Write the components, all or nothing.
+        """Write nothing but components; resets until now do not concern them. Raises as :meth:`save`."""
+        learned = LearnedState(
+            machine=self._machine,
+            site=self._site,
+            twin=self._twin.name,
+            signal_fingerprint=self._signal_fingerprint,
+            twin_fingerprint=twin_fingerprint(self._twin),
+            resets=dict(self.decisions().resets),
+            components=components,
+        )
+        self._write_learned(learned)
 
-        Raises:
-            ServiceError: the file cannot be written.
-        """
-        file = _ComponentsFile(twin=self._twin.name, signal_fingerprint=self._signal_fingerprint, components=components)
-        _write(self.components_path, file)
+    def _write_learned(self, learned: LearnedState) -> None:
+        if self._is_blocked:
+            raise ServiceError(f"{self.components_path}: not overwritten: it was refused and could not be renamed")
+        with self.locked():
+            _write(self.components_path, learned, f"{self.components_path.name}.new")
 
     def decisions(self) -> OperatorDecisions:
         """Return the operator's decisions.
@@ -108,10 +230,10 @@ class StateStore:
         Raises:
             ConfigurationError: the file is unreadable or not a decisions file.
         """
-        file = _read(self.decisions_path, _DecisionsFile)
+        file = _read(self.decisions_path, _DecisionsFile, DECISIONS_VERSION)
         if file is None:
             return OperatorDecisions()
-        return OperatorDecisions(frozenset(file.approved), frozenset(file.rejected), file.forgotten)
+        return OperatorDecisions(frozenset(file.approved), frozenset(file.rejected), file.forgotten, file.resets)
 
     def save_decisions(self, decisions: OperatorDecisions) -> None:
         """Write the operator's decisions; a running daemon applies them with its next window.
@@ -120,8 +242,13 @@ class StateStore:
             ServiceError: the file cannot be written.
         """
         approved, rejected = tuple(sorted(decisions.approved)), tuple(sorted(decisions.rejected))
-        file = _DecisionsFile(approved=approved, rejected=rejected, forgotten=dict(decisions.forgotten))
-        _write(self.decisions_path, file)
+        file = _DecisionsFile(
+            approved=approved,
+            rejected=rejected,
+            forgotten=dict(decisions.forgotten),
+            resets=dict(decisions.resets),
+        )
+        _write(self.decisions_path, file, f"{self.decisions_path.name}.{os.getpid()}.new")
 
     def decisions_time(self) -> float:
         """Return the Unix time of the latest decision, s; 0 if there is none."""
@@ -130,42 +257,76 @@ class StateStore:
         return 0.0
 
 
-def _read(path: Path, model: type[StateModel]) -> StateModel | None:
+def _read(path: Path, model: type[StateModel], newest: int) -> StateModel | None:
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as stream:
+            data = stream.read(MAX_STATE_BYTES + 1)
+        text = _limited(data).decode()
+        check_version(text, newest)
+        return model.model_validate_json(text)
     except FileNotFoundError:
         return None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error}") from error
-    try:
-        return model.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "file"
-        remedy = "move the file away to start without it"
-        raise ConfigurationError(f"{path}: {where}: {first['msg']}: {remedy}") from error
-
-
-def _write(path: Path, model: StrictModel) -> None:
-    try:
-        writable(path.parent)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".new")
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(model.model_dump_json(indent=2) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        if os.geteuid() == 0:  # the daemon runs as another user and must be able to read what root writes
-            owner = path.parent.stat()
-            os.chown(temporary, owner.st_uid, owner.st_gid)
-        Path(temporary).replace(path)
     except OSError as error:
-        with contextlib.suppress(OSError, UnboundLocalError):
-            Path(temporary).unlink()
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        reason = first_error(error) if isinstance(error, ValidationError) else str(error)
+        raise ConfigurationError(f"{path}: {reason}: {REMEDY}") from error
+
+
+def _limited(data: bytes) -> bytes:
+    if len(data) > MAX_STATE_BYTES:
+        raise StateRefusedError(f"larger than {MAX_STATE_BYTES} bytes")
+    return data
+
+
+def _write(path: Path, model: StrictModel, temporary: str) -> None:
+    """Replace a file, all or nothing, also if the computer loses power meanwhile; ``temporary`` is a name beside it.
+
+    All names are relative to the open folder: its owner could replace a path while root writes there.
+    """
+    try:
+        data = _limited((model.model_dump_json() + "\n").encode())
+        with _opened(path.parent) as folder:
+            with contextlib.suppress(FileNotFoundError):  # left by a process that was killed
+                os.unlink(temporary, dir_fd=folder)
+            try:
+                handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600, dir_fd=folder)
+                with os.fdopen(handle, "wb") as stream:
+                    stream.write(data)
+                    stream.flush()
+                    _give_to_owner(handle, folder)
+                    os.fsync(handle)
+                os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+                os.fsync(folder)
+            except OSError:
+                with contextlib.suppress(OSError):
+                    os.unlink(temporary, dir_fd=folder)
+                raise
+    except OSError as error:
         raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
+    except StateRefusedError as error:
+        raise ServiceError(f"{path}: not written: {error}") from error
+
+
+@contextlib.contextmanager
+def _opened(folder: Path) -> Iterator[int]:
+    """Descriptor of ``folder``, which is created if it is missing."""
+    handle = os.open(writable(folder), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        yield handle
+    finally:
+        os.close(handle)
+
+
+def _give_to_owner(handle: int, folder: int) -> None:
+    """Give an open file to the owner of its folder: the daemon runs as another user and must be able to use it."""
+    if os.geteuid() == 0:
+        owner = os.fstat(folder)
+        os.fchown(handle, owner.st_uid, owner.st_gid)
 
 
 class WriterThread:
-    """Writes components and reads operator decisions in the background; its callers never wait for the disk.
+    """Writes the learned state and reads operator decisions in the background; its callers never wait for the disk.
 
     Only the latest value is kept in each direction.
     """
@@ -173,10 +334,10 @@ class WriterThread:
     def __init__(self, store: StateStore, decisions_time: float) -> None:
         """``decisions_time`` is the :meth:`StateStore.decisions_time` of the decisions that are known already."""
         self._store, self._decisions_time = store, decisions_time
-        self._to_save: deque[tuple[ComponentRecord, ...]] = deque(maxlen=1)
+        self._to_save: deque[AdaptationState] = deque(maxlen=1)
         self._new_decisions: deque[OperatorDecisions] = deque(maxlen=1)
         self._wakeup, self._stopping = threading.Event(), threading.Event()
-        self._unsaved: tuple[ComponentRecord, ...] | None = None
+        self._unsaved: AdaptationState | None = None
         self._retry_at, self._last_error = 0.0, ""
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
 
@@ -184,9 +345,9 @@ class WriterThread:
         """Start the thread."""
         self._thread.start()
 
-    def save(self, components: tuple[ComponentRecord, ...]) -> None:
-        """Request that ``components`` replace those on disk."""
-        self._to_save.append(components)
+    def save(self, state: AdaptationState) -> None:
+        """Request that ``state`` replaces what is on disk."""
+        self._to_save.append(state)
         self._wakeup.set()
 
     def new_decisions(self) -> OperatorDecisions | None:
@@ -200,7 +361,7 @@ class WriterThread:
         if self._thread.is_alive():
             self._thread.join(seconds)
             if self._thread.is_alive():
-                log.warning("components may not be saved: writing took over %.1f s: check the disk", seconds)
+                log.warning("what was learned may not be saved: writing took over %.1f s: check the disk", seconds)
 
     def _run(self) -> None:
         while True:
@@ -215,12 +376,12 @@ class WriterThread:
                 return
             self._read_decisions()
 
-    def _save(self, components: tuple[ComponentRecord, ...]) -> None:
+    def _save(self, state: AdaptationState) -> None:
         try:
-            self._store.save_components(components)
+            self._store.save(state)
         except OtolithError as error:  # monitoring continues on a full disk
             if str(error) != self._last_error:
-                log.warning("components are not saved: %s", error)
+                log.warning("what was learned is not saved: %s", error)
             self._last_error, self._retry_at = str(error), time.monotonic() + WRITE_RETRY
         else:
             self._last_error, self._unsaved = "", None

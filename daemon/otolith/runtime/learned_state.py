@@ -1,0 +1,317 @@
+"""What was learned of a machine, as it is saved: schema, fingerprints, checks, and the way to a state and back.
+
+Numbers are saved with all their digits, so that a restored filter is the same bit for bit. What is read is checked
+before it is used: a file may be damaged, written by another version, or belong to another machine.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, Field, ValidationError
+
+from otolith.acquisition.window import Array
+from otolith.adaptation.state import AdaptationState, ComponentRecord, component_records, restore_components
+from otolith.estimation.arrival_cost import MAX_TREND
+from otolith.estimation.augmented import augment, indices
+from otolith.estimation.imm_filter import HIGHEST_LEVEL, MAX_VARIANCE_RATIO, ImmPosterior, moment_match
+from otolith.estimation.posterior import PhaseAdvance, Posterior
+from otolith.estimation.problem import UNLIMITED, Problem
+from otolith.health.status import PreviousStatus
+from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
+from otolith.twin.component_families import FAMILY_NAMES
+from otolith.twin.definition import Definition
+from otolith_drivers.config_files import StrictModel
+
+VERSION = 2
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+MAX_MAGNITUDE = 1e12
+MIN_SD, MAX_SD = 1e-12, 1e9  # relative to the size of a parameter
+MAX_OUTSIDE = 1.0  # widths of the bounds by which a mean may lie outside of them
+MIN_EIGENVALUE = -1e-9  # of a covariance with unit variances: rounding may leave as much
+MAX_NOISE_RATIO = 1e6  # noise that was accepted over stated noise
+
+Count = Annotated[int, Field(ge=0, le=2**53)]
+Number = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
+Vector = tuple[Number, ...]
+
+
+class StateRefusedError(ValueError):
+    """Saved state that must not be used; the text is the reason."""
+
+
+class _AnyVersion(BaseModel):
+    version: int = VERSION
+
+
+class FilterRecord(StrictModel):
+    """The filter across windows; numbers are relative to ``scale`` as in :class:`ImmPosterior`."""
+
+    labels: tuple[str, ...]
+    scale: Vector
+    level: tuple[tuple[Count, ...], ...]
+    mean: tuple[Vector, ...]
+    covariance: tuple[tuple[tuple[float, ...], ...], ...]
+    weight: Vector
+    end: Number
+    variance_ratio: Annotated[float, Field(ge=1.0, le=MAX_VARIANCE_RATIO)]
+    phase: PhaseAdvance | None
+    noise: Vector
+    """Of the outputs; empty unless it was accepted as larger than the machine file states."""
+    previous: tuple[PreviousStatus, ...]
+    records: Count
+    learned: Count
+    contradictions: Count
+    noisier_since: Number | None
+
+
+class LearnedState(StrictModel):
+    """What was learned of one machine."""
+
+    version: int = VERSION
+    machine: str = ""
+    site: str = ""
+    twin: str
+    signal_fingerprint: str = ""
+    """See :attr:`otolith.machine.LoadedMachine.signal_fingerprint`."""
+    twin_fingerprint: str = ""
+    configuration_fingerprint: str = ""
+    saved_at: Number = 0.0
+    """Unix seconds."""
+    resets: dict[str, float] = Field(default_factory=dict)
+    """See :attr:`otolith.adaptation.state.AdaptationState.resets`."""
+    components: Annotated[tuple[ComponentRecord, ...], Field(max_length=MAX_COMPONENTS)] = ()
+    filter: FilterRecord | None = None
+    """None in files of version 1, and where nothing but components is to be kept."""
+
+
+def check_version(text: str, newest: int) -> None:
+    """Check that ``text`` is JSON of a version up to ``newest``.
+
+    Raises:
+        StateRefusedError: it is not.
+    """
+    try:
+        version = _AnyVersion.model_validate_json(text).version
+    except ValidationError as error:
+        raise StateRefusedError(first_error(error)) from error
+    if not 1 <= version <= newest:
+        raise StateRefusedError(f"version {version} of the format: this Otolith reads 1 to {newest}")
+
+
+def first_error(error: ValidationError) -> str:
+    """Return place and text of the first error."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    return f"{'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}"
+
+
+def twin_fingerprint(twin: Definition) -> str:
+    """Return a hash of what the equations of a twin mean; titles and meanings in words do not count."""
+    quantities = (twin.states, twin.parameters, twin.outputs)
+    named = [[(each.name, each.unit) for each in group] for group in quantities]
+    inputs = [(each.name, each.unit, each.hold) for each in twin.inputs]
+    constants = [(each.name, each.unit, each.value) for each in twin.constants]
+    definitions = [(name, expression) for name, expression, _ in twin.definitions]
+    places = [(each.name, each.unit, each.into, each.mode, each.through) for each in twin.sites]
+    return _hash([named, inputs, constants, definitions, places, twin.equations])
+
+
+def configuration_fingerprint(problem: Problem) -> str:
+    """Return a hash of what the machine file states of parameters and noise, without what was learned."""
+    free = [(item.name, item.nominal, item.low, item.high) for item in problem.free if not item.name.startswith("_")]
+    known = [pair for pair in problem.known if not pair[0].startswith("_")]
+    noise = problem.stated_noise or problem.noise, problem.input_noise, problem.process_noise
+    return _hash([free, known, noise, problem.open_loop])
+
+
+def _hash(content: Sequence[object]) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def learned_state(state: AdaptationState, signal_fingerprint: str, now: float) -> LearnedState:
+    """Return what is to be saved of ``state`` at ``now`` (Unix s).
+
+    Raises:
+        StateRefusedError: it would not be accepted when it is read.
+    """
+    base = state.problem.base_model
+    try:
+        document = LearnedState(
+            machine=state.machine,
+            site=state.site,
+            twin=base.name,
+            signal_fingerprint=signal_fingerprint,
+            twin_fingerprint=twin_fingerprint(base),
+            configuration_fingerprint=configuration_fingerprint(state.problem),
+            saved_at=now,
+            resets=dict(state.resets),
+            components=component_records(state),
+            filter=_filter_record(state) if np.isfinite(state.posterior.belief.end) else None,
+        )
+    except ValidationError as error:
+        raise StateRefusedError(first_error(error)) from error
+    check_components(document.components, base)
+    if document.filter is not None:
+        _posterior(document.filter, state.problem)
+    return document
+
+
+def _filter_record(state: AdaptationState) -> FilterRecord:
+    problem, belief = state.problem, state.posterior.belief
+    return FilterRecord(
+        labels=tuple(parameter.label for parameter in problem.free),
+        scale=tuple(problem.scale.tolist()),
+        level=belief.level.tolist(),
+        mean=belief.mean.tolist(),
+        covariance=belief.covariance.tolist(),
+        weight=tuple(belief.weight.tolist()),
+        end=belief.end,
+        variance_ratio=belief.variance_ratio,
+        phase=state.posterior.phase,
+        noise=problem.noise if problem.stated_noise else (),
+        previous=tuple(state.previous.get(parameter.label, PreviousStatus()) for parameter in problem.free),
+        records=state.records,
+        learned=state.learned,
+        contradictions=state.contradictions,
+        noisier_since=state.noisier_since,
+    )
+
+
+def restored(document: LearnedState, state: AdaptationState, now: float) -> AdaptationState:
+    """Return the initial ``state`` with what was saved; its variance grows with the next window by the time since.
+
+    If the last window ends after ``now`` (Unix s), the clock was set back. The time since is unknown then, and counts
+    as the difference.
+
+    Raises:
+        StateRefusedError: the document is not plausible.
+    """
+    check_components(document.components, state.problem.base_model)
+    record, problem = document.filter, state.problem
+    adopted = tuple(component.adopted for component in document.components)
+    if adopted:
+        problem = augment(problem, [item.component for item in adopted])
+        _check_values(problem, document.components)
+    if record is None:
+        return replace(restore_components(state, document.components), resets=document.resets)
+    problem = _with_noise(problem, record.noise)
+    posterior = _posterior(record, problem)
+    if record.end > now:
+        posterior = replace(posterior, belief=replace(posterior.belief, end=now - (record.end - now)))
+    window = problem.window
+    return replace(
+        state,
+        posterior=posterior,
+        previous=dict(zip(record.labels, record.previous, strict=True)),
+        records=record.records if window.shortest <= record.records <= window.longest else state.records,
+        learned=record.learned,
+        contradictions=record.contradictions,
+        adopted=adopted,
+        noisier_since=record.noisier_since,
+        resets=document.resets,
+    )
+
+
+def check_components(records: Sequence[ComponentRecord], twin: Definition) -> None:
+    """Check that ``twin``, the base model, can have all components at once.
+
+    Raises:
+        StateRefusedError: it cannot.
+    """
+    places, origins = {site.name for site in sites(twin)}, {source.name for source in sources(twin)}
+    keys = [record.adopted.component.key for record in records]
+    _require(len(set(keys)) == len(keys), "components: the same one twice")
+    for record in records:
+        item, component = record.adopted, record.adopted.component
+        where = f"component {component.key}"
+        is_known = component.family in FAMILY_NAMES and component.site in places and component.source in origins
+        _require(is_known, f"{where}: this twin or version of Otolith does not have it")
+        numbers = (item.onset, component.inner, component.phase, component.low, component.high, component.origin)
+        _require(max(map(abs, (*numbers, *record.values, *record.deviations))) <= MAX_MAGNITUDE, f"{where}: too large")
+        low, amplitude, high = component.amplitude_low, component.amplitude, component.amplitude_high
+        is_bounded = -UNLIMITED <= low <= amplitude <= high <= UNLIMITED and amplitude != 0.0
+        _require(is_bounded and 0.0 <= item.probability <= 1.0 and item.fading >= 0, f"{where}: not plausible")
+        count = 1 + (component.model.inner is not None) + component.periodic
+        is_complete = len(record.values) == len(record.deviations) == count and min(record.deviations) > 0.0
+        _require(is_complete, f"{where}: values or deviations are missing")
+
+
+def _check_values(problem: Problem, components: Sequence[ComponentRecord]) -> None:
+    """Check the values of the ``components`` in ``problem`` against the bounds of its parameters."""
+    low, high = problem.bounds
+    _require(bool((low < high).all()), "components: their bounds leave no value")
+    for slot, record in enumerate(components):
+        at = indices(problem, slot)
+        _require_near(np.array(record.values), low[at], high[at], "components")
+
+
+def _with_noise(problem: Problem, noise: Vector) -> Problem:
+    """Return the problem with the ``noise`` that was accepted; empty for that of the machine file."""
+    if not noise:
+        return problem
+    _require(len(noise) == len(problem.noise), "noise: not one for each output")
+    ratio = np.array(noise) / np.array(problem.noise)
+    _require(bool(((ratio >= 1.0) & (ratio <= MAX_NOISE_RATIO)).all()), "noise: not plausible")
+    return replace(problem, noise=noise, stated_noise=problem.noise)
+
+
+def _posterior(record: FilterRecord, problem: Problem) -> Posterior:
+    """Return the posterior of a record, checked."""
+    free = len(problem.free)
+    _require(record.labels == tuple(parameter.label for parameter in problem.free), "labels: other parameters")
+    _require(len(record.previous) == free and record.scale == tuple(problem.scale.tolist()), "scale: another problem")
+    modes = len(record.weight)
+    level = np.array(record.level, dtype=np.int64)
+    mean, covariance, weight = np.array(record.mean), np.array(record.covariance), np.array(record.weight)
+    shapes = level.shape, mean.shape, covariance.shape
+    _require(shapes == ((modes, free), (modes, 2 * free), (modes, 2 * free, 2 * free)), "filter: wrong shape")
+    _require(modes > 1 and len(np.unique(level, axis=0)) == modes, "level: modes are missing or repeated")
+    _require(int(level.max()) <= HIGHEST_LEVEL, "level: too high")
+    _require(float(weight.min()) > 0.0 and abs(float(weight.sum()) - 1.0) < 1e-6, "weight: no probabilities")
+    belief = ImmPosterior(level, mean, covariance, weight, record.end, record.variance_ratio)
+    together = moment_match(belief)
+    trend = np.full(free, MAX_TREND)
+    low, high = (
+        np.concatenate([bound / problem.scale, sign * trend])
+        for bound, sign in zip(problem.bounds, (-1, 1), strict=True)
+    )
+    _require_near(together[0], low, high, "mean")
+    for each in (*covariance, together[1]):
+        _check_covariance(each)
+    sd = np.sqrt(np.diag(together[1]))
+    np.linalg.cholesky(together[1] / np.outer(sd, sd))  # as the next window does; a ValueError if it is singular
+    _check_phase(record.phase, problem)
+    return Posterior(problem, belief, record.phase)
+
+
+def _check_covariance(covariance: Array) -> None:
+    variances = np.diag(covariance)
+    in_range = (variances >= MIN_SD**2) & (variances <= MAX_SD**2)
+    _require(bool(in_range.all()), "covariance: a variance is not plausible")
+    size = np.sqrt(variances)
+    unit = covariance / np.outer(size, size)
+    _require(float(np.abs(unit - unit.T).max()) <= -MIN_EIGENVALUE, "covariance: not symmetric")
+    _require(float(np.linalg.eigvalsh(unit).min()) >= MIN_EIGENVALUE, "covariance: not positive semidefinite")
+
+
+def _check_phase(phase: PhaseAdvance | None, problem: Problem) -> None:
+    if phase is None:
+        return
+    _require(len(phase.by) == len(problem.components), "phase: not one for each component")
+    _require(len(phase.last_state) in (0, len(problem.base_model.states)), "phase: not one value for each state")
+    largest = max(map(abs, (phase.start, phase.next_start, *phase.by, *phase.last_state)))
+    _require(largest <= MAX_MAGNITUDE, "phase: too large")
+
+
+def _require_near(values: Array, low: Array, high: Array, name: str) -> None:
+    """Check that ``values`` are at most ``MAX_OUTSIDE`` widths outside of the bounds."""
+    reach = MAX_OUTSIDE * (high - low)
+    _require(bool(((values >= low - reach) & (values <= high + reach)).all()), f"{name}: far outside of the bounds")
+
+
+def _require(condition: bool, reason: str) -> None:
+    if not condition:
+        raise StateRefusedError(reason)

@@ -1,0 +1,146 @@
+"""A daemon that is killed, stopped or started twice, with real processes and files."""
+
+import json
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from otolith.adaptation.state import OperatorDecisions
+from otolith.health.schema import ReportDocument, Status
+from otolith.machine import load_machine
+from otolith.runtime.service import Service
+from otolith.runtime.state_store import StateStore
+from tests.conftest import OwnMachine
+from tests.system.conftest import OTOLITH, Running, is_estimated
+from tests.waiting import PATIENCE, wait_for
+
+RESISTANCE = 6.5  # ohm
+Start = Callable[[], Running]
+
+
+@pytest.fixture
+def healthy(tmp_path: Path) -> OwnMachine:
+    """A motor of which nothing changes, simulated by the daemon itself."""
+    return OwnMachine(tmp_path / "machine", "in-process", faults="")
+
+
+@pytest.fixture
+def store(healthy: OwnMachine) -> StateStore:
+    machine = load_machine(healthy.machine, with_driver=False)
+    return StateStore(machine.file.machine.site, machine.file.machine.name, machine.twin)
+
+
+@pytest.fixture
+def start(healthy: OwnMachine, tmp_path: Path) -> Iterator[Start]:
+    """Function that starts a daemon of the motor; all end with the test."""
+    started: list[Running] = []
+
+    def begin() -> Running:
+        folder = tmp_path / f"daemon-{len(started)}"
+        folder.mkdir()
+        started.append(Running(healthy, folder))
+        return started[-1]
+
+    yield begin
+    for running in started:
+        running.close()
+
+
+def holds_truth(report: ReportDocument) -> bool:
+    """Whether the report has an interval that holds the resistance of the motor."""
+    resistance = report.parameters["R_a"]
+    return (
+        resistance.low is not None and resistance.high is not None and resistance.low <= RESISTANCE <= resistance.high
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_the_first_reports_after_a_restart_hold_the_truth(
+    start: Start, store: StateStore, number: signal.Signals
+) -> None:
+    first = start()
+    first.wait_for(lambda reports: bool(reports) and is_estimated(reports[-1]))
+    wait_for(store.components_path.exists)
+    first.stop(number)
+    second = start()
+    reports = second.wait_for(lambda reports: len(reports) >= 2)
+    assert holds_truth(reports[0]) or holds_truth(reports[1])
+    assert reports[0].parameters["R_a"].status in {Status.ESTIMATED, Status.HELD}
+    assert "started with what was learned up to" in second.log.read_text()
+    assert reports[0].notes == ()
+
+
+def test_a_second_daemon_of_the_same_name_ends_with_an_error(start: Start, healthy: OwnMachine) -> None:
+    first = start()
+    command = [*OTOLITH, "run", str(healthy.machine), "--listen", "tcp/127.0.0.1:0"]
+    second = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert second.returncode == 2
+    assert f"process {first.daemon.pid} of Otolith already uses its state: stop it" in second.stderr
+    first.stop(signal.SIGKILL)
+    start()
+
+
+def test_a_file_that_is_refused_is_published_and_kept_with_the_decisions(start: Start, store: StateStore) -> None:
+    store.save_decisions(OperatorDecisions(rejected=frozenset({"shaft/Coulomb/omega"})))
+    store.components_path.write_text('{"version": 99}', encoding="utf-8")
+    running = start()
+    (report, *_) = running.wait_for(lambda reports: len(reports) >= 1)
+    (note,) = report.notes
+    assert "version 99" in note
+    assert note in running.log.read_text()
+    (kept,) = store.components_path.parent.glob("*.kept.json")
+    assert kept.name in note
+    assert kept.read_text(encoding="utf-8") == '{"version": 99}'
+    running.stop()
+    assert json.loads(store.components_path.read_text(encoding="utf-8"))["version"] == 2
+    assert store.decisions().rejected == {"shaft/Coulomb/omega"}
+
+
+def test_unreadable_decisions_do_not_cost_the_learned_state(start: Start, store: StateStore) -> None:
+    first = start()
+    first.wait_for(lambda reports: bool(reports) and is_estimated(reports[-1]))
+    first.stop()
+    store.decisions_path.write_text("half a fi", encoding="utf-8")
+    second = start()
+    (report, *_) = second.wait_for(lambda reports: len(reports) >= 1)
+    assert report.parameters["R_a"].value is not None
+    assert any("decisions" in note for note in report.notes)
+    assert store.decisions_path.read_text(encoding="utf-8") == "half a fi"
+
+
+def test_a_reset_reaches_a_running_daemon(start: Start, healthy: OwnMachine, store: StateStore) -> None:
+    running = start()
+    running.wait_for(lambda reports: bool(reports) and is_estimated(reports[-1]))
+    command = [*OTOLITH, "reset", str(healthy.machine), "R_a"]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=True)
+    assert shown.stdout.startswith("R_a is forgotten: ")
+    count = len(running.reports)
+    running.wait_for(lambda reports: len(reports) >= count + 2)
+    running.stop()
+    learned = store.learned()
+    assert learned is not None
+    assert learned.filter is not None
+    assert learned.resets == store.decisions().resets
+    assert learned.filter.learned > 1
+
+
+def test_a_state_that_windows_contradict_is_not_saved(healthy: OwnMachine, monkeypatch: pytest.MonkeyPatch) -> None:
+    service, requested = Service(load_machine(healthy.machine)), list[object]()
+    monkeypatch.setattr(service._writer, "save", requested.append)
+    service._save(1e6)
+    assert requested == []  # before the first window
+    service._supervisor.finished += 1
+    state = service._supervisor.state
+    before = state.previous["R_a"]
+    state.previous["R_a"] = type(before)(known=True, status=Status.INVALID)
+    service._save(1e6)
+    assert requested == []
+    state.previous["R_a"] = before
+    service._save(1e6)
+    service._save(1e6 + 59.0)
+    assert requested == [state]
+    service._save(1e6 + 61.0)
+    assert requested == [state, state]
