@@ -67,6 +67,16 @@ def initial_state(machine: str, site: str, problem: Problem) -> AdaptationState:
     )
 
 
+def cleared(state: AdaptationState) -> AdaptationState:
+    """Return the state before the first window of the same machine, with the restrictions that hold now."""
+    problem = state.problem
+    for component in problem.components:
+        problem = without(problem, component)
+    problem = replace(problem, noise=problem.stated_noise or problem.noise, stated_noise=())
+    initial = initial_state(state.machine, state.site, problem)
+    return replace(initial, restricted=state.restricted, approved=state.approved)
+
+
 def with_problem(state: AdaptationState, problem: Problem) -> AdaptationState:
     """Return the state with other options of the problem; its free parameters must be the same."""
     return replace(state, posterior=replace(state.posterior, problem=problem))
@@ -138,12 +148,7 @@ def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> Ada
 def _reset(state: AdaptationState, name: str) -> AdaptationState:
     """Return the state without what was learned of a parameter, a component or everything; an open test is dropped."""
     if name == EVERYTHING:
-        problem = state.problem
-        for component in problem.components:
-            problem = without(problem, component)
-        problem = replace(problem, noise=problem.stated_noise or problem.noise, stated_noise=())
-        fresh = initial_state(state.machine, state.site, problem)
-        return replace(fresh, restricted=state.restricted, approved=state.approved)
+        return cleared(state)
     for index, parameter in enumerate(state.problem.free):
         if parameter.name == name:
             previous = {**state.previous, parameter.label: PreviousStatus()}

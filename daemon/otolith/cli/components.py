@@ -167,42 +167,21 @@ def reset(file: Path, names: tuple[str, ...], dry_run: bool) -> None:
       otolith reset my-machine.toml
     """
     from otolith.adaptation.state import EVERYTHING
-    from otolith_drivers.errors import ConfigurationError, nearest
+    from otolith_drivers.errors import ConfigurationError, OtolithError, nearest
 
     machine, store = _store(file)
-    decisions, learned = store.decisions(), _learned_values(machine, store)
-    known = learned | dict.fromkeys(decisions.approved - learned.keys(), "nothing is saved of it")
+    decisions, known = store.decisions(), [parameter.name for parameter in machine.problem.free]
+    try:
+        known += map(_key, store.components())
+    except OtolithError as error:
+        click.echo(f"components cannot be named: {error}", err=True)
     for name in names:
         if name not in known:
-            raise ConfigurationError(f"no parameter or component {name!r}: {nearest(name, sorted(known))}")
+            raise ConfigurationError(f"no parameter or component {name!r}: {nearest(name, known)}")
     if not dry_run:
         times = dict.fromkeys(names or (EVERYTHING,), time.time())
         store.save_decisions(replace(decisions, resets={**decisions.resets, **times}))
-    for name in names or learned:
-        click.echo(f"{name} {'would be' if dry_run else 'is'} forgotten: {known[name]}")
-
-
-def _learned_values(machine: "LoadedMachine", store: "StateStore") -> dict[str, str]:
-    """The saved value of each parameter and component; a file that cannot be used has none."""
-    from otolith.adaptation.state import initial_state
-    from otolith.health.text import interval_text
-    from otolith.runtime.learned_state import restored
-    from otolith_drivers.errors import OtolithError
-
-    names, problem, values = machine.file.machine, machine.problem, dict[str, str]()
-    state = initial_state(names.name, names.site, problem)
-    try:
-        learned = store.learned()
-        state = state if learned is None else restored(learned, state, time.time())
-    except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
-        click.echo(f"what was saved cannot be shown: {error}", err=True)
-    prior = state.posterior.prior()
-    for index, parameter in enumerate(state.problem.free):
-        mean, sd = float(prior.mean[index]), float(prior.covariance[index, index]) ** 0.5
-        if not parameter.name.startswith("_"):
-            is_known = state.previous[parameter.label].known
-            values[parameter.name] = interval_text(mean, sd, parameter.unit) if is_known else "not determined so far"
-    return values | {item.component.key: f"a component since {local_time(item.onset)}" for item in state.adopted}
+    click.echo("\n".join(f"{name} {'would be' if dry_run else 'is'} forgotten" for name in names or known))
 
 
 def _store(file: Path) -> "tuple[LoadedMachine, StateStore]":

@@ -6,7 +6,7 @@ before it is used: a file may be damaged, written by another version, or belong 
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Annotated
 
@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from otolith.acquisition.window import Array
-from otolith.adaptation.state import AdaptationState, ComponentRecord, component_records, restore_components
+from otolith.adaptation.state import AdaptationState, ComponentRecord, cleared, component_records, restore_components
 from otolith.estimation.arrival_cost import MAX_TREND
 from otolith.estimation.augmented import augment, indices
 from otolith.estimation.imm_filter import HIGHEST_LEVEL, MAX_VARIANCE_RATIO, ImmPosterior, moment_match
@@ -28,15 +28,11 @@ from otolith_drivers.config_files import StrictModel
 
 VERSION = 2
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-MAX_MAGNITUDE = 1e12
-MIN_SD, MAX_SD = 1e-12, 1e9  # relative to the size of a parameter
+MAX_MAGNITUDE = 1e12  # of any number but an amplitude's bound
+MIN_SD, MAX_SD = 1e-12, 1e6  # relative to the size of a parameter
 MAX_OUTSIDE = 1.0  # widths of the bounds by which a mean may lie outside of them
-MIN_EIGENVALUE = -1e-9  # of a covariance with unit variances: rounding may leave as much
+MAX_ROUNDING = 1e-9  # of a covariance with unit variances: asymmetry, and what is missing to positive semidefinite
 MAX_NOISE_RATIO = 1e6  # noise that was accepted over stated noise
-
-Count = Annotated[int, Field(ge=0, le=2**53)]
-Number = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
-Vector = tuple[Number, ...]
 
 
 class StateRefusedError(ValueError):
@@ -51,21 +47,21 @@ class FilterRecord(StrictModel):
     """The filter across windows; numbers are relative to ``scale`` as in :class:`ImmPosterior`."""
 
     labels: tuple[str, ...]
-    scale: Vector
-    level: tuple[tuple[Count, ...], ...]
-    mean: tuple[Vector, ...]
+    scale: tuple[float, ...]
+    level: tuple[tuple[int, ...], ...]
+    mean: tuple[tuple[float, ...], ...]
     covariance: tuple[tuple[tuple[float, ...], ...], ...]
-    weight: Vector
-    end: Number
+    weight: tuple[float, ...]
+    end: float
     variance_ratio: Annotated[float, Field(ge=1.0, le=MAX_VARIANCE_RATIO)]
     phase: PhaseAdvance | None
-    noise: Vector
+    noise: tuple[float, ...]
     """Of the outputs; empty unless it was accepted as larger than the machine file states."""
     previous: tuple[PreviousStatus, ...]
-    records: Count
-    learned: Count
-    contradictions: Count
-    noisier_since: Number | None
+    records: int
+    learned: int
+    contradictions: int
+    noisier_since: float | None
 
 
 class LearnedState(StrictModel):
@@ -79,8 +75,6 @@ class LearnedState(StrictModel):
     """See :attr:`otolith.machine.LoadedMachine.signal_fingerprint`."""
     twin_fingerprint: str = ""
     configuration_fingerprint: str = ""
-    saved_at: Number = 0.0
-    """Unix seconds."""
     resets: dict[str, float] = Field(default_factory=dict)
     """See :attr:`otolith.adaptation.state.AdaptationState.resets`."""
     components: Annotated[tuple[ComponentRecord, ...], Field(max_length=MAX_COMPONENTS)] = ()
@@ -127,42 +121,37 @@ def configuration_fingerprint(problem: Problem) -> str:
     return _hash([free, known, noise, problem.open_loop])
 
 
-def _hash(content: Sequence[object]) -> str:
+def _hash(content: list[object]) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def learned_state(state: AdaptationState, signal_fingerprint: str, now: float) -> LearnedState:
-    """Return what is to be saved of ``state`` at ``now`` (Unix s).
+def learned_state(state: AdaptationState, signal_fingerprint: str) -> LearnedState:
+    """Return what is to be saved of ``state``.
 
     Raises:
-        StateRefusedError: it would not be accepted when it is read.
+        ValueError: it would not be restored.
     """
-    base = state.problem.base_model
-    try:
-        document = LearnedState(
-            machine=state.machine,
-            site=state.site,
-            twin=base.name,
-            signal_fingerprint=signal_fingerprint,
-            twin_fingerprint=twin_fingerprint(base),
-            configuration_fingerprint=configuration_fingerprint(state.problem),
-            saved_at=now,
-            resets=dict(state.resets),
-            components=component_records(state),
-            filter=_filter_record(state) if np.isfinite(state.posterior.belief.end) else None,
-        )
-    except ValidationError as error:
-        raise StateRefusedError(first_error(error)) from error
-    check_components(document.components, base)
-    if document.filter is not None:
-        _posterior(document.filter, state.problem)
+    base, end = state.problem.base_model, state.posterior.belief.end
+    document = LearnedState(
+        machine=state.machine,
+        site=state.site,
+        twin=base.name,
+        signal_fingerprint=signal_fingerprint,
+        twin_fingerprint=twin_fingerprint(base),
+        configuration_fingerprint=configuration_fingerprint(state.problem),
+        resets=dict(state.resets),
+        components=component_records(state),
+        filter=_filter_record(state) if np.isfinite(end) else None,
+    )
+    restored(document, cleared(state), end)
     return document
 
 
 def _filter_record(state: AdaptationState) -> FilterRecord:
     problem, belief = state.problem, state.posterior.belief
+    labels = tuple(parameter.label for parameter in problem.free)
     return FilterRecord(
-        labels=tuple(parameter.label for parameter in problem.free),
+        labels=labels,
         scale=tuple(problem.scale.tolist()),
         level=belief.level.tolist(),
         mean=belief.mean.tolist(),
@@ -172,7 +161,7 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
         variance_ratio=belief.variance_ratio,
         phase=state.posterior.phase,
         noise=problem.noise if problem.stated_noise else (),
-        previous=tuple(state.previous.get(parameter.label, PreviousStatus()) for parameter in problem.free),
+        previous=tuple(state.previous.get(label, PreviousStatus()) for label in labels),
         records=state.records,
         learned=state.learned,
         contradictions=state.contradictions,
@@ -187,21 +176,24 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
     as the difference.
 
     Raises:
-        StateRefusedError: the document is not plausible.
+        ValueError: the document is not plausible.
     """
-    check_components(document.components, state.problem.base_model)
+    _require(max(map(abs, _numbers(document.model_dump())), default=0.0) <= MAX_MAGNITUDE, "a number is too large")
     record, problem = document.filter, state.problem
+    check_components(document.components, problem.base_model)
     adopted = tuple(component.adopted for component in document.components)
     if adopted:
         problem = augment(problem, [item.component for item in adopted])
-        _check_values(problem, document.components)
+    low, high = problem.bounds
+    _require(bool((low < high).all()), "components: their bounds leave no value")
+    for slot, component in enumerate(document.components):
+        at = indices(problem, slot)
+        _require_near(np.array(component.values), low[at], high[at], "components")
     if record is None:
         return replace(restore_components(state, document.components), resets=document.resets)
-    problem = _with_noise(problem, record.noise)
-    posterior = _posterior(record, problem)
+    posterior, window = _posterior(record, _with_noise(problem, record.noise)), problem.window
     if record.end > now:
         posterior = replace(posterior, belief=replace(posterior.belief, end=now - (record.end - now)))
-    window = problem.window
     return replace(
         state,
         posterior=posterior,
@@ -215,95 +207,79 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
     )
 
 
-def check_components(records: Sequence[ComponentRecord], twin: Definition) -> None:
+def _numbers(content: object) -> Iterator[float]:
+    """All numbers in a document, without the bounds of amplitudes that nothing limits."""
+    if isinstance(content, int | float):
+        yield 0.0 if abs(content) == UNLIMITED else content
+    elif isinstance(content, dict | tuple | list):
+        for item in content.values() if isinstance(content, dict) else content:
+            yield from _numbers(item)
+
+
+def check_components(records: tuple[ComponentRecord, ...], twin: Definition) -> None:
     """Check that ``twin``, the base model, can have all components at once.
 
     Raises:
         StateRefusedError: it cannot.
     """
     places, origins = {site.name for site in sites(twin)}, {source.name for source in sources(twin)}
-    keys = [record.adopted.component.key for record in records]
-    _require(len(set(keys)) == len(keys), "components: the same one twice")
+    keys = {record.adopted.component.key for record in records}
+    _require(len(keys) == len(records), "components: the same one twice")
     for record in records:
         item, component = record.adopted, record.adopted.component
         where = f"component {component.key}"
         is_known = component.family in FAMILY_NAMES and component.site in places and component.source in origins
         _require(is_known, f"{where}: this twin or version of Otolith does not have it")
-        numbers = (item.onset, component.inner, component.phase, component.low, component.high, component.origin)
-        _require(max(map(abs, (*numbers, *record.values, *record.deviations))) <= MAX_MAGNITUDE, f"{where}: too large")
-        low, amplitude, high = component.amplitude_low, component.amplitude, component.amplitude_high
-        is_bounded = -UNLIMITED <= low <= amplitude <= high <= UNLIMITED and amplitude != 0.0
-        _require(is_bounded and 0.0 <= item.probability <= 1.0 and item.fading >= 0, f"{where}: not plausible")
+        is_bounded = component.amplitude_low <= component.amplitude <= component.amplitude_high
+        is_plausible = is_bounded and component.amplitude != 0.0 and 0.0 <= item.probability <= 1.0
+        _require(is_plausible, f"{where}: not plausible")
         count = 1 + (component.model.inner is not None) + component.periodic
         is_complete = len(record.values) == len(record.deviations) == count and min(record.deviations) > 0.0
         _require(is_complete, f"{where}: values or deviations are missing")
 
 
-def _check_values(problem: Problem, components: Sequence[ComponentRecord]) -> None:
-    """Check the values of the ``components`` in ``problem`` against the bounds of its parameters."""
-    low, high = problem.bounds
-    _require(bool((low < high).all()), "components: their bounds leave no value")
-    for slot, record in enumerate(components):
-        at = indices(problem, slot)
-        _require_near(np.array(record.values), low[at], high[at], "components")
-
-
-def _with_noise(problem: Problem, noise: Vector) -> Problem:
+def _with_noise(problem: Problem, noise: tuple[float, ...]) -> Problem:
     """Return the problem with the ``noise`` that was accepted; empty for that of the machine file."""
     if not noise:
         return problem
-    _require(len(noise) == len(problem.noise), "noise: not one for each output")
-    ratio = np.array(noise) / np.array(problem.noise)
-    _require(bool(((ratio >= 1.0) & (ratio <= MAX_NOISE_RATIO)).all()), "noise: not plausible")
+    ratios = [accepted / stated for accepted, stated in zip(noise, problem.noise, strict=True)]
+    _require(1.0 <= min(ratios) <= max(ratios) <= MAX_NOISE_RATIO, "noise: not plausible")
     return replace(problem, noise=noise, stated_noise=problem.noise)
 
 
 def _posterior(record: FilterRecord, problem: Problem) -> Posterior:
     """Return the posterior of a record, checked."""
-    free = len(problem.free)
+    free, modes, phase = len(problem.free), len(record.weight), record.phase
     _require(record.labels == tuple(parameter.label for parameter in problem.free), "labels: other parameters")
     _require(len(record.previous) == free and record.scale == tuple(problem.scale.tolist()), "scale: another problem")
-    modes = len(record.weight)
     level = np.array(record.level, dtype=np.int64)
     mean, covariance, weight = np.array(record.mean), np.array(record.covariance), np.array(record.weight)
     shapes = level.shape, mean.shape, covariance.shape
     _require(shapes == ((modes, free), (modes, 2 * free), (modes, 2 * free, 2 * free)), "filter: wrong shape")
     _require(modes > 1 and len(np.unique(level, axis=0)) == modes, "level: modes are missing or repeated")
-    _require(int(level.max()) <= HIGHEST_LEVEL, "level: too high")
-    _require(float(weight.min()) > 0.0 and abs(float(weight.sum()) - 1.0) < 1e-6, "weight: no probabilities")
+    _require(0 <= int(level.min()) <= int(level.max()) <= HIGHEST_LEVEL, "level: there is no such mode")
+    _require(float(weight.min()) > 0.0 and abs(float(weight.sum()) - 1.0) < MAX_ROUNDING, "weight: no probabilities")
     belief = ImmPosterior(level, mean, covariance, weight, record.end, record.variance_ratio)
-    together = moment_match(belief)
+    together, matched = moment_match(belief)
     trend = np.full(free, MAX_TREND)
-    low, high = (
-        np.concatenate([bound / problem.scale, sign * trend])
-        for bound, sign in zip(problem.bounds, (-1, 1), strict=True)
-    )
-    _require_near(together[0], low, high, "mean")
-    for each in (*covariance, together[1]):
+    low, high = problem.bounds[0] / problem.scale, problem.bounds[1] / problem.scale
+    _require_near(together, np.concatenate([low, -trend]), np.concatenate([high, trend]), "mean")
+    for each in (*covariance, matched):
         _check_covariance(each)
-    sd = np.sqrt(np.diag(together[1]))
-    np.linalg.cholesky(together[1] / np.outer(sd, sd))  # as the next window does; a ValueError if it is singular
-    _check_phase(record.phase, problem)
-    return Posterior(problem, belief, record.phase)
+    sd = np.sqrt(np.diag(matched))
+    np.linalg.cholesky(matched / np.outer(sd, sd))  # as the next window does; a ValueError if it is singular
+    if phase is not None:
+        states = len(problem.base_model.states)
+        _require(len(phase.by) == len(problem.components) and len(phase.last_state) in (0, states), "phase: wrong size")
+    return Posterior(problem, belief, phase)
 
 
 def _check_covariance(covariance: Array) -> None:
     variances = np.diag(covariance)
-    in_range = (variances >= MIN_SD**2) & (variances <= MAX_SD**2)
-    _require(bool(in_range.all()), "covariance: a variance is not plausible")
-    size = np.sqrt(variances)
-    unit = covariance / np.outer(size, size)
-    _require(float(np.abs(unit - unit.T).max()) <= -MIN_EIGENVALUE, "covariance: not symmetric")
-    _require(float(np.linalg.eigvalsh(unit).min()) >= MIN_EIGENVALUE, "covariance: not positive semidefinite")
-
-
-def _check_phase(phase: PhaseAdvance | None, problem: Problem) -> None:
-    if phase is None:
-        return
-    _require(len(phase.by) == len(problem.components), "phase: not one for each component")
-    _require(len(phase.last_state) in (0, len(problem.base_model.states)), "phase: not one value for each state")
-    largest = max(map(abs, (phase.start, phase.next_start, *phase.by, *phase.last_state)))
-    _require(largest <= MAX_MAGNITUDE, "phase: too large")
+    _require(variances.min() >= MIN_SD**2 and variances.max() <= MAX_SD**2, "covariance: a variance is not plausible")
+    unit = covariance / np.sqrt(np.outer(variances, variances))
+    _require(float(np.abs(unit - unit.T).max()) <= MAX_ROUNDING, "covariance: not symmetric")
+    _require(float(np.linalg.eigvalsh(unit).min()) >= -MAX_ROUNDING, "covariance: not positive semidefinite")
 
 
 def _require_near(values: Array, low: Array, high: Array, name: str) -> None:

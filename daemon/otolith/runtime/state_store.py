@@ -116,22 +116,17 @@ class StateStore:
             if not had:
                 self.unlock()
 
-    def learned(self) -> LearnedState | None:
-        """Return what was saved of this twin in these signals; None if nothing was, or of other ones.
+    def components(self) -> tuple[ComponentRecord, ...]:
+        """Return the saved components of this twin in these signals; none if they are of others.
 
         Raises:
             ConfigurationError: the file is unreadable or damaged.
         """
         learned = _read(self.components_path, LearnedState, VERSION)
-        if learned is not None and (reason := self._other_origin(learned)):
-            log.warning("%s: not used: %s", self.components_path, reason)
-            return None
-        return learned
-
-    def components(self) -> tuple[ComponentRecord, ...]:
-        """Return the saved components; raises as :meth:`learned`."""
-        learned = self.learned()
         if learned is None:
+            return ()
+        if reason := self._other_origin(learned):
+            log.warning("%s: not used: %s", self.components_path, reason)
             return ()
         try:
             check_components(learned.components, self._twin)
@@ -154,13 +149,19 @@ class StateStore:
 
         A file that is not used as a whole is kept under another name. Requires the lock; ``now`` in Unix s.
         """
+        warm, reason = state, ""
         try:
             learned = _read(self.components_path, LearnedState, VERSION)
             if learned is None:
                 return state, ""
-            warm, reason = self._restored(learned, state, now)
+            reason = self._other_origin(learned)
+            if not reason:
+                if learned.configuration_fingerprint not in ("", configuration_fingerprint(state.problem)):
+                    reason = "parameters or noise in the machine file have changed since it was saved"
+                    learned = learned.model_copy(update={"filter": None})
+                warm = restored(learned, state, now)
         except (OtolithError, ValueError, ArithmeticError, LookupError) as error:
-            warm, reason = state, str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")
+            reason = str(error).removeprefix(f"{self.components_path}: ").removesuffix(f": {REMEDY}")
         if not reason:
             return warm, ""
         note = f"{self.components_path}: {'only components are used' if warm.adopted else 'not used'}: {reason}"
@@ -168,15 +169,6 @@ class StateStore:
             return warm, f"{note}; the file is kept as {self.set_aside().name}"
         except OtolithError as error:
             return warm, f"{note}; {error}"
-
-    def _restored(self, learned: LearnedState, state: AdaptationState, now: float) -> tuple[AdaptationState, str]:
-        """Return the restored state, and why not all of ``learned`` was used."""
-        if reason := self._other_origin(learned):
-            return state, reason
-        if learned.configuration_fingerprint in ("", configuration_fingerprint(state.problem)):
-            return restored(learned, state, now), ""
-        reason = "parameters or noise in the machine file have changed since it was saved"
-        return restored(learned.model_copy(update={"filter": None}), state, now), reason
 
     def set_aside(self) -> Path:
         """Rename the file with what was learned, and return its new path.
@@ -200,8 +192,8 @@ class StateStore:
             ServiceError: the file cannot be written, another process has the lock, or the state is not plausible.
         """
         try:
-            learned = learned_state(state, self._signal_fingerprint, time.time())
-        except (ValueError, ArithmeticError) as error:
+            learned = learned_state(state, self._signal_fingerprint)
+        except (ValueError, ArithmeticError, LookupError) as error:
             raise ServiceError(f"{self.components_path}: kept as it was: {error}") from error
         self._write_learned(learned)
 
