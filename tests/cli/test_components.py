@@ -16,7 +16,7 @@ from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial
 from otolith.cli.main import cli
 from otolith.machine import load_machine
 from otolith.runtime.state_store import StateStore
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.cli.replays import MACHINE
 from tests.conftest import EXAMPLES
 
@@ -166,3 +166,50 @@ def test_a_restricted_search_excludes_the_rest(tmp_path: Path) -> None:
     assert KEY not in excluded
     assert "shaft/linear/omega" in excluded
     assert "winding/periodic/t" in excluded
+
+
+def test_reset_records_what_to_forget_and_keeps_decisions(data: Path) -> None:
+    otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
+    shown = otolith("reset", MACHINE, "R_a", KEY, "--dry-run").stdout
+    assert shown.splitlines() == ["R_a would be forgotten", f"{KEY} would be forgotten"]
+    assert not store().decisions().resets
+    assert otolith("reset", MACHINE, "R_a", KEY).exit_code == 0
+    decisions = store().decisions()
+    assert decisions.resets.keys() == {"R_a", KEY}
+    assert decisions.approved == {KEY}
+    assert (
+        len(otolith("reset", MACHINE).stdout.splitlines())
+        == len(load_machine(MACHINE, with_driver=False).problem.free) + 1
+    )
+    assert store().decisions().resets.keys() == {"R_a", KEY, "*"}
+    machine = load_machine(MACHINE, with_driver=False)
+    warm, note = store().restore(initial_state("m", "s", machine.problem), 0.0)
+    assert note == ""
+    assert [component.key for component in warm.problem.components] == [KEY]
+    assert apply_decisions(warm, store().decisions()).problem.components == ()
+
+
+def test_reset_of_an_unknown_name_names_the_nearest() -> None:
+    with pytest.raises(ConfigurationError, match="no parameter or component 'R_b': did you mean 'R_a'"):
+        otolith("reset", MACHINE, "R_b")
+
+
+def test_reset_works_where_the_saved_state_is_damaged() -> None:
+    files = store()
+    files.components_path.parent.mkdir(parents=True, exist_ok=True)
+    files.components_path.write_text("half a fi", encoding="utf-8")
+    result = otolith("reset", MACHINE)
+    assert "components cannot be named" in result.stderr
+    assert store().decisions().resets.keys() == {"*"}
+
+
+def test_commission_keeps_what_was_learned_before_beside(data: Path) -> None:
+    for _ in range(2):
+        result = otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
+    (kept,) = store().components_path.parent.glob("*.kept.json")
+    assert f"what was learned before is kept as {kept}" in result.stderr
+
+
+def test_commission_refuses_while_a_daemon_runs(data: Path) -> None:
+    with store().locked(), pytest.raises(ServiceError, match="already uses its state: stop it"):
+        otolith("commission", MACHINE, data)

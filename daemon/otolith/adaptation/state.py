@@ -14,7 +14,7 @@ from otolith.health.schema import Status
 from otolith.health.status import PreviousStatus
 
 MIN_COARSE_RECORDS = 50  # records of a window on a coarser grid: fewer determine little, however long the sample period
-RESTART_FACTOR = 3.0  # on the standard deviations before a restart: nothing was observed meanwhile
+RESTART_FACTOR = 3.0  # on the standard deviations of a component whose filter was not saved: nothing was observed since
 PHASE = 2  # position of the phase among the values of a component
 EVERYTHING = "*"
 """Stands for all parameters, components and noise levels among the names of :attr:`OperatorDecisions.resets`."""
