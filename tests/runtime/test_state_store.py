@@ -175,6 +175,16 @@ def test_root_gives_the_open_file_to_the_owner_of_the_folder_and_never_a_path(
     assert (victim.stat().st_uid, victim.read_text(encoding="utf-8")) == (before.st_uid, "of root")
 
 
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files away")
+def test_what_root_writes_belongs_to_the_user_of_the_daemon(store: StateStore) -> None:
+    folder = store.decisions_path.parent
+    os.chown(folder.parent, 12345, 12345)
+    store.save_decisions(OperatorDecisions())
+    with store.locked():
+        owners = {path.stat().st_uid for path in (folder, store.decisions_path, store.lock_path)}
+    assert owners == {12345}
+
+
 def test_nothing_is_written_through_a_folder_that_was_replaced_by_a_link(store: StateStore, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()

@@ -57,13 +57,21 @@ def holds_truth(report: ReportDocument) -> bool:
     )
 
 
+def is_saved(store: StateStore) -> bool:
+    """Whether the resistance is saved as determined."""
+    if not store.components_path.exists():
+        return False
+    learned = json.loads(store.components_path.read_text(encoding="utf-8"))["filter"]
+    return learned is not None and all(before["known"] for before in learned["previous"])
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_the_first_reports_after_a_restart_hold_the_truth(
     start: Start, store: StateStore, number: signal.Signals
 ) -> None:
     first = start()
     first.wait_for(lambda reports: bool(reports) and is_estimated(reports[-1]))
-    wait_for(store.components_path.exists)
+    wait_for(lambda: is_saved(store), 2 * PATIENCE)
     first.stop(number)
     second = start()
     reports = second.wait_for(lambda reports: len(reports) >= 2)

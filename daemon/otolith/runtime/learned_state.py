@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.state import AdaptationState, ComponentRecord, cleared, component_records, restore_components
@@ -27,16 +27,14 @@ from otolith.twin.definition import Definition
 from otolith_drivers.config_files import StrictModel
 
 VERSION = 2
+SCALARS = ("records", "learned", "contradictions", "noisier_since")
+"""What a state and its record have in common, beside the posterior."""
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_MAGNITUDE = 1e12  # of any number but an amplitude's bound
 MIN_SD, MAX_SD = 1e-12, 1e6  # relative to the size of a parameter
 MAX_OUTSIDE = 1.0  # widths of the bounds by which a mean may lie outside of them
 MAX_ROUNDING = 1e-9  # of a covariance with unit variances: asymmetry, and what is missing to positive semidefinite
 MAX_NOISE_RATIO = 1e6  # noise that was accepted over stated noise
-
-
-class StateRefusedError(ValueError):
-    """Saved state that must not be used; the text is the reason."""
 
 
 class _AnyVersion(BaseModel):
@@ -86,20 +84,10 @@ def check_version(text: str, newest: int) -> None:
     """Check that ``text`` is JSON of a version up to ``newest``.
 
     Raises:
-        StateRefusedError: it is not.
+        ValueError: it is not.
     """
-    try:
-        version = _AnyVersion.model_validate_json(text).version
-    except ValidationError as error:
-        raise StateRefusedError(first_error(error)) from error
-    if not 1 <= version <= newest:
-        raise StateRefusedError(f"version {version} of the format: this Otolith reads 1 to {newest}")
-
-
-def first_error(error: ValidationError) -> str:
-    """Return place and text of the first error."""
-    first = error.errors(include_url=False, include_input=False)[0]
-    return f"{'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}"
+    version = _AnyVersion.model_validate_json(text).version
+    _require(1 <= version <= newest, f"version {version} of the format: this Otolith reads 1 to {newest}")
 
 
 def twin_fingerprint(twin: Definition) -> str:
@@ -153,19 +141,13 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
     return FilterRecord(
         labels=labels,
         scale=tuple(problem.scale.tolist()),
-        level=belief.level.tolist(),
-        mean=belief.mean.tolist(),
-        covariance=belief.covariance.tolist(),
-        weight=tuple(belief.weight.tolist()),
+        **{name: getattr(belief, name).tolist() for name in ("level", "mean", "covariance", "weight")},
         end=belief.end,
         variance_ratio=belief.variance_ratio,
         phase=state.posterior.phase,
         noise=problem.noise if problem.stated_noise else (),
         previous=tuple(state.previous.get(label, PreviousStatus()) for label in labels),
-        records=state.records,
-        learned=state.learned,
-        contradictions=state.contradictions,
-        noisier_since=state.noisier_since,
+        **{name: getattr(state, name) for name in SCALARS},
     )
 
 
@@ -194,15 +176,15 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
     posterior, window = _posterior(record, _with_noise(problem, record.noise)), problem.window
     if record.end > now:
         posterior = replace(posterior, belief=replace(posterior.belief, end=now - (record.end - now)))
+    kept = {name: getattr(record, name) for name in SCALARS}
+    if not window.shortest <= record.records <= window.longest:
+        kept["records"] = state.records
     return replace(
         state,
+        **kept,
         posterior=posterior,
         previous=dict(zip(record.labels, record.previous, strict=True)),
-        records=record.records if window.shortest <= record.records <= window.longest else state.records,
-        learned=record.learned,
-        contradictions=record.contradictions,
         adopted=adopted,
-        noisier_since=record.noisier_since,
         resets=document.resets,
     )
 
@@ -220,7 +202,7 @@ def check_components(records: tuple[ComponentRecord, ...], twin: Definition) -> 
     """Check that ``twin``, the base model, can have all components at once.
 
     Raises:
-        StateRefusedError: it cannot.
+        ValueError: it cannot.
     """
     places, origins = {site.name for site in sites(twin)}, {source.name for source in sources(twin)}
     keys = {record.adopted.component.key for record in records}
@@ -290,4 +272,4 @@ def _require_near(values: Array, low: Array, high: Array, name: str) -> None:
 
 def _require(condition: bool, reason: str) -> None:
     if not condition:
-        raise StateRefusedError(reason)
+        raise ValueError(reason)

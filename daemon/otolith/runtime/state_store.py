@@ -21,11 +21,9 @@ from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorD
 from otolith.runtime.learned_state import (
     VERSION,
     LearnedState,
-    StateRefusedError,
     check_components,
     check_version,
     configuration_fingerprint,
-    first_error,
     learned_state,
     restored,
     twin_fingerprint,
@@ -86,7 +84,7 @@ class StateStore:
         try:
             with _opened(self.lock_path.parent) as folder:
                 handle = os.open(self.lock_path.name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600, dir_fd=folder)
-                _give_to_owner(handle, folder)
+                _give_to(os.fstat(folder), handle)
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             holder = os.read(handle, PROCESS_ID_BYTES).decode("ascii", "replace").strip()
@@ -130,7 +128,7 @@ class StateStore:
             return ()
         try:
             check_components(learned.components, self._twin)
-        except StateRefusedError as error:
+        except ValueError as error:
             raise ConfigurationError(f"{self.components_path}: {error}: {REMEDY}") from error
         return learned.components
 
@@ -194,7 +192,7 @@ class StateStore:
         try:
             learned = learned_state(state, self._signal_fingerprint)
         except (ValueError, ArithmeticError, LookupError) as error:
-            raise ServiceError(f"{self.components_path}: kept as it was: {error}") from error
+            raise ServiceError(f"{self.components_path}: kept as it was: {_reason(error)}") from error
         self._write_learned(learned)
 
     def save_components(self, components: tuple[ComponentRecord, ...]) -> None:
@@ -261,13 +259,20 @@ def _read(path: Path, model: type[StateModel], newest: int) -> StateModel | None
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
-        reason = first_error(error) if isinstance(error, ValidationError) else str(error)
-        raise ConfigurationError(f"{path}: {reason}: {REMEDY}") from error
+        raise ConfigurationError(f"{path}: {_reason(error)}: {REMEDY}") from error
+
+
+def _reason(error: Exception) -> str:
+    """Return the text of an error in one line; of a document that does not fit its schema, the first fault."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}"
 
 
 def _limited(data: bytes) -> bytes:
     if len(data) > MAX_STATE_BYTES:
-        raise StateRefusedError(f"larger than {MAX_STATE_BYTES} bytes")
+        raise ValueError(f"larger than {MAX_STATE_BYTES} bytes")
     return data
 
 
@@ -286,7 +291,7 @@ def _write(path: Path, model: StrictModel, temporary: str) -> None:
                 with os.fdopen(handle, "wb") as stream:
                     stream.write(data)
                     stream.flush()
-                    _give_to_owner(handle, folder)
+                    _give_to(os.fstat(folder), handle)
                     os.fsync(handle)
                 os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
                 os.fsync(folder)
@@ -296,24 +301,26 @@ def _write(path: Path, model: StrictModel, temporary: str) -> None:
                 raise
     except OSError as error:
         raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
-    except StateRefusedError as error:
+    except ValueError as error:
         raise ServiceError(f"{path}: not written: {error}") from error
 
 
 @contextlib.contextmanager
 def _opened(folder: Path) -> Iterator[int]:
     """Descriptor of ``folder``, which is created if it is missing."""
+    is_new = not folder.exists()
     handle = os.open(writable(folder), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
+        if is_new:
+            _give_to(folder.parent.stat(), handle)
         yield handle
     finally:
         os.close(handle)
 
 
-def _give_to_owner(handle: int, folder: int) -> None:
-    """Give an open file to the owner of its folder: the daemon runs as another user and must be able to use it."""
+def _give_to(owner: os.stat_result, handle: int) -> None:
+    """Give what root has opened to an owner: the daemon runs as another user and must be able to use it."""
     if os.geteuid() == 0:
-        owner = os.fstat(folder)
         os.fchown(handle, owner.st_uid, owner.st_gid)
 
 
