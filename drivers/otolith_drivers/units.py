@@ -13,6 +13,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from otolith_drivers.errors import OtolithError
+from otolith_drivers.unit_names import EXACT, FOLDED, ODD_PREFIX, OTHER_MEANINGS, POWER, UNCLEAR
 from otolith_drivers.user_dirs import cache_directory
 
 if TYPE_CHECKING:
@@ -21,34 +22,16 @@ if TYPE_CHECKING:
 MAX_LENGTH = 100  # characters of a quantity: engineering choice; bounds the time of the patterns below
 NUMBER_AND_UNIT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*)")
 # Unit names with one small exponent each, joined by * or /. A larger exponent would keep pint busy for minutes.
-FACTOR = r"[( ]*(?:1|[^\W\d][\w°%µμΩ]*|[°%][^\W\d]*)(?: ?(?:\^|\*\*) ?\(?-?\d(?:\.\d{1,3})?\)?)?[) ]*"
+FACTOR = r"[( ]*(?:1|[^\W\d][\w°%µμΩ]*|[°º%℃℉][^\W\d]*)(?: ?(?:\^|\*\*) ?\(?-?\d(?:\.\d{1,3})?\)?)?[) ]*"
 UNIT = re.compile(rf"{FACTOR}(?:[*/· ]{FACTOR}){{0,12}}")
 
-# Units as drives and DBC files write them, where pint reads something else ("Nm" is "number meter") or nothing.
-ALIASES = {
-    "Nm": "N*m",
-    "mNm": "mN*m",
-    "Nms": "N*m*s",
-    "U/min": "rpm",
-    "1/min": "rpm",
-    "r/min": "rpm",
-    "rev/min": "rpm",
-    "RPM": "rpm",
-    "rev": "turn",
-    "rev/s": "turn/s",
-    "Volt": "V",
-    "Amp": "A",
-    "min^-1": "rpm",
-    "min**-1": "rpm",
-    "min-1": "rpm",
-    "°C": "degC",
-    "°": "degree",
-    "": "dimensionless",
-    "1": "dimensionless",
-    "-": "dimensionless",
-}
-RATES = ({"[time]": -1}, {"[time]": -2})
-"""Dimensions in which pint cannot tell turns from radians."""
+FACTOR_NAME = re.compile(r"[^\W\d][\w°%µμΩ]*|[°º%℃℉][^\W\d]*")
+RATES: tuple[dict[str, int], ...] = ({}, {"[time]": -1}, {"[time]": -2})
+"""Dimensions in which pint cannot tell angles from numbers: of an angle, its rate and its acceleration."""
+
+
+class UnitNameError(ValueError):
+    """A text names no unit, or leaves open which."""
 
 
 @cache
@@ -68,16 +51,48 @@ def unit(text: str) -> "pint.Unit":
     """Return the unit that ``text`` names.
 
     Raises:
-        ValueError: unknown or malformed unit.
+        UnitNameError: unknown, malformed or ambiguous unit.
     """
-    short = re.sub(r"\s+", " ", text.strip())
-    written = ALIASES.get(short.replace(" ", ""), short)
-    if len(text) > MAX_LENGTH or not UNIT.fullmatch(written):
-        raise ValueError(f"{text!r} is not a unit")
+    short = re.sub(r"\s+", " ", text.strip()).removesuffix(".").replace("\u2126", "Ω")
+    whole = short.replace(" ", "")
+    written = _known_name(whole) if whole else "dimensionless"
+    if len(text) > MAX_LENGTH or not (written or UNIT.fullmatch(short)):
+        raise UnitNameError(f"{text!r} is not a unit")
     try:
-        return _registry().Unit(written)
+        parsed = _registry().Unit(written or FACTOR_NAME.sub(_renamed, short))
+    except UnitNameError:
+        raise
     except Exception as error:
-        raise ValueError(f"{text!r} is not a unit (examples: ohm, N*m*s/rad, rad/s, ms)") from error
+        raise UnitNameError(f"{text!r} is not a unit (examples: ohm, N*m*s/rad, rad/s, ms)") from error
+    if odd := ODD_PREFIX.search(str(parsed)):
+        raise UnitNameError(f"{text!r} would be {odd[0]}: write another prefix, or the name of the unit in full")
+    return parsed
+
+
+def _known_name(spelling: str) -> str:
+    """Return pint's name of what databases write as ``spelling``; empty if no table has it.
+
+    Raises:
+        UnitNameError: it has several meanings of one dimension.
+    """
+    if spelling in UNCLEAR:
+        names = " or ".join(map(repr, UNCLEAR[spelling]))
+        raise UnitNameError(f"{spelling!r} may be {names}: write one of them")
+    return EXACT.get(spelling) or FOLDED.get(spelling.casefold(), "")
+
+
+def _renamed(match: re.Match[str]) -> str:
+    """Return pint's name of a factor, with its exponent if one is attached."""
+    if power := POWER.fullmatch(match[0]):
+        return f"{power[1].lower()}^{power[2]}"
+    return _known_name(match[0]) or match[0]
+
+
+def _meant(source: str, target: str) -> str:
+    """Return ``source``, or its other meaning if only that has the dimension of ``target``."""
+    other = OTHER_MEANINGS.get(source.strip())
+    dimension = unit(target).dimensionality
+    return other if other and unit(source).dimensionality != dimension == unit(other).dimensionality else source
 
 
 def factor(source: str, target: str) -> tuple[float, float]:
@@ -86,6 +101,7 @@ def factor(source: str, target: str) -> tuple[float, float]:
     Raises:
         ValueError: the units have different dimensions; the message names both.
     """
+    source = _meant(source, target)
     _check_dimension(source, target)
     zero = _registry().Quantity(0.0, unit(source)).to(unit(target)).magnitude
     one = _registry().Quantity(1.0, unit(source)).to(unit(target)).magnitude

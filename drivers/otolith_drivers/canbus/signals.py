@@ -19,7 +19,7 @@ from otolith_drivers.base import Signal
 from otolith_drivers.canbus.database import CanDatabase
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.units import factor
+from otolith_drivers.units import UnitNameError, factor
 
 CLASSIC_LENGTH, FD_LENGTH = 8, 64  # bytes of a frame
 STANDARD_LIMIT, EXTENDED_LIMIT = 0x7FF, 0x1FFFFFFF  # arbitration IDs of 11 and of 29 bits
@@ -253,7 +253,8 @@ def request_for(signal: Signal, message: Message, layout: CanSignal, origin: str
     try:
         to_target, target_offset = factor(unit, signal.unit)
     except ValueError as error:
-        raise ConfigurationError(f"{origin}: {error}", key) from error
+        way_out = "; set 'unit' beside it" if isinstance(error, UnitNameError) and not source.unit else ""
+        raise ConfigurationError(f"{origin}: {error}{way_out}", key) from error
     inner = (float(layout.conversion.scale), float(layout.conversion.offset))
     scale, offset = source.scale * inner[0], source.scale * inner[1] + source.offset
     if scale == 0.0 or not math.isfinite(scale + offset):

@@ -1,0 +1,135 @@
+"""Units as databases of drives and vehicles write them: converted, or refused with a request to write them out."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.units import factor, unit
+from tests.drivers.can_frames import dbc, decoder, frame
+
+TURN, DEGREE = 2 * math.pi, math.pi / 180
+SPELLINGS: dict[tuple[str, float, float], str] = {
+    ("V", 1, 0): "V|v|Volt|Volts|volt|volts|VOLT|VOLTS|Vdc|VDC|V DC|Vrms|V_rms|Vac",
+    ("V", 1e-3, 0): "mV|mVolt|mVolts|millivolts",
+    ("V", 1e3, 0): "kV|KV",
+    ("A", 1, 0): "A|Amp|Amps|amps|AMPS|amp|Ampere|Amperes|ampere|Amp.|Arms|A rms|A_rms|ARMS|Apk|A peak|Adc|A DC",
+    ("A", 1e-3, 0): "mA|mAmp|mAmps|milliamps",
+    ("ohm", 1, 0): "ohm|Ohm|Ohms|OHM|Ω|\u2126",
+    ("ohm", 1e-3, 0): "mOhm|mohm|mΩ|milliohm",
+    ("ohm", 1e3, 0): "kOhm|KOhm|kΩ",
+    ("rad", DEGREE, 0): "°|º|deg|Deg|DEG|deg.|Degree|Degrees|degrees|DEGREES|Grad|Winkelgrad",
+    ("rad", 1, 0): "rad|Rad|RAD|rads|Radian|Radians",
+    ("rad", TURN, 0): "rev|Rev|turn|Turns|revolutions|Umdrehungen|Umdr",
+    ("rad/s", DEGREE, 0): "°/s|deg/s|Deg/s|deg/sec|Deg/Sec|degrees/s|Degree/Second|Grad/s|Grad/Sek|º/s",
+    ("rad/s", 1, 0): "rad/s|Rad/s|rad/sec|Radians/Second",
+    ("rad/s", TURN / 60, 0): "rpm|RPM|Rpm|r.p.m.|1/min|min-1|min^-1|/min|U/min|U/Min|Umdr/min|Umdrehungen/min|"
+    "Umdr./min|rev/min|Rev/Min|revs/min|Revolutions/Minute|r/min|tr/min|1/Min",
+    ("rad/s", TURN, 0): "rps|rev/s|Rev/s|U/s|Umdr/s|r/s",
+    ("rad/s^2", 1, 0): "rad/s2|rad/s²|rad/s^2|rad/s/s|rad/sec2|rad/s**2",
+    ("rad/s^2", DEGREE, 0): "deg/s2|°/s2|°/s²|deg/s^2|Deg/s2|Grad/s2|deg/sec^2",
+    ("degC", 1, 0): "°C|ºC|° C|℃|degC|DegC|deg C|Deg C|DEG C|deg.C|Degrees C|degrees C|Degree C|Celsius|celsius|"
+    "Degrees Celsius|deg Celsius|Grad C|Grad Celsius|GradC|C|deg_C|°Celsius",
+    ("degC", 5 / 9, -160 / 9): "°F|degF|deg F|Deg F|Degrees F|Fahrenheit|F",
+    ("K", 1, 0): "K|Kelvin|kelvin|degK|deg K|°K",
+    ("N*m", 1, 0): "Nm|NM|N.m|N-m|N*m|N m|N·m|Newton meter|Newton-meters|newtonmeter",
+    ("N*m", 1e3, 0): "kNm|KNm|kN*m",
+    ("N*m", 1e-2, 0): "Ncm",
+    ("N*m/A", 1, 0): "Nm/A|N.m/A|Nm/Arms|Nm/Amp",
+    ("N*m/s", 1, 0): "Nm/s|Nm/sec",
+    ("m/s^2", 1, 0): "m/s2|m/s²|m/s^2|m/ss|m/s/s|m/sec2|m/sec^2|M/S2",
+    ("m/s^2", 9.80665, 0): "g|G|g_n",
+    ("m/s", 1 / 3.6, 0): "km/h|Km/h|KM/H|kmh|Kmh|KMH|kph|KPH|kmph|km/hr|km/Std",
+    ("m/s", 1, 0): "m/s|m/sec|M/s",
+    ("N", 1, 0): "N|Newton|Newtons|newtons",
+    ("N", 1e3, 0): "kN|KN|kn",
+    ("W", 1, 0): "W|Watt|Watts|WATT|watts",
+    ("W", 1e3, 0): "kW|KW|Kw|kw|kiloWatt",
+    ("W*h", 1e3, 0): "kWh|KWh|KWH|kwh",
+    ("J", 1, 0): "J|Joule|Joules",
+    ("Hz", 1, 0): "Hz|hz|HZ|Hertz",
+    ("Hz", 1e3, 0): "kHz|KHz|khz|KHZ",
+    ("s", 1, 0): "s|S|sec|Sec|SEC|secs|Seconds|second|sec.|Sekunden|Sek",
+    ("s", 1e-3, 0): "ms|msec|mSec|Msec|milliseconds",
+    ("s", 60, 0): "min|Min|MIN|minutes|Minuten|min.",
+    ("s", 3600, 0): "h|hr|hrs|Hours|hour|Std|Stunden",
+    ("Pa", 1e5, 0): "bar|Bar|BAR",
+    ("Pa", 1e2, 0): "mbar|mBar|hPa|hpa",
+    ("Pa", 1e3, 0): "kPa|KPa|kpa|KPA",
+    ("Pa", 1e6, 0): "MPa|Mpa",
+    ("Pa", 6894.757, 0): "psi|PSI|Psi",
+    ("kg", 1, 0): "kg|Kg|KG",
+    ("m", 1e-3, 0): "mm",
+    ("m", 1e3, 0): "km|Km|KM",
+    ("m^3/s", 1 / 60e3, 0): "l/min|L/min|l/Min|lpm|LPM|liters/minute",
+    ("m^3/s", 1 / 3600, 0): "m3/h|m³/h|m^3/h|m3/hr",
+    ("kg*m^2", 1, 0): "kgm2|kg*m2|kg m2|kg m^2|kgm^2|kgm²",
+    ("kg*m^2", 1e-4, 0): "kgcm2|kg*cm2|kg cm^2",
+    ("1", 0.01, 0): "%|Percent|percent|PERCENT|pct|Pct|Prozent",
+    ("1", 1, 0): "|-|--|1|none|None|n/a|N/A|unitless|Unitless|counts",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("written", "target", "scale", "offset"),
+    [(text, *meaning) for meaning, texts in SPELLINGS.items() for text in texts.split("|")],
+)
+def test_spelling_of_a_database_is_understood(written: str, target: str, scale: float, offset: float) -> None:
+    assert list(factor(written, target)) == [pytest.approx(scale, rel=1e-6), pytest.approx(offset, abs=1e-9)]
+
+
+@pytest.mark.parametrize(
+    ("written", "target"),
+    [
+        ("grad", "rad"),  # the degree in German, the gon elsewhere
+        ("grad/s", "rad/s"),
+        ("Gon?", "rad"),
+        ("MV", "V"),  # of a file in capitals, or a million volts
+        ("MA", "A"),
+        ("Ms", "s"),
+        ("MRAD", "rad"),
+        ("Mrad", "rad"),
+        ("PF", "F"),
+        ("counts", "rad"),  # an encoder's
+        ("", "rad"),
+        ("%", "rad"),
+        ("deg", "degC"),  # Celsius or Fahrenheit
+        ("°", "kelvin"),
+        ("ERPM", "rad/s"),  # times the pole pairs
+        ("1/s", "rad/s"),
+        ("Hz", "rad/s"),
+        ("barg", "Pa"),  # above the pressure of the air
+        ("mpa", "Pa"),
+        ("U", "rad"),
+        ("bits", "rad"),
+        ("rad", "1"),
+    ],
+)  # fmt: skip
+def test_ambiguous_unit_is_refused(written: str, target: str) -> None:
+    with pytest.raises(ValueError, match=r"unit|measure|write"):
+        factor(written, target)
+
+
+def test_ambiguous_unit_names_its_meanings() -> None:
+    with pytest.raises(ValueError, match=r"'grad' may be 'degree' or 'gon': write one of them"):
+        unit("grad")
+    with pytest.raises(ValueError, match=r"'MV' would be megavolt: write"):
+        unit("MV")
+
+
+@pytest.mark.parametrize("written", ["C", "F", "g", "kn", "S"])
+def test_a_symbol_keeps_its_standard_meaning(written: str) -> None:
+    """Only a signal of another dimension takes the other meaning."""
+    standard = {"C": "coulomb", "F": "farad", "g": "gram", "kn": "knot", "S": "siemens"}[written]
+    assert factor(written, standard) == (1.0, 0.0)
+
+
+def test_ambiguous_unit_of_a_database_asks_for_unit(tmp_path: Path) -> None:
+    """And the unit of the machine file replaces that of the database."""
+    text = dbc('BO_ 385 Motor: 8 Drive\n SG_ Angle : 0|16@1- (0.5,0) [0|0] "grad" Monitor')
+    with pytest.raises(ConfigurationError, match=r"Motor\.Angle: 'grad' may be .*; set 'unit' beside it"):
+        decoder(tmp_path, {"phi": ("rad", {"signal": "Angle"})}, text)
+    read = decoder(tmp_path, {"phi": ("rad", {"signal": "Angle", "unit": "degree"})}, text)
+    (sample,) = read.decode(frame(385, bytes([180, 0, 0, 0, 0, 0, 0, 0])), 0.0)
+    assert sample.value == pytest.approx(math.pi / 2)
