@@ -49,6 +49,7 @@ CERTAIN_MARGIN_PER_CHANGE = 0.3  # and for each change of long numbers, of which
 LOW_HALF_SIZE = 0x2000  # magnitude from which a register may be the low half of a number whose high half is still
 LIKELY_FLOATS = (1e-6, 1e8)  # median magnitudes of most signals in the units that people use
 MAX_WRITTEN = 30  # values whose decimal digits are counted, to bound the time
+MAX_PROBABILITY = 0.95  # of an inferred number; more are not right (see the page of thresholds)
 MAX_OTHERS = 3  # alternatives reported for one number
 
 MAX_WIDTH = 8  # bytes of a number
@@ -197,6 +198,8 @@ class Part:
     """The number in each reading."""
     others: tuple[Other, ...] = ()
     """Alternatives with other values, the most probable first."""
+    probability: float = MAX_PROBABILITY
+    """That it is this number, if one of the layouts is right."""
 
     @property
     def end(self) -> int:
@@ -327,10 +330,18 @@ def _judged(part: Part, rivals: Sequence[tuple[float, Part]]) -> Part:
     if part.verdict is not LayoutVerdict.CERTAIN:
         return part
     changes = int(np.count_nonzero(np.diff(part.numbers)))
+    weights: dict[tuple[int, tuple[int, ...]], float] = {}
     others: dict[tuple[int, tuple[int, ...]], Other] = {}  # a signed and an unsigned number count as one
     for cost, rival in sorted(rivals, key=lambda rival: rival[0]):
         per_change = CERTAIN_MARGIN_PER_CHANGE if max(part.width, rival.width) > 2 else 0.0
-        if rival.layout is None or cost >= max(CERTAIN_MARGIN, per_change * changes):
+        if rival.layout is None:
+            continue
+        margin = max(CERTAIN_MARGIN, per_change * changes)
+        if not np.array_equal(rival.numbers, part.numbers):
+            weights.setdefault(
+                (rival.start, rival.layout.positions), 2.0 ** (-CERTAIN_MARGIN * max(cost, 0.0) / margin)
+            )
+        if cost >= margin:
             continue
         # If the high half is constant, the integer has the values of its low half, up to a constant.
         extends = rival.width > part.width and not rival.layout.is_float
@@ -339,7 +350,8 @@ def _judged(part: Part, rivals: Sequence[tuple[float, Part]]) -> Part:
             other = Other(rival.start, rival.layout, rival.latest)
             others.setdefault((rival.start, rival.layout.positions), other)
     verdict = LayoutVerdict.LIKELY if others or len(part.numbers) < MIN_READINGS else LayoutVerdict.CERTAIN
-    return replace(part, verdict=verdict, others=tuple(others.values())[:MAX_OTHERS])
+    probability = min(1.0 / (1.0 + sum(weights.values())), MAX_PROBABILITY)
+    return replace(part, verdict=verdict, others=tuple(others.values())[:MAX_OTHERS], probability=probability)
 
 
 def quoted(value: str | float) -> str:

@@ -26,6 +26,7 @@ EXACT = _by_spelling(
         "kelvin": "°K",
         "V": "v",
         "(m/s)": "M/s M/S",
+        "(degree/s)": "D/S",
         "(m/s^2)": "M/s2 M/S2",
         "milliohm": "mOhm",
         "megaohm": "MOhm",
@@ -48,6 +49,7 @@ FOLDED = _by_spelling({
     "W": "watt watts",
     "kW": "kw kilowatt kilowatts",
     "kWh": "kwh",
+    "Ah": "ah",
     "J": "joule joules",
     "N": "newton newtons",
     "(N*m)": "newtonmeter newtonmeters newton-meter newton-meters newtonmetre newtonmetres",
@@ -99,6 +101,7 @@ OTHER_MEANINGS = {
     "G": "standard_gravity",
     "kn": "kN",
     "S": "s",
+    "M": "m",
 }
 """What a symbol means for a signal that has not the dimension of its standard meaning."""
 

@@ -1,5 +1,7 @@
 """Number inference: certain where bytes move, likely where they hardly do, none where they are still."""
 
+import struct
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -161,3 +163,33 @@ def test_any_bytes_are_covered_once(data: NDArray[np.uint8]) -> None:
     places = [at for part in parts(data, FRAMES, 1) for at in range(part.start, part.start + part.width)]
     assert places == list(range(data.shape[1]))
     assert all(layout.width <= 8 for layout in REGISTERS)
+
+
+def test_a_probability_is_not_too_high() -> None:
+    """Of the candidates in frames with one moving number, at least as many are right as their probabilities say."""
+    random = np.random.default_rng(1)
+    right, probabilities = [], []
+    for _ in range(400):
+        layout = FRAMES[random.integers(len(FRAMES))]
+        count, at = int(random.choice([8, 12, 20, 40])), int(random.integers(0, 9 - layout.width))
+        wave = np.sin(random.uniform(0.01, 0.3) * np.arange(count) + random.uniform(0.0, 6.0))
+        wave += 10.0 ** random.uniform(-3.0, -1.0) * random.standard_normal(count)
+        if layout.is_float:
+            rows = [struct.pack(">f", value) for value in 10.0 ** random.uniform(-1.0, 3.0) * wave]
+        else:
+            size = 2.0 ** random.uniform(3.0, 8 * layout.width - 2)
+            middle = 0.0 if layout.signed else 2.0 * size
+            rows = [round(middle + size * value).to_bytes(layout.width, "big", signed=layout.signed) for value in wave]
+        data = np.repeat(random.integers(0, 256, (1, 8)), count, axis=0).astype(np.uint8)
+        data[:, [at + position for position in layout.positions]] = np.frombuffer(b"".join(rows), np.uint8).reshape(
+            count, -1
+        )
+        number = layout.numbers(data[:, at : at + layout.width])
+        for part in parts(data, FRAMES, 1):
+            if part.layout is not None and part.verdict in (LayoutVerdict.CERTAIN, LayoutVerdict.LIKELY):
+                overlaps = part.start < at + layout.width and part.end > at
+                right.append(overlaps and np.ptp(part.numbers - number) == 0.0)
+                probabilities.append(part.probability)
+    assert len(right) > 300
+    assert np.mean(right) > np.mean(probabilities)
+    assert np.mean(np.array(right)[np.array(probabilities) >= 0.95]) > 0.93

@@ -22,7 +22,7 @@ SPELLINGS: dict[tuple[str, float, float], str] = {
     ("rad", DEGREE, 0): "°|º|deg|Deg|DEG|deg.|Degree|Degrees|degrees|DEGREES|Grad|Winkelgrad",
     ("rad", 1, 0): "rad|Rad|RAD|rads|Radian|Radians",
     ("rad", TURN, 0): "rev|Rev|turn|Turns|revolutions|Umdrehungen|Umdr",
-    ("rad/s", DEGREE, 0): "°/s|deg/s|Deg/s|deg/sec|Deg/Sec|degrees/s|Degree/Second|Grad/s|Grad/Sek|º/s",
+    ("rad/s", DEGREE, 0): "°/s|deg/s|Deg/s|deg/sec|Deg/Sec|degrees/s|Degree/Second|Grad/s|Grad/Sek|º/s|D/S",
     ("rad/s", 1, 0): "rad/s|Rad/s|rad/sec|Radians/Second",
     ("rad/s", TURN / 60, 0): "rpm|RPM|Rpm|r.p.m.|1/min|min-1|min^-1|/min|U/min|U/Min|Umdr/min|Umdrehungen/min|"
     "Umdr./min|rev/min|Rev/Min|revs/min|Revolutions/Minute|r/min|tr/min|1/Min",
@@ -60,6 +60,8 @@ SPELLINGS: dict[tuple[str, float, float], str] = {
     ("Pa", 1e6, 0): "MPa|Mpa",
     ("Pa", 6894.757, 0): "psi|PSI|Psi",
     ("kg", 1, 0): "kg|Kg|KG",
+    ("m", 1, 0): "m|M|meter|Meters|metres",
+    ("A*h", 1, 0): "Ah|AH",
     ("m", 1e-3, 0): "mm",
     ("m", 1e3, 0): "km|Km|KM",
     ("m^3/s", 1 / 60e3, 0): "l/min|L/min|l/Min|lpm|LPM|liters/minute",

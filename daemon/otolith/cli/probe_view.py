@@ -356,7 +356,16 @@ def _can_lines(picture: canbus.Picture, options: BusOptions, database: Path | No
     """The tables ``[driver]`` and ``[signals]``."""
     driver = canbus.can_driver_lines(options, picture, str(database.absolute()) if database else None)
     lines = [*driver, "", *canbus.can_signal_lines(picture)]
-    still = [frames.name for frames in picture.ordered() if frames.message is None and not canbus.fields_of(frames)]
+    unknown = [frames for frames in picture.ordered() if frames.message is None]
+    if any(canbus.fields_of(frames) for frames in unknown):
+        lines.append("# lines with ? are candidates among numbers of whole bytes: compare each with the machine")
+    selected = {frames.name: canbus.selector_of(frames) for frames in unknown}
+    lines += [
+        f"# {name} seems multiplexed by {selector}: no candidates, as they would mix several signals"
+        for name, selector in selected.items()
+        if selector
+    ]
+    still = [frames.name for frames in unknown if not selected[frames.name] and not canbus.fields_of(frames)]
     if still:
         lines.append(f"# no number changes smoothly in {_names(still)}: move the machine and probe again")
     return lines

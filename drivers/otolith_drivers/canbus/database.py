@@ -21,6 +21,7 @@ from otolith_drivers.errors import ConfigurationError
 
 SIZE_LIMIT = 4 << 20  # bytes; databases of large vehicles have 2 MB, and take some seconds each
 MAX_MESSAGE_LENGTH = 4096  # bytes; CAN FD has 64, the transport protocol of SAE J1939 1785
+STANDARD_LIMIT, EXTENDED_LIMIT = 0x7FF, 0x1FFFFFFF  # arbitration IDs of 11 and of 29 bits
 MAX_RANGE = 1 << 16  # values of one multiplexer, and arbitration IDs of one message
 SHEETS = (".eds", ".dcf")
 FORMATS = {".dbc": "dbc", ".kcd": "kcd", ".sym": "sym", ".arxml": "arxml"}
@@ -37,6 +38,9 @@ RANGES = re.compile(r"\b(\d+)\s*-\s*(\d+)\s*[,;]")
 IDENTIFIERS = re.compile(r"^\s*ID\s*=\s*([0-9A-Fa-f]+)h\s*-\s*([0-9A-Fa-f]+)h", re.MULTILINE)
 # The parts of a DBC that describe frames; comments, attributes and tables of values may be broken.
 DBC_MESSAGE = re.compile(r"^[ \t]*BO_ .*(?:\r?\n[ \t]*(?:\r?\n[ \t]*)*SG_ .*)*", re.MULTILINE)
+DBC_REFERENCE = re.compile(r"(\b(?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|SIG_GROUP_|BO_TX_BU_)\s+)(\d+)\b")
+DBC_MULTIPLEXED = re.compile(r"^[ \t]*SG_\s+\S+\s+m\d+M?\s*:\s*(\d+)\s*\|\s*(\d+)", re.MULTILINE)
+EXTENDED_FLAG = 1 << 31  # of an identifier in a DBC
 DBC_EXTRA = re.compile(r"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s[^;]*;", re.MULTILINE)
 
 logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings become faults here
@@ -94,7 +98,11 @@ def load_database(path: Path) -> CanDatabase:
     if excess := _excess(text):
         raise ConfigurationError(f"{path}: not a CAN database: {excess}", KEY)
     kind = FORMATS.get(path.suffix.lower())
+    if kind in (None, "dbc"):
+        text, flagged = _with_extended_flags(text)
+        faults += [DatabaseFault(fault) for fault in flagged]
     unread: dict[str, str] = {}
+    multiplexed = _multiplexed_places(text) if kind in (None, "dbc") else set()
     try:
         parsed = _parse(text, kind, strict=True)
     except Exception as strict_error:  # noqa: BLE001 - parsers raise exceptions of many types
@@ -113,7 +121,7 @@ def load_database(path: Path) -> CanDatabase:
             faults.append(DatabaseFault(f"message {message.name} cannot be used: {why}"))
         else:
             messages.append(message)
-            faults += _layout_faults(message)
+            faults += [*_multiplexer_faults(message, multiplexed), *_layout_faults(message)]
     return CanDatabase(path, tuple(messages), (*faults, *_shared_frames(messages)), unread)
 
 
@@ -143,6 +151,30 @@ def _excess(text: str) -> str:
     if any(_is_long(match, 16) for match in IDENTIFIERS.finditer(text)):
         return f"it has a message of more than {MAX_RANGE} arbitration IDs"
     return ""
+
+
+def _with_extended_flags(text: str) -> tuple[str, list[str]]:
+    """A DBC with bit 31 in each identifier that needs 29 bits, as the format asks for; and what was changed."""
+    names = [
+        words[2].rstrip(":")
+        for words in (block.split(None, 3) for block in DBC_MESSAGE.findall(text))
+        if len(words) > 2 and words[1].isdecimal() and _needs_flag(int(words[1]))
+    ]
+    if not names:
+        return text, []
+
+    def flag(match: re.Match[str]) -> str:
+        identifier = int(match[2])
+        return f"{match[1]}{identifier | EXTENDED_FLAG if _needs_flag(identifier) else identifier}"
+
+    some = ", ".join(names[:3]) + (f" and {len(names) - 3} more have" if len(names) > 3 else "")
+    have = "" if len(names) > 3 else " has" if len(names) == 1 else " have"
+    flagged = f"{some}{have} an identifier over 11 bits without bit 31: read as extended"
+    return DBC_REFERENCE.sub(flag, text), [flagged]
+
+
+def _needs_flag(identifier: int) -> bool:
+    return STANDARD_LIMIT < identifier <= EXTENDED_LIMIT
 
 
 def _is_long(match: re.Match[str], base: int) -> bool:
@@ -199,6 +231,36 @@ def _layout_faults(message: Message) -> list[DatabaseFault]:
     except Exception as error:  # noqa: BLE001 - the faults are then named more precisely than by cantools
         return _signal_faults(message) or [DatabaseFault(f"message {message.name}: {_cause(error)}", message.name)]
     return []
+
+
+Places = set[tuple[int, int, int]]
+"""Arbitration ID, start and length of signals."""
+
+
+def _multiplexed_places(text: str) -> Places:
+    """The signals that a DBC calls multiplexed; cantools takes those without a multiplexer for plain ones."""
+    return {
+        (int(words[1]) % EXTENDED_FLAG, int(match[1]), int(match[2]))
+        for block in DBC_MESSAGE.findall(text)
+        if len(words := block.split(None, 2)) > 2 and words[1].isdecimal()
+        for match in DBC_MULTIPLEXED.finditer(block)
+    }
+
+
+def _multiplexer_faults(message: Message, multiplexed: Places) -> list[DatabaseFault]:
+    """Multiplexed signals whose multiplexer is not in ``message``, such as one whose name is cut short."""
+    names = {signal.name for signal in message.signals}
+    return [
+        DatabaseFault(
+            f"{message.name}.{signal.name} is multiplexed by {signal.multiplexer_signal or 'a signal without a name'}, "
+            "which the message does not have",
+            message.name,
+            signal.name,
+        )
+        for signal in message.signals
+        if signal.multiplexer_signal not in names
+        and (signal.multiplexer_signal is not None or (message.frame_id, signal.start, signal.length) in multiplexed)
+    ]
 
 
 def _signal_faults(message: Message) -> list[DatabaseFault]:

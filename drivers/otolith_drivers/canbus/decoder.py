@@ -4,6 +4,7 @@
 is intact and new, and reads its signals. No clock in here: the time of a frame is an argument.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -26,6 +27,7 @@ from otolith_drivers.canbus.monitoring import (
 )
 from otolith_drivers.canbus.options import FrameOptions, MessageTable
 from otolith_drivers.canbus.signals import (
+    MAX_VALUE,
     BitRange,
     RawReader,
     SignalRequest,
@@ -129,7 +131,7 @@ class MessageReader:
         samples = [
             Sample(name, time, scale * raw + offset)
             if low <= (raw := read(data)) <= high
-            else self._no_reading(name, time, scale * raw + offset, unit)
+            else self._no_reading((name, read, low, high, scale, offset, unit), time, raw)
             for name, read, low, high, scale, offset, unit in rows
         ]
         self.received += len(samples)
@@ -191,8 +193,13 @@ class MessageReader:
                 rows += group.rows
         return rows
 
-    def _no_reading(self, name: str, time: float, value: float, unit: str) -> Sample:
-        self._count_rejection(name, time, f"{name} of {value:.6g} {unit} is out of its range")
+    def _no_reading(self, row: Row, time: float, raw: float) -> Sample:
+        name, _, low, high, scale, offset, unit = row
+        first, last = sorted((scale * low + offset, scale * high + offset))
+        why = f"is out of its range from {first:.6g} to {last:.6g} {unit}"
+        if not math.isfinite(raw) or abs(raw) >= high >= MAX_VALUE / max(1.0, abs(scale)):
+            why = "is no number"
+        self._count_rejection(name, time, f"{name} of {scale * raw + offset:.6g} {unit} {why}")
         return Sample(name, time, NO_READING)
 
     def _reject(self, data: bytes | bytearray, time: float) -> list[Sample]:

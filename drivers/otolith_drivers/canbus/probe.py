@@ -15,16 +15,19 @@ import numpy as np
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
 from cantools.database.can.database import Database
+from numpy.typing import NDArray
 
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import STATES
 from otolith_drivers.canbus.monitoring import error_classes
-from otolith_drivers.canbus.signals import CLASSIC_LENGTH, RANGE_TOLERANCE
+from otolith_drivers.canbus.signals import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
 from otolith_drivers.number_inference import FRAMES, Layout, LayoutVerdict, Part, number_text, parts, quoted, spread
 
 MAX_IDENTIFIERS = 2048  # that are kept apart; a bus with standard identifiers has no more
 MAX_FRAMES = 500  # of each identifier that are kept
 MIN_FRAMES = 8  # of one identifier before numbers are looked for in them
+MAX_SELECTED, MIN_SELECTED_SHARE = 16, 0.25  # values of a selector; share of frames in which it changes
+MIN_SELECTED_BITS, MAX_GROUPED_SHARE = 2.0, 0.6  # bits per change of a selected byte; what is left of them in a group
 MAX_JITTER = 1.0  # periods; a message with more is irregular
 COUNTER_OR_CHECKSUM = re.compile(
     r"count|alive|rolling|sequence|checksum|crc|^(?:mc|bz|cnt|chk)|(?:mc|bz|cnt|chk)$", re.IGNORECASE
@@ -141,9 +144,9 @@ class ObservedFrames:
 
 
 def within(signal: CanSignal, number: float) -> bool:
-    """Whether ``number`` is in the range of the database; [0|0] means that there is none."""
-    low, high = signal.minimum, signal.maximum
-    if low is None or high is None or not low < high:
+    """Whether ``number`` is in the range of the database, if it has one."""
+    low, high = range_of(signal)
+    if math.isinf(low):
         return True
     slack = RANGE_TOLERANCE * max(abs(low), abs(high))
     return bool(low - slack <= number <= high + slack)
@@ -242,12 +245,12 @@ def canopen_name(identifier: int) -> str:
 
 
 def fields_of(observed: ObservedFrames) -> list[tuple[Part, Layout]]:
-    """The numbers in the frames of one arbitration ID, without counters and without what jumps.
+    """Candidates for numbers in the frames of one arbitration ID, without counters and without what jumps.
 
-    There are none before ``MIN_FRAMES`` frames.
+    There are none before ``MIN_FRAMES`` frames, and none in a multiplexed payload.
     """
     history = [data for data in observed.history if len(data) == len(observed.latest)]
-    if len(history) < MIN_FRAMES or not observed.latest:
+    if len(history) < MIN_FRAMES or not observed.latest or selector_of(observed):
         return []
     data = np.frombuffer(b"".join(history), dtype=np.uint8).reshape(len(history), -1)
     return [
@@ -255,6 +258,44 @@ def fields_of(observed: ObservedFrames) -> list[tuple[Part, Layout]]:
         for part in parts(data, FRAMES, 1)
         if part.layout is not None and part.verdict in (LayoutVerdict.CERTAIN, LayoutVerdict.LIKELY)
     ]
+
+
+def selector_of(observed: ObservedFrames) -> str:
+    """The byte, or half of one, that selects what the others mean; empty if there seems to be none.
+
+    Under a selector, another byte changes by far fewer bits from frame to frame of one value than from frame to frame.
+    """
+    history = [data for data in observed.history if len(data) == len(observed.latest)]
+    if len(history) < MIN_FRAMES or not observed.latest:
+        return ""
+    data = np.frombuffer(b"".join(history), dtype=np.uint8).reshape(len(history), -1).astype(np.int64)
+    whole = _change_bits(data)
+    for place in range(data.shape[1] if np.any(whole >= MIN_SELECTED_BITS) else 0):
+        byte = data[:, place]
+        for values, name in (
+            (byte, "byte"),
+            (byte & 0x0F, "the low half of byte"),
+            (byte >> 4, "the high half of byte"),
+        ):
+            order = np.argsort(values, kind="stable")
+            count = len(np.unique(values))
+            if not 1 < count <= MAX_SELECTED or np.count_nonzero(np.diff(values)) < MIN_SELECTED_SHARE * len(values):
+                continue
+            within_value = np.diff(values[order]) == 0
+            grouped = _change_bits(data[order], within_value)
+            selected = (whole >= MIN_SELECTED_BITS) & (grouped <= MAX_GROUPED_SHARE * whole)
+            selected[place] = False
+            if selected.any():
+                return f"{name} {place}"
+    return ""
+
+
+def _change_bits(data: NDArray[np.int64], counted: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    """Mean bits of the change of each byte from row to row; a byte wraps from 255 to 0."""
+    changes = np.abs(np.diff(data, axis=0))
+    bits = np.log2(1.0 + np.minimum(changes, 256 - changes))
+    rows = bits if counted is None else bits[counted]
+    return rows.mean(axis=0) if len(rows) else np.full(data.shape[1], np.inf)
 
 
 def can_driver_lines(options: BusOptions, picture: Picture, database: str | None) -> list[str]:
@@ -313,7 +354,7 @@ def _field_line(observed: ObservedFrames, part: Part, layout: Layout) -> str:
         f"({number_text(other.latest, other.layout)})"
         for other in part.others
     )
-    comment = spread(part) + (f"; or {others}" if others else "")
+    comment = f"? {100 * part.probability:.0f} %: " + spread(part) + (f"; or {others}" if others else "")
     name = f'"0x{observed.identifier:X}"'
     return f'NAME = {{ id = {name}{extended}{fd}, {bits}, scale = 1.0, unit = "?" }}  # {comment}'
 

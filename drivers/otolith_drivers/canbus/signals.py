@@ -16,14 +16,14 @@ from cantools.database.conversion import BaseConversion
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Signal
-from otolith_drivers.canbus.database import CanDatabase
+from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT, CanDatabase
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import UnitNameError, factor
 
 CLASSIC_LENGTH, FD_LENGTH = 8, 64  # bytes of a frame
-STANDARD_LIMIT, EXTENDED_LIMIT = 0x7FF, 0x1FFFFFFF  # arbitration IDs of 11 and of 29 bits
 MAX_VALUE = 1e300  # of a float, raw or scaled; the largest double is 1.8e308
+PLACEHOLDER_SHARE = 0.25  # of the raw numbers, below which a range of [0|1] is a placeholder of the tool
 RANGE_TOLERANCE = 1e-6  # of a bound: 0.1 in a frame of 32-bit floats is above 0.1
 
 FLOAT_CODES = {16: "e", 32: "f", 64: "d"}
@@ -262,16 +262,18 @@ def request_for(signal: Signal, message: Message, layout: CanSignal, origin: str
     if source.range is not None:
         low, high = _raw_range(*source.range, scale, offset)
     else:
-        low, high = _raw_range(layout.minimum, layout.maximum, *inner)
+        low, high = _raw_range(*range_of(layout), *inner)
     limit = MAX_VALUE / max(1.0, abs(to_target * scale))
     times = "" if source.scale == 1.0 else f" * {source.scale:g}"
+    ignored = source.range is None and has_placeholder_range(layout)
+    remark = "; its range [0|1] is taken for a placeholder" if ignored else ""
     plus = "" if source.offset == 0.0 else f" {source.offset:+g}"
     return SignalRequest(
         name=signal.name,
         target_unit=signal.unit,
         message=message,
         signal=layout,
-        origin=f"{origin}{times}{plus} [{unit}], frame 0x{message.frame_id:X}",
+        origin=f"{origin}{times}{plus} [{unit}], frame 0x{message.frame_id:X}{remark}",
         raw_low=max(low, -limit),
         raw_high=min(high, limit),
         scale=to_target * scale,
@@ -279,11 +281,24 @@ def request_for(signal: Signal, message: Message, layout: CanSignal, origin: str
     )
 
 
-def _raw_range(low: float | None, high: float | None, scale: float, offset: float) -> tuple[float, float]:
-    """The raw numbers of the range ``low`` to ``high`` with some tolerance; infinite if there is no range."""
-    if low is None or high is None or not low < high:  # [0|0] in a DBC means that there is none
+def has_placeholder_range(layout: CanSignal) -> bool:
+    """Whether the range is [0|1] although the bits hold many more numbers: tools write it where nobody gave one."""
+    numbers = abs(float(layout.conversion.scale)) * 2.0**layout.length
+    few = layout.conversion.is_float or PLACEHOLDER_SHARE * numbers > 1.0
+    return (layout.minimum, layout.maximum) == (0, 1) and layout.length > 1 and few
+
+
+def range_of(layout: CanSignal) -> tuple[float, float]:
+    """The range in the database, in its unit; infinite if there is none, which a DBC writes as [0|0]."""
+    low, high = layout.minimum, layout.maximum
+    if low is None or high is None or not low < high or has_placeholder_range(layout):
         return -math.inf, math.inf
-    first, last = sorted((float(bound) - offset) / scale for bound in (low, high))
+    return float(low), float(high)
+
+
+def _raw_range(low: float, high: float, scale: float, offset: float) -> tuple[float, float]:
+    """The raw numbers of the range ``low`` to ``high`` with some tolerance."""
+    first, last = sorted((bound - offset) / scale for bound in (low, high))
     slack = [RANGE_TOLERANCE * abs(bound) if math.isfinite(bound) else 0.0 for bound in (first, last)]
     return first - slack[0], last + slack[1]
 

@@ -1,5 +1,6 @@
 """Probing a bus: periods, what changes, signals of a database, and numbers in frames without one."""
 
+import re
 import tomllib
 
 import can
@@ -183,3 +184,38 @@ def test_any_frames_make_tables_and_lines(
     document = can_document(picture, BusOptions(), None, 1.0)
     assert len(document["frames"]) == len(picture.observed)
     tomllib.loads("\n".join(can_driver_lines(BusOptions(), picture, None)))
+
+
+def test_fields_without_a_database_are_candidates_with_a_probability() -> None:
+    picture = Picture()
+    receive_sine(picture)
+    (_, line) = can_signal_lines(picture)
+    (percent,) = re.findall(r"# \? (\d+) %: -?\d+ now", line)
+    assert 90 <= int(percent) <= 99
+    assert any("candidates" in text for text in can_document(picture, BusOptions(), None, 1.0)["lines"])
+
+
+@pytest.mark.parametrize("selectors", [(0, 1), (0, 1, 2, 3), (0x10, 0x20, 0x30), (0, 1, 0, 2, 0, 3)])
+@pytest.mark.parametrize("nibble", [False, True])
+def test_no_candidate_crosses_a_multiplexed_payload(selectors: tuple[int, ...], nibble: bool) -> None:
+    """The first byte, or a half of it, selects which of several signals the others hold."""
+    picture, random = Picture(), np.random.default_rng(5)
+    for index in range(400):
+        selector = selectors[index % len(selectors)]
+        number = round(6000 * (selector + 1) + 800 * np.sin(0.02 * index + selector) + 5 * random.standard_normal())
+        first = (selector >> 4 or selector) << 4 | index % 16 if nibble else selector
+        picture.take(frame(0x321, bytes([first]) + (number % 65536).to_bytes(2, "little") + bytes(5)), 0.01 * index)
+    assert list(can_signal_lines(picture)) == ["[signals]"]
+    lines = can_document(picture, BusOptions(), None, 1.0)["lines"]
+    assert any("0x321" in line and "multiplexed" in line for line in lines)
+
+
+@pytest.mark.parametrize("amplitude", [4, 40, 400, 4000])
+def test_a_counter_or_a_high_byte_is_no_multiplexer(amplitude: int) -> None:
+    picture, random = Picture(), np.random.default_rng(6)
+    for index in range(300):
+        number = round(amplitude * (np.sin(0.05 * index) + 0.02 * random.standard_normal()))
+        data = number.to_bytes(2, "little", signed=True) + bytes([index % 16])
+        picture.take(frame(0x222, data), 0.01 * index)
+    (_, line) = can_signal_lines(picture)
+    assert "start = 0, length = 16" in line

@@ -1,0 +1,108 @@
+"""What tools and vendors write into databases: names cut short, placeholders, identifiers without their flag."""
+
+from pathlib import Path
+
+import pytest
+
+from otolith_drivers.canbus.database import load_database, load_dbc
+from otolith_drivers.canbus.probe import Picture
+from otolith_drivers.errors import ConfigurationError
+from tests.drivers.can_frames import dbc, decoder, frame, values
+
+NESTED = """BO_ 258 Mux: 8 Drive
+ SG_ VeryLongNameOfTheOuterMultiplexer M : 0|8@1+ (1,0) [0|0] "" Monitor
+ SG_ InnerMultiplexer m0M : 8|8@1+ (1,0) [0|0] "" Monitor
+ SG_ Volts m1 : 16|8@1+ (1,0) [0|0] "V" Monitor
+ SG_ Plain : 24|8@1+ (1,0) [0|0] "V" Monitor"""
+CUT = dbc(
+    NESTED,
+    after="SG_MUL_VAL_ 258 InnerMultiplexer VeryLongNameOfTheOuterMul 0-0;\n\nSG_MUL_VAL_ 258 Volts InnerMult 1-1;",
+)
+VOLTS, PLAIN = {"U": ("V", {"signal": "Volts"})}, {"U": ("V", {"signal": "Plain"})}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        CUT,
+        dbc(NESTED),  # two multiplexers, and nothing that assigns the signals to them
+        dbc(NESTED.replace("m0M", "m0").replace("Multiplexer M ", "Multiplexer ")),
+    ],
+    ids=["name cut short", "not assigned", "no multiplexer"],
+)
+def test_signal_without_its_multiplexer_is_an_error_only_if_requested(tmp_path: Path, text: str) -> None:
+    """It would otherwise be read from frames that do not contain it."""
+    with pytest.raises(ConfigurationError, match=r"Mux\.Volts is multiplexed by .*: read it by 'id'"):
+        decoder(tmp_path, VOLTS, text)
+    frame_decoder = decoder(tmp_path, PLAIN, text)
+    assert any("Mux.Volts is multiplexed by" in line for line in frame_decoder.describe())
+    assert values(frame_decoder.decode(frame(258, bytes([0, 1, 2, 3, 0, 0, 0, 0])), 0.0)) == {"U": 3.0}
+
+
+@pytest.mark.parametrize("length", [0, 12])
+def test_signal_of_an_impossible_length_is_an_error_in_one_line(tmp_path: Path, length: int) -> None:
+    text = dbc(
+        f'BO_ 385 Motor: 8 Drive\n SG_ Speed : 0|{length}@1- (1,0) [0|0] "rad/s" Monitor',
+        after="SIG_VALTYPE_ 385 Speed : 1;" if length else "",
+    )
+    with pytest.raises(ConfigurationError, match=r"drive\.dbc: "):
+        decoder(tmp_path, {"omega": ("rad/s", {"signal": "Speed"})}, text)
+
+
+def test_identifier_of_29_bits_without_its_flag_is_extended(tmp_path: Path) -> None:
+    """As SavvyCAN and opendbc write it; everything else in the file refers to the same number."""
+    text = dbc(
+        'BO_ 419385573 Drive: 8 Drive\n SG_ Speed : 0|32@1- (1,0) [0|0] "rad/s" Monitor',
+        'BO_ 385 Other: 8 Drive\n SG_ U : 0|16@1- (1,0) [0|0] "V" Monitor',
+        after='SIG_VALTYPE_ 419385573 Speed : 1;\nCM_ SG_ 419385573 Speed "of the shaft";',
+    )
+    frame_decoder = decoder(tmp_path, {"omega": ("rad/s", {"signal": "Speed"})}, text)
+    assert frame_decoder.identifiers() == [(419385573, True)]
+    data = bytes.fromhex("00002041") + bytes(4)  # 10.0 as a float
+    assert values(frame_decoder.decode(frame(419385573, data, extended=True), 0.0)) == {"omega": 10.0}
+    (warning,) = frame_decoder.configuration_warnings
+    assert "Drive has an identifier over 11 bits without bit 31: read as extended" in warning
+    database = load_database(tmp_path / "drive.dbc")
+    assert [message.is_extended_frame for message in database.messages] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("bits", "scale", "placeholder"),
+    [("0|16", "1", True), ("0|16", "0.01", True), ("0|8", "0.005", False), ("0|1", "1", False), ("0|8", "0.01", False)],
+)
+def test_range_0_to_1_on_several_bits_is_none(tmp_path: Path, bits: str, scale: str, placeholder: bool) -> None:
+    """Unless half of the numbers that the bits hold are in it, as of a duty cycle."""
+    text = dbc(f'BO_ 385 Motor: 8 Drive\n SG_ U : {bits}@1+ ({scale},0) [0|1] "V" Monitor')
+    frame_decoder = decoder(tmp_path, {"U": ("V", {"signal": "U"})}, text)
+    assert ("[0|1] is taken for a placeholder" in frame_decoder.describe()[0]) is placeholder
+    (sample,) = frame_decoder.decode(frame(385, bytes([255] * 8)), 0.0)
+    assert (sample.value == sample.value) is (placeholder or bits == "0|1")
+    picture = Picture(load_dbc(tmp_path / "drive.dbc"))
+    picture.take(frame(385, bytes([255] * 8)), 0.0)
+    ((_, _, value),) = picture.signals()
+    assert (value.beyond == 0) is (placeholder or bits == "0|1")
+
+
+@pytest.mark.parametrize(
+    ("scale", "raw", "sentence"),
+    [
+        ("0.001", 32700, "i of 32700 mA is out of its range from -32000 to 32000 mA"),
+        ("-0.001", 32700, "i of -32700 mA is out of its range from -32000 to 32000 mA"),
+    ],
+)
+def test_discarded_value_is_named_with_signal_value_and_range(
+    tmp_path: Path, scale: str, raw: int, sentence: str
+) -> None:
+    text = dbc(f'BO_ 385 Motor: 8 Drive\n SG_ Current : 0|16@1- ({scale},0) [-32|32] "A" Monitor')
+    frame_decoder = decoder(tmp_path, {"i": ("mA", {"signal": "Current"})}, text)
+    frame_decoder.decode(frame(385, raw.to_bytes(2, "little", signed=True) + bytes(6)), 0.0)
+    (line,) = frame_decoder.warnings(0.1)
+    assert sentence in line
+
+
+def test_number_that_is_not_finite_is_named(tmp_path: Path) -> None:
+    text = dbc('BO_ 385 Motor: 8 Drive\n SG_ U : 0|32@1- (1,0) [0|0] "V" Monitor', after="SIG_VALTYPE_ 385 U : 1;")
+    frame_decoder = decoder(tmp_path, {"U": ("V", {"signal": "U"})}, text)
+    frame_decoder.decode(frame(385, bytes.fromhex("0000c07f") + bytes(4)), 0.0)
+    (line,) = frame_decoder.warnings(0.1)
+    assert "U of nan V is no number" in line
