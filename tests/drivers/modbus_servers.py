@@ -75,6 +75,8 @@ class Behaviour:
     """Whether a device does not answer."""
     corrupt: Callable[[bytes], bytes] = lambda reply: reply
     """Takes a reply and returns the bytes to send."""
+    closes: bool = False
+    """Whether the server closes the connection after each answer."""
     functions: list[int] = field(default_factory=list)
     """Function codes of all requests."""
     asked: list[tuple[int, int, int, int]] = field(default_factory=list)
@@ -91,7 +93,7 @@ class _Handler(socketserver.BaseRequestHandler):
                 transaction, _, length, device = struct.unpack(">HHHB", header)
                 self._answer(transaction, device, self._exactly(length - 1))
         except OSError:
-            pass
+            self.request.close()
         finally:
             self.server.connections.discard(self.request)
 
@@ -114,11 +116,16 @@ class _Handler(socketserver.BaseRequestHandler):
         code = behaviour.refuse(device, address, count)
         if code is not None:
             body = bytes([function | 0x80, code])
+        elif function in {1, 2}:
+            bits = sum(bool(behaviour.words.get(address + at, 0)) << at for at in range(count))
+            body = bytes([function, (count + 7) // 8]) + bits.to_bytes((count + 7) // 8, "little")
         else:
             words = [behaviour.words.get(at, 0) for at in range(address, address + count)]
             body = bytes([function, 2 * count]) + struct.pack(f">{count}H", *words)
         reply = struct.pack(">HHHB", transaction, 0, len(body) + 1, device) + body
         self.request.sendall(behaviour.corrupt(reply))
+        if behaviour.closes:
+            raise ConnectionAbortedError
 
 
 class OddServer(socketserver.ThreadingTCPServer):

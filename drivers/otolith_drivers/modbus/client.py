@@ -1,13 +1,15 @@
-"""A read-only Modbus client over pymodbus: only function codes 3 (holding registers) and 4 (input registers)."""
+"""A read-only Modbus client over pymodbus: only function codes 1 to 4, which read bits and registers."""
 
 import contextlib
 import errno
 import logging
+import math
 import os
 import socket
 import termios
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -17,11 +19,13 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException
 from pymodbus.framer import FramerType
 
-from otolith_drivers.modbus.options import LineOptions, Table
+from otolith_drivers.modbus.options import BIT_TABLES, LineOptions, Table
 from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
 
-FUNCTION_CODES: Final[dict[Table, int]] = {"holding": 3, "input": 4}
+FUNCTION_CODES: Final[dict[Table, int]] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 DRAIN_STEP = 0.02  # s between looks for late bytes; engineering choice: at most 1 % of a core
+HEADER_LENGTH = 7  # bytes of a TCP answer before its function code
+REPEATED_FIELDS = (("reply_transaction", "transaction", 0, 2), ("reply_device", "device", 6, 7))
 MAX_DRAIN = 5  # timeouts, after which a line that never falls silent is reopened all the same; engineering choice
 
 
@@ -33,7 +37,9 @@ class ReadOnlyClient:
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
         self._options = options
         self._aborted = threading.Event()
-        self._client = _client(options, self._aborted)
+        is_tcp = options.host is not None and options.framing == "tcp"
+        self._headers = _HeaderFilter(options) if is_tcp else None
+        self._client = _client(options, self._aborted, self._headers or _EchoFilter())
 
     def connect(self) -> None:
         """Open the connection.
@@ -60,29 +66,40 @@ class ReadOnlyClient:
                 handle.shutdown(socket.SHUT_RDWR)
 
     def read(self, device: int, table: Table, address: int, count: int) -> list[int]:
-        """Return ``count`` registers from ``address`` on, each 0 to 65535.
+        """Return ``count`` registers (each 0 to 65535) or bits from ``address`` on.
 
         Raises:
             ExceptionReplyError: the device answers with an exception.
             NoReplyError: no valid answer in time; the connection must be reopened before the next request.
             ConnectionLostError: the connection failed.
         """
-        read = self._client.read_holding_registers if table == "holding" else self._client.read_input_registers
+        client = self._client
+        read = {
+            "coil": client.read_coils,
+            "discrete": client.read_discrete_inputs,
+            "holding": client.read_holding_registers,
+            "input": client.read_input_registers,
+        }[table]
+        if self._options.reply_transaction is not None:  # no number tells a second copy of an answer from the next one
+            self._discard()
         try:
             reply = read(address, count=count, device_id=device)
         except ConnectionException as error:
             raise ConnectionLostError("the connection was closed") from error
         except ModbusException as error:
-            raise NoReplyError(f"no answer within {self._options.timeout:g} s") from error
+            mismatch = self._headers.mismatch if self._headers is not None else ""
+            raise NoReplyError(mismatch or f"no answer within {self._options.timeout:g} s") from error
         except OSError as error:
             raise ConnectionLostError(error.strerror or str(error)) from error
         except Exception as error:  # the library's decoder may raise anything for corrupted bytes
             raise NoReplyError(f"an answer that cannot be decoded ({type(error).__name__})") from error
         if reply.isError():
             raise ExceptionReplyError(int(reply.exception_code))
-        if reply.function_code != FUNCTION_CODES[table] or len(reply.registers) != count:
-            raise NoReplyError(f"an answer to another request: {len(reply.registers)} registers instead of {count}")
-        return list(reply.registers)
+        values = list(map(int, reply.bits)) if table in BIT_TABLES else list(reply.registers)
+        size = 8 * math.ceil(count / 8) if table in BIT_TABLES else count  # bits fill whole bytes
+        if reply.function_code != FUNCTION_CODES[table] or len(values) != size:
+            raise NoReplyError(f"an answer to another request: {len(values)} values instead of {size}")
+        return values[:count]
 
     def drain(self) -> None:
         """Close the connection so that a late answer is not taken for the answer to the next request.
@@ -174,12 +191,44 @@ class _EchoFilter:
         return data.removeprefix(self._sent)
 
 
+class _HeaderFilter:
+    """Checks the transaction and device number of each TCP answer, and replaces those that the options expect."""
+
+    def __init__(self, options: LineOptions) -> None:
+        self.mismatch = ""
+        """What differed in an answer to the latest request; empty if nothing did."""
+        self._options = options
+        self._sent = b""
+
+    def __call__(self, sending: bool, data: bytes) -> bytes:
+        if sending:
+            self._sent, self.mismatch = data, ""
+            return data
+        answers, at = bytearray(data), 0
+        while at + HEADER_LENGTH <= len(answers):
+            for name, what, begin, end in REPEATED_FIELDS:
+                number, sent = (int.from_bytes(part) for part in (data[at + begin : at + end], self._sent[begin:end]))
+                if number == sent:
+                    continue
+                if number == getattr(self._options, name):
+                    answers[at + begin : at + end] = self._sent[begin:end]
+                else:
+                    self.mismatch = (
+                        f"an answer with {what} number {number} instead of {sent}: "
+                        f"if the device always answers so, set {name} = {number} in [driver]"
+                    )
+            at += 6 + max(1, int.from_bytes(data[at + 4 : at + 6]))
+        return bytes(answers)
+
+
 def _is_pseudo_terminal(port: str | None) -> bool:
     """Whether it is a pseudo-terminal, which has no parity and rejects one when it is opened again."""
     return str(Path(port or "").resolve()).startswith("/dev/pts/")
 
 
-def _client(options: LineOptions, aborted: threading.Event) -> ModbusTcpClient | ModbusSerialClient:
+def _client(
+    options: LineOptions, aborted: threading.Event, trace: Callable[[bool, bytes], bytes]
+) -> ModbusTcpClient | ModbusSerialClient:
     if options.host is not None:
         return ModbusTcpClient(
             options.host,
@@ -187,7 +236,7 @@ def _client(options: LineOptions, aborted: threading.Event) -> ModbusTcpClient |
             framer=FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU,
             timeout=options.timeout,
             retries=0,
-            trace_packet=_EchoFilter() if options.framing == "rtu" else None,
+            trace_packet=trace,
         )
     client = _SerialClient(
         options.serial or "",
@@ -196,7 +245,7 @@ def _client(options: LineOptions, aborted: threading.Event) -> ModbusTcpClient |
         stopbits=options.stop_bits,
         timeout=options.timeout,
         retries=0,
-        trace_packet=_EchoFilter(),
+        trace_packet=trace,
     )
     client.aborted = aborted
     return client

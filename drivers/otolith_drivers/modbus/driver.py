@@ -9,14 +9,15 @@ import math
 import random
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
 from otolith_drivers.modbus.client import ReadOnlyClient
-from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, RegisterSignal, register_signal
+from otolith_drivers.modbus.options import BIT_TABLES, ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.plausibility import OrderMonitor, StalenessMonitor
-from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
-from otolith_drivers.modbus.schedule import PollSchedule, Request, RequestSet, plan, summary
+from otolith_drivers.modbus.protocol import BUSY_CODES, ConnectionLostError, ExceptionReplyError, NoReplyError
+from otolith_drivers.modbus.schedule import MAX_FAILURES, PollSchedule, Request, RequestSet, plan, summary
 
 __all__ = ["ModbusPoller", "Options", "Source", "build"]
 
@@ -27,6 +28,8 @@ Source = ModbusSource
 
 BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect; engineering choice
 CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s. Only a name lookup in progress takes longer.
+BUSY_PAUSES = 10  # of a period: how often a busy device is asked again at most; engineering choice
+TRIPS = 100  # round trips of which the longest bounds the error of the times; engineering choice: a second at 100 Hz
 MAX_SLEEP = 0.2  # s that a stop between two rounds may go unnoticed; engineering choice
 
 
@@ -48,7 +51,14 @@ class ModbusPoller:
         self._options = options
         self._signals = signals
         self._client = ReadOnlyClient(options)
-        self._requests = RequestSet(plan(signals, options.max_gap, options.max_registers))
+        hidden = {signal.decimals.place: signal.decimals for signal in signals if signal.decimals is not None}
+        self._requests = RequestSet(plan([*signals, *hidden.values()], options.max_gap, options.max_registers))
+        self._decimals: dict[tuple[int, str, int], float] = {}
+        """Latest numbers of decimals by the place of their register."""
+        self._trips: deque[float] = deque(maxlen=TRIPS)
+        """Latest round-trip times in s."""
+        self._answers = self._closings = 0
+        """Answers since the connection was opened, and connections in a row that ended after one answer."""
         self._schedule = PollSchedule(period)
         self._order = OrderMonitor(signals)
         self._unjudged: dict[str, list[Sample]] = {}
@@ -83,17 +93,26 @@ class ModbusPoller:
         warnings = [*self._requests.warnings(time.monotonic()), *self._order.warnings()]
         warnings += self._staleness.warnings(requests, schedule.period)
         period = schedule.period if schedule.known or schedule.period > schedule.requested else None
-        return Link(self._up, self._reason, tuple(warnings), f"{summary(requests)}, {schedule.describe()}", period)
+        plan_text = f"{summary(requests)}, {schedule.describe()}"
+        if trips := list(self._trips):
+            plan_text += f", times right within {500.0 * max(trips):.2g} ms"
+        if self._closings >= MAX_FAILURES:
+            plan_text += ", reconnected for each request, as the device closes the connection after each answer"
+        return Link(self._up, self._reason, tuple(warnings), plan_text, period)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
         requests, period = self._requests.requests, self._schedule.requested
-        title = f"{self._options.title()}, read only (function codes 3 and 4)"
+        title = f"{self._options.title()}, read only (function codes {self._codes()})"
         lines = [f"{title}: {summary(requests)}, {1.0 / period:g} Hz asked"]
         least = sum(self._options.least_time(request.count) for request in requests)
         if least > period:
             lines.append(f"the line is too slow for that: at most {1.0 / least:.3g} Hz can be achieved")
         return lines + [f"{signal.name} [{signal.target_unit}] from {signal.describe()}" for signal in self._signals]
+
+    def _codes(self) -> str:
+        """Return the function codes that are sent, in words."""
+        return "1 to 4" if any(signal.table in BIT_TABLES for signal in self._signals) else "3 and 4"
 
     def _run(self, deliver: Deliver) -> None:
         self._schedule.start(time.monotonic())
@@ -102,6 +121,7 @@ class ModbusPoller:
             try:
                 if not connected:
                     self._client.connect()
+                    self._answers = 0
                     self._lost += self._schedule.pass_over(time.monotonic()) * len(self._signals)
                     connected, backoff = True, BACKOFF_FIRST
                 self._wait()
@@ -128,22 +148,25 @@ class ModbusPoller:
         begun = time.monotonic()
         self._lost += self._schedule.begin(begun) * len(self._signals)
         usable, answered, repeated = True, 0, True
-        for request in self._requests.due(begun):
+        waiting = deque(self._requests.due(begun))
+        busy: list[Request] = []
+        while waiting and usable:
+            request = waiting.popleft()
             try:
                 repeated &= self._read(request, deliver)
-                answered += len(request.signals)
+                answered += request.samples
             except ExceptionReplyError as error:
-                log.debug("%s: %s", request.describe(), error)
-                self._requests.refused(request, error, time.monotonic())
+                busy += self._refused(request, error)
             except NoReplyError as error:
                 self._requests.unanswered(request, str(error), time.monotonic())
                 usable = False
-                break
             except ConnectionLostError:
                 self._end_reading(answered, deliver)
                 raise
-            if self._options.pause:
-                self._stop.wait(self._options.pause)
+            self._stop.wait(self._options.pause)
+            if busy and not waiting:
+                self._stop.wait(self._busy_pause)
+                waiting, busy = deque(busy), []
         self._end_reading(answered, deliver)
         if answered:
             self._come_up()
@@ -155,21 +178,67 @@ class ModbusPoller:
                 self._go_down("no device answers")
         return usable
 
+    @property
+    def _busy_pause(self) -> float:
+        """Time in s before a busy device is asked again."""
+        return self._schedule.period / BUSY_PAUSES
+
+    def _refused(self, request: Request, error: ExceptionReplyError) -> list[Request]:
+        """Return the request if the device is busy and can be asked again before the next round; else note it."""
+        log.debug("%s: %s", request.describe(), error)
+        now = time.monotonic()
+        if error.code in BUSY_CODES and not self._stop.is_set() and now + 2.0 * self._busy_pause < self._schedule.due:
+            return [request]
+        self._requests.refused(request, error, now)
+        return []
+
+    def _request(self, request: Request) -> tuple[list[int], float]:
+        """Return the registers and the middle (s) of the round trip; reconnect once if the device has hung up.
+
+        Some devices close the connection after each answer, which shows only at the next request.
+
+        Raises:
+            ExceptionReplyError, NoReplyError, ConnectionLostError: see :meth:`ReadOnlyClient.read`.
+        """
+        while True:
+            sent = time.monotonic()
+            try:
+                registers = self._client.read(request.device, request.table, request.address, request.count)
+            except ConnectionLostError:
+                if not self._answers or self._stop.is_set():
+                    raise
+                self._closings = self._closings + 1 if self._answers == 1 else 0
+                if self._closings == MAX_FAILURES:
+                    log.warning("%s: closes the connection after each answer", self._options.title())
+                self._client.close()
+                self._client.connect()
+                self._answers = 0
+                continue
+            except ExceptionReplyError:
+                self._answers += 1
+                raise
+            now = time.monotonic()
+            self._answers += 1
+            self._trips.append(now - sent)
+            return registers, 0.5 * (sent + now)
+
     def _read(self, request: Request, deliver: Deliver) -> bool:
         """Read one request and deliver its samples; return whether all registers repeat the previous values."""
-        sent = time.monotonic()
-        registers = self._client.read(request.device, request.table, request.address, request.count)
-        moment = 0.5 * (sent + time.monotonic())
+        registers, moment = self._request(request)
         self._requests.answered(request)
         repeated, stale = self._staleness.take(request, registers)
         if stale:
-            self._bad += len(request.signals)
+            self._bad += request.samples
             return repeated
         samples = []
-        for signal in request.signals:
+        for signal in sorted(request.signals, key=lambda signal: signal.is_sampled):  # decimals first
             part = registers[signal.address - request.address : signal.end - request.address]
+            if not signal.is_sampled:
+                self._decimals[signal.place] = signal.number(part)
+                continue
             self._order.take(signal, part)
-            samples.append(Sample(signal.name, moment, signal.value(part)))
+            decimals = 0.0 if signal.decimals is None else self._decimals.get(signal.decimals.place, math.nan)
+            samples.append(Sample(signal.name, moment, signal.value(part, decimals)))
         for sample in samples:
             if self._order.is_unjudged(sample.signal):
                 self._unjudged.setdefault(sample.signal, []).append(sample)

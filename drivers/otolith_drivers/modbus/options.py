@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -18,7 +18,12 @@ HIGHEST_ADDRESS = 65535
 REQUEST_BYTES, REPLY_BYTES = 8, 5  # of RTU; the reply has two more for each register
 SILENT_CHARACTERS = 3.5  # between frames (Modbus over Serial Line V1.02, section 2.5.1.1)
 
-Table = Literal["holding", "input"]
+MAX_DECIMALS = 9  # digits behind the point; more are no decimals register
+
+Table = Literal["holding", "input", "coil", "discrete"]
+BIT_TABLES: tuple[Table, ...] = ("coil", "discrete")
+"""Tables of single bits; their values are 0 and 1."""
+BIT_NAMES = {"coil": "coil", "discrete": "discrete input"}
 Device = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -38,11 +43,17 @@ class LineOptions(StrictModel):
     """Longest time (s) from a request to its answer."""
     pause: Annotated[float, BeforeValidator(Quantity("s", 0.0, 1.0))] = 0.0
     """Time (s) between two requests, for devices that need one."""
+    reply_device: Device | None = None
+    """Device number in the answers, of a TCP device that does not repeat that of the request."""
+    reply_transaction: Annotated[int, Field(ge=0, le=65535)] | None = None
+    """Transaction number in the answers, of a TCP device that does not repeat that of the request."""
 
     @model_validator(mode="after")
     def _host_or_serial(self) -> Self:
         if (self.host is None) == (self.serial is None):
             raise ValueError('write either host = "192.168.0.10" or serial = "/dev/ttyUSB0"')
+        if (self.serial or self.framing == "rtu") and not self.reply_device is self.reply_transaction is None:
+            raise ValueError("reply_device and reply_transaction are of Modbus TCP, which repeats both numbers")
         return self
 
     def title(self) -> str:
@@ -81,6 +92,7 @@ class ModbusSource(StrictModel):
     register_: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1, alias="register")]
     table: Table = "holding"
     type: TypeName
+    """Not of a coil or discrete input, which is 0 or 1."""
     unit: str
     device: Device | None = None
     order: Order | None = None
@@ -93,6 +105,17 @@ class ModbusSource(StrictModel):
     """Whether to skip the plausibility check of the byte order."""
     range: tuple[float, float] | None = None
     """In ``unit``; a value outside is no reading."""
+    decimals: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1)] | None = None
+    """Register with the number of decimals: the number is divided by 10 to its power."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _give_a_bit_its_type(cls, written: object) -> object:
+        if not isinstance(written, dict) or written.get("table") not in BIT_TABLES:
+            return written
+        if foreign := [key for key in ("type", "order", "bits", "decimals") if key in written]:
+            raise ValueError(f"{foreign[0]!r} is of registers: a {written['table']} is 0 or 1")
+        return written | {"type": "uint16"}
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -123,6 +146,15 @@ class RegisterSignal:
     scale: float
     offset: float
     """From the number to the target unit."""
+    decimals: "RegisterSignal | None" = None
+    """The register with the number of decimals."""
+    is_sampled: bool = True
+    """False for a register of decimals, which is no signal of its own."""
+
+    @property
+    def place(self) -> tuple[int, str, int]:
+        """Device, table and address."""
+        return self.device, self.table, self.address
 
     @property
     def count(self) -> int:
@@ -134,9 +166,11 @@ class RegisterSignal:
         """First address behind the signal."""
         return self.address + self.count
 
-    def value(self, registers: Sequence[int]) -> float:
+    def value(self, registers: Sequence[int], decimals: float = 0.0) -> float:
         """Return the value in the target unit; NaN if the number is not finite or out of range."""
-        number = self.number(registers)
+        if not 0.0 <= decimals <= MAX_DECIMALS:
+            return math.nan
+        number = self.number(registers) / 10.0**decimals
         if self.source.range is not None:
             low, high = self.source.range
             if not low <= self.source.scale * number + self.source.offset <= high:
@@ -148,7 +182,10 @@ class RegisterSignal:
         """Return device, register, type, order and bit field in words."""
         order = f" {self.order}" if self.count > 1 else ""
         field = f" bits {self.source.bits}" if self.source.bits else ""
-        return f"device {self.device}, {self.table} register {self.source.register_}, {self.kind}{order}{field}"
+        point = f" with the decimals of register {self.source.decimals}" if self.decimals is not None else ""
+        if self.table in BIT_TABLES:
+            return f"device {self.device}, {BIT_NAMES[self.table]} {self.source.register_}"
+        return f"device {self.device}, {self.table} register {self.source.register_}, {self.kind}{order}{field}{point}"
 
 
 def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
@@ -173,6 +210,11 @@ def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
     except ValueError as error:
         raise ConfigurationError(str(error), key) from error
     order = source.order or options.order
+    decimals = None
+    if source.decimals is not None:
+        keys = {"register": source.decimals, "type": "uint16", "unit": "1"}
+        hidden = ModbusSource.model_validate(keys | {"table": source.table, "device": source.device})
+        decimals = replace(register_signal(Signal(f"{signal.name}.decimals", "1", hidden), options), is_sampled=False)
     return RegisterSignal(
         name=signal.name,
         target_unit=signal.unit,
@@ -185,6 +227,7 @@ def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
         number=_number_reader(source, order),
         scale=scale * source.scale,
         offset=scale * source.offset + offset,
+        decimals=decimals,
     )
 
 

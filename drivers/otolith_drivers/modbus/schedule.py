@@ -11,7 +11,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from otolith_drivers.modbus.options import RegisterSignal, Table
-from otolith_drivers.modbus.protocol import GATEWAY_CODES, PERMANENT_CODES, ExceptionReplyError
+from otolith_drivers.modbus.protocol import (
+    BUSY_CODES,
+    GATEWAY_CODES,
+    ILLEGAL_FUNCTION,
+    PERMANENT_CODES,
+    ExceptionReplyError,
+)
 
 # Requests. Engineering choices, guarded by tests/drivers/modbus/test_schedule.py.
 MAX_FAILURES = 3  # in a row before a request or device is paused; one timeout on a noisy line is no dead device
@@ -46,6 +52,11 @@ class Request:
     signals: tuple[RegisterSignal, ...]
     """In the order of their addresses."""
 
+    @property
+    def samples(self) -> int:
+        """Number of samples in an answer."""
+        return sum(signal.is_sampled for signal in self.signals)
+
     @classmethod
     def of(cls, signals: Sequence[RegisterSignal]) -> "Request":
         """Return the request that reads ``signals``, which are sorted by address."""
@@ -55,7 +66,8 @@ class Request:
     def describe(self) -> str:
         """Return device and registers in words."""
         last = self.address + self.count - 1
-        return f"device {self.device}, {self.table} registers {self.address} to {last}"
+        noun = {"coil": "coils", "discrete": "discrete inputs"}.get(self.table, f"{self.table} registers")
+        return f"device {self.device}, {noun} {self.address} to {last}"
 
 
 def plan(signals: Iterable[RegisterSignal], max_gap: int, max_registers: int) -> tuple[Request, ...]:
@@ -106,7 +118,7 @@ class Backoff:
     until: float = 0.0
     """End of the pause in s; 0 if there is none."""
 
-    def fail(self, fault: str, now: float, max_failures: int) -> None:
+    def fail(self, fault: str, now: float, max_failures: float) -> None:
         """Count a failure; from ``max_failures`` in a row on, pause, each time twice as long."""
         if not self.failures:
             self.since = now
@@ -155,7 +167,10 @@ class RequestSet:
         self._by_device[request.device].fail(fault, now, MAX_FAILURES)
 
     def refused(self, request: Request, error: ExceptionReplyError, now: float) -> None:
-        """Note that the device answered with an exception; split the request if the exception is permanent."""
+        """Note that the device answered with an exception; split the request if the exception is permanent.
+
+        A device that is busy is asked again in the next round: it has the registers, and answers.
+        """
         if error.code in GATEWAY_CODES:
             self.unanswered(request, str(error), now)
             return
@@ -167,7 +182,8 @@ class RequestSet:
             self.requests = (*self.requests[:at], *parts, *self.requests[at + 1 :])
             self._by_request.pop(request, None)
         else:
-            self._by_request[request].fail(str(error), now, 1 if permanent else MAX_FAILURES)
+            limit = math.inf if error.code in BUSY_CODES else 1 if permanent else MAX_FAILURES
+            self._by_request[request].fail(f"{error}{_hint(request, error)}", now, limit)
 
     @property
     def all_silent(self) -> bool:
@@ -185,7 +201,18 @@ class RequestSet:
             if backoff.paused:
                 names = ", ".join(signal.name for signal in request.signals)
                 lines.append(f"{names}: {request.describe()} refused: {backoff.fault}; retried after a pause")
+            elif backoff.failures >= MAX_FAILURES:
+                where, seconds = request.describe(), now - backoff.since
+                lines.append(f"{where}: no answer for {seconds:.0f} s: {backoff.fault}; repeated in each round")
         return lines
+
+
+def _hint(request: Request, error: ExceptionReplyError) -> str:
+    """Return what may help, as the end of a sentence; empty if nothing is known."""
+    other = {"holding": "input", "coil": "discrete"}.get(request.table)
+    if error.code != ILLEGAL_FUNCTION or other is None:
+        return ""
+    return f'; the device has no such table: try table = "{other}"'
 
 
 class PollSchedule:

@@ -162,15 +162,18 @@ def test_backoff_of_a_dead_device_is_bounded() -> None:
     assert len(asked) <= 40
 
 
-def test_busy_device_is_paused_after_three_failures() -> None:
+@pytest.mark.parametrize("code", [5, 6])
+def test_busy_device_is_reported_and_never_paused(code: int) -> None:
     requests = RequestSet(plan([item("a")], 0, 125))
     only = requests.requests[0]
-    for _ in range(2):
-        requests.refused(only, ExceptionReplyError(6), 1.0)
+    for _ in range(3):
+        assert requests.warnings(1.0) == []
+        requests.refused(only, ExceptionReplyError(code), 1.0)
         assert requests.due(1.0) == [only]
-    requests.refused(only, ExceptionReplyError(6), 1.0)
-    assert requests.due(1.0) == []
-    assert "server device busy" in requests.warnings(1.0)[0]
+    assert "no answer for 2 s: exception" in requests.warnings(3.0)[0]
+    assert "repeated in each round" in requests.warnings(3.0)[0]
+    requests.answered(only)
+    assert requests.warnings(3.0) == []
 
 
 def test_least_time_counts_serial_characters() -> None:
