@@ -58,10 +58,9 @@ def unit(text: str) -> "pint.Unit":
     written = _known_name(whole) if whole else "dimensionless"
     if len(text) > MAX_LENGTH or not (written or UNIT.fullmatch(short)):
         raise UnitNameError(f"{text!r} is not a unit")
+    name = written or FACTOR_NAME.sub(_renamed, short)
     try:
-        parsed = _registry().Unit(written or FACTOR_NAME.sub(_renamed, short))
-    except UnitNameError:
-        raise
+        parsed = _registry().Unit(name)
     except Exception as error:
         raise UnitNameError(f"{text!r} is not a unit (examples: ohm, N*m*s/rad, rad/s, ms)") from error
     if odd := ODD_PREFIX.search(str(parsed)):

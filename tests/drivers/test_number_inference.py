@@ -1,5 +1,6 @@
 """Number inference: certain where bytes move, likely where they hardly do, none where they are still."""
 
+import re
 import struct
 
 import numpy as np
@@ -9,8 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
+from otolith_drivers.modbus.options import LineOptions
 from otolith_drivers.modbus.probe import Block, Words
-from otolith_drivers.modbus.probe_numbers import Number, numbers_of
+from otolith_drivers.modbus.probe_numbers import Number, Place, modbus_signal_lines, numbers_of
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, is_float, orders_of
 from otolith_drivers.number_inference import FRAMES, REGISTERS, Layout, LayoutVerdict, Part, parts
 from tests.drivers.registers import registers
@@ -193,3 +195,31 @@ def test_a_probability_is_not_too_high() -> None:
     assert len(right) > 300
     assert np.mean(right) > np.mean(probabilities)
     assert np.mean(np.array(right)[np.array(probabilities) >= 0.95]) > 0.93
+
+
+def lines_of(words: Words) -> list[str]:
+    place = Place(LineOptions(host="plc"), 1, "holding", 0)
+    return [
+        line for line in modbus_signal_lines(place, numbers_of({Block(0, words.shape[1]): words})) if "NAME" in line
+    ]
+
+
+def test_a_quiet_high_word_offers_the_reading_of_32_bits() -> None:
+    """While the high word is still, the low one changes as a number of 16 bits does."""
+    random, time = np.random.default_rng(4), np.arange(READINGS)
+    number = np.round(70_000 + 300 * np.sin(0.05 * time) + random.standard_normal(READINGS)).astype(np.int64)
+    words = np.stack([number >> 16, number & 0xFFFF, 0 * number + 7], axis=1).astype(np.uint16)
+    (line,) = lines_of(words)
+    assert re.search(r"# \? \d+ now.*; or u?int32 of register 0 \((69|70)\d\d\d\)", line)
+    assert re.search(r"; or u?int32 CDAB of register 1 \(46\d\d\d\d\)", line), (
+        "the register behind may be the high word"
+    )
+
+
+def test_only_what_is_uncertain_is_marked_in_the_lines() -> None:
+    random, time = np.random.default_rng(4), np.arange(READINGS)
+    number = np.round(900 * np.sin(0.05 * time) + 2 * random.standard_normal(READINGS)).astype(np.int16)
+    words = np.stack([number.view(np.uint16), (number // 3 + 100).view(np.uint16)], axis=1)
+    assert [line.partition("#")[2].startswith(" ?") for line in lines_of(words)] == [False, False]
+    (line,) = lines_of(words[:5, :1])
+    assert line.partition("#")[2].startswith(" ? ")

@@ -167,10 +167,8 @@ def _with_extended_flags(text: str) -> tuple[str, list[str]]:
         identifier = int(match[2])
         return f"{match[1]}{identifier | EXTENDED_FLAG if _needs_flag(identifier) else identifier}"
 
-    some = ", ".join(names[:3]) + (f" and {len(names) - 3} more have" if len(names) > 3 else "")
-    have = "" if len(names) > 3 else " has" if len(names) == 1 else " have"
-    flagged = f"{some}{have} an identifier over 11 bits without bit 31: read as extended"
-    return DBC_REFERENCE.sub(flag, text), [flagged]
+    some = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return DBC_REFERENCE.sub(flag, text), [f"identifiers over 11 bits without bit 31 are read as extended: {some}"]
 
 
 def _needs_flag(identifier: int) -> bool:
@@ -233,12 +231,11 @@ def _layout_faults(message: Message) -> list[DatabaseFault]:
     return []
 
 
-Places = set[tuple[int, int, int]]
-"""Arbitration ID, start and length of signals."""
+def _multiplexed_places(text: str) -> set[tuple[int, int, int]]:
+    """Arbitration ID, start and length of the signals that a DBC calls multiplexed.
 
-
-def _multiplexed_places(text: str) -> Places:
-    """The signals that a DBC calls multiplexed; cantools takes those without a multiplexer for plain ones."""
+    cantools takes those without a multiplexer for plain ones.
+    """
     return {
         (int(words[1]) % EXTENDED_FLAG, int(match[1]), int(match[2]))
         for block in DBC_MESSAGE.findall(text)
@@ -247,7 +244,7 @@ def _multiplexed_places(text: str) -> Places:
     }
 
 
-def _multiplexer_faults(message: Message, multiplexed: Places) -> list[DatabaseFault]:
+def _multiplexer_faults(message: Message, multiplexed: set[tuple[int, int, int]]) -> list[DatabaseFault]:
     """Multiplexed signals whose multiplexer is not in ``message``, such as one whose name is cut short."""
     names = {signal.name for signal in message.signals}
     return [

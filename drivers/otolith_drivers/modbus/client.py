@@ -80,7 +80,7 @@ class ReadOnlyClient:
             "holding": client.read_holding_registers,
             "input": client.read_input_registers,
         }[table]
-        if self._options.reply_transaction is not None:  # no number tells a second copy of an answer from the next one
+        if self._options.reply_transaction is not None:  # a second copy of an answer looks like the next answer
             self._discard()
         try:
             reply = read(address, count=count, device_id=device)
@@ -195,8 +195,7 @@ class _HeaderFilter:
     """Checks the transaction and device number of each TCP answer, and replaces those that the options expect."""
 
     def __init__(self, options: LineOptions) -> None:
-        self.mismatch = ""
-        """What differed in an answer to the latest request; empty if nothing did."""
+        self.mismatch = ""  # what differed in an answer to the latest request
         self._options = options
         self._sent = b""
 

@@ -53,12 +53,9 @@ class ModbusPoller:
         self._client = ReadOnlyClient(options)
         hidden = {signal.decimals.place: signal.decimals for signal in signals if signal.decimals is not None}
         self._requests = RequestSet(plan([*signals, *hidden.values()], options.max_gap, options.max_registers))
-        self._decimals: dict[tuple[int, str, int], float] = {}
-        """Latest numbers of decimals by the place of their register."""
-        self._trips: deque[float] = deque(maxlen=TRIPS)
-        """Latest round-trip times in s."""
-        self._answers = self._closings = 0
-        """Answers since the connection was opened, and connections in a row that ended after one answer."""
+        self._decimals: dict[tuple[int, str, int], float] = {}  # latest ones, by the place of their register
+        self._trips: deque[float] = deque(maxlen=TRIPS)  # latest round-trip times in s
+        self._answers = self._closings = 0  # since the connection was opened; connections in a row with one answer
         self._schedule = PollSchedule(period)
         self._order = OrderMonitor(signals)
         self._unjudged: dict[str, list[Sample]] = {}
@@ -103,16 +100,13 @@ class ModbusPoller:
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
         requests, period = self._requests.requests, self._schedule.requested
-        title = f"{self._options.title()}, read only (function codes {self._codes()})"
+        codes = "1 to 4" if any(signal.table in BIT_TABLES for signal in self._signals) else "3 and 4"
+        title = f"{self._options.title()}, read only (function codes {codes})"
         lines = [f"{title}: {summary(requests)}, {1.0 / period:g} Hz asked"]
         least = sum(self._options.least_time(request.count) for request in requests)
         if least > period:
             lines.append(f"the line is too slow for that: at most {1.0 / least:.3g} Hz can be achieved")
         return lines + [f"{signal.name} [{signal.target_unit}] from {signal.describe()}" for signal in self._signals]
-
-    def _codes(self) -> str:
-        """Return the function codes that are sent, in words."""
-        return "1 to 4" if any(signal.table in BIT_TABLES for signal in self._signals) else "3 and 4"
 
     def _run(self, deliver: Deliver) -> None:
         self._schedule.start(time.monotonic())
@@ -150,7 +144,7 @@ class ModbusPoller:
         usable, answered, repeated = True, 0, True
         waiting = deque(self._requests.due(begun))
         busy: list[Request] = []
-        while waiting and usable:
+        while waiting and usable and not self._stop.is_set():
             request = waiting.popleft()
             try:
                 repeated &= self._read(request, deliver)
@@ -165,7 +159,7 @@ class ModbusPoller:
                 raise
             self._stop.wait(self._options.pause)
             if busy and not waiting:
-                self._stop.wait(self._busy_pause)
+                self._stop.wait(self._schedule.period / BUSY_PAUSES)
                 waiting, busy = deque(busy), []
         self._end_reading(answered, deliver)
         if answered:
@@ -178,16 +172,11 @@ class ModbusPoller:
                 self._go_down("no device answers")
         return usable
 
-    @property
-    def _busy_pause(self) -> float:
-        """Time in s before a busy device is asked again."""
-        return self._schedule.period / BUSY_PAUSES
-
     def _refused(self, request: Request, error: ExceptionReplyError) -> list[Request]:
         """Return the request if the device is busy and can be asked again before the next round; else note it."""
         log.debug("%s: %s", request.describe(), error)
-        now = time.monotonic()
-        if error.code in BUSY_CODES and not self._stop.is_set() and now + 2.0 * self._busy_pause < self._schedule.due:
+        now, schedule = time.monotonic(), self._schedule
+        if error.code in BUSY_CODES and now + 2.0 * schedule.period / BUSY_PAUSES < schedule.due:
             return [request]
         self._requests.refused(request, error, now)
         return []
@@ -207,7 +196,7 @@ class ModbusPoller:
             except ConnectionLostError:
                 if not self._answers or self._stop.is_set():
                     raise
-                self._closings = self._closings + 1 if self._answers == 1 else 0
+                self._closings += self._answers == 1
                 if self._closings == MAX_FAILURES:
                     log.warning("%s: closes the connection after each answer", self._options.title())
                 self._client.close()
@@ -219,6 +208,7 @@ class ModbusPoller:
                 raise
             now = time.monotonic()
             self._answers += 1
+            self._closings = self._closings if self._answers == 1 else 0
             self._trips.append(now - sent)
             return registers, 0.5 * (sent + now)
 

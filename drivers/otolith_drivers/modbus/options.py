@@ -21,9 +21,8 @@ SILENT_CHARACTERS = 3.5  # between frames (Modbus over Serial Line V1.02, sectio
 MAX_DECIMALS = 9  # digits behind the point; more are no decimals register
 
 Table = Literal["holding", "input", "coil", "discrete"]
-BIT_TABLES: tuple[Table, ...] = ("coil", "discrete")
-"""Tables of single bits; their values are 0 and 1."""
-BIT_NAMES = {"coil": "coil", "discrete": "discrete input"}
+BIT_TABLES: dict[Table, str] = {"coil": "coil", "discrete": "discrete input"}
+"""Tables of single bits, whose values are 0 and 1, and their names in words."""
 Device = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -146,10 +145,8 @@ class RegisterSignal:
     scale: float
     offset: float
     """From the number to the target unit."""
-    decimals: "RegisterSignal | None" = None
-    """The register with the number of decimals."""
-    is_sampled: bool = True
-    """False for a register of decimals, which is no signal of its own."""
+    decimals: "RegisterSignal | None" = None  # the register with their number
+    is_sampled: bool = True  # False for a register of decimals, which is no signal of its own
 
     @property
     def place(self) -> tuple[int, str, int]:
@@ -184,7 +181,7 @@ class RegisterSignal:
         field = f" bits {self.source.bits}" if self.source.bits else ""
         point = f" with the decimals of register {self.source.decimals}" if self.decimals is not None else ""
         if self.table in BIT_TABLES:
-            return f"device {self.device}, {BIT_NAMES[self.table]} {self.source.register_}"
+            return f"device {self.device}, {BIT_TABLES[self.table]} {self.source.register_}"
         return f"device {self.device}, {self.table} register {self.source.register_}, {self.kind}{order}{field}{point}"
 
 

@@ -42,6 +42,8 @@ class Number:
 
     address: int
     part: Part
+    word: int | None = None
+    """The latest content of its first register."""
 
     @property
     def count(self) -> int:
@@ -60,7 +62,11 @@ def numbers_of(readings: Mapping[Block, Words]) -> list[Number]:
     blocks = {block.address: bytes_of(words) for block, words in readings.items() if len(words)}
 
     def infer(layouts: Sequence[Layout]) -> list[Number]:
-        return [Number(at + part.start // 2, part) for at, data in blocks.items() for part in parts(data, layouts, 2)]
+        return [
+            Number(at + part.start // 2, part, int.from_bytes(data[-1, part.start : part.start + 2].tobytes()))
+            for at, data in blocks.items()
+            for part in parts(data, layouts, 2)
+        ]
 
     numbers, orders = infer(REGISTERS), Counter[str]()
     for part in (number.part for number in numbers):
@@ -145,7 +151,9 @@ def modbus_signal_lines(place: Place, numbers: Sequence[Number]) -> list[str]:
         order = f', order = "{layout.order}"' if layout.width > 2 or layout.order != "ABCD" else ""
         table = f', table = "{place.table}"' if place.table != "holding" else ""
         register = f"register = {place.shown(number.address)}{table}"
-        comment = f"{spread(part)}{_alternatives(place, number)}"
+        longer = _longer_readings(place, number, numbers)
+        mark = "? " if longer or part.verdict is LayoutVerdict.LIKELY else ""
+        comment = f"{mark}{spread(part)}{_alternatives(place, number)}{longer}"
         lines.append(f'NAME = {{ {register}, type = "{layout.kind}"{order}, unit = "?" }}  # {comment}')
     for verdict, remark in REMARKS.items():
         unknown = [number for number in numbers if number.part.verdict is verdict]
@@ -153,6 +161,22 @@ def modbus_signal_lines(place: Place, numbers: Sequence[Number]) -> list[str]:
             addresses = [number.address + offset for number in unknown for offset in range(number.count)]
             lines.append(f"# {spans(map(place.shown, addresses))}: {remark}")
     return lines
+
+
+def _longer_readings(place: Place, number: Number, numbers: Sequence[Number]) -> str:
+    """Return numbers of 32 bits whose high word may be a still register beside ``number``, as the end of a sentence."""
+    layout = number.part.layout
+    if layout is None or layout.width > 2 or layout.order != "ABCD":
+        return ""
+    texts = []
+    kind = layout.kind.replace("16", "32")
+    for offset, order in ((-1, ""), (1, " CDAB")):
+        high = next((other for other in numbers if other.address == number.address + offset), None)
+        if high is not None and high.part.verdict is LayoutVerdict.STILL and high.word is not None:
+            whole = (high.word << 16) + (int(number.part.latest) & 0xFFFF)
+            whole -= 1 << 32 if layout.signed and high.word >> 15 else 0
+            texts.append(f"{kind}{order} of register {place.shown(min(number.address, high.address))} ({whole})")
+    return "".join(f"; or {text}" for text in texts)
 
 
 def _alternatives(place: Place, number: Number) -> str:

@@ -23,8 +23,7 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target device failed to respond",
 }
-ILLEGAL_FUNCTION = 1
-PERMANENT_CODES = (ILLEGAL_FUNCTION, 2, 3)
+PERMANENT_CODES = (1, 2, 3)
 """Exceptions that a repeated request will meet again."""
 BUSY_CODES = (5, 6)
 """Exceptions that ask to repeat the request later."""
@@ -61,6 +60,7 @@ class ExceptionReplyError(Exception):
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
         self.code = code
+        self.is_illegal_function = code == 1
 
     @property
     def meaning(self) -> str:

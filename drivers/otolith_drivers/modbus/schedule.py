@@ -10,14 +10,8 @@ from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from otolith_drivers.modbus.options import RegisterSignal, Table
-from otolith_drivers.modbus.protocol import (
-    BUSY_CODES,
-    GATEWAY_CODES,
-    ILLEGAL_FUNCTION,
-    PERMANENT_CODES,
-    ExceptionReplyError,
-)
+from otolith_drivers.modbus.options import BIT_TABLES, RegisterSignal, Table
+from otolith_drivers.modbus.protocol import BUSY_CODES, GATEWAY_CODES, PERMANENT_CODES, ExceptionReplyError
 
 # Requests. Engineering choices, guarded by tests/drivers/modbus/test_schedule.py.
 MAX_FAILURES = 3  # in a row before a request or device is paused; one timeout on a noisy line is no dead device
@@ -66,8 +60,8 @@ class Request:
     def describe(self) -> str:
         """Return device and registers in words."""
         last = self.address + self.count - 1
-        noun = {"coil": "coils", "discrete": "discrete inputs"}.get(self.table, f"{self.table} registers")
-        return f"device {self.device}, {noun} {self.address} to {last}"
+        noun = BIT_TABLES.get(self.table, f"{self.table} register")
+        return f"device {self.device}, {noun}s {self.address} to {last}"
 
 
 def plan(signals: Iterable[RegisterSignal], max_gap: int, max_registers: int) -> tuple[Request, ...]:
@@ -167,10 +161,7 @@ class RequestSet:
         self._by_device[request.device].fail(fault, now, MAX_FAILURES)
 
     def refused(self, request: Request, error: ExceptionReplyError, now: float) -> None:
-        """Note that the device answered with an exception; split the request if the exception is permanent.
-
-        A device that is busy is asked again in the next round: it has the registers, and answers.
-        """
+        """Note that the device answered with an exception; split the request if it is permanent, pause if not busy."""
         if error.code in GATEWAY_CODES:
             self.unanswered(request, str(error), now)
             return
@@ -210,9 +201,7 @@ class RequestSet:
 def _hint(request: Request, error: ExceptionReplyError) -> str:
     """Return what may help, as the end of a sentence; empty if nothing is known."""
     other = {"holding": "input", "coil": "discrete"}.get(request.table)
-    if error.code != ILLEGAL_FUNCTION or other is None:
-        return ""
-    return f'; the device has no such table: try table = "{other}"'
+    return f'; try table = "{other}"' if error.is_illegal_function and other is not None else ""
 
 
 class PollSchedule:

@@ -61,7 +61,7 @@ def test_identifier_of_29_bits_without_its_flag_is_extended(tmp_path: Path) -> N
     data = bytes.fromhex("00002041") + bytes(4)  # 10.0 as a float
     assert values(frame_decoder.decode(frame(419385573, data, extended=True), 0.0)) == {"omega": 10.0}
     (warning,) = frame_decoder.configuration_warnings
-    assert "Drive has an identifier over 11 bits without bit 31: read as extended" in warning
+    assert "identifiers over 11 bits without bit 31 are read as extended: Drive" in warning
     database = load_database(tmp_path / "drive.dbc")
     assert [message.is_extended_frame for message in database.messages] == [True, False]
 
