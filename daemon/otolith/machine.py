@@ -15,7 +15,10 @@ from typing import Any
 from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
+from otolith.health.diagnosis import Rule, RulesFile
+from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan
 from otolith.machine_file import (
+    ComponentTable,
     DiscoveryTable,
     MachineFile,
     ParameterTable,
@@ -25,16 +28,17 @@ from otolith.machine_file import (
 )
 from otolith.twin.augmentation import sources
 from otolith.twin.component_families import FAMILY_NAMES
-from otolith.twin.definition import Definition, Parameter, Role
+from otolith.twin.definition import Definition, Parameter, Role, Site
 from otolith.twin.language import read_twin
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal
 from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.registry import find
-from otolith_drivers.units import Quantity
+from otolith_drivers.units import Quantity, limit_values
 from otolith_drivers.user_dirs import state_directory
 
 LIBRARY = Path(__file__).parent / "twin" / "library"
+RULES = Path(__file__).parent / "health" / "rules.toml"
 FINGERPRINT_KEYS = ("dbc", "eds", "order", "first_address", "device")  # driver options that signal values depend on
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
@@ -66,6 +70,8 @@ class LoadedMachine:
     file: MachineFile
     twin: Definition
     problem: Problem
+    plan: MonitoringPlan
+    """Limits of parameters and components, and the rules of the diagnosis."""
     signal_tables: Mapping[str, SignalTable]
     """Of each signal of the twin."""
     built_driver: Driver | None
@@ -166,7 +172,7 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
         config = driver_config(file, twin, source)
         with config.located_errors():
             driver = config.module.build(config.options, config.setup)
-    return LoadedMachine(path, file, twin, problem, tables, driver)
+    return LoadedMachine(path, file, twin, problem, _plan(file, twin, problem, context), tables, driver)
 
 
 def _common(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -338,6 +344,71 @@ def _parameter(parameter: Parameter, table: ParameterTable, context: Context, *,
         remedy = f"write a value between {low:g} and {high:g} {unit}, or change low and high"
         context.fail(where, f"{value:g} {unit} is out of bounds: {remedy}")
     return replace(parameter, nominal=value, low=low, high=high)
+
+
+def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Context) -> MonitoringPlan:
+    """Return the limits of the file, or those of the twin where it has none, and the rules of the diagnosis."""
+    free, sites = {parameter.name: parameter for parameter in problem.free}, {site.name: site for site in twin.sites}
+    for name, table in file.parameters.items():
+        for key, written in (("watch", table.watch), ("act", table.act)):
+            if written and name not in free:
+                context.fail(("parameters", name, key), f"{name} is not estimated: write estimate = true, or no limit")
+    for name in file.components:
+        if name not in sites:
+            context.fail(("components", name), f"twin {twin.name!r} has no such site: {nearest(name, list(sites))}")
+    parameters = {
+        name: _monitored(row, file.parameters.get(name, ParameterTable()), context) for name, row in free.items()
+    }
+    components = {
+        name: _monitored_site(row, file.components.get(name, ComponentTable()), context) for name, row in sites.items()
+    }
+    return MonitoringPlan(parameters, components, load_rules())
+
+
+def load_rules() -> tuple[Rule, ...]:
+    """Return the rules of the diagnosis."""
+    source = read(RULES)
+    return validate(parse(source), RulesFile, source).rule
+
+
+def _monitored(parameter: Parameter, table: ParameterTable, context: Context) -> MonitoredQuantity:
+    """Return part and limits of an estimated parameter; limits of the file replace all limits of the twin."""
+    unit, nominal, limits = parameter.unit, parameter.nominal, []
+    is_written = table.watch is not None or table.act is not None
+    defaults = (parameter.watch, parameter.act) if nominal != 0.0 and not is_written else ((), ())
+    for level, written, default in zip((Level.WATCH, Level.ACT), (table.watch, table.act), defaults, strict=True):
+        where = ("parameters", parameter.name, level.lower())
+        with context.at(*where):
+            values = limit_values(default if written is None else written, unit, nominal)
+        limits += [Limit(level, value, value < nominal) for value in values]
+        for value in values:
+            if is_written and not parameter.low < value < parameter.high:
+                bounds = f"the bounds {parameter.low:g} to {parameter.high:g} {unit}"
+                context.fail(where, f"{value:g} {unit} is outside {bounds}: no estimate can pass it: widen them")
+    quantity = MonitoredQuantity(parameter.part or MACHINE, parameter.meaning, unit, nominal, tuple(limits))
+    _check_order(("parameters", parameter.name, "watch"), quantity, context)
+    return quantity
+
+
+def _monitored_site(site: Site, table: ComponentTable, context: Context) -> MonitoredQuantity:
+    """Return part and limits of the components at a site."""
+    limits = []
+    for level, written in ((Level.WATCH, table.watch), (Level.ACT, table.act)):
+        if written is not None:
+            with context.at("components", site.name, level.lower()):
+                limits.append(Limit(level, Quantity(site.unit, 0.0, difference=True)(written), is_lower=False))
+    quantity = MonitoredQuantity(site.part or site.name, site.meaning, site.unit, 0.0, tuple(limits))
+    _check_order(("components", site.name, "watch"), quantity, context)
+    return quantity
+
+
+def _check_order(where: tuple[str, ...], quantity: MonitoredQuantity, context: Context) -> None:
+    """Raise an error for a limit of WATCH that is not passed before the limit of ACT on its side."""
+    acts = [limit for limit in quantity.limits if limit.level is Level.ACT]
+    for watch in (limit for limit in quantity.limits if limit.level is Level.WATCH):
+        if any(act.is_lower is watch.is_lower and act.excess(watch.value) >= 0.0 for act in acts):
+            remedy = f"write a limit nearer to the nominal value {quantity.nominal:g} {quantity.unit}"
+            context.fail(where, f"{watch.value:g} {quantity.unit} is not passed before act: {remedy}")
 
 
 def _noise(

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.acquisition.samples import Check
 from otolith_drivers.base import Sampling
-from otolith_drivers.config_files import StrictModel
+from otolith_drivers.config_files import StrictModel, one_or_two
 from otolith_drivers.units import Quantity
 
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
@@ -42,6 +42,8 @@ Name = Annotated[str, AfterValidator(_name)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 RawQuantity = str | float | None
 """A quantity as written in the file. It is converted once the twin tells its unit; a number without unit is refused."""
+RawLimits = Annotated[tuple[str | float, ...] | None, BeforeValidator(one_or_two)]
+"""One limit or two, relative to the nominal value or with a unit; an empty list for none."""
 WindowLength = Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))]
 
 
@@ -68,6 +70,16 @@ class ParameterTable(StrictModel):
     """Without it, a parameter with a value is known, and one without has the role that the twin gives it."""
     low: RawQuantity = None
     high: RawQuantity = None
+    watch: RawLimits = None
+    """Limits of the state WATCH; without ``watch`` and ``act`` the parameter has those of the twin."""
+    act: RawLimits = None
+
+
+class ComponentTable(StrictModel):
+    """Limits of the amplitude of components at one site."""
+
+    watch: RawQuantity = None
+    act: RawQuantity = None
 
 
 class SignalTable(StrictModel):
@@ -156,6 +168,8 @@ class MachineFile(StrictModel):
     parameters: Annotated[
         dict[str, Annotated[ParameterTable, BeforeValidator(_expand_value)]], Field(default_factory=dict)
     ]
+    components: Annotated[dict[str, ComponentTable], Field(default_factory=dict)]
+    """Limits of the amplitudes of components, by site."""
     noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]
     """Standard deviation of the sensors of outputs and measured inputs."""
     process_noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]

@@ -38,6 +38,13 @@ KINDS = {
 """By the key that only this kind of file has: its name, and the command that reads it."""
 
 
+def one_or_two(written: object) -> object:
+    """Return a value that may be written alone or in a list of two as a list; raise ValueError for a longer one."""
+    if isinstance(written, list | tuple) and len(written) > 2:
+        raise ValueError(f"{written!r} are {len(written)} limits: write one, or two in a list")
+    return written if isinstance(written, list | tuple) else (written,)
+
+
 class StrictModel(BaseModel):
     """A table of a file: unknown keys are errors, values are finite and immutable."""
 

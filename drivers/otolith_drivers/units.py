@@ -8,6 +8,7 @@ import contextlib
 import math
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import pint
 
 MAX_LENGTH = 100  # characters of a quantity: engineering choice; bounds the time of the patterns below
+RELATIVE = re.compile(r"([+-]?)\s*(\d+\.?\d*|\.\d+)\s*%")
 NUMBER_AND_UNIT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*)")
 # Unit names with one small exponent each, joined by * or /. A larger exponent would keep pint busy for minutes.
 FACTOR = r"[( ]*(?:1|[^\W\d][\w°%µμΩ]*|[°º%℃℉][^\W\d]*)(?: ?(?:\^|\*\*) ?\(?-?\d(?:\.\d{1,3})?\)?)?[) ]*"
@@ -180,3 +182,28 @@ class Quantity:
         if math.isinf(self.low):
             return f"at or below {self.high:g} {self.unit}"
         return f"between {self.low:g} and {self.high:g} {self.unit}"
+
+
+def limit_values(written: Sequence[Any], unit_text: str, nominal: float) -> tuple[float, ...]:
+    """Return limits in ``unit_text`` of one or two texts like ``"-3 %"`` (of ``nominal``) or ``"5.9 ohm"``.
+
+    Raises:
+        ValueError: no quantity, a percentage without sign or of zero, ``nominal`` itself, or two on one side of it.
+    """
+    values = tuple(_limit_value(limit, unit_text, nominal) for limit in written)
+    if len(values) > 1 and (values[0] < nominal) == (values[1] < nominal):
+        limits = " and ".join(f"{value:g}" for value in values)
+        raise ValueError(f"{limits} {unit_text} lie on the same side of {nominal:g} {unit_text}: one is enough")
+    return values
+
+
+def _limit_value(written: Any, unit_text: str, nominal: float) -> float:
+    match = RELATIVE.fullmatch(str(written).strip()[:MAX_LENGTH])
+    if match and not match[1]:
+        raise ValueError(f'{written!r} has no sign: write "-{match[2]} %" or "+{match[2]} %", or both in a list')
+    if match and nominal == 0.0:
+        raise ValueError(f'{written!r} of a nominal value of 0 is 0: write it with its unit, like "1 {unit_text}"')
+    value = nominal * (1.0 + float(match[1] + match[2]) / 100.0) if match else Quantity(unit_text)(written)
+    if value == nominal:
+        raise ValueError(f"{written!r} is the nominal value {nominal:g} {unit_text} itself: write a limit beside it")
+    return value

@@ -68,7 +68,7 @@ def frozen_from(window: Window, signal: str, first: int, last: int = RECORDS) ->
 
 def faults(problem: Problem, window: Window, state: AdaptationState | None = None) -> tuple[str, ...]:
     posterior = Posterior.initial(problem) if state is None else state.posterior
-    return check_window(window, posterior.predict(window)).faulty_sensors
+    return tuple(sensor.text for sensor in check_window(window, posterior.predict(window)).faulty_sensors)
 
 
 @pytest.mark.parametrize("wrong", [0.5, 1.5])
@@ -210,8 +210,9 @@ def test_noisy_position_that_stops_dead_is_frozen() -> None:
     estimated = estimate_window(posterior.predict(window), window)
     posterior = posterior.predict(window).update(estimated.evidence, estimated.advance)
     moving = replace(window, index=1, start=2.0, values=values[RECORDS : 2 * RECORDS])
-    (sentence,) = check_window(frozen_from(moving, "x", 80), posterior.predict(moving)).faulty_sensors
-    assert sentence.startswith("x is ")
+    (sensor,) = check_window(frozen_from(moving, "x", 80), posterior.predict(moving)).faulty_sensors
+    assert sensor.signal == "x"
+    assert sensor.text.startswith("x is ")
 
 
 def test_window_of_a_frozen_sensor_leaves_an_open_test_open(scenario: MotorScenario, windows: Cut) -> None:

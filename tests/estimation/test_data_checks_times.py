@@ -84,9 +84,10 @@ def test_share_of_spikes_is_that_of_the_samples() -> None:
     values[20:180:35, 2] += 3.0
     assert drop_spikes(replace(window, values=values), TWIN, NOISE)[2] == []
     missing[:, 2] = np.arange(RECORDS) % 5 != 0
-    (sentence,) = drop_spikes(replace(window, values=values, missing=missing), TWIN, NOISE)[2]
-    assert "i spikes in 5 of 40 records" in sentence
-    assert 'checks = ["frozen", "stale"]' in sentence
+    (sensor,) = drop_spikes(replace(window, values=values, missing=missing), TWIN, NOISE)[2]
+    assert sensor.signal == "i"
+    assert "i spikes in 5 of 40 records" in sensor.text
+    assert 'checks = ["frozen", "stale"]' in sensor.text
 
 
 def test_measured_input_is_bridged_from_the_samples_beside_a_spike() -> None:

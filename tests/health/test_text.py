@@ -4,6 +4,7 @@ import pytest
 
 from otolith.acquisition.window import Verdict
 from otolith.discovery.decision import WindowDecision
+from otolith.health.diagnosis import FindingKind
 from otolith.health.schema import (
     DriverDocument,
     FindingDocument,
@@ -19,7 +20,13 @@ from otolith.health.text import finding_text, summary, value_cells, value_text
 ESTIMATED = ParameterDocument(value=5.98561, sd=0.00382, unit="ohm", nominal=6.5, status=Status.ESTIMATED)
 UNKNOWN = ParameterDocument(unit="ohm", nominal=6.5, status=Status.UNESTIMATED, reason="no current")
 LEAK = FindingDocument(
-    id="s/f", severity=Severity.FAULT, condition="leak", text="a leak", since=0.0, advice="Close it."
+    id="s/f",
+    kind=FindingKind.COMPONENT,
+    severity=Severity.FAULT,
+    condition="leak",
+    text="a leak",
+    since=0.0,
+    advice="Close it.",
 )
 
 

@@ -5,12 +5,14 @@ what differs between computers. ``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the
 """
 
 import os
+import re
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
 
 from otolith.cli.check import describe
+from otolith.health.limits import Level, MonitoringPlan
 from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from tests.conftest import EXAMPLES, OwnMachine
@@ -104,3 +106,46 @@ def test_any_unit_of_the_dimension_is_accepted(own_machine: OwnMachine) -> None:
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="No such file"):
         load_machine(tmp_path / "none.toml")
+
+
+def limits_of(own_machine: OwnMachine, row: str, extra: str = "") -> MonitoringPlan:
+    text = own_machine.machine.read_text(encoding="utf-8")
+    text = re.sub(r"^R_a = .*$", f"R_a = {{ estimate = true, {row} }}", text, flags=re.MULTILINE)
+    text = re.sub(r"^\[components\]\n(.+\n)*", "", text, flags=re.MULTILINE)
+    own_machine.machine.write_text(text + extra, encoding="utf-8")
+    return load_machine(own_machine.machine, with_driver=False).plan
+
+
+@pytest.mark.parametrize(
+    ("row", "expected"),
+    [
+        ('watch = "-3 %", act = "-8 %"', [(Level.WATCH, 6.305, True), (Level.ACT, 5.98, True)]),
+        ('value = "10 ohm", act = "+10 %"', [(Level.ACT, 11.0, False)]),
+        ('watch = ["5.9 ohm", "7000 mohm"]', [(Level.WATCH, 5.9, True), (Level.WATCH, 7.0, False)]),
+        ("watch = []", []),
+    ],
+)
+def test_limits_are_relative_or_absolute(
+    own_machine: OwnMachine, row: str, expected: list[tuple[Level, float, bool]]
+) -> None:
+    limits = limits_of(own_machine, row).parameters["R_a"].limits
+    assert [(limit.level, limit.is_lower) for limit in limits] == [(level, lower) for level, _, lower in expected]
+    assert [limit.value for limit in limits] == pytest.approx([value for _, value, _ in expected])
+
+
+def test_the_twin_gives_limits_relative_to_the_value_of_the_machine(own_machine: OwnMachine) -> None:
+    quantity = limits_of(own_machine, 'value = "10 ohm"').parameters["R_a"]
+    assert quantity.part == "winding"
+    assert [limit.value for limit in quantity.limits] == pytest.approx([9.5, 12.5, 9.0, 14.5])
+
+
+def test_a_default_limit_beyond_the_bounds_is_no_error(own_machine: OwnMachine) -> None:
+    """The library's lines cannot suit each machine: a limit that no estimate passes does no harm."""
+    row = 'value = "6.5 ohm", low = "6.4 ohm", high = "6.6 ohm"'
+    assert limits_of(own_machine, row).parameters["R_a"].limits
+
+
+def test_components_have_limits_by_site(own_machine: OwnMachine) -> None:
+    plan = limits_of(own_machine, 'value = "6.5 ohm"', '[components]\nshaft = { watch = "1 mN*m", act = "4 mN*m" }\n')
+    assert [limit.value for limit in plan.sites["shaft"].limits] == pytest.approx([0.001, 0.004])
+    assert plan.sites["winding"].limits == ()

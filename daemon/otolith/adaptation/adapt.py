@@ -34,6 +34,7 @@ from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.window_fit import Search, WindowEstimate, estimate, estimate_window
 from otolith.estimation.window_length import WindowExcitation, next_records
+from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
 
@@ -53,7 +54,8 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)
-    return _next_state(state, result, previous), report
+    health, document = assess(state.plan, state.health, report.document)
+    return _next_state(state, result, previous, health), replace(report, document=document)
 
 
 def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
@@ -67,8 +69,9 @@ def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWind
 def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
     """Return the result of a window whose data are faulty: it does not update the posterior."""
     decision = WindowDecision.BAD if checked.bad else WindowDecision.SENSOR
-    reason = UNUSED + "; ".join(checked.bad or checked.faulty_sensors)
-    return WindowResult.unchanged(state, predicted, decision, reason=reason)
+    reason = UNUSED + "; ".join(checked.bad or (sensor.text for sensor in checked.faulty_sensors))
+    result = WindowResult.unchanged(state, predicted, decision, reason=reason)
+    return replace(result, faulty_sensors=checked.faulty_sensors)
 
 
 def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
@@ -192,7 +195,9 @@ def _keep_posterior(
     return replace(result, before=mixed, after=mixed)
 
 
-def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus]) -> AdaptationState:
+def _next_state(
+    state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus], health: HealthState
+) -> AdaptationState:
     """Return the state for the next window."""
     if result.estimate is None:  # data that are not used are evidence neither for a hypothesis nor against one
         test = state.test
@@ -207,6 +212,7 @@ def _next_state(state: AdaptationState, result: WindowResult, previous: dict[str
         adopted=result.adopted,
         noisier_since=result.noisier_since(state),
         previous=previous,
+        health=health,
         records=_next_records(state, result),
     )
 

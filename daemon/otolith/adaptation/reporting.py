@@ -15,11 +15,13 @@ from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describ
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.augmented import equation, indices, site_of, source_of
+from otolith.estimation.data_checks import FaultySensor
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import WindowEstimate
+from otolith.health.diagnosis import FindingKind
 from otolith.health.schema import (
     AlternativeDocument,
     ComponentDocument,
@@ -53,6 +55,7 @@ DATA_FAULTS = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
 OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
 """Decisions after which the hypotheses of a test go on, and their mixture is published."""
 OPEN_CONDITION = "the data do not yet decide between the hypotheses"
+SENSOR_CONDITION = "its samples cannot be true"
 NOISE_CONDITION = "the innovations are white, but larger than [noise] allows"
 NOISE_ADVICE = "if it has always been so, correct [noise]; otherwise inspect the sensor, its cable and its supply"
 AMBIGUOUS_CONDITION = "these explain the data equally well: what was recorded so far cannot distinguish them"
@@ -77,6 +80,8 @@ class WindowResult:
     """
     reason: str = ""
     """Why the window was not estimated from."""
+    faulty_sensors: tuple[FaultySensor, ...] = ()
+    """Those whose samples made it unusable."""
     notes: tuple[str, ...] = ()
     """What the data checks left out."""
     searched: bool = False
@@ -143,8 +148,11 @@ def make_report(
         parameters=parameters,
         components=components,
         explanations=explanations,
-        findings=_findings(
-            components, explanations, result, result.noisier_since(state), _experiment(undecided, situation)
+        findings=(
+            *_sensor_findings(result, window.start),
+            *_findings(
+                components, explanations, result, result.noisier_since(state), _experiment(undecided, situation)
+            ),
         ),
         **_fit_and_cost(problem, result),
     )
@@ -326,6 +334,22 @@ def _alternative_documents(alternatives: Sequence[Alternative]) -> tuple[Alterna
     )
 
 
+def _sensor_findings(result: WindowResult, start: float) -> list[FindingDocument]:
+    """Return a finding for each sensor whose samples made the window unusable."""
+    return [
+        FindingDocument(
+            id=f"{FindingKind.SENSOR}/{sensor.signal}",
+            kind=FindingKind.SENSOR,
+            subject=sensor.signal,
+            severity=Severity.FAULT,
+            condition=SENSOR_CONDITION,
+            text=sensor.text,
+            since=start,
+        )
+        for sensor in result.faulty_sensors
+    ]
+
+
 def _findings(
     components: Sequence[ComponentDocument],
     explanations: Sequence[AlternativeDocument],
@@ -338,12 +362,17 @@ def _findings(
     ``experiment`` is what would decide the test.
     """
     decision, test = result.decision, result.test
-    findings = [_component_finding(component) for component in components if component.approval is Approval.OPEN]
+    findings = [
+        _component_finding(component)
+        for component in components
+        if component.approval is Approval.OPEN and component.status is ComponentStatus.ADOPTED
+    ]
     if noisier_since is not None:
         noisier = describe_noise(result.posterior.problem)
         findings.append(
             FindingDocument(
                 id="noise",
+                kind=FindingKind.NOISE,
                 severity=Severity.WARNING,
                 condition=NOISE_CONDITION,
                 text=noisier,
@@ -352,11 +381,13 @@ def _findings(
             )
         )
     if explanations and test is not None:
-        best = explanations[0]
+        best, kind, subject = explanations[0], *_kind_and_subject(decision, test)
         others = "".join(f"; or {other.text} ({other.probability:.0%})" for other in explanations[1:3])
         findings.append(
             FindingDocument(
-                id="undecided",
+                id=f"{kind}/{subject}" if subject else "undecided",
+                kind=kind,
+                subject=subject,
                 severity=Severity.FAULT if decision in DATA_FAULTS else Severity.WARNING,
                 condition=AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION,
                 text=f"{best.reason}: {best.text} ({best.probability:.0%}){others}",
@@ -367,9 +398,25 @@ def _findings(
     return tuple(findings)
 
 
+def _kind_and_subject(decision: WindowDecision, test: SequentialTest) -> tuple[FindingKind, str]:
+    """Return what an open test is about: a sensor, a late signal, a class of hypotheses, or not known yet."""
+    if decision is WindowDecision.AMBIGUOUS:
+        return FindingKind.CLASS, ""
+    fault = {WindowDecision.SENSOR: FaultType.SENSOR, WindowDecision.TIMING: FaultType.TIMING}.get(decision)
+    excluding = next((item for item in test.hypotheses if item.type is fault), None)
+    if excluding is None:
+        return FindingKind.OPEN, ""
+    if fault is FaultType.TIMING:
+        return FindingKind.TIMING, excluding.problem.delays[0][0]
+    sites = [site_of(excluding.problem.base_model, item.site).into for item in excluding.problem.components[-1:]]
+    return FindingKind.SENSOR, sites[0] if sites else ""
+
+
 def _component_finding(component: ComponentDocument) -> FindingDocument:
     return FindingDocument(
         id=component.id,
+        kind=FindingKind.COMPONENT,
+        subject=component.site,
         severity=Severity.WARNING,
         condition=component.conditions,
         text=f"new {component.meaning}: {component.equation}",

@@ -10,6 +10,8 @@ from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.augmented import augment, indices, slot_of, without
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
+from otolith.health.events import HealthState
+from otolith.health.limits import MonitoringPlan
 from otolith.health.schema import Status
 from otolith.health.status import PreviousStatus
 
@@ -45,6 +47,9 @@ class AdaptationState:
     """The components in the twin."""
     noisier_since: float | None = None
     """Unix seconds from which on sensors are noisier than stated; None if they are not."""
+    plan: MonitoringPlan = field(default_factory=MonitoringPlan)
+    """Limits and rules by which states and events follow from the reports."""
+    health: HealthState = field(default_factory=HealthState)
     resets: Mapping[str, float] = field(default_factory=dict)
     """The :attr:`OperatorDecisions.resets` that have been applied."""
 
@@ -59,11 +64,17 @@ class AdaptationState:
         return self.posterior.problem
 
 
-def initial_state(machine: str, site: str, problem: Problem) -> AdaptationState:
-    """Return the state before the first window."""
+def initial_state(machine: str, site: str, problem: Problem, plan: MonitoringPlan | None = None) -> AdaptationState:
+    """Return the state before the first window; without ``plan`` no parameter has limits."""
     previous = {parameter.label: PreviousStatus() for parameter in problem.free}
     return AdaptationState(
-        machine, site, Posterior.initial(problem), previous, problem.window.records, restricted=problem.excluded
+        machine,
+        site,
+        Posterior.initial(problem),
+        previous,
+        problem.window.records,
+        restricted=problem.excluded,
+        plan=plan or MonitoringPlan(),
     )
 
 
@@ -73,7 +84,7 @@ def cleared(state: AdaptationState) -> AdaptationState:
     for component in problem.components:
         problem = without(problem, component)
     problem = replace(problem, noise=problem.stated_noise or problem.noise, stated_noise=())
-    initial = initial_state(state.machine, state.site, problem)
+    initial = initial_state(state.machine, state.site, problem, state.plan)
     return replace(initial, restricted=state.restricted, approved=state.approved)
 
 

@@ -53,6 +53,15 @@ Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
+class FaultySensor:
+    """A sensor whose samples make the window unusable."""
+
+    signal: str
+    text: str
+    """What is wrong, since when, and the way out."""
+
+
+@dataclass(frozen=True, slots=True)
 class CheckedWindow:
     """A window without faulty records, and the results of the checks."""
 
@@ -61,7 +70,7 @@ class CheckedWindow:
     """What was left out."""
     bad: tuple[str, ...] = ()
     """Why the sampling or the values make the window unusable."""
-    faulty_sensors: tuple[str, ...] = ()
+    faulty_sensors: tuple[FaultySensor, ...] = ()
     """Which sensors make the window unusable, and why."""
 
     @property
@@ -99,8 +108,8 @@ def _unusable_values(window: Window) -> tuple[str, ...]:
 
 def drop_spikes(
     window: Window, twin: Definition, noise: tuple[float, ...], checked: frozenset[str] | None = None
-) -> tuple[Window, list[str], list[str]]:
-    """Return the window with spikes missing, notes, and a sentence for each channel with too many spikes.
+) -> tuple[Window, list[str], list[FaultySensor]]:
+    """Return the window with spikes missing, notes, and the channels with too many spikes.
 
     ``noise`` holds the standard deviations of the outputs. Commands (``zoh`` inputs) may jump. Of the other signals
     those in ``checked`` are looked at, all by default.
@@ -109,7 +118,8 @@ def drop_spikes(
     levels |= {source.name: 0.0 for source in twin.inputs if source.hold == "foh"}
     values, missing = window.values.copy(), window.missing.copy()
     times = _times(window)
-    notes, faulty = [], []
+    notes: list[str] = []
+    faulty: list[FaultySensor] = []
     for name, level in levels.items():
         if checked is not None and name not in checked:
             continue
@@ -119,7 +129,7 @@ def drop_spikes(
         count = int(is_spike.sum())
         if count > MAX_SPIKE_SHARE * len(present):
             way_out = f"look at its cable and its connector{_turned_off(name, Check.SPIKES)}"
-            faulty.append(f"{name} spikes in {count} of {len(present)} records: {way_out}")
+            faulty.append(FaultySensor(name, f"{name} spikes in {count} of {len(present)} records: {way_out}"))
         elif count:
             values[:, column] = _bridge(times, values[:, column], present, is_spike)
             missing[present[is_spike], column] = True
@@ -179,9 +189,9 @@ def _bridge(times: Array, values: Array, present: Indices, spikes: Mask) -> Arra
     return bridged
 
 
-def frozen_channels(predicted: Posterior, window: Window) -> list[str]:
-    """Return a sentence for each channel that keeps a value which its prediction makes improbable."""
-    problem, sentences = predicted.problem, []
+def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
+    """Return the channels that keep a value which their prediction makes improbable."""
+    problem, faulty = predicted.problem, []
     for output in problem.base_model.outputs:
         name = output.name
         if (name, Check.FROZEN) in problem.unchecked:
@@ -192,8 +202,8 @@ def frozen_channels(predicted: Posterior, window: Window) -> list[str]:
             continue
         run = _frozen_run(predicted, window, name, runs)
         if run is not None:
-            sentences.append(_frozen_sentence(window, output, run))
-    return sentences
+            faulty.append(FaultySensor(name, _frozen_sentence(window, output, run)))
+    return faulty
 
 
 def _constant_runs(values: Array, present: Indices) -> list[Indices]:

@@ -12,6 +12,8 @@ from otolith.discovery.adopted import Approval
 from otolith.discovery.decision import WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.information import Identifiability, Outcome
+from otolith.health.diagnosis import FindingKind
+from otolith.health.limits import Level
 from otolith_drivers.config_files import StrictModel
 
 
@@ -82,12 +84,74 @@ class FindingDocument(StrictModel):
     """A finding for the operator."""
 
     id: str
+    kind: FindingKind
+    subject: str = ""
+    """Signal or site that it is about."""
     severity: Severity
     condition: str
     text: str
     since: float
     """Unix seconds."""
     advice: str = ""
+
+
+class EventChange(StrEnum):
+    """What a window changed in an event."""
+
+    RAISED = "raised"
+    CHANGED = "changed"
+    CLEARED = "cleared"
+
+
+class EvidenceDocument(StrictModel):
+    """What an event rests on."""
+
+    windows: tuple[int, int]
+    """Index of the first and of the latest window that showed it."""
+    value: float | None = None
+    sd: float | None = None
+    unit: str = ""
+    limit: float | None = None
+    """The limit that was passed, in ``unit``."""
+    probability: float | None = None
+    """That the true value is beyond the limit."""
+
+
+class EventDocument(StrictModel):
+    """A condition of a part that calls for attention, from the window that raised it to the one that cleared it."""
+
+    id: str
+    """What it is about, and when it began: the same in each of its reports."""
+    part: str
+    state: Level
+    change: EventChange | None = None
+    """None if this window changed nothing."""
+    start: float
+    """Unix seconds, as are ``since`` and ``end``."""
+    since: float
+    """Begin of the present state."""
+    end: float | None = None
+    condition: str
+    text: str
+    cause: str = ""
+    advice: str = ""
+    source: str = ""
+    evidence: EvidenceDocument
+
+
+class PartDocument(StrictModel):
+    """State of a part or of the machine."""
+
+    state: Level
+    since: float
+    """Unix seconds."""
+    reason: str = ""
+
+
+class HealthDocument(PartDocument):
+    """State of the machine and of its parts."""
+
+    parts: dict[str, PartDocument]
 
 
 SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"
@@ -235,6 +299,10 @@ class ReportDocument(StrictModel):
     explanations: tuple[AlternativeDocument, ...] = ()
     """Competing hypotheses while they are undecided; the most probable first."""
     findings: tuple[FindingDocument, ...] = ()
+    health: HealthDocument | None = None
+    """State of the machine and of its parts."""
+    events: tuple[EventDocument, ...] = ()
+    """Events that are not cleared, and those that this window cleared; the most severe first."""
     fit: FitDocument | None = None
     """None for a window that was not estimated from."""
     cost: CostDocument = CostDocument()

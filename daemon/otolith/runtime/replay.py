@@ -121,7 +121,7 @@ class Replay:
         With ``timing`` the reports have computing times, so that they differ from run to run.
         """
         identity, window = machine.file.machine, machine.file.window
-        self.state = initial_state(identity.name, identity.site, machine.problem)
+        self.state = initial_state(identity.name, identity.site, machine.problem, machine.plan)
         """State after the last window."""
         self.statistics = RecordingStatistics(machine.twin.signals)
         """Of the rows that were read so far."""

@@ -70,7 +70,7 @@ class Service:
         self._notes: tuple[str, ...] = ()
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
-        state = initial_state(file.machine.name, file.machine.site, machine.problem)
+        state = initial_state(file.machine.name, file.machine.site, machine.problem, machine.plan)
         self._supervisor = Supervisor(state, longest * period)
         self._recorder = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
         self._recording = recording

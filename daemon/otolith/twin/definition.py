@@ -27,6 +27,12 @@ class Parameter:
     high: float
     meaning: str
     role: Role = Role.INSTRUMENTED
+    part: str = ""
+    """The part of the machine that it describes, as ``winding``."""
+    watch: tuple[str | float, ...] = ()
+    """Limits beyond which the part is watched, as written: absolute or relative to the nominal value."""
+    act: tuple[str | float, ...] = ()
+    """Limits beyond which somebody has to act."""
 
     @property
     def label(self) -> str:
@@ -96,6 +102,8 @@ class Site:
     """Additive: the right side becomes ``right + through * U``; multiplicative: ``right * (1 + U)`` (Eq. 18)."""
     through: str = "1"
     """Turns the unit of the component into that of the right side: ``1/J`` for a torque in ``der(omega)``."""
+    part: str = ""
+    """The part of the machine where such a component arises; its own name by default."""
 
 
 @dataclass(frozen=True, slots=True)

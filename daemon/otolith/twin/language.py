@@ -15,10 +15,10 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, StateVariable
 from otolith.twin.dimensions import NONE, Dimension, describe, dimension_of, infer_dimension
 from otolith.twin.expressions import ExpressionError, check_known, check_name, names_in, parse
-from otolith_drivers.config_files import Location, SourceFile, StrictModel, expect, validate
+from otolith_drivers.config_files import Location, SourceFile, StrictModel, expect, one_or_two, validate
 from otolith_drivers.config_files import parse as parse_toml
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.units import Quantity, to_base
+from otolith_drivers.units import Quantity, limit_values, to_base
 
 # Limits keep the compile time of a kernel in minutes; docs/reference/thresholds-twin.md.
 MAX_ROWS = {"states": 12, "parameters": 40, "inputs": 40, "outputs": 40, "definitions": 60}
@@ -49,6 +49,8 @@ def _no_boolean(written: object) -> object:
 Unit = Annotated[str, AfterValidator(_unit)]
 Number = Annotated[float | str, BeforeValidator(_no_boolean)]
 Bounds = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
+Limits = Annotated[tuple[str | float, ...], BeforeValidator(one_or_two)]
+"""One limit or a list of two, relative or with a unit."""
 
 
 class _HeadTable(StrictModel):
@@ -81,6 +83,9 @@ class _ParameterTable(_QuantityTable):
     nominal: Number
     bounds: Bounds
     role: Role = Role.INSTRUMENTED
+    part: str = ""
+    watch: Limits = ()
+    act: Limits = ()
 
 
 class _ConstantTable(_QuantityTable):
@@ -96,6 +101,7 @@ class _SiteTable(_QuantityTable):
     into: str
     mode: Literal["additive", "multiplicative"]
     through: str = "1"
+    part: str = ""
 
 
 class _TwinFile(StrictModel):
@@ -157,7 +163,10 @@ class _Reader:
                 for name, table in file.definitions.items()
             ),
             equations=tuple(file.equations.items()),
-            sites=tuple(Site(name, t.unit, t.meaning, t.into, t.mode, t.through) for name, t in file.sites.items()),
+            sites=tuple(
+                Site(name, t.unit, t.meaning, t.into, t.mode, t.through, t.part or name)
+                for name, t in file.sites.items()
+            ),
         )
 
     def _check_sizes(self) -> None:
@@ -225,7 +234,14 @@ class _Reader:
     def _parameter(self, name: str, table: _ParameterTable) -> Parameter:
         bounds = self._bounds(("parameters", name, "bounds"), table.unit, table.bounds)
         nominal = self._inside(("parameters", name), table.unit, "nominal", table.nominal, bounds)
-        return Parameter(name, table.unit, nominal, *bounds, table.meaning, table.role)
+        for key, limits in (("watch", table.watch), ("act", table.act)):
+            try:
+                limit_values(limits, table.unit, nominal)
+            except ValueError as error:
+                self._fault(("parameters", name, key), str(error))
+        return Parameter(
+            name, table.unit, nominal, *bounds, table.meaning, table.role, table.part, table.watch, table.act
+        )
 
     def _constant(self, name: str, table: _ConstantTable) -> Constant:
         value = self._number(("constants", name, "value"), table.unit, table.value)

@@ -1,0 +1,110 @@
+"""Diagnosis: from findings to conditions, causes and advice, by the rows of ``rules.toml``.
+
+A row matches a finding if every key that it has agrees. Of the rows that match, those with most keys rest on most
+evidence. If several remain, the data do not distinguish them: they are given together, and none is preferred.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+from otolith_drivers.config_files import StrictModel
+
+KEYS = ("twin", "subject", "side", "manner", "family", "input")
+
+
+class FindingKind(StrEnum):
+    """What was observed."""
+
+    LIMIT = "limit"
+    """A parameter is beyond a limit."""
+    COMPONENT = "component"
+    SENSOR = "sensor"
+    TIMING = "late signal"
+    NOISE = "noise"
+    CLASS = "class"
+    """Several hypotheses explain the windows equally well."""
+    OPEN = "open"
+    """Hypotheses are being compared."""
+    UNEXPLAINED = "unexplained"
+    NO_DATA = "no data"
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What the rules look at; empty where it is not known or does not apply."""
+
+    finding: FindingKind
+    twin: str = ""
+    subject: str = ""
+    """Parameter, site or signal."""
+    side: str = ""
+    """Of the nominal value on which a parameter is: ``below`` or ``above``."""
+    manner: str = ""
+    """How a parameter came there: ``step`` or ``trend``."""
+    family: str = ""
+    input: str = ""
+    """``t``, ``angle``, or another signal or state."""
+    order: float | None = None
+    """Of a component that is periodic in an angle."""
+
+
+class Rule(StrictModel):
+    """A row: the values that it matches, and what they mean. A key without values matches everything."""
+
+    finding: FindingKind
+    twin: tuple[str, ...] = ()
+    subject: tuple[str, ...] = ()
+    side: tuple[Literal["below", "above"], ...] = ()
+    manner: tuple[Literal["step", "trend"], ...] = ()
+    family: tuple[str, ...] = ()
+    input: tuple[str, ...] = ()
+    order: tuple[float, float] | None = None
+    """Lowest and highest order."""
+    condition: str
+    cause: str
+    advice: str
+    severity: Literal["WATCH", "ACT"] = "WATCH"
+    """Level of what has no limits."""
+    source: str
+
+    @property
+    def specificity(self) -> int:
+        """Number of keys that a finding must agree with."""
+        return sum(bool(getattr(self, key)) for key in (*KEYS, "order"))
+
+    def matches(self, evidence: Evidence) -> bool:
+        """Whether the row applies."""
+        agree = all(not (own := getattr(self, key)) or getattr(evidence, key) in own for key in KEYS)
+        low, high = self.order or (0.0, 0.0)
+        in_order = self.order is None or (evidence.order is not None and low <= evidence.order <= high)
+        return self.finding is evidence.finding and agree and in_order
+
+
+class RulesFile(StrictModel):
+    """The file of rules."""
+
+    rule: tuple[Rule, ...]
+
+
+def matching(rules: Sequence[Rule], evidence: Evidence) -> list[Rule]:
+    """Return the rows that rest on most evidence; several if the data do not distinguish them."""
+    rows = [rule for rule in rules if rule.matches(evidence)]
+    most = max((rule.specificity for rule in rows), default=0)
+    return [rule for rule in rows if rule.specificity == most]
+
+
+def diagnose(rules: Sequence[Rule], evidence: Evidence) -> dict[str, str]:
+    """Return condition, cause, advice and source of the rows that match, alternatives joined; empty without one."""
+    rows = matching(rules, evidence)
+    joints = {"condition": " or ", "cause": "; or ", "advice": "; ", "source": "; "}
+    return {
+        key: joint.join(dict.fromkeys(getattr(rule, key) for rule in rows)) for key, joint in joints.items() if rows
+    }
+
+
+def severity(rules: Sequence[Rule], evidence: Evidence) -> Literal["WATCH", "ACT"]:
+    """Return the level of a finding without limits: ACT if each row that matches says so."""
+    rows = matching(rules, evidence)
+    return "ACT" if rows and all(rule.severity == "ACT" for rule in rows) else "WATCH"

@@ -1,0 +1,171 @@
+"""States and events: from the report of each window to the state of each part, with hysteresis and persistence.
+
+    report → observations → levels (persistent) → events (raised, changed, cleared) → states of parts and machine
+
+Times are those of the windows. A window that determines nothing about a condition leaves it as it was.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.health.diagnosis import diagnose
+from otolith.health.limits import MACHINE, Level, MonitoringPlan
+from otolith.health.observations import BUS, SENSORS, Observation, observe
+from otolith.health.schema import (
+    EventChange,
+    EventDocument,
+    EvidenceDocument,
+    HealthDocument,
+    PartDocument,
+    ReportDocument,
+    WindowDocument,
+)
+
+PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionRecord:
+    """What is carried from window to window about one condition."""
+
+    level: Level = Level.OK
+    recent: tuple[tuple[Level, WindowDocument], ...] = ()
+    """The last observed levels with their windows."""
+    event: EventDocument | None = None
+    """None at :attr:`Level.OK`."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing of it has to be carried on."""
+        return self.event is None and all(level is Level.OK for level, _ in self.recent)
+
+
+@dataclass(frozen=True, slots=True)
+class HealthState:
+    """Everything that the states of parts need from earlier windows. Plain: it pickles."""
+
+    records: Mapping[str, ConditionRecord] = field(default_factory=dict)
+    """By the key of the condition."""
+    values: Mapping[str, float] = field(default_factory=dict)
+    """Of the parameters, after the last window that updated them."""
+    steps: Mapping[str, float] = field(default_factory=dict)
+    """Last sudden change of each parameter."""
+    document: HealthDocument | None = None
+    """The states in the report before."""
+
+
+def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
+    """Return the state after ``report``, and the report with states and events."""
+    state = _with_steps(state, report)
+    levels = {key: record.level for key, record in state.records.items()}
+    absent = Level.OK if report.decision in ACCEPTED else None  # the window would have shown the condition
+    observations = {key: Observation(key, MACHINE, absent) for key in state.records}
+    observations |= {item.key: item for item in observe(plan, report, levels, state.steps)}
+    records, events = {}, []
+    for key, observed in observations.items():
+        record = _advance(plan, state.records.get(key, ConditionRecord()), observed, report)
+        if record.event is not None:
+            events.append(record.event)
+            record = replace(record, event=record.event if record.event.end is None else None)
+        if not record.is_over:
+            records[key] = record
+    events.sort(key=lambda event: -event.state.rank)
+    document = _states(plan, state.document, report, [event for event in events if event.end is None])
+    changed = {"health": document, "events": tuple(events)}
+    return replace(state, records=records, document=document), report.model_copy(update=changed)
+
+
+def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
+    """Return the state with the values of a window that updated them, and with their sudden changes."""
+    if report.decision not in ACCEPTED:
+        return state
+    values = {name: item.value for name, item in report.parameters.items() if item.value is not None}
+    steps = dict(state.steps)
+    if report.decision is WindowDecision.STEPPED:
+        steps |= {name: value - state.values[name] for name, value in values.items() if name in state.values}
+    return replace(state, values=values, steps=steps)
+
+
+def _level_if_absent(report: ReportDocument) -> Level | None:
+    """Return the level of a condition that a window does not show: it is over if the window would have shown it."""
+    return Level.OK if report.decision in ACCEPTED else None
+
+
+def _advance(
+    plan: MonitoringPlan, before: ConditionRecord, observed: Observation, report: ReportDocument
+) -> ConditionRecord:
+    """Return the record after an observation, with its event; one that the window clears has an end."""
+    event = before.event and before.event.model_copy(update={"change": None})
+    if observed.level is None:
+        return replace(before, event=event)
+    recent = (*before.recent, (observed.level, report.window))[-PERSISTENT_WINDOWS:]
+    level, first = _persistent(before.level, [item[0] for item in recent]), recent[0][1]
+    if event is None and level is not Level.OK:
+        start = first.start if observed.since is None else observed.since
+        evidence = EvidenceDocument(windows=(first.index, report.window.index))
+        event = EventDocument(
+            id=f"{observed.key}@{start:.1f}", part=observed.part, state=level, change=EventChange.RAISED,
+            start=start, since=start, condition="", text="", evidence=evidence,
+        )  # fmt: skip
+    elif event is not None and level is not before.level:
+        is_over = level is Level.OK
+        changed = {"end": first.start} if is_over else {"state": level, "since": first.start}
+        change = EventChange.CLEARED if is_over else EventChange.CHANGED
+        event = event.model_copy(update={"change": change, **changed})
+    if event is not None and observed.level is not Level.OK:
+        event = event.model_copy(update=_description(plan, event, observed, report.window.index))
+    return ConditionRecord(level, recent, event)
+
+
+def _persistent(level: Level, recent: Sequence[Level]) -> Level:
+    """Return the level after the ``recent`` observations, which must agree that it is higher or lower."""
+    lowest, highest = min(recent, key=lambda item: item.rank), max(recent, key=lambda item: item.rank)
+    if len(recent) < PERSISTENT_WINDOWS:
+        return level
+    return lowest if lowest.rank > level.rank else highest if highest.rank < level.rank else level
+
+
+def _description(
+    plan: MonitoringPlan, event: EventDocument, observed: Observation, window: int
+) -> dict[str, str | EvidenceDocument]:
+    """Return text, diagnosis and evidence of an observation that shows the condition, by the keys of the event."""
+    texts = {"condition": observed.condition, **diagnose(plan.rules, observed.evidence)}
+    texts["advice"] = "; ".join(filter(None, (texts.get("advice"), observed.advice)))
+    numbers = {"windows": (event.evidence.windows[0], window), **(observed.numbers or {})}
+    return {**texts, "text": observed.text, "evidence": event.evidence.model_copy(update=numbers)}
+
+
+def _states(
+    plan: MonitoringPlan, before: HealthDocument | None, report: ReportDocument, events: Sequence[EventDocument]
+) -> HealthDocument:
+    """Return the states of parts and machine; ``events`` begin with the most severe."""
+    worst = {event.part: event for event in reversed(events)}
+    silent = next((event for event in events if event.state is Level.NO_DATA), None)
+    parts: dict[str, PartDocument] = {}
+    for part in dict.fromkeys((*plan.parts, SENSORS, BUS, *worst)):
+        event, missing = worst.get(part, silent), _undetermined(plan, part, report)
+        state = event.state if event else Level.NO_DATA if missing else Level.OK
+        since, reason = (event.since, event.condition) if event else (report.window.start, missing)
+        parts[part] = _kept(before.parts.get(part) if before else None, state, since, reason)
+    levels = [item.state for item in parts.values() if item.state.rank > Level.NO_DATA.rank]
+    is_known = any(parts[part].state is not Level.NO_DATA for part in plan.parts) or not plan.parts
+    state = max(levels, key=lambda level: level.rank, default=Level.OK if is_known and not silent else Level.NO_DATA)
+    same = [item for item in parts.values() if item.state is state]
+    reason = "; ".join(dict.fromkeys(item.reason for item in same if item.reason))
+    since = min(item.since for item in same) if levels else report.window.start
+    whole = _kept(before, state, since, reason)
+    return HealthDocument(state=state, since=whole.since, reason=reason, parts=parts)
+
+
+def _kept(before: PartDocument | None, state: Level, since: float, reason: str) -> PartDocument:
+    """Return a state, since the report before or earlier if that has the same one."""
+    since = before.since if before is not None and before.state is state else since
+    return PartDocument(state=state, since=since, reason=reason)
+
+
+def _undetermined(plan: MonitoringPlan, part: str, report: ReportDocument) -> str:
+    """Return why nothing is known of a part of the twin; empty if something is."""
+    own = [name for name, quantity in plan.parameters.items() if quantity.part == part] or list(report.parameters)
+    known = any(report.parameters[name].value is not None for name in own if name in report.parameters)
+    return "" if known or part not in plan.parts else f"not determined yet: {', '.join(own)}"

@@ -1,0 +1,97 @@
+"""Limits of parameters and components, and which of them an estimate has passed, judged by its interval.
+
+A limit is passed if the value is beyond it with a probability of 97.5 %: if the whole 95 % interval is. A level is left
+if the value is back inside with the same probability, by a share of the distance to the nominal value. An estimate that
+wanders around its limit therefore changes nothing.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from otolith.estimation.information import QUANTILE
+from otolith.health.diagnosis import Rule
+
+RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
+MACHINE = "machine"  # the part to which belongs what no part of the twin explains
+
+
+class Level(StrEnum):
+    """State of a part or of the machine."""
+
+    OK = "OK"
+    NO_DATA = "NO DATA"
+    """Nothing is known at present."""
+    WATCH = "WATCH"
+    ACT = "ACT"
+
+    @property
+    def rank(self) -> int:
+        """Position from the least severe to the most severe."""
+        return list(Level).index(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A limit of a value."""
+
+    level: Level
+    value: float
+    is_lower: bool
+    """Whether values below it are beyond it."""
+
+    @property
+    def side(self) -> str:
+        """On which side of the nominal value it is."""
+        return "below" if self.is_lower else "above"
+
+    def excess(self, value: float) -> float:
+        """Return how far ``value`` is beyond the limit; negative inside."""
+        return self.value - value if self.is_lower else value - self.value
+
+
+@dataclass(frozen=True, slots=True)
+class MonitoredQuantity:
+    """A parameter, or the components at a site: its part and its limits."""
+
+    part: str = MACHINE
+    meaning: str = ""
+    unit: str = ""
+    nominal: float = 0.0
+    limits: tuple[Limit, ...] = ()
+
+    def level(self, value: float, sd: float, before: Level) -> tuple[Level, Limit | None]:
+        """Return the level of an estimate after the level ``before``, with the limit that decides it."""
+        levels: list[tuple[Level, Limit | None]] = [(Level.OK, None)]
+        for limit in self.limits:
+            excess, reach = limit.excess(value), QUANTILE * sd
+            release = RELEASE * abs(limit.value - self.nominal)
+            stays = before.rank >= limit.level.rank and excess > -release - reach
+            if excess > reach or stays:
+                levels.append((limit.level, limit))
+        return max(levels, key=lambda item: item[0].rank)
+
+
+def probability_beyond(limit: Limit, value: float, sd: float) -> float:
+    """Return the probability that the true value is beyond ``limit``."""
+    if sd <= 0.0:
+        return float(limit.excess(value) > 0.0)
+    return 0.5 * math.erfc(-limit.excess(value) / (math.sqrt(2.0) * sd))
+
+
+@dataclass(frozen=True, slots=True)
+class MonitoringPlan:
+    """What is monitored of a machine, and the rules of the diagnosis. Plain: it pickles."""
+
+    parameters: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
+    """Of the estimated parameters."""
+    sites: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
+    """Limits are those of the amplitude of a component at the site."""
+    rules: Sequence[Rule] = ()
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts of the twin, in the order of its parameters and sites."""
+        quantities = (*self.parameters.values(), *self.sites.values())
+        return tuple(dict.fromkeys(quantity.part for quantity in quantities))

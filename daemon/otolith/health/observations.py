@@ -1,0 +1,131 @@
+"""What the report of a window shows about each condition of the machine, before any persistence."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from otolith.discovery.adopted import Approval
+from otolith.discovery.decision import WindowDecision
+from otolith.estimation.information import QUANTILE
+from otolith.health.diagnosis import Evidence, FindingKind, severity
+from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan, probability_beyond
+from otolith.health.schema import ComponentDocument, ComponentStatus, ParameterDocument, ReportDocument, Status
+from otolith.health.text import interval_text, value_text
+
+MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
+DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
+BUS, SENSORS = "bus", "sensors"  # parts that every machine has
+PARTS = {FindingKind.SENSOR: SENSORS, FindingKind.NOISE: SENSORS, FindingKind.TIMING: BUS}
+"""Of findings that are about no part of the twin."""
+NOTHING = Evidence(FindingKind.OPEN)
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a window shows about one condition."""
+
+    key: str
+    part: str
+    level: Level | None
+    """None if the window does not show it."""
+    evidence: Evidence = NOTHING
+    text: str = ""
+    condition: str = ""
+    """What it is called if no rule matches."""
+    advice: str = ""
+    """Beside that of the rules."""
+    since: float | None = None
+    """Unix seconds; None for the first window that shows it."""
+    numbers: Mapping[str, float | str] | None = None
+    """For the evidence of the event."""
+
+
+def observe(
+    plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], steps: Mapping[str, float]
+) -> list[Observation]:
+    """Return the observations of a window after the levels ``before`` and sudden changes ``steps`` of parameters."""
+    data = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.OK
+    reasons = "; ".join(report.window.quality.reasons)
+    observations = [Observation("data", BUS, data, Evidence(FindingKind.NO_DATA), reasons, "no usable data")]
+    if report.decision is WindowDecision.REFUSED:
+        evidence, text = Evidence(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
+        observations.append(Observation("unexplained", MACHINE, Level.WATCH, evidence, text, "an unknown change"))
+    for name, parameter in report.parameters.items():
+        quantity, key = plan.parameters.get(name, MonitoredQuantity()), f"limit/{name}"
+        if parameter.value is None or parameter.sd is None or parameter.status not in DETERMINED:
+            observations.append(Observation(key, quantity.part, None))
+            continue
+        level, limit = quantity.level(parameter.value, parameter.sd, before.get(key, Level.OK))
+        if limit is None:
+            observations.append(Observation(key, quantity.part, level))
+        else:
+            evidence = Evidence(
+                FindingKind.LIMIT, report.twin, name, limit.side, _manner(parameter, steps.get(name, 0.0))
+            )
+            observations.append(_beyond(name, parameter, quantity, limit, evidence))
+    observations += [_of_component(plan, report.twin, component, before) for component in report.components]
+    for finding in report.findings:
+        if finding.kind not in (FindingKind.OPEN, FindingKind.COMPONENT):
+            evidence = Evidence(finding.kind, report.twin, finding.subject)
+            level, part = Level(severity(plan.rules, evidence)), PARTS.get(finding.kind, MACHINE)
+            texts = finding.text, finding.condition, finding.advice
+            observations.append(Observation(finding.id, part, level, evidence, *texts, finding.since))
+    return observations
+
+
+def _beyond(
+    name: str, parameter: ParameterDocument, quantity: MonitoredQuantity, limit: Limit, evidence: Evidence
+) -> Observation:
+    """Return the observation of a parameter beyond a limit."""
+    value, sd, unit = parameter.value or 0.0, parameter.sd or 0.0, parameter.unit
+    change = f" ({value / parameter.nominal - 1.0:+.1%})" if parameter.nominal else ""
+    text = (
+        f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {limit.side} its limit {limit.value:.4g} {unit}"
+    )
+    condition = f"{quantity.meaning} is {limit.side} its limit"
+    numbers = _numbers(value, sd, unit, limit)
+    return Observation(f"limit/{name}", quantity.part, limit.level, evidence, text, condition, numbers=numbers)
+
+
+def _numbers(value: float, sd: float, unit: str, limit: Limit | None) -> dict[str, float | str]:
+    numbers: dict[str, float | str] = {"value": value, "sd": sd, "unit": unit}
+    if limit is None:
+        return numbers
+    return numbers | {"limit": limit.value, "probability": probability_beyond(limit, value, sd)}
+
+
+def _manner(parameter: ParameterDocument, step: float) -> str:
+    """Return how a parameter came to its deviation from the nominal value, if that is significant."""
+    deviation = (parameter.value or 0.0) - parameter.nominal
+    trend, sd = parameter.trend_per_hour or 0.0, parameter.trend_sd_per_hour or 0.0
+    if step * deviation > 0.0 and abs(step) >= MAIN_SHARE * abs(deviation):
+        return "step"
+    return "trend" if trend * deviation > 0.0 and abs(trend) > QUANTILE * sd else ""
+
+
+def _of_component(
+    plan: MonitoringPlan, twin: str, component: ComponentDocument, before: Mapping[str, Level]
+) -> Observation:
+    """Return the observation of a component; one that is expected, fades or is of the size of noise is no warning."""
+    key, amplitude, order = f"component/{component.id}", component.values["amplitude"], component.values.get("order")
+    source = component.input.partition("(")[0]
+    evidence = Evidence(
+        FindingKind.COMPONENT,
+        twin,
+        component.site,
+        family=component.family,
+        input=source,
+        order=order.value if order else None,
+    )
+    quantity = plan.sites.get(component.site, MonitoredQuantity())
+    size, limit, level = abs(amplitude.value), None, Level.OK
+    is_expected = component.approval is Approval.APPROVED or component.status is ComponentStatus.FADING
+    if quantity.limits and amplitude.unit == quantity.unit and not is_expected:
+        level, limit = quantity.level(size, amplitude.sd, before.get(key, Level.OK))
+    elif size > QUANTILE * amplitude.sd and not is_expected:
+        level = Level(severity(plan.rules, evidence))
+    interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
+    text = f"new {component.meaning} {component.equation}, amplitude {interval}"
+    numbers = _numbers(size, amplitude.sd, amplitude.unit, limit)
+    return Observation(
+        key, quantity.part, level, evidence, text, component.conditions, since=component.onset, numbers=numbers
+    )

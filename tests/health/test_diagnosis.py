@@ -1,0 +1,103 @@
+"""The rules of the diagnosis: one contract over each row, and classes where the data do not distinguish."""
+
+import pytest
+
+from otolith.health.diagnosis import Evidence, FindingKind, Rule, diagnose, matching, severity
+from otolith.machine import find_twin, library_twins, load_rules
+from otolith.twin.component_families import FAMILY_NAMES
+
+RULES = load_rules()
+TWINS = {name: find_twin(name) for name in library_twins()}
+PARAMETERS = {parameter.name for twin in TWINS.values() for parameter in twin.parameters}
+SITES = {site.name for twin in TWINS.values() for site in twin.sites}
+
+
+def example(rule: Rule) -> Evidence:
+    """Return a finding that the row must match, and no row that rests on more evidence."""
+    first = {
+        key: next(iter(getattr(rule, key)), "") for key in ("twin", "subject", "side", "manner", "family", "input")
+    }
+    return Evidence(rule.finding, **first, order=None if rule.order is None else sum(rule.order) / 2.0)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: f"{rule.finding}: {rule.condition}")
+def test_every_rule_is_given_where_it_applies(rule: Rule) -> None:
+    evidence = example(rule)
+    assert rule in matching(RULES, evidence)
+    diagnosis = diagnose(RULES, evidence)
+    assert rule.condition in diagnosis["condition"]
+    assert rule.advice in diagnosis["advice"]
+    assert rule.source in diagnosis["source"]
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: f"{rule.finding}: {rule.condition}")
+def test_every_rule_names_what_exists(rule: Rule) -> None:
+    assert set(rule.twin) <= set(TWINS)
+    assert set(rule.subject) <= (PARAMETERS if rule.finding is FindingKind.LIMIT else SITES)
+    assert set(rule.family) <= set(FAMILY_NAMES)
+    assert set(rule.input) <= {"t", "angle"}
+    for text in (rule.condition, rule.cause, rule.advice, rule.source):
+        assert text == text.strip()
+        assert text
+
+
+def test_every_kind_of_event_has_a_rule() -> None:
+    for kind in set(FindingKind) - {FindingKind.OPEN, FindingKind.COMPONENT}:
+        assert matching(RULES, Evidence(kind))
+    assert all(matching(RULES, Evidence(FindingKind.COMPONENT, family=family)) for family in FAMILY_NAMES)
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_every_parameter_with_limits_and_every_site_belongs_to_a_part(name: str) -> None:
+    for parameter in TWINS[name].parameters:
+        assert parameter.part or not (parameter.watch or parameter.act)
+    assert all(site.part for site in TWINS[name].sites)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "condition"),
+    [
+        (
+            Evidence(FindingKind.LIMIT, "dc_motor", "R_a", "below", "trend"),
+            "short circuit between turns of the winding",
+        ),
+        (Evidence(FindingKind.LIMIT, "dc_motor", "K_e", "below"), "the magnetic field of the motor is weaker"),
+        (
+            Evidence(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=1.0),
+            "unbalanced shaft",
+        ),
+        (
+            Evidence(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=2.0),
+            "shaft misalignment",
+        ),
+        (
+            Evidence(FindingKind.COMPONENT, "hydraulic_actuator", "pressure", family="constant"),
+            "a leak of the hydraulic circuit",
+        ),
+        (Evidence(FindingKind.LIMIT, "pump", "h_0", "below", "trend"), "the pump builds up less head"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_the_faults_of_the_paper_have_their_condition(evidence: Evidence, condition: str) -> None:
+    assert diagnose(RULES, evidence)["condition"] == condition
+
+
+def test_conditions_that_the_data_do_not_distinguish_are_one_class() -> None:
+    constant = Evidence(FindingKind.COMPONENT, "dc_motor", "shaft", family="constant")
+    diagnosis = diagnose(RULES, constant)
+    assert diagnosis["condition"] == "a constant torque on the shaft or an offset of the load sensor"
+    assert "without load" in diagnosis["advice"]
+    hot = diagnose(RULES, Evidence(FindingKind.LIMIT, "dc_motor", "R_a", "above", "trend"))
+    assert "hotter" in hot["condition"]
+    assert "contact" in hot["condition"]
+
+
+def test_a_class_calls_for_action_only_if_each_member_does() -> None:
+    rows = [
+        Rule(finding=FindingKind.SENSOR, condition=level, cause="c", advice="a", severity=level, source="s")
+        for level in ("ACT", "WATCH")
+    ]
+    evidence = Evidence(FindingKind.SENSOR)
+    assert severity(rows, evidence) == "WATCH"
+    assert severity(rows[:1], evidence) == "ACT"
+    assert severity((), evidence) == "WATCH"

@@ -1,0 +1,277 @@
+"""States and events: from intervals, with hysteresis and persistence, each event raised once and cleared once."""
+
+import pickle
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from otolith.acquisition.window import Verdict
+from otolith.discovery.adopted import Approval
+from otolith.discovery.decision import WindowDecision
+from otolith.health.diagnosis import FindingKind
+from otolith.health.events import PERSISTENT_WINDOWS, HealthState, assess
+from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity, MonitoringPlan
+from otolith.health.schema import (
+    ComponentDocument,
+    ComponentStatus,
+    EventChange,
+    EventDocument,
+    FindingDocument,
+    NumberDocument,
+    ParameterDocument,
+    QualityDocument,
+    ReportDocument,
+    Severity,
+    Status,
+    WindowDocument,
+)
+from otolith.machine import load_rules
+
+NOMINAL, WATCH, ACT = 6.5, 6.3, 6.0  # ohm
+LENGTH = 2.0  # s
+RESISTANCE = MonitoredQuantity(
+    "winding",
+    "armature resistance",
+    "ohm",
+    NOMINAL,
+    (Limit(Level.WATCH, WATCH, True), Limit(Level.ACT, ACT, True), Limit(Level.ACT, 8.0, False)),
+)
+SHAFT = MonitoredQuantity("shaft", "torque on the shaft", "N*m", 0.0, (Limit(Level.ACT, 0.004, False),))
+PLAN = MonitoringPlan({"R_a": RESISTANCE}, {"shaft": SHAFT}, load_rules())
+
+
+def report(
+    index: int,
+    value: float | None = NOMINAL,
+    sd: float = 0.01,
+    *,
+    decision: WindowDecision = WindowDecision.LEARNED,
+    status: Status = Status.ESTIMATED,
+    findings: tuple[FindingDocument, ...] = (),
+    components: tuple[ComponentDocument, ...] = (),
+) -> ReportDocument:
+    quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
+    window = WindowDocument(index=index, start=LENGTH * index, end=LENGTH * (index + 1), records=200, quality=quality)
+    parameter = ParameterDocument(
+        value=value, sd=None if value is None else sd, unit="ohm", nominal=NOMINAL, status=status
+    )
+    return ReportDocument(
+        machine="m",
+        site="s",
+        twin="dc_motor",
+        window=window,
+        decision=decision,
+        parameters={"R_a": parameter},
+        findings=findings,
+        components=components,
+    )
+
+
+def assessed(reports: Iterable[ReportDocument], state: HealthState | None = None) -> list[ReportDocument]:
+    """Assess one report after the other; the state is sent to another process between them."""
+    state, documents = state or HealthState(), []
+    for document in reports:
+        state, after = assess(PLAN, pickle.loads(pickle.dumps(state)), document)  # noqa: S301 - our own state
+        documents.append(ReportDocument.from_json(after.to_json()))
+    return documents
+
+
+def changes(documents: Iterable[ReportDocument]) -> list[tuple[int, EventChange, Level]]:
+    return [
+        (document.window.index, event.change, event.state)
+        for document in documents
+        for event in document.events
+        if event.change is not None
+    ]
+
+
+def events(document: ReportDocument) -> dict[str, EventDocument]:
+    return {event.part: event for event in document.events}
+
+
+def state_of(document: ReportDocument, part: str) -> Level:
+    assert document.health is not None
+    return document.health.parts[part].state
+
+
+def test_a_healthy_machine_has_no_event() -> None:
+    """Three thousand windows of an estimate whose truth is nominal, with the limit four standard deviations away."""
+    random = np.random.default_rng(16)
+    sd = (NOMINAL - WATCH) / 4.0
+    documents = assessed(report(index, NOMINAL + sd * random.standard_normal(), sd) for index in range(3000))
+    assert changes(documents) == []
+    assert {state_of(document, "winding") for document in documents} == {Level.OK}
+    assert documents[-1].health is not None
+    assert documents[-1].health.state is Level.OK
+    assert documents[-1].health.since == 0.0
+
+
+@pytest.mark.parametrize(("sd", "expected"), [(0.05, True), (0.052, False)])
+def test_act_needs_a_probability_of_97_5_percent(sd: float, expected: bool) -> None:
+    """The value is 0.1 ohm beyond the limit: 1.96 standard deviations are the bound."""
+    documents = assessed(report(index, ACT - 0.1, sd) for index in range(5))
+    assert (state_of(documents[-1], "winding") is Level.ACT) == expected
+    if expected:
+        probability = events(documents[-1])["winding"].evidence.probability
+        assert probability == pytest.approx(0.97725, abs=1e-4)
+
+
+def test_an_event_is_raised_changed_and_cleared_once() -> None:
+    values = [*np.linspace(6.5, 5.8, 60), *[5.8] * 10, *np.linspace(5.8, 6.5, 60), *[6.5] * 5]
+    documents = assessed(report(index, float(value)) for index, value in enumerate(values))
+    assert [item[1:] for item in changes(documents)] == [
+        (EventChange.RAISED, Level.WATCH),
+        (EventChange.CHANGED, Level.ACT),
+        (EventChange.CHANGED, Level.WATCH),
+        (EventChange.CLEARED, Level.WATCH),
+    ]
+    assert len({event.id for document in documents for event in document.events}) == 1
+    cleared = next(event for document in documents for event in document.events if event.end is not None)
+    assert cleared.start < cleared.since < cleared.end  # type: ignore[operator]  # it has an end
+    assert documents[-1].events == ()
+    assert state_of(documents[-1], "winding") is Level.OK
+
+
+def test_a_state_begins_with_the_first_window_that_showed_it() -> None:
+    documents = assessed(report(index, 6.5 if index < 10 else 5.8) for index in range(20))
+    assert changes(documents) == [(10 + PERSISTENT_WINDOWS - 1, EventChange.RAISED, Level.ACT)]
+    event = events(documents[-1])["winding"]
+    assert event.since == event.start == 10 * LENGTH
+    assert event.evidence.windows == (10, 19)
+    assert documents[-1].health is not None
+    assert documents[-1].health.parts["winding"].since == documents[-1].health.since == 10 * LENGTH
+
+
+def test_fewer_windows_than_must_agree_change_nothing() -> None:
+    beyond = {10, 11, 14, 20, 21}
+    documents = assessed(report(index, 5.8 if index in beyond else 6.5) for index in range(30))
+    assert changes(documents) == []
+
+
+def test_a_value_that_wanders_around_its_limit_is_one_event() -> None:
+    """Hysteresis: 97.5 % on either side, and a tenth of the distance to the nominal value."""
+    random = np.random.default_rng(3)
+    values = ACT + 0.5 * RELEASE * (NOMINAL - ACT) * np.sign(random.standard_normal(500))
+    documents = assessed(report(index, float(value), 0.002) for index, value in enumerate(values))
+    raised = [item for item in changes(documents) if item[2] is Level.ACT]
+    assert len(raised) == 1
+    assert state_of(documents[-1], "winding") is Level.ACT
+
+
+@pytest.mark.parametrize("status", [Status.HELD, Status.INVALID])
+def test_a_window_that_determines_nothing_leaves_the_state(status: Status) -> None:
+    raised = [report(index, 5.8) for index in range(5)]
+    silent = [report(index, 6.5, status=status) for index in range(5, 15)]
+    assert len(changes(assessed([*raised, *silent]))) == 1
+    assert changes(assessed(report(index, 5.8, status=status) for index in range(10))) == []
+
+
+def test_a_part_without_a_value_has_no_data() -> None:
+    documents = assessed(report(index, None, status=Status.UNESTIMATED) for index in range(3))
+    assert state_of(documents[-1], "winding") is Level.NO_DATA
+    assert documents[-1].health is not None
+    assert documents[-1].health.state is Level.NO_DATA
+    assert documents[-1].health.parts["winding"].reason == "not determined yet: R_a"
+
+
+def test_bad_windows_are_no_data_and_hide_no_fault() -> None:
+    raised = [report(index, 5.8) for index in range(5)]
+    bad = [report(index, 5.8, decision=WindowDecision.BAD, status=Status.HELD) for index in range(5, 12)]
+    documents = assessed([*raised, *bad, *[report(index, 5.8) for index in range(12, 20)]])
+    assert [item[0] for item in changes(documents)] == [2, 7, 14]
+    during = documents[11]
+    assert (state_of(during, "bus"), state_of(during, "winding")) == (Level.NO_DATA, Level.ACT)
+    assert state_of(during, "shaft") is Level.NO_DATA
+    assert during.health is not None
+    assert during.health.state is Level.ACT
+    assert state_of(documents[-1], "bus") is Level.OK
+
+
+def finding(kind: FindingKind, subject: str) -> FindingDocument:
+    return FindingDocument(
+        id=f"{kind}/{subject}",
+        kind=kind,
+        subject=subject,
+        severity=Severity.FAULT,
+        condition="c",
+        text="i is frozen",
+        since=20.0,
+    )
+
+
+def test_a_frozen_sensor_is_an_event() -> None:
+    frozen = finding(FindingKind.SENSOR, "i")
+    wrong = [
+        report(index, status=Status.HELD, decision=WindowDecision.SENSOR, findings=(frozen,)) for index in range(10, 20)
+    ]
+    healthy = [report(index) for index in range(10)], [report(index) for index in range(20, 30)]
+    documents = assessed([*healthy[0], *wrong, *healthy[1]])
+    assert [item[1] for item in changes(documents)] == [EventChange.RAISED, EventChange.CLEARED]
+    event = events(documents[15])["sensors"]
+    assert (event.start, event.text) == (20.0, "i is frozen")
+    assert event.advice
+    assert state_of(documents[-1], "sensors") is Level.OK
+
+
+def unbalance(
+    amplitude: float, status: ComponentStatus = ComponentStatus.ADOPTED, approval: Approval = Approval.OPEN
+) -> ComponentDocument:
+    numbers = {"amplitude": (amplitude, 1e-5, "N*m"), "order": (1.0, 1e-4, "1"), "phase": (0.3, 0.01, "rad")}
+    return ComponentDocument(
+        id="shaft/periodic/angle(omega)",
+        site="shaft",
+        meaning="torque on the shaft",
+        mode="additive",
+        family="periodic",
+        input="angle(omega)",
+        equation="4.7e-3·sin(1·θ)",
+        values={
+            name: NumberDocument(value=value, sd=sd, low=value - 2 * sd, high=value + 2 * sd, unit=unit)
+            for name, (value, sd, unit) in numbers.items()
+        },
+        conditions="unbalanced shaft",
+        domain="",
+        status=status,
+        approval=approval,
+        probability=0.99,
+        onset=7.0,
+    )
+
+
+def test_a_component_beyond_its_limit_is_an_event_since_its_onset() -> None:
+    documents = assessed(report(index, components=(unbalance(0.005),)) for index in range(10, 20))
+    assert changes(documents) == [(12, EventChange.RAISED, Level.ACT)]
+    event = events(documents[-1])["shaft"]
+    assert event.start == 7.0
+    assert "unbalance" in event.condition
+    assert event.evidence.limit == 0.004
+
+
+@pytest.mark.parametrize(
+    "component",
+    [
+        unbalance(0.003),
+        unbalance(0.005, ComponentStatus.FADING),
+        unbalance(0.005, approval=Approval.APPROVED),
+    ],
+    ids=["small", "fading", "approved"],
+)
+def test_a_component_that_is_small_fades_or_is_approved_is_no_event(component: ComponentDocument) -> None:
+    assert changes(assessed(report(index, components=(component,)) for index in range(20))) == []
+
+
+def test_a_component_that_fades_clears_its_event() -> None:
+    present = [report(index, components=(unbalance(0.005),)) for index in range(6)]
+    fading = [report(index, components=(unbalance(0.001, ComponentStatus.FADING),)) for index in range(6, 9)]
+    documents = assessed([*present, *fading, *[report(index) for index in range(9, 12)]])
+    assert [item[1] for item in changes(documents)] == [EventChange.RAISED, EventChange.CLEARED]
+
+
+def test_a_sudden_change_is_told_from_a_slow_one_by_the_values() -> None:
+    """The same limit, passed in one step or slowly: the diagnosis may differ, the event is the same."""
+    step = [report(index) for index in range(5)]
+    step += [report(5, 5.8, decision=WindowDecision.STEPPED), *[report(index, 5.8) for index in range(6, 12)]]
+    slow = [report(index, max(6.5 - 0.02 * index, 5.8)) for index in range(60)]
+    texts = {events(assessed(reports)[-1])["winding"].cause for reports in (step, slow)}
+    assert len(texts) == 2
