@@ -5,17 +5,23 @@ import pytest
 from otolith.acquisition.window import Verdict
 from otolith.discovery.decision import WindowDecision
 from otolith.health.diagnosis import FindingKind
+from otolith.health.limits import Level
 from otolith.health.schema import (
     DriverDocument,
+    EventChange,
+    EventDocument,
+    EvidenceDocument,
     FindingDocument,
+    HealthDocument,
     ParameterDocument,
+    PartDocument,
     QualityDocument,
     ReportDocument,
     Severity,
     Status,
     WindowDocument,
 )
-from otolith.health.text import finding_text, summary, value_cells, value_text
+from otolith.health.text import announcements, event_text, finding_text, headline, summary, value_cells, value_text
 
 ESTIMATED = ParameterDocument(value=5.98561, sd=0.00382, unit="ohm", nominal=6.5, status=Status.ESTIMATED)
 UNKNOWN = ParameterDocument(unit="ohm", nominal=6.5, status=Status.UNESTIMATED, reason="no current")
@@ -66,3 +72,55 @@ def test_summary_is_one_line_with_reasons_and_warnings() -> None:
         "window 3 good, R_a 5.9856 ohm ± 0.0075, L_a unknown (unestimated: no current), fault: a leak Close it., "
         "no connection: unplugged, slow, and 2 more warnings"
     )
+
+
+EVENT = EventDocument(
+    id="limit/R_a@54.0",
+    part="winding",
+    state=Level.ACT,
+    change=EventChange.RAISED,
+    start=54.0,
+    since=74.0,
+    condition="short circuit between turns",
+    text="R_a is 5.9 ohm",
+    advice="plan a replacement",
+    evidence=EvidenceDocument(windows=(27, 39), probability=0.984),
+)
+
+
+def test_an_event_is_one_sentence_with_state_begin_certainty_and_advice() -> None:
+    assert event_text(EVENT) == (
+        "ACT: winding: short circuit between turns since t = 74 s: R_a is 5.9 ohm (with 98.4 % probability); "
+        "plan a replacement"
+    )
+    certain = EVENT.model_copy(update={"evidence": EvidenceDocument(windows=(27, 39), probability=1.0)})
+    assert "with over 99.9 % probability" in event_text(certain)
+
+
+def test_a_cleared_event_has_begin_and_end() -> None:
+    cleared = EVENT.model_copy(update={"change": EventChange.CLEARED, "end": 90.0})
+    assert event_text(cleared) == "cleared: winding: short circuit between turns, from t = 54 s to t = 90 s"
+
+
+def test_the_headline_names_the_parts_in_the_state_of_the_machine() -> None:
+    parts = {
+        "winding": PartDocument(state=Level.ACT, since=74.0, reason="short circuit between turns"),
+        "shaft": PartDocument(state=Level.OK, since=0.0),
+    }
+    health = HealthDocument(state=Level.ACT, since=74.0, parts=parts)
+    assert headline(health) == "ACT since t = 74 s: winding: short circuit between turns"
+    assert headline(HealthDocument(state=Level.OK, since=0.0, parts=parts)) == "OK since t = 0 s"
+
+
+def test_only_a_change_is_announced() -> None:
+    quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
+    report = ReportDocument(
+        machine="m",
+        site="s",
+        twin="dc_motor",
+        window=WindowDocument(index=3, start=1.0, end=3.0, records=200, quality=quality),
+        decision=WindowDecision.LEARNED,
+        parameters={},
+        events=(EVENT, EVENT.model_copy(update={"change": None})),
+    )
+    assert announcements(report) == [EVENT]

@@ -88,6 +88,9 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     for free in problem.free:
         bounds = f"from {free.low:g} to {free.high:g} {free.unit}, starting at {free.nominal:g} {free.unit}"
         lines.append(f"estimated: {free.name} {bounds} ({free.meaning}){_origin(free.name, file.parameters)}")
+        lines += [f"limits of {free.name}: {text}" for text in [machine.plan.parameters[free.name].limits_text] if text]
+    for name, site in machine.plan.sites.items():
+        lines += [f"limits of components at {name}: {site.limits_text}"] if site.limits else []
     for output, noise in zip(twin.outputs, problem.noise, strict=True):
         lines.append(f"noise of {output.name}: {noise:g} {output.unit}{_origin(output.name, file.noise)}")
     for driving, noise in zip(twin.inputs, problem.input_noise, strict=True):

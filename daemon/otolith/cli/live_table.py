@@ -11,8 +11,10 @@ from rich.text import Text
 
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import local_time
+from otolith.health.diagnosis import FindingKind
+from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, ParameterDocument, ReportDocument, Status
-from otolith.health.text import interval_text, value_cells
+from otolith.health.text import event_text, headline, interval_text, value_cells
 
 HISTORY = 200  # windows that the curve of a parameter can show
 OTHER_COLUMNS = 72  # characters that the table needs beside the curve
@@ -25,6 +27,7 @@ STYLES = {
     Status.INVALID: "red",
     Status.UNESTIMATED: "dim",
 }
+LEVEL_STYLES = {Level.OK: "bold green", Level.NO_DATA: "bold dim", Level.WATCH: "bold yellow", Level.ACT: "bold red"}
 VALUE_COLUMNS = ("parameter", "value", "± 95 %", "unit", "change")
 RIGHT = {"value", "± 95 %", "change"}
 
@@ -67,7 +70,11 @@ class LiveTable:
             histories = {name: tuple(values) for name, values in self._histories.items()}
         if document is None:
             return Text(self._state(), style="dim")
-        parts: list[RenderableType] = [*_title_lines(document), _parameters(document.parameters, histories, width)]
+        parts: list[RenderableType] = [
+            *state_lines(document),
+            *_title_lines(document),
+            _parameters(document.parameters, histories, width),
+        ]
         parts += [_components(document)] if document.components else []
         parts += [*_messages(document), *_counters(document)]
         if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
@@ -81,6 +88,19 @@ def title(document: ReportDocument, rest: str = "") -> Text:
     """The machine of a report, its site, twin and model."""
     text = f" at {document.site}, twin {document.twin} ({document.model}){rest}"
     return Text.assemble((document.machine, "bold"), text)
+
+
+def state_lines(document: ReportDocument) -> list[Text]:
+    """State of the machine, then its parts, then the events that are not cleared."""
+    health = document.health
+    if health is None:
+        return []
+    parts = Text()
+    for name, part in health.parts.items():
+        parts.append(f"{name} ").append(part.state, style=LEVEL_STYLES[part.state]).append("  ")
+    current = [event for event in document.events if event.end is None]
+    events = [Text(event_text(event, local_time), style=LEVEL_STYLES[event.state]) for event in current]
+    return [Text(headline(health, local_time), style=LEVEL_STYLES[health.state]), parts, *events]
 
 
 def parameter_table(*columns: str) -> Table:
@@ -126,7 +146,7 @@ def _components(document: ReportDocument) -> Table:
 
 
 def _messages(document: ReportDocument) -> list[Text]:
-    """Reasons, advice, findings, and how well the twin explains the window."""
+    """Reasons, advice, open tests, and how well the twin explains the window."""
     bad = document.window.quality.reasons
     lines = [Text(f"bad window: {reason}", style="red") for reason in bad]
     for name, parameter in document.parameters.items():
@@ -134,8 +154,8 @@ def _messages(document: ReportDocument) -> list[Text]:
             lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
         if parameter.advice:
             lines.append(Text(f"{name}: {parameter.advice}", style="cyan"))
-    for finding in document.findings:
-        lines.append(Text(f"{finding.severity}: {finding.text}", style="bold red"))
+    for finding in (finding for finding in document.findings if finding.kind is FindingKind.OPEN):
+        lines.append(Text(f"not yet decided: {finding.text}", style="magenta"))
         if finding.advice:
             lines.append(Text(f"  {finding.advice}", style="cyan"))
     if document.fit is not None:

@@ -14,10 +14,11 @@ from rich.text import Text
 
 from otolith.acquisition.quality import ReasonCounts, time_text
 from otolith.cli.common import echo_warnings, progress_line
-from otolith.cli.live_table import STYLES, parameter_table, title
+from otolith.cli.live_table import LEVEL_STYLES, STYLES, parameter_table, title
 from otolith.discovery.decision import WindowDecision
-from otolith.health.schema import ReportDocument, Status
-from otolith.health.text import component_text, finding_text, value_cells
+from otolith.health.diagnosis import FindingKind
+from otolith.health.schema import EventDocument, ReportDocument, Status
+from otolith.health.text import component_text, event_text, finding_text, headline, value_cells
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import computing_time_text, preview_recording, short_lines
 from otolith.runtime.replay import RealTimePacer, Replay, ReplayRecorder, open_recordings
@@ -38,6 +39,7 @@ class ReplaySummary:
         self._statuses: Counter[tuple[str, Status]] = Counter()
         self._seconds: list[float] = []
         self._reasons = ReasonCounts()
+        self._events: dict[str, EventDocument] = {}
 
     def add(self, document: ReportDocument) -> None:
         """Count one report."""
@@ -50,6 +52,7 @@ class ReplaySummary:
             self._fitted += 1
             self._explained += document.fit.explained
         self._statuses.update((name, parameter.status) for name, parameter in document.parameters.items())
+        self._events |= {event.id: event for event in document.events}
         self._reasons.add(document.window.index, document.window.quality.reasons)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -59,6 +62,8 @@ class ReplaySummary:
             yield Text("no window")
             return
         last = self._last
+        if last.health is not None:
+            yield Text(headline(last.health), style=LEVEL_STYLES[last.health.state])
         yield title(last, f", from {time_text(self._first.window.start)} to {time_text(last.window.end)}")
         yield self._parameters(last)
         for name, parameter in last.parameters.items():
@@ -66,10 +71,11 @@ class ReplaySummary:
                 yield Text(f"{name} in the last window: {parameter.reason}", style="yellow")
         for component in last.components:
             yield Text(f"{component_text(component)}, since {time_text(component.onset)}", style="bold red")
-        shown = {component.id for component in last.components}
+        for event in self._events.values():
+            yield Text(event_text(event), style=LEVEL_STYLES[event.state])
         for finding in last.findings:
-            if finding.id not in shown:
-                yield Text(finding_text(finding), style="red")
+            if finding.kind is FindingKind.OPEN:
+                yield Text(finding_text(finding), style="magenta")
         yield from self._counts()
 
     def _parameters(self, last: ReportDocument) -> Table:

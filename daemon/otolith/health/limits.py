@@ -61,6 +61,12 @@ class MonitoredQuantity:
     nominal: float = 0.0
     limits: tuple[Limit, ...] = ()
 
+    @property
+    def limits_text(self) -> str:
+        """The limits in words; empty without one."""
+        texts = (f"{item.level} {item.side} {item.value:.5g} {self.unit}" for item in self.limits)
+        return ", ".join(texts)
+
     def level(self, value: float, sd: float, before: Level) -> tuple[Level, Limit | None]:
         """Return the level of an estimate after the level ``before``, with the limit that decides it."""
         levels: list[tuple[Level, Limit | None]] = [(Level.OK, None)]

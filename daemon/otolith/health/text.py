@@ -1,7 +1,19 @@
 """A report in words. Every text that shows a value, a component or a finding to a person is made here."""
 
+from collections.abc import Callable
+
+from otolith.acquisition.quality import time_text
 from otolith.estimation.information import QUANTILE
-from otolith.health.schema import ComponentDocument, FindingDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.schema import (
+    ComponentDocument,
+    EventChange,
+    EventDocument,
+    FindingDocument,
+    HealthDocument,
+    ParameterDocument,
+    ReportDocument,
+    Status,
+)
 
 UNKNOWN = "unknown"
 
@@ -50,9 +62,33 @@ def finding_text(finding: FindingDocument) -> str:
     return " ".join(filter(None, [f"{finding.severity}: {finding.text}", finding.advice]))
 
 
+def event_text(event: EventDocument, when: Callable[[float], str] = time_text) -> str:
+    """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text."""
+    if event.change is EventChange.CLEARED or event.end is not None:
+        return f"cleared: {event.part}: {event.condition}, from {when(event.start)} to {when(event.end or 0.0)}"
+    certainty = event.evidence.probability
+    share = "over 99.9" if certainty is not None and certainty > 0.999 else f"{100.0 * (certainty or 0.0):.3g}"
+    sure = "" if certainty is None else f" (with {share} % probability)"
+    advice = f"; {event.advice}" if event.advice else ""
+    return f"{event.state}: {event.part}: {event.condition} since {when(event.since)}: {event.text}{sure}{advice}"
+
+
+def announcements(document: ReportDocument) -> list[EventDocument]:
+    """The events that the window raised, changed or cleared."""
+    return [event for event in document.events if event.change is not None]
+
+
+def headline(health: HealthDocument, when: Callable[[float], str] = time_text) -> str:
+    """State of the machine, since when, and which parts are in it and why."""
+    reasons = {name: part.reason for name, part in health.parts.items() if part.state is health.state and part.reason}
+    why = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+    return f"{health.state} since {when(health.since)}" + (f": {why}" if why else "")
+
+
 def summary(document: ReportDocument) -> str:
-    """A report in one line: window, parameters, findings, and the first warning of the driver."""
-    parts = [f"window {document.window.index} {document.window.quality.verdict}"]
+    """A report in one line: state, window, parameters, findings, and the first warning of the driver."""
+    parts: list[str] = [] if document.health is None else [document.health.state]
+    parts += [f"window {document.window.index} {document.window.quality.verdict}"]
     parts += [parameter_text(name, parameter) for name, parameter in document.parameters.items()]
     parts += [finding_text(finding) for finding in document.findings]
     if (driver := document.driver) is not None:

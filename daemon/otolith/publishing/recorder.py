@@ -20,7 +20,9 @@ import rerun.blueprint as rrb
 
 from otolith.acquisition.window import Array, Verdict
 from otolith.estimation.information import QUANTILE
+from otolith.health.limits import Level
 from otolith.health.schema import Report, ReportDocument, Status
+from otolith.health.text import announcements, event_text, headline
 from otolith.machine import RecordedMachine
 from otolith.twin.definition import Definition, Parameter
 
@@ -130,15 +132,23 @@ def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
     for name, parameter in document.parameters.items():
         if parameter.status is not Status.ESTIMATED and not reasons:
             yield f"{name} {parameter.status}: {parameter.reason}", "INFO"
-    for finding in document.findings:
-        yield finding.text + (f" ({finding.advice})" if finding.advice else ""), "WARN"
+    for event in announcements(document):
+        yield event_text(event), "ERROR" if event.state is Level.ACT and event.end is None else "WARN"
     if document.fit is not None and not document.fit.explained:
         yield "the twin does not explain the window up to the noise", "INFO"
 
 
 def _table(document: ReportDocument) -> str:
     """Return the report as a Markdown table."""
-    rows = [f"# {document.machine} at {document.site}", "", "| parameter | value | status |", "|---|---|---|"]
+    state = [headline(document.health)] if document.health is not None else []
+    rows = [
+        f"# {document.machine} at {document.site}",
+        "",
+        *state,
+        "",
+        "| parameter | value | status |",
+        "|---|---|---|",
+    ]
     for name, parameter in document.parameters.items():
         value = "unknown"
         if parameter.value is not None and parameter.sd is not None:
@@ -147,7 +157,7 @@ def _table(document: ReportDocument) -> str:
     if document.components:
         rows += ["", "| component | equation | status |", "|---|---|---|"]
         rows += [f"| {row.meaning} | {row.equation} | {row.status} {row.approval} |" for row in document.components]
-    rows += [f"\n**{finding.severity}**: {finding.text} {finding.advice}" for finding in document.findings]
+    rows += [f"\n{event_text(event)}" for event in document.events if event.end is None]
     return "\n".join(rows)
 
 

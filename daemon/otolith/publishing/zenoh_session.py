@@ -11,6 +11,8 @@ from typing import Self
 import zenoh
 
 from otolith.health.schema import ReportDocument
+from otolith.health.text import announcements
+from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ServiceError
 
 LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
@@ -32,10 +34,12 @@ REPORT = Topic("report")
 """JSON document ``otolith.report/1``, once per window; a query returns the latest one."""
 PARAMETER = Topic("parameter/*")
 """JSON object, once per window: what the report says of one parameter."""
+EVENT = Topic("event")
+"""JSON object, once when a window raises, changes or clears an event."""
 ALIVE = Topic("alive")
 """Liveliness token, while the daemon runs."""
 
-TOPICS = (REPORT, PARAMETER, ALIVE)
+TOPICS = (REPORT, PARAMETER, EVENT, ALIVE)
 
 
 def prefix(site: str, machine: str) -> str:
@@ -94,15 +98,19 @@ class Publisher:
         self._token = self._session.liveliness().declare_token(ALIVE.under(site, machine))
 
     def publish(self, document: ReportDocument) -> None:
-        """Send the report, and one key per parameter; a slow subscriber never blocks."""
+        """Send the report, each parameter, and the events that it changed; a slow subscriber never blocks."""
         text = document.to_json()
         with self._lock:
             self._latest = text
         self._reports.put(text)
-        for name, parameter in document.parameters.items():
+        others: list[tuple[str, StrictModel]] = [
+            (PARAMETER.under(self._site, self._machine, name), item) for name, item in document.parameters.items()
+        ]
+        others += [(EVENT.under(self._site, self._machine), event) for event in announcements(document)]
+        for key, item in others:
             self._session.put(
-                PARAMETER.under(self._site, self._machine, name),
-                parameter.model_dump_json(exclude_none=True),
+                key,
+                item.model_dump_json(exclude_none=True),
                 encoding=zenoh.Encoding.APPLICATION_JSON,
                 congestion_control=zenoh.CongestionControl.DROP,
             )

@@ -22,8 +22,9 @@ from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
-from otolith.health.schema import CountersDocument, DriverDocument, Report
-from otolith.health.text import summary
+from otolith.health.limits import Level
+from otolith.health.schema import CountersDocument, DriverDocument, Report, ReportDocument
+from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS, ChildProcess
@@ -46,6 +47,7 @@ RECORDER_FLUSH, WRITER_FLUSH = 1.5, 0.5  # s to finish writing at the end
 STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths; the watchdog is not fed afterwards
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
+SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
 RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
 
 
@@ -79,6 +81,7 @@ class Service:
         self._stop_signal: int | None = None
         self._windows = self._windows_bad = self._recordings_dropped = self._finished = 0
         self._started_at = self._progress_at = self._fed_at = 0.0
+        self._summarised_at = -math.inf
 
     def run(self) -> int:
         """Serve until SIGTERM, SIGHUP or SIGINT, and return the number of that signal.
@@ -214,9 +217,17 @@ class Service:
         if self._machine.file.recording.enabled:
             recorded = self._recorder.alive and self._recorder.offer(Report(document, report.traces))
             self._recordings_dropped += not recorded
-        line = summary(document)
+        self._log(document, time.monotonic())
+
+    def _log(self, document: ReportDocument, now: float) -> None:
+        """Log the events that the window changed, and once per hour the window; in a terminal each window."""
+        for event in announcements(document):
+            is_fault = event.state is Level.ACT and event.end is None
+            log.log(logging.ERROR if is_fault else logging.WARNING, "%s", event_text(event))
+        line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
+        self._summarised_at = now if is_due else self._summarised_at
         self._notifier.send(f"STATUS={line}")
-        log.info("%s", line)
+        log.log(logging.INFO if is_due or sys.stderr.isatty() else logging.DEBUG, "%s", line)
 
     def _save(self, now: float) -> None:
         """Request a save if components were added or removed, or the last save is ``SAVE_INTERVAL`` ago.

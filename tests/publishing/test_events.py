@@ -1,0 +1,89 @@
+"""An event is published and logged once, when it changes, and shown as long as it is not cleared."""
+
+import logging
+import socket
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from otolith.cli.live_table import LiveTable
+from otolith.health.limits import Level
+from otolith.health.schema import EventChange, EventDocument, ReportDocument
+from otolith.machine import load_machine
+from otolith.publishing.recorder import _log_lines
+from otolith.publishing.zenoh_session import EVENT, Publisher, session
+from otolith.runtime.service import SUMMARY_INTERVAL, Service
+from tests.conftest import EXAMPLES, free_port
+from tests.health.test_events import assessed, report
+from tests.waiting import wait_for
+
+CHANGES = [EventChange.RAISED, EventChange.CHANGED, EventChange.CLEARED]
+
+
+def documents() -> list[ReportDocument]:
+    """The winding at WATCH, at ACT, and back."""
+    values = [*[6.5] * 3, *[6.2] * 6, *[5.8] * 6, *[6.5] * 6]
+    return assessed(report(index, value) for index, value in enumerate(values))
+
+
+def test_each_change_of_an_event_is_published_once() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    publisher = Publisher("here", "motor", [endpoint], [])
+    received: list[tuple[str, str]] = []
+
+    def published(document: ReportDocument, count: int) -> bool:
+        publisher.publish(document)
+        return len(received) > count
+
+    def events() -> list[EventDocument]:
+        key = EVENT.under("here", "motor")
+        return [EventDocument.model_validate_json(text) for own, text in received if own == key]
+
+    with session(connect=[endpoint]) as listener:
+        listener.declare_subscriber(
+            "otolith/**", lambda sample: received.append((str(sample.key_expr), sample.payload.to_string()))
+        )
+        wait_for(lambda: published(documents()[0], 0))  # it has no event
+        for document in documents():
+            publisher.publish(document)
+        wait_for(lambda: len(events()) >= len(CHANGES))
+        publisher.close()
+    assert [event.change for event in events()] == CHANGES
+    assert len({event.id for event in events()}) == 1
+
+
+def test_events_are_logged_once_at_their_priority(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: False)
+    service = Service(load_machine(EXAMPLES / "dc-motor-in-process.toml"))
+    with caplog.at_level(logging.DEBUG, "otolith"):
+        for index, document in enumerate(documents()):
+            service._log(document, 0.1 * SUMMARY_INTERVAL * index)
+    levels = [record.levelname for record in caplog.records if record.levelno > logging.INFO]
+    assert levels == ["WARNING", "ERROR", "WARNING"]
+    assert [record.levelname for record in caplog.records].count("INFO") == 3
+
+
+def test_the_recording_has_an_event_on_its_changes_only() -> None:
+    lines = [(text.partition(":")[0], level) for document in documents() for text, level in _log_lines(document)]
+    assert lines == [("WATCH", "WARN"), ("ACT", "ERROR"), ("cleared", "WARN")]
+
+
+def drawn(document: ReportDocument, tmp_path: Path) -> str:
+    table = LiveTable(lambda: "waiting")
+    table.add(document.to_json())
+    with (tmp_path / "table.txt").open("w", encoding="utf-8") as file:
+        Console(file=file, width=200).print(table)
+    return (tmp_path / "table.txt").read_text(encoding="utf-8")
+
+
+def test_the_live_table_begins_with_the_state(tmp_path: Path) -> None:
+    at_act = next(document for document in documents() if document.health and document.health.state is Level.ACT)
+    lines = drawn(at_act, tmp_path).splitlines()
+    assert lines[0].startswith("ACT since ")
+    assert "winding: short circuit between turns of the winding" in lines[0]
+    assert lines[1].split()[:2] == ["winding", "ACT"]
+    assert "plan a replacement of the winding" in " ".join(drawn(at_act, tmp_path).split())
+    assert drawn(documents()[0], tmp_path).startswith("OK since ")
