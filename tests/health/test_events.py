@@ -215,16 +215,20 @@ def test_a_frozen_sensor_is_an_event() -> None:
 
 
 def unbalance(
-    amplitude: float, status: ComponentStatus = ComponentStatus.ADOPTED, approval: Approval = Approval.OPEN
+    amplitude: float,
+    status: ComponentStatus = ComponentStatus.ADOPTED,
+    approval: Approval = Approval.OPEN,
+    source: str = "angle(omega)",
 ) -> ComponentDocument:
-    numbers = {"amplitude": (amplitude, 1e-5, "N*m"), "order": (1.0, 1e-4, "1"), "phase": (0.3, 0.01, "rad")}
+    inner = {"order": (1.0, 1e-4, "1")} if source == "angle(omega)" else {"frequency": (15.0, 0.1, "rad/s")}
+    numbers = {"amplitude": (amplitude, 1e-5, "N*m"), **inner, "phase": (0.3, 0.01, "rad")}
     return ComponentDocument(
-        id="shaft/periodic/angle(omega)",
+        id=f"shaft/periodic/{source}",
         site="shaft",
         meaning="torque on the shaft",
         mode="additive",
         family="periodic",
-        input="angle(omega)",
+        input=source,
         equation="4.7e-3·sin(1·θ)",
         values={
             name: NumberDocument(value=value, sd=sd, low=value - 2 * sd, high=value + 2 * sd, unit=unit)
@@ -259,6 +263,19 @@ def test_a_component_beyond_its_limit_is_an_event_since_its_onset() -> None:
 )
 def test_a_component_that_is_small_fades_or_is_approved_is_no_event(component: ComponentDocument) -> None:
     assert changes(assessed(report(index, components=(component,)) for index in range(20))) == []
+
+
+def test_a_sine_of_time_that_proves_to_be_one_of_the_angle_is_the_same_event() -> None:
+    """At a constant speed nobody can tell them apart, so the first diagnosis is a class."""
+    of_time = [report(index, components=(unbalance(0.005, source="t"),)) for index in range(8)]
+    of_angle = [report(index, components=(unbalance(0.005),)) for index in range(9, 15)]
+    documents = assessed([*of_time, report(8), *of_angle])
+    assert [item[:2] for item in changes(documents)] == [(2, EventChange.RAISED), (9, EventChange.CHANGED)]
+    first, last = events(documents[5])["shaft"], events(documents[-1])["shaft"]
+    assert first.id == last.id
+    assert first.condition == "machine unsteadiness or an unbalanced or misaligned shaft at a constant speed"
+    assert "run at another speed" in first.advice
+    assert last.condition == "unbalanced shaft"
 
 
 def test_a_component_that_fades_clears_its_event() -> None:

@@ -114,7 +114,9 @@ def _advance(
         change = EventChange.CLEARED if is_over else EventChange.CHANGED
         event = event.model_copy(update={"change": change, **changed})
     if event is not None and observed.level is not Level.OK:
-        event = event.model_copy(update=_description(plan, event, observed, report.window.index))
+        described = event.model_copy(update=_description(plan, event, observed, report.window.index))
+        is_other = event.condition not in ("", described.condition) and event.change is None
+        event = described.model_copy(update={"change": EventChange.CHANGED}) if is_other else described
     return ConditionRecord(level, recent, event)
 
 

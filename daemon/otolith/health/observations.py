@@ -62,7 +62,8 @@ def observe(
                 FindingKind.LIMIT, report.twin, name, limit.side, _manner(parameter, steps.get(name, 0.0))
             )
             observations.append(_beyond(name, parameter, quantity, limit, evidence))
-    observations += [_of_component(plan, report.twin, component, before) for component in report.components]
+    components = (_of_component(plan, report.twin, component, before) for component in report.components)
+    observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
     for finding in report.findings:
         if finding.kind not in (FindingKind.OPEN, FindingKind.COMPONENT):
             evidence = Evidence(finding.kind, report.twin, finding.subject)
@@ -105,8 +106,12 @@ def _manner(parameter: ParameterDocument, step: float) -> str:
 def _of_component(
     plan: MonitoringPlan, twin: str, component: ComponentDocument, before: Mapping[str, Level]
 ) -> Observation:
-    """Return the observation of a component; one that is expected, fades or is of the size of noise is no warning."""
-    key, amplitude, order = f"component/{component.id}", component.values["amplitude"], component.values.get("order")
+    """Return the observation of a component; one that is expected, fades or is of the size of noise is no warning.
+
+    Its key leaves its input open: at a constant speed, a sine of time may later prove to be one of the angle.
+    """
+    key, amplitude = f"component/{component.site}/{component.family}", component.values["amplitude"]
+    order = component.values.get("order")
     source = component.input.partition("(")[0]
     evidence = Evidence(
         FindingKind.COMPONENT,

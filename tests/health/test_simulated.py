@@ -1,0 +1,70 @@
+"""The example motor, simulated: no event while it is healthy, and each fault of the demo announced in words."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from otolith.acquisition.window import Window
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import initial_state
+from otolith.health.limits import Level
+from otolith.health.schema import EventChange, ReportDocument
+from otolith.health.text import announcements
+from otolith.machine import load_machine
+from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.plant.scenario import load_scenario, simulate
+from tests.conftest import EXAMPLES, SIGNALS
+
+PERIOD, RECORDS = 0.01, 200
+
+
+def reports(scenario: MotorScenario, count: int) -> list[ReportDocument]:
+    machine = load_machine(EXAMPLES / "dc-motor.toml")
+    state, documents, ticks = initial_state("m", "s", machine.problem, machine.plan), [], simulate(scenario)
+    for index in range(count):
+        rows = [[tick.measured[name] for name in SIGNALS.values()] for tick in islice(ticks, RECORDS)]
+        window = Window.whole(index, index * PERIOD * RECORDS, PERIOD, tuple(SIGNALS), np.array(rows))
+        state, report = adapt(state, window)
+        documents.append(report.document)
+    return documents
+
+
+def motor(name: str) -> MotorScenario:
+    scenario = load_scenario(EXAMPLES / "scenarios" / f"{name}.toml")
+    assert isinstance(scenario, MotorScenario)
+    return scenario
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_healthy_motor_has_no_event(seed: int) -> None:
+    documents = reports(motor("demo").model_copy(update={"faults": (), "seed": seed}), 300)
+    assert [event for document in documents for event in document.events] == []
+    assert documents[-1].health is not None
+    assert {part.state for part in documents[-1].health.parts.values()} == {Level.OK}
+
+
+def test_the_demo_announces_winding_and_shaft_once_each_state() -> None:
+    documents = reports(motor("demo"), 45)
+    announced = [event for document in documents for event in announcements(document)]
+    assert [(event.part, event.change, event.state) for event in announced] == [
+        ("winding", EventChange.RAISED, Level.WATCH),
+        ("shaft", EventChange.RAISED, Level.ACT),
+        ("winding", EventChange.CHANGED, Level.ACT),
+    ]
+    winding, shaft = announced[2], announced[1]
+    assert winding.condition == "short circuit between turns of the winding"
+    assert shaft.condition == "unbalanced shaft"
+    assert shaft.since == pytest.approx(45.0, abs=2.0)
+    assert winding.since == pytest.approx(75.0, abs=3.0)  # from then on the injected resistance is below 95 %
+    assert all(event.advice and event.source for event in announced)
+    last = documents[-1].health
+    assert last is not None
+    assert (last.state, last.parts["winding"].state, last.parts["shaft"].state) == (Level.ACT, Level.ACT, Level.ACT)
+
+
+def test_a_frozen_sensor_of_the_motor_is_one_event() -> None:
+    documents = reports(motor("sensor-frozen"), 22)
+    (event,) = [event for document in documents for event in announcements(document)]
+    assert (event.part, event.state, event.condition) == ("sensors", Level.ACT, "a sensor is wrong")
+    assert event.text.startswith("omega is frozen at ")
