@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pint
 
 MAX_LENGTH = 100  # characters of a quantity: engineering choice; bounds the time of the patterns below
-RELATIVE = re.compile(r"([+-]?)\s*(\d+\.?\d*|\.\d+)\s*%")
+RELATIVE = re.compile(r"([+-]?)\s*((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*%")
 NUMBER_AND_UNIT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*)")
 # Unit names with one small exponent each, joined by * or /. A larger exponent would keep pint busy for minutes.
 FACTOR = r"[( ]*(?:1|[^\W\d][\w°%µμΩ]*|[°º%℃℉][^\W\d]*)(?: ?(?:\^|\*\*) ?\(?-?\d(?:\.\d{1,3})?\)?)?[) ]*"

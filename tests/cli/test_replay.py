@@ -89,7 +89,7 @@ def test_reports_equal_those_of_windows_without_a_file(
     tmp_path: Path, rows: Lines, scenario: MotorScenario, capsys: pytest.CaptureFixture[str]
 ) -> None:
     machine = load_machine(MACHINE, with_driver=False)
-    state = initial_state("motor", "site", machine.problem)
+    state = initial_state("motor", "site", machine.problem, machine.plan)
     documents = reports(written(tmp_path, rows), capsys)
     assert len(documents) == 5
     with table.TableReader(tmp_path / "data.csv", {name: machine.twin.unit_of(name) for name in SIGNALS}) as opened:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from otolith.health.diagnosis import Evidence, FindingKind, Rule, diagnose, matching, severity
+from otolith.health.diagnosis import FindingFeatures, FindingKind, Rule, diagnose, matching, severity
 from otolith.machine import find_twin, library_twins, load_rules
 from otolith.twin.component_families import FAMILY_NAMES
 
@@ -12,19 +12,19 @@ PARAMETERS = {parameter.name for twin in TWINS.values() for parameter in twin.pa
 SITES = {site.name for twin in TWINS.values() for site in twin.sites}
 
 
-def example(rule: Rule) -> Evidence:
+def example(rule: Rule) -> FindingFeatures:
     """Return a finding that the row must match, and no row that rests on more evidence."""
     first = {
         key: next(iter(getattr(rule, key)), "") for key in ("twin", "subject", "side", "manner", "family", "input")
     }
-    return Evidence(rule.finding, **first, order=None if rule.order is None else sum(rule.order) / 2.0)
+    return FindingFeatures(rule.finding, **first, order=None if rule.order is None else sum(rule.order) / 2.0)
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: f"{rule.finding}: {rule.condition}")
 def test_every_rule_is_given_where_it_applies(rule: Rule) -> None:
-    evidence = example(rule)
-    assert rule in matching(RULES, evidence)
-    diagnosis = diagnose(RULES, evidence)
+    features = example(rule)
+    assert rule in matching(RULES, features)
+    diagnosis = diagnose(RULES, features)
     assert rule.condition in diagnosis["condition"]
     assert rule.advice in diagnosis["advice"]
     assert rule.source in diagnosis["source"]
@@ -43,8 +43,8 @@ def test_every_rule_names_what_exists(rule: Rule) -> None:
 
 def test_every_kind_of_event_has_a_rule() -> None:
     for kind in set(FindingKind) - {FindingKind.OPEN, FindingKind.COMPONENT}:
-        assert matching(RULES, Evidence(kind))
-    assert all(matching(RULES, Evidence(FindingKind.COMPONENT, family=family)) for family in FAMILY_NAMES)
+        assert matching(RULES, FindingFeatures(kind))
+    assert all(matching(RULES, FindingFeatures(FindingKind.COMPONENT, family=family)) for family in FAMILY_NAMES)
 
 
 @pytest.mark.parametrize("name", TWINS)
@@ -55,39 +55,43 @@ def test_every_parameter_with_limits_and_every_site_belongs_to_a_part(name: str)
 
 
 @pytest.mark.parametrize(
-    ("evidence", "condition"),
+    ("features", "condition"),
     [
         (
-            Evidence(FindingKind.LIMIT, "dc_motor", "R_a", "below", "trend"),
+            FindingFeatures(FindingKind.LIMIT, "pump", "h_0", "below", "start"),
+            "a nominal value that does not fit, or a fault that is older than the monitoring",
+        ),
+        (
+            FindingFeatures(FindingKind.LIMIT, "dc_motor", "R_a", "below", "trend"),
             "short circuit between turns of the winding",
         ),
-        (Evidence(FindingKind.LIMIT, "dc_motor", "K_e", "below"), "the magnetic field of the motor is weaker"),
+        (FindingFeatures(FindingKind.LIMIT, "dc_motor", "K_e", "below"), "the magnetic field of the motor is weaker"),
         (
-            Evidence(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=1.0),
+            FindingFeatures(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=1.0),
             "unbalanced shaft",
         ),
         (
-            Evidence(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=2.0),
+            FindingFeatures(FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=2.0),
             "shaft misalignment",
         ),
         (
-            Evidence(FindingKind.COMPONENT, "hydraulic_actuator", "pressure", family="constant"),
+            FindingFeatures(FindingKind.COMPONENT, "hydraulic_actuator", "pressure", family="constant"),
             "a leak of the hydraulic circuit",
         ),
-        (Evidence(FindingKind.LIMIT, "pump", "h_0", "below", "trend"), "the pump builds up less head"),
+        (FindingFeatures(FindingKind.LIMIT, "pump", "h_0", "below", "trend"), "the pump builds up less head"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_the_faults_of_the_paper_have_their_condition(evidence: Evidence, condition: str) -> None:
-    assert diagnose(RULES, evidence)["condition"] == condition
+def test_the_faults_of_the_paper_have_their_condition(features: FindingFeatures, condition: str) -> None:
+    assert diagnose(RULES, features)["condition"] == condition
 
 
 def test_conditions_that_the_data_do_not_distinguish_are_one_class() -> None:
-    constant = Evidence(FindingKind.COMPONENT, "dc_motor", "shaft", family="constant")
+    constant = FindingFeatures(FindingKind.COMPONENT, "dc_motor", "shaft", family="constant")
     diagnosis = diagnose(RULES, constant)
     assert diagnosis["condition"] == "a constant torque on the shaft or an offset of the load sensor"
     assert "without load" in diagnosis["advice"]
-    hot = diagnose(RULES, Evidence(FindingKind.LIMIT, "dc_motor", "R_a", "above", "trend"))
+    hot = diagnose(RULES, FindingFeatures(FindingKind.LIMIT, "dc_motor", "R_a", "above", "trend"))
     assert "hotter" in hot["condition"]
     assert "contact" in hot["condition"]
 
@@ -97,7 +101,7 @@ def test_a_class_calls_for_action_only_if_each_member_does() -> None:
         Rule(finding=FindingKind.SENSOR, condition=level, cause="c", advice="a", severity=level, source="s")
         for level in ("ACT", "WATCH")
     ]
-    evidence = Evidence(FindingKind.SENSOR)
-    assert severity(rows, evidence) == "WATCH"
-    assert severity(rows[:1], evidence) == "ACT"
-    assert severity((), evidence) == "WATCH"
+    features = FindingFeatures(FindingKind.SENSOR)
+    assert severity(rows, features) == "WATCH"
+    assert severity(rows[:1], features) == "ACT"
+    assert severity((), features) == "WATCH"

@@ -188,7 +188,7 @@ def test_bad_windows_are_no_data_and_hide_no_fault() -> None:
     assert state_of(documents[-1], "bus") is Level.OK
 
 
-def finding(kind: FindingKind, subject: str) -> FindingDocument:
+def finding(kind: FindingKind, subject: str, since: float) -> FindingDocument:
     return FindingDocument(
         id=f"{kind}/{subject}",
         kind=kind,
@@ -196,14 +196,15 @@ def finding(kind: FindingKind, subject: str) -> FindingDocument:
         severity=Severity.FAULT,
         condition="c",
         text="i is frozen",
-        since=20.0,
+        since=since,
     )
 
 
 def test_a_frozen_sensor_is_an_event() -> None:
-    frozen = finding(FindingKind.SENSOR, "i")
+    frozen = [finding(FindingKind.SENSOR, "i", index * LENGTH) for index in range(20)]  # each window has its own
     wrong = [
-        report(index, status=Status.HELD, decision=WindowDecision.SENSOR, findings=(frozen,)) for index in range(10, 20)
+        report(index, status=Status.HELD, decision=WindowDecision.SENSOR, findings=(frozen[index],))
+        for index in range(10, 20)
     ]
     healthy = [report(index) for index in range(10)], [report(index) for index in range(20, 30)]
     documents = assessed([*healthy[0], *wrong, *healthy[1]])
@@ -283,6 +284,13 @@ def test_a_component_that_fades_clears_its_event() -> None:
     fading = [report(index, components=(unbalance(0.001, ComponentStatus.FADING),)) for index in range(6, 9)]
     documents = assessed([*present, *fading, *[report(index) for index in range(9, 12)]])
     assert [item[1] for item in changes(documents)] == [EventChange.RAISED, EventChange.CLEARED]
+
+
+def test_a_value_that_never_was_inside_may_be_a_wrong_nominal_value() -> None:
+    beyond = assessed(report(index, 5.8) for index in range(5))[-1]
+    assert events(beyond)["winding"].condition.startswith("a nominal value that does not fit")
+    was_inside = assessed(report(index, 6.5 if index < 3 else 5.8) for index in range(9))[-1]
+    assert events(was_inside)["winding"].condition == "short circuit between turns of the winding"
 
 
 def test_a_sudden_change_is_told_from_a_slow_one_by_the_values() -> None:

@@ -32,7 +32,7 @@ class FindingKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class FindingFeatures:
     """What the rules look at; empty where it is not known or does not apply."""
 
     finding: FindingKind
@@ -42,7 +42,7 @@ class Evidence:
     side: str = ""
     """Of the nominal value on which a parameter is: ``below`` or ``above``."""
     manner: str = ""
-    """How a parameter came there: ``step`` or ``trend``."""
+    """How a parameter came there: by a ``step``, by a ``trend``, or it was there from the ``start``."""
     family: str = ""
     input: str = ""
     """``t``, ``angle``, or another signal or state."""
@@ -57,7 +57,7 @@ class Rule(StrictModel):
     twin: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
     side: tuple[Literal["below", "above"], ...] = ()
-    manner: tuple[Literal["step", "trend"], ...] = ()
+    manner: tuple[Literal["step", "trend", "start"], ...] = ()
     family: tuple[str, ...] = ()
     input: tuple[str, ...] = ()
     order: tuple[float, float] | None = None
@@ -74,12 +74,12 @@ class Rule(StrictModel):
         """Number of keys that a finding must agree with."""
         return sum(bool(getattr(self, key)) for key in (*KEYS, "order"))
 
-    def matches(self, evidence: Evidence) -> bool:
+    def matches(self, features: FindingFeatures) -> bool:
         """Whether the row applies."""
-        agree = all(not (own := getattr(self, key)) or getattr(evidence, key) in own for key in KEYS)
+        agree = all(not (own := getattr(self, key)) or getattr(features, key) in own for key in KEYS)
         low, high = self.order or (0.0, 0.0)
-        in_order = self.order is None or (evidence.order is not None and low <= evidence.order <= high)
-        return self.finding is evidence.finding and agree and in_order
+        in_order = self.order is None or (features.order is not None and low <= features.order <= high)
+        return self.finding is features.finding and agree and in_order
 
 
 class RulesFile(StrictModel):
@@ -88,23 +88,23 @@ class RulesFile(StrictModel):
     rule: tuple[Rule, ...]
 
 
-def matching(rules: Sequence[Rule], evidence: Evidence) -> list[Rule]:
+def matching(rules: Sequence[Rule], features: FindingFeatures) -> list[Rule]:
     """Return the rows that rest on most evidence; several if the data do not distinguish them."""
-    rows = [rule for rule in rules if rule.matches(evidence)]
+    rows = [rule for rule in rules if rule.matches(features)]
     most = max((rule.specificity for rule in rows), default=0)
     return [rule for rule in rows if rule.specificity == most]
 
 
-def diagnose(rules: Sequence[Rule], evidence: Evidence) -> dict[str, str]:
+def diagnose(rules: Sequence[Rule], features: FindingFeatures) -> dict[str, str]:
     """Return condition, cause, advice and source of the rows that match, alternatives joined; empty without one."""
-    rows = matching(rules, evidence)
+    rows = matching(rules, features)
     joints = {"condition": " or ", "cause": "; or ", "advice": "; ", "source": "; "}
     return {
         key: joint.join(dict.fromkeys(getattr(rule, key) for rule in rows)) for key, joint in joints.items() if rows
     }
 
 
-def severity(rules: Sequence[Rule], evidence: Evidence) -> Literal["WATCH", "ACT"]:
+def severity(rules: Sequence[Rule], features: FindingFeatures) -> Literal["WATCH", "ACT"]:
     """Return the level of a finding without limits: ACT if each row that matches says so."""
-    rows = matching(rules, evidence)
+    rows = matching(rules, features)
     return "ACT" if rows and all(rule.severity == "ACT" for rule in rows) else "WATCH"

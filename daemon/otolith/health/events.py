@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
-from otolith.health.diagnosis import diagnose
+from otolith.health.diagnosis import FindingKind, diagnose
 from otolith.health.limits import MACHINE, Level, MonitoringPlan
 from otolith.health.observations import BUS, SENSORS, Observation, observe
 from otolith.health.schema import (
@@ -51,6 +51,8 @@ class HealthState:
     """Of the parameters, after the last window that updated them."""
     steps: Mapping[str, float] = field(default_factory=dict)
     """Last sudden change of each parameter."""
+    inside: frozenset[str] = frozenset()
+    """Keys of conditions that were at OK in some window."""
     document: HealthDocument | None = None
     """The states in the report before."""
 
@@ -62,8 +64,11 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     absent = Level.OK if report.decision in ACCEPTED else None  # the window would have shown the condition
     observations = {key: Observation(key, MACHINE, absent) for key in state.records}
     observations |= {item.key: item for item in observe(plan, report, levels, state.steps)}
+    was_ok = {key for key, item in observations.items() if item.level is Level.OK}
     records, events = {}, []
     for key, observed in observations.items():
+        if key not in state.inside and observed.features.finding is FindingKind.LIMIT:
+            observed = replace(observed, features=replace(observed.features, manner="start"))  # noqa: PLW2901
         record = _advance(plan, state.records.get(key, ConditionRecord()), observed, report)
         if record.event is not None:
             events.append(record.event)
@@ -73,7 +78,8 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     events.sort(key=lambda event: -event.state.rank)
     document = _states(plan, state.document, report, [event for event in events if event.end is None])
     changed = {"health": document, "events": tuple(events)}
-    return replace(state, records=records, document=document), report.model_copy(update=changed)
+    state = replace(state, records=records, document=document, inside=state.inside | was_ok)
+    return state, report.model_copy(update=changed)
 
 
 def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
@@ -102,7 +108,7 @@ def _advance(
     recent = (*before.recent, (observed.level, report.window))[-PERSISTENT_WINDOWS:]
     level, first = _persistent(before.level, [item[0] for item in recent]), recent[0][1]
     if event is None and level is not Level.OK:
-        start = first.start if observed.since is None else observed.since
+        start = min(first.start, first.start if observed.since is None else observed.since)
         evidence = EvidenceDocument(windows=(first.index, report.window.index))
         event = EventDocument(
             id=f"{observed.key}@{start:.1f}", part=observed.part, state=level, change=EventChange.RAISED,
@@ -132,7 +138,7 @@ def _description(
     plan: MonitoringPlan, event: EventDocument, observed: Observation, window: int
 ) -> dict[str, str | EvidenceDocument]:
     """Return text, diagnosis and evidence of an observation that shows the condition, by the keys of the event."""
-    texts = {"condition": observed.condition, **diagnose(plan.rules, observed.evidence)}
+    texts = {"condition": observed.condition, **diagnose(plan.rules, observed.features)}
     texts["advice"] = "; ".join(filter(None, (texts.get("advice"), observed.advice)))
     numbers = {"windows": (event.evidence.windows[0], window), **(observed.numbers or {})}
     return {**texts, "text": observed.text, "evidence": event.evidence.model_copy(update=numbers)}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from otolith.discovery.adopted import Approval
 from otolith.discovery.decision import WindowDecision
 from otolith.estimation.information import QUANTILE
-from otolith.health.diagnosis import Evidence, FindingKind, severity
+from otolith.health.diagnosis import FindingFeatures, FindingKind, severity
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan, probability_beyond
 from otolith.health.schema import ComponentDocument, ComponentStatus, ParameterDocument, ReportDocument, Status
 from otolith.health.text import interval_text, value_text
@@ -16,7 +16,7 @@ DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
 BUS, SENSORS = "bus", "sensors"  # parts that every machine has
 PARTS = {FindingKind.SENSOR: SENSORS, FindingKind.NOISE: SENSORS, FindingKind.TIMING: BUS}
 """Of findings that are about no part of the twin."""
-NOTHING = Evidence(FindingKind.OPEN)
+NOTHING = FindingFeatures(FindingKind.OPEN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Observation:
     part: str
     level: Level | None
     """None if the window does not show it."""
-    evidence: Evidence = NOTHING
+    features: FindingFeatures = NOTHING
     text: str = ""
     condition: str = ""
     """What it is called if no rule matches."""
@@ -45,10 +45,10 @@ def observe(
     """Return the observations of a window after the levels ``before`` and sudden changes ``steps`` of parameters."""
     data = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.OK
     reasons = "; ".join(report.window.quality.reasons)
-    observations = [Observation("data", BUS, data, Evidence(FindingKind.NO_DATA), reasons, "no usable data")]
+    observations = [Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons, "no usable data")]
     if report.decision is WindowDecision.REFUSED:
-        evidence, text = Evidence(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
-        observations.append(Observation("unexplained", MACHINE, Level.WATCH, evidence, text, "an unknown change"))
+        features, text = FindingFeatures(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
+        observations.append(Observation("unexplained", MACHINE, Level.WATCH, features, text, "an unknown change"))
     for name, parameter in report.parameters.items():
         quantity, key = plan.parameters.get(name, MonitoredQuantity()), f"limit/{name}"
         if parameter.value is None or parameter.sd is None or parameter.status not in DETERMINED:
@@ -58,23 +58,23 @@ def observe(
         if limit is None:
             observations.append(Observation(key, quantity.part, level))
         else:
-            evidence = Evidence(
+            features = FindingFeatures(
                 FindingKind.LIMIT, report.twin, name, limit.side, _manner(parameter, steps.get(name, 0.0))
             )
-            observations.append(_beyond(name, parameter, quantity, limit, evidence))
+            observations.append(_beyond(name, parameter, quantity, limit, features))
     components = (_of_component(plan, report.twin, component, before) for component in report.components)
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
     for finding in report.findings:
         if finding.kind not in (FindingKind.OPEN, FindingKind.COMPONENT):
-            evidence = Evidence(finding.kind, report.twin, finding.subject)
-            level, part = Level(severity(plan.rules, evidence)), PARTS.get(finding.kind, MACHINE)
+            features = FindingFeatures(finding.kind, report.twin, finding.subject)
+            level, part = Level(severity(plan.rules, features)), PARTS.get(finding.kind, MACHINE)
             texts = finding.text, finding.condition, finding.advice
-            observations.append(Observation(finding.id, part, level, evidence, *texts, finding.since))
+            observations.append(Observation(finding.id, part, level, features, *texts, finding.since))
     return observations
 
 
 def _beyond(
-    name: str, parameter: ParameterDocument, quantity: MonitoredQuantity, limit: Limit, evidence: Evidence
+    name: str, parameter: ParameterDocument, quantity: MonitoredQuantity, limit: Limit, features: FindingFeatures
 ) -> Observation:
     """Return the observation of a parameter beyond a limit."""
     value, sd, unit = parameter.value or 0.0, parameter.sd or 0.0, parameter.unit
@@ -84,7 +84,7 @@ def _beyond(
     )
     condition = f"{quantity.meaning} is {limit.side} its limit"
     numbers = _numbers(value, sd, unit, limit)
-    return Observation(f"limit/{name}", quantity.part, limit.level, evidence, text, condition, numbers=numbers)
+    return Observation(f"limit/{name}", quantity.part, limit.level, features, text, condition, numbers=numbers)
 
 
 def _numbers(value: float, sd: float, unit: str, limit: Limit | None) -> dict[str, float | str]:
@@ -113,7 +113,7 @@ def _of_component(
     key, amplitude = f"component/{component.site}/{component.family}", component.values["amplitude"]
     order = component.values.get("order")
     source = component.input.partition("(")[0]
-    evidence = Evidence(
+    features = FindingFeatures(
         FindingKind.COMPONENT,
         twin,
         component.site,
@@ -127,10 +127,10 @@ def _of_component(
     if quantity.limits and amplitude.unit == quantity.unit and not is_expected:
         level, limit = quantity.level(size, amplitude.sd, before.get(key, Level.OK))
     elif size > QUANTILE * amplitude.sd and not is_expected:
-        level = Level(severity(plan.rules, evidence))
+        level = Level(severity(plan.rules, features))
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
     text = f"new {component.meaning} {component.equation}, amplitude {interval}"
     numbers = _numbers(size, amplitude.sd, amplitude.unit, limit)
     return Observation(
-        key, quantity.part, level, evidence, text, component.conditions, since=component.onset, numbers=numbers
+        key, quantity.part, level, features, text, component.conditions, since=component.onset, numbers=numbers
     )
