@@ -1,4 +1,4 @@
-"""The picture of the README: the live table of the demo after 74 s, drawn from the simulated motor.
+"""The picture of the README: the live table of the demo after 84 s, drawn from the simulated motor.
 
 python -m benchmarks.picture docs/pictures/demo.svg
 """
@@ -18,7 +18,7 @@ from otolith.cli.live_table import LiveTable
 from otolith.machine import load_machine
 from otolith_drivers.plant.scenario import load_scenario
 
-SECONDS = 74.0
+SECONDS = 84.0
 START = 1.7e9  # Unix seconds of the first record
 COLUMNS = 124
 
@@ -26,7 +26,7 @@ COLUMNS = 124
 def main(path: str) -> None:
     machine = load_machine(CONFIG / "dc-motor.toml")
     scenario = load_scenario(CONFIG / "scenarios" / "demo.toml")
-    state = initial_state(machine.file.machine.name, machine.file.machine.site, machine.problem)
+    state = initial_state(machine.file.machine.name, machine.file.machine.site, machine.problem, machine.plan)
     table = LiveTable(lambda: "")
     for window in windows(scenario, round(SECONDS / (RECORDS * scenario.sample_period))):
         state, report = adapt(state, replace(window, start=START + window.start))

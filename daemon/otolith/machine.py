@@ -18,8 +18,8 @@ from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key
 from otolith.health.diagnosis import Rule, RulesFile
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan
 from otolith.machine_file import (
-    ComponentTable,
     DiscoveryTable,
+    LimitsTable,
     MachineFile,
     ParameterTable,
     RawQuantity,
@@ -28,7 +28,7 @@ from otolith.machine_file import (
 )
 from otolith.twin.augmentation import sources
 from otolith.twin.component_families import FAMILY_NAMES
-from otolith.twin.definition import Definition, Parameter, Role, Site
+from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import read_twin
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal
 from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
@@ -357,10 +357,14 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         if name not in sites:
             context.fail(("components", name), f"twin {twin.name!r} has no such site: {nearest(name, list(sites))}")
     parameters = {
-        name: _monitored(row, file.parameters.get(name, ParameterTable()), context) for name, row in free.items()
+        name: _monitored(row, file.parameters.get(name, LimitsTable()), ("parameters", name), context)
+        for name, row in free.items()
     }
+    amplitudes = {name: Parameter(name, row.unit, 0.0, 0.0, math.inf, row.meaning, part=row.part or name)
+                  for name, row in sites.items()}  # fmt: skip
     components = {
-        name: _monitored_site(row, file.components.get(name, ComponentTable()), context) for name, row in sites.items()
+        name: _monitored(row, file.components.get(name, LimitsTable()), ("components", name), context)
+        for name, row in amplitudes.items()
     }
     return MonitoringPlan(parameters, components, load_rules())
 
@@ -371,44 +375,26 @@ def load_rules() -> tuple[Rule, ...]:
     return validate(parse(source), RulesFile, source).rule
 
 
-def _monitored(parameter: Parameter, table: ParameterTable, context: Context) -> MonitoredQuantity:
-    """Return part and limits of an estimated parameter; limits of the file replace all limits of the twin."""
+def _monitored(parameter: Parameter, table: LimitsTable, where: tuple[str, ...], context: Context) -> MonitoredQuantity:
+    """Return part and limits of a parameter or amplitude; limits of the file replace all limits of the twin."""
     unit, nominal, limits = parameter.unit, parameter.nominal, []
     is_written = table.watch is not None or table.act is not None
     defaults = (parameter.watch, parameter.act) if nominal != 0.0 and not is_written else ((), ())
     for level, written, default in zip((Level.WATCH, Level.ACT), (table.watch, table.act), defaults, strict=True):
-        where = ("parameters", parameter.name, level.lower())
-        with context.at(*where):
+        with context.at(*where, level.lower()):
             values = limit_values(default if written is None else written, unit, nominal)
         limits += [Limit(level, value, value < nominal) for value in values]
         for value in values:
             if is_written and not parameter.low < value < parameter.high:
                 bounds = f"the bounds {parameter.low:g} to {parameter.high:g} {unit}"
-                context.fail(where, f"{value:g} {unit} is outside {bounds}: no estimate can pass it: widen them")
-    quantity = MonitoredQuantity(parameter.part or MACHINE, parameter.meaning, unit, nominal, tuple(limits))
-    _check_order(("parameters", parameter.name, "watch"), quantity, context)
-    return quantity
-
-
-def _monitored_site(site: Site, table: ComponentTable, context: Context) -> MonitoredQuantity:
-    """Return part and limits of the components at a site."""
-    limits = []
-    for level, written in ((Level.WATCH, table.watch), (Level.ACT, table.act)):
-        if written is not None:
-            with context.at("components", site.name, level.lower()):
-                limits.append(Limit(level, Quantity(site.unit, 0.0, difference=True)(written), is_lower=False))
-    quantity = MonitoredQuantity(site.part or site.name, site.meaning, site.unit, 0.0, tuple(limits))
-    _check_order(("components", site.name, "watch"), quantity, context)
-    return quantity
-
-
-def _check_order(where: tuple[str, ...], quantity: MonitoredQuantity, context: Context) -> None:
-    """Raise an error for a limit of WATCH that is not passed before the limit of ACT on its side."""
-    acts = [limit for limit in quantity.limits if limit.level is Level.ACT]
-    for watch in (limit for limit in quantity.limits if limit.level is Level.WATCH):
+                fault = f"{value:g} {unit} is outside {bounds}: no estimate can pass it: write one within them"
+                context.fail((*where, level.lower()), fault)
+    acts = [limit for limit in limits if limit.level is Level.ACT]
+    for watch in (limit for limit in limits if limit.level is Level.WATCH):
         if any(act.is_lower is watch.is_lower and act.excess(watch.value) >= 0.0 for act in acts):
-            remedy = f"write a limit nearer to the nominal value {quantity.nominal:g} {quantity.unit}"
-            context.fail(where, f"{watch.value:g} {quantity.unit} is not passed before act: {remedy}")
+            remedy = f"write a limit nearer to the nominal value {nominal:g} {unit}"
+            context.fail((*where, "watch"), f"{watch.value:g} {unit} is not passed before act: {remedy}")
+    return MonitoredQuantity(parameter.part or MACHINE, parameter.meaning, unit, nominal, tuple(limits))
 
 
 def _noise(

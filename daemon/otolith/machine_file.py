@@ -61,7 +61,14 @@ class TwinTable(StrictModel):
     file: Path | None = None
 
 
-class ParameterTable(StrictModel):
+class LimitsTable(StrictModel):
+    """Limits of a parameter, or of the amplitude of components at a site; without any, those of the twin."""
+
+    watch: RawLimits = None
+    act: RawLimits = None
+
+
+class ParameterTable(LimitsTable):
     """What the file says of one parameter; the twin gives the rest."""
 
     value: RawQuantity = None
@@ -70,16 +77,6 @@ class ParameterTable(StrictModel):
     """Without it, a parameter with a value is known, and one without has the role that the twin gives it."""
     low: RawQuantity = None
     high: RawQuantity = None
-    watch: RawLimits = None
-    """Limits of the state WATCH; without ``watch`` and ``act`` the parameter has those of the twin."""
-    act: RawLimits = None
-
-
-class ComponentTable(StrictModel):
-    """Limits of the amplitude of components at one site."""
-
-    watch: RawQuantity = None
-    act: RawQuantity = None
 
 
 class SignalTable(StrictModel):
@@ -168,7 +165,7 @@ class MachineFile(StrictModel):
     parameters: Annotated[
         dict[str, Annotated[ParameterTable, BeforeValidator(_expand_value)]], Field(default_factory=dict)
     ]
-    components: Annotated[dict[str, ComponentTable], Field(default_factory=dict)]
+    components: Annotated[dict[str, LimitsTable], Field(default_factory=dict)]
     """Limits of the amplitudes of components, by site."""
     noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]
     """Standard deviation of the sensors of outputs and measured inputs."""

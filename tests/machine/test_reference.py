@@ -23,7 +23,7 @@ TABLES: list[tuple[str, str, type[BaseModel]]] = [
     ("[machine]", "key", machine_file.MachineTable),
     ("[twin]", "key", machine_file.TwinTable),
     ("[parameters]", "key", machine_file.ParameterTable),
-    ("[components]", "key", machine_file.ComponentTable),
+    ("[components]", "key", machine_file.LimitsTable),
     ("[window]", "key", machine_file.WindowTable),
     ("[estimation]", "key", machine_file.EstimationTable),
     ("[discovery]", "key", machine_file.DiscoveryTable),

@@ -149,7 +149,7 @@ def make_report(
         components=components,
         explanations=explanations,
         findings=(
-            *_sensor_findings(result, window.start),
+            *(_sensor_finding(sensor, window.start) for sensor in result.faulty_sensors),
             *_findings(
                 components, explanations, result, result.noisier_since(state), _experiment(undecided, situation)
             ),
@@ -334,20 +334,16 @@ def _alternative_documents(alternatives: Sequence[Alternative]) -> tuple[Alterna
     )
 
 
-def _sensor_findings(result: WindowResult, start: float) -> list[FindingDocument]:
-    """Return a finding for each sensor whose samples made the window unusable."""
-    return [
-        FindingDocument(
-            id=f"{FindingKind.SENSOR}/{sensor.signal}",
-            kind=FindingKind.SENSOR,
-            subject=sensor.signal,
-            severity=Severity.FAULT,
-            condition=SENSOR_CONDITION,
-            text=sensor.text,
-            since=start,
-        )
-        for sensor in result.faulty_sensors
-    ]
+def _sensor_finding(sensor: FaultySensor, start: float) -> FindingDocument:
+    return FindingDocument(
+        id=f"{FindingKind.SENSOR}/{sensor.signal}",
+        kind=FindingKind.SENSOR,
+        subject=sensor.signal,
+        severity=Severity.FAULT,
+        condition=SENSOR_CONDITION,
+        text=sensor.text,
+        since=start,
+    )
 
 
 def _findings(

@@ -49,19 +49,7 @@ def observe(
     if report.decision is WindowDecision.REFUSED:
         features, text = FindingFeatures(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
         observations.append(Observation("unexplained", MACHINE, Level.WATCH, features, text, "an unknown change"))
-    for name, parameter in report.parameters.items():
-        quantity, key = plan.parameters.get(name, MonitoredQuantity()), f"limit/{name}"
-        if parameter.value is None or parameter.sd is None or parameter.status not in DETERMINED:
-            observations.append(Observation(key, quantity.part, None))
-            continue
-        level, limit = quantity.level(parameter.value, parameter.sd, before.get(key, Level.OK))
-        if limit is None:
-            observations.append(Observation(key, quantity.part, level))
-        else:
-            features = FindingFeatures(
-                FindingKind.LIMIT, report.twin, name, limit.side, _manner(parameter, steps.get(name, 0.0))
-            )
-            observations.append(_beyond(name, parameter, quantity, limit, features))
+    observations += [_of_parameter(plan, report, name, before, steps.get(name, 0.0)) for name in report.parameters]
     components = (_of_component(plan, report.twin, component, before) for component in report.components)
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
     for finding in report.findings:
@@ -73,18 +61,23 @@ def observe(
     return observations
 
 
-def _beyond(
-    name: str, parameter: ParameterDocument, quantity: MonitoredQuantity, limit: Limit, features: FindingFeatures
+def _of_parameter(
+    plan: MonitoringPlan, report: ReportDocument, name: str, before: Mapping[str, Level], step: float
 ) -> Observation:
-    """Return the observation of a parameter beyond a limit."""
-    value, sd, unit = parameter.value or 0.0, parameter.sd or 0.0, parameter.unit
+    """Return the observation of a parameter, whose level is not known unless this window determines it."""
+    key, parameter, quantity = f"limit/{name}", report.parameters[name], plan.parameters.get(name, MonitoredQuantity())
+    value, sd, unit = parameter.value, parameter.sd, parameter.unit
+    if value is None or sd is None or parameter.status not in DETERMINED:
+        return Observation(key, quantity.part, None)
+    level, limit = quantity.level(value, sd, before.get(key, Level.OK))
+    if limit is None:
+        return Observation(key, quantity.part, level)
+    features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, _manner(parameter, step))
     change = f" ({value / parameter.nominal - 1.0:+.1%})" if parameter.nominal else ""
-    text = (
-        f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {limit.side} its limit {limit.value:.4g} {unit}"
-    )
-    condition = f"{quantity.meaning} is {limit.side} its limit"
-    numbers = _numbers(value, sd, unit, limit)
-    return Observation(f"limit/{name}", quantity.part, limit.level, features, text, condition, numbers=numbers)
+    beyond = f"{limit.side} its limit {limit.value:.4g} {unit}"
+    text = f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {beyond}"
+    condition, numbers = f"{quantity.meaning} is {limit.side} its limit", _numbers(value, sd, unit, limit)
+    return Observation(key, quantity.part, level, features, text, condition, numbers=numbers)
 
 
 def _numbers(value: float, sd: float, unit: str, limit: Limit | None) -> dict[str, float | str]:
