@@ -215,6 +215,15 @@ def test_a_frozen_sensor_is_an_event() -> None:
     assert state_of(documents[-1], "sensors") is Level.OK
 
 
+def test_a_machine_at_rest_does_not_clear_the_event_of_a_sensor() -> None:
+    frozen = finding(FindingKind.SENSOR, "i", 0.0)
+    wrong = [
+        report(index, status=Status.HELD, decision=WindowDecision.SENSOR, findings=(frozen,)) for index in range(5)
+    ]
+    rest = [report(index, status=Status.HELD) for index in range(5, 15)]
+    assert len(changes(assessed([*wrong, *rest]))) == 1
+
+
 def unbalance(
     amplitude: float,
     status: ComponentStatus = ComponentStatus.ADOPTED,

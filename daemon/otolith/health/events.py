@@ -19,6 +19,7 @@ from otolith.health.schema import (
     HealthDocument,
     PartDocument,
     ReportDocument,
+    Status,
     WindowDocument,
 )
 
@@ -61,7 +62,8 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     """Return the state after ``report``, and the report with states and events."""
     state = _with_steps(state, report)
     levels = {key: record.level for key, record in state.records.items()}
-    absent = Level.OK if report.decision in ACCEPTED else None  # the window would have shown the condition
+    is_informative = any(item.status is Status.ESTIMATED for item in report.parameters.values())  # not at rest
+    absent = Level.OK if report.decision in ACCEPTED and is_informative else None
     observations = {key: Observation(key, MACHINE, absent) for key in state.records}
     observations |= {item.key: item for item in observe(plan, report, levels, state.steps)}
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
@@ -91,11 +93,6 @@ def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
     if report.decision is WindowDecision.STEPPED:
         steps |= {name: value - state.values[name] for name, value in values.items() if name in state.values}
     return replace(state, values=values, steps=steps)
-
-
-def _level_if_absent(report: ReportDocument) -> Level | None:
-    """Return the level of a condition that a window does not show: it is over if the window would have shown it."""
-    return Level.OK if report.decision in ACCEPTED else None
 
 
 def _advance(
