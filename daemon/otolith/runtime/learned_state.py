@@ -20,6 +20,7 @@ from otolith.estimation.augmented import augment, indices
 from otolith.estimation.imm_filter import HIGHEST_LEVEL, MAX_VARIANCE_RATIO, ImmPosterior, moment_match
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import UNLIMITED, Problem
+from otolith.health.events import HealthState
 from otolith.health.status import PreviousStatus
 from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
 from otolith.twin.component_families import FAMILY_NAMES
@@ -76,6 +77,8 @@ class LearnedState(StrictModel):
     resets: dict[str, float] = Field(default_factory=dict)
     """See :attr:`otolith.adaptation.state.AdaptationState.resets`."""
     components: Annotated[tuple[ComponentRecord, ...], Field(max_length=MAX_COMPONENTS)] = ()
+    health: HealthState = Field(default_factory=HealthState)
+    """Open events and states, so that a restart neither repeats nor drops them."""
     filter: FilterRecord | None = None
     """None in files of version 1, and where nothing but components is to be kept."""
 
@@ -129,6 +132,7 @@ def learned_state(state: AdaptationState, signal_fingerprint: str) -> LearnedSta
         configuration_fingerprint=configuration_fingerprint(state.problem),
         resets=dict(state.resets),
         components=component_records(state),
+        health=state.health,
         filter=_filter_record(state) if np.isfinite(end) else None,
     )
     restored(document, cleared(state), end)
@@ -172,7 +176,8 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         at = indices(problem, slot)
         _require_near(np.array(component.values), low[at], high[at], "components")
     if record is None:
-        return replace(restore_components(state, document.components), resets=document.resets)
+        known = restore_components(state, document.components)
+        return replace(known, resets=document.resets, health=document.health)
     posterior, window = _posterior(record, _with_noise(problem, record.noise)), problem.window
     if record.end > now:
         posterior = replace(posterior, belief=replace(posterior.belief, end=now - (record.end - now)))
@@ -186,6 +191,7 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         previous=dict(zip(record.labels, record.previous, strict=True)),
         adopted=adopted,
         resets=document.resets,
+        health=document.health,
     )
 
 
