@@ -58,7 +58,7 @@ def test_every_parameter_with_limits_and_every_site_belongs_to_a_part(name: str)
     ("features", "condition"),
     [
         (
-            FindingFeatures(FindingKind.LIMIT, "pump", "h_0", "below", "start"),
+            FindingFeatures(FindingKind.LIMIT_FROM_START, "pump", "h_0", "below", "trend"),
             "a nominal value that does not fit, or a fault that is older than the monitoring",
         ),
         (

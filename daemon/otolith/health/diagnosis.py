@@ -19,6 +19,8 @@ class FindingKind(StrEnum):
 
     LIMIT = "limit"
     """A parameter is beyond a limit."""
+    LIMIT_FROM_START = "limit from the start"
+    """The same, since the first window that determined it."""
     COMPONENT = "component"
     SENSOR = "sensor"
     TIMING = "late signal"
@@ -42,7 +44,7 @@ class FindingFeatures:
     side: str = ""
     """Of the nominal value on which a parameter is: ``below`` or ``above``."""
     manner: str = ""
-    """How a parameter came there: by a ``step``, by a ``trend``, or it was there from the ``start``."""
+    """How a parameter came there: by a ``step`` or by a ``trend``."""
     family: str = ""
     input: str = ""
     """``t``, ``angle``, or another signal or state."""
@@ -57,7 +59,7 @@ class Rule(StrictModel):
     twin: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
     side: tuple[Literal["below", "above"], ...] = ()
-    manner: tuple[Literal["step", "trend", "start"], ...] = ()
+    manner: tuple[Literal["step", "trend"], ...] = ()
     family: tuple[str, ...] = ()
     input: tuple[str, ...] = ()
     order: tuple[float, float] | None = None

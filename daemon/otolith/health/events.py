@@ -70,7 +70,8 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     records, events = {}, []
     for key, observed in observations.items():
         if key not in state.inside and observed.features.finding is FindingKind.LIMIT:
-            observed = replace(observed, features=replace(observed.features, manner="start"))  # noqa: PLW2901
+            features = replace(observed.features, finding=FindingKind.LIMIT_FROM_START)
+            observed = replace(observed, features=features)  # noqa: PLW2901
         record = _advance(plan, state.records.get(key, ConditionRecord()), observed, report)
         if record.event is not None:
             events.append(record.event)
