@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from otolith.adaptation.state import EVERYTHING, AdaptationState, OperatorDecisions, apply_decisions, component_records
-from otolith.health.schema import ReportDocument, Status
+from otolith.health.schema import EventChange, ReportDocument, Status
 from otolith.runtime.state_store import MAX_STATE_BYTES, StateStore
 from otolith_drivers.errors import OtolithError
 from tests.runtime.motors import NAMES, PROBLEM, START, UNBALANCE, fresh, healthy, noisy, run, unbalanced, windows
@@ -105,6 +105,20 @@ def test_a_step_while_the_daemon_was_away_is_found_as_without_a_restart(
     assert high is not None
     assert low <= moved <= high
     assert warm.is_valid
+
+
+def test_an_open_event_goes_on_after_a_restart(tmp_path: Path) -> None:
+    state = unbalanced()
+    assert state.health.records
+    warm = restarted(state, tmp_path)
+    assert warm.health == state.health
+    torque = Faults(torque=lambda _, angle, *__: 0.004 * math.sin(angle))
+    _, reports = run(warm, windows(simulate_motor("sweep", 8.0, torque, seed=4), START + 60.0))
+    open_before = {record.event.id for record in state.health.records.values() if record.event is not None}
+    assert open_before
+    for report in reports:
+        assert {event.id for event in report.events} == open_before
+        assert not any(event.change is EventChange.RAISED for event in report.events)
 
 
 def test_a_component_is_still_there_after_a_year(tmp_path: Path) -> None:
