@@ -36,9 +36,11 @@ from otolith_drivers.user_dirs import state_directory, writable
 log = logging.getLogger(__name__)
 
 DECISIONS_VERSION = 2
+KEPT = ".kept.json"
 REMEDY = "move the file away to start without it"
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_STATE_BYTES = 8 * 1024 * 1024
+MAX_KEPT = 8  # files that were not used and are kept under another name
 PROCESS_ID_BYTES = 20
 DECISIONS_INTERVAL = 0.5  # s between two checks for new operator decisions
 WRITE_RETRY = 30.0  # s after which a failed write is tried again
@@ -169,18 +171,23 @@ class StateStore:
             return warm, f"{note}; {error}"
 
     def set_aside(self) -> Path:
-        """Rename the file with what was learned, and return its new path.
+        """Rename the file with what was learned, and return its new path; only the newest such files stay.
 
         Raises:
             ServiceError: it cannot be renamed; it is not overwritten then.
         """
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")
-        kept = self.components_path.with_name(f"{self.components_path.stem}.{stamp}.kept.json")
+        kept = self.components_path.with_name(f"{self.components_path.stem}.{stamp}{KEPT}")
         try:
             self.components_path.rename(kept)
         except OSError as error:
             self._is_blocked = True
             raise ServiceError(f"{self.components_path}: cannot be renamed to {kept.name}: {error.strerror}") from error
+        prefix = f"{self.components_path.stem}."
+        names = (path for path in kept.parent.iterdir() if path.name.startswith(prefix) and path.name.endswith(KEPT))
+        for old in sorted(names, key=lambda path: path.name)[:-MAX_KEPT]:
+            with contextlib.suppress(OSError):
+                old.unlink()
         return kept
 
     def save(self, state: AdaptationState) -> None:
