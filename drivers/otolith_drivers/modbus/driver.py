@@ -189,7 +189,7 @@ class ModbusPoller:
         Raises:
             ExceptionReplyError, NoReplyError, ConnectionLostError: see :meth:`ReadOnlyClient.read`.
         """
-        while True:
+        for reopened in (False, True):
             sent = time.monotonic()
             try:
                 registers = self._client.read(request.device, request.table, request.address, request.count)
@@ -208,9 +208,11 @@ class ModbusPoller:
                 raise
             now = time.monotonic()
             self._answers += 1
+            self._reconnects += reopened
             self._closings = self._closings if self._answers == 1 else 0
             self._trips.append(now - sent)
             return registers, 0.5 * (sent + now)
+        raise ConnectionLostError("the connection was closed")
 
     def _read(self, request: Request, deliver: Deliver) -> bool:
         """Read one request and deliver its samples; return whether all registers repeat the previous values."""

@@ -161,7 +161,7 @@ def test_a_device_that_closes_each_time_loses_nothing_and_is_reported_once(caplo
         wait_for(lambda: len(listener.samples) >= 200)
         counters = listener.driver.counters()
         assert listener.driver.link().up
-    assert counters.reconnects == 0
+    assert counters.reconnects >= 95, "each is counted"
     assert counters.lost <= 20, "rounds that a busy computer skipped"
     assert len([record for record in caplog.records if "closes the connection" in record.message]) == 1
 
