@@ -232,10 +232,7 @@ def _layout_faults(message: Message) -> list[DatabaseFault]:
 
 
 def _multiplexed_places(text: str) -> set[tuple[int, int, int]]:
-    """Arbitration ID, start and length of the signals that a DBC calls multiplexed.
-
-    cantools takes those without a multiplexer for plain ones.
-    """
+    """Arbitration ID, start and length of the multiplexed signals of a DBC: cantools takes some for plain ones."""
     return {
         (int(words[1]) % EXTENDED_FLAG, int(match[1]), int(match[2]))
         for block in DBC_MESSAGE.findall(text)

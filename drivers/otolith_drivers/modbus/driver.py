@@ -182,9 +182,7 @@ class ModbusPoller:
         return []
 
     def _request(self, request: Request) -> tuple[list[int], float]:
-        """Return the registers and the middle (s) of the round trip; reconnect once if the device has hung up.
-
-        Some devices close the connection after each answer, which shows only at the next request.
+        """Return the registers and the middle (s) of the round trip; reconnect once if the line was closed.
 
         Raises:
             ExceptionReplyError, NoReplyError, ConnectionLostError: see :meth:`ReadOnlyClient.read`.
