@@ -65,8 +65,8 @@ def runs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     """Both machines, after all faults of a scenario."""
     running, (scenario, end) = {}, SCENARIOS[request.param]
     monkeypatch = pytest.MonkeyPatch()
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))  # no saved components
-    for transport in BOTH:
+    for transport in BOTH:  # each machine has its own state: they have one name
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         folder = tmp_path_factory.mktemp(transport)
         faults = "".join(str(fault) for fault in scenario if transport in fault.on)
         running[transport] = Running(OwnMachine(folder / "machine", transport, faults=faults), folder)
