@@ -85,16 +85,16 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
         screening = with_threshold_test(screening)
     is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
     is_calm = is_expected and not screening.is_positive
-    test = None if state.test is None else continue_test(state.test, predicted, screening).beside(estimated.fit)
+    test = None if state.test is None else continue_test(state.test, predicted, screening).with_filter(estimated.fit)
     if test is not None and test.best.type is FaultType.NOTHING and not is_expected:
-        state, test = replace(state, test=None), None  # what the window shows is none of what opened the test
+        test = None  # the window shows something else than what opened the test
     if test is not None:
-        goes_on = is_calm and not test.is_confirmed
-        result = (_go_on_beside if goes_on else _apply_decision)(state, predicted, estimated, test)
+        act = _update_filter_beside if is_calm and not test.is_confirmed else _apply_decision
+        result = act(state, predicted, estimated, test)
     elif is_calm:
         return _update_filter(state, predicted, estimated)
     else:
-        test = open_test(predicted, screening)
+        state, test = replace(state, test=None), open_test(predicted, screening)
         if is_expected and test.is_null_possible:
             result = _update_filter(state, predicted, estimated)
         else:
@@ -119,7 +119,7 @@ def _apply_decision(
     return _update_filter(state, predicted, estimated)
 
 
-def _go_on_beside(
+def _update_filter_beside(
     state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, test: SequentialTest
 ) -> WindowResult:
     """Update the filter with a window that shows nothing of what opened the test.

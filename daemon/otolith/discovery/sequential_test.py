@@ -75,7 +75,7 @@ class SequentialTest:
     """Consecutive windows after which one type of hypotheses explained all windows best."""
     quiet: int = 0
     """Consecutive windows, up to the last, that the filter expected, and that did not confirm the test."""
-    behind: float = -MAX_WINDOW_EVIDENCE
+    against_filter: float = -MAX_WINDOW_EVIDENCE
     """Evidence against the filter, in -2 log likelihood, of the windows after the one that opened the test; without
     that one, they alone must pay for the complexity of a hypothesis."""
     null_reduced_chi_square: float = 1.0
@@ -119,9 +119,9 @@ class SequentialTest:
     @property
     def is_confirmed(self) -> bool:
         """Whether windows after the one that opened the test speak decisively against the filter."""
-        return self.behind > DECISIVE
+        return self.against_filter > DECISIVE
 
-    def beside(self, filtered: Fit) -> "SequentialTest":
+    def with_filter(self, filtered: Fit) -> "SequentialTest":
         """Return the test after its last window, of which the filter leaves ``filtered``.
 
         The evidence against the filter is a cumulative sum (E. S. Page, Biometrika 41, 1954) with decisive evidence as
@@ -129,8 +129,8 @@ class SequentialTest:
         """
         last = self.last
         more = (filtered.chi_square - last.chi_square) / residual_variance_factor([last.chi_square], last.count)
-        behind = self.behind + float(np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE))
-        return replace(self, behind=float(np.clip(behind, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)))
+        total = self.against_filter + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
+        return replace(self, against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)))
 
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
