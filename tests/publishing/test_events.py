@@ -2,14 +2,14 @@
 
 import logging
 import socket
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from otolith.cli.live_table import LiveTable
 from otolith.health.limits import Level
-from otolith.health.schema import EventChange, EventDocument, ReportDocument
+from otolith.health.schema import EventChange, EventDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.text import value_cells
 from otolith.machine import load_machine
 from otolith.publishing.recorder import _log_lines
 from otolith.publishing.zenoh_session import EVENT, Publisher, session
@@ -71,19 +71,29 @@ def test_the_recording_has_an_event_on_its_changes_only() -> None:
     assert lines == [("WATCH", "WARN"), ("ACT", "ERROR"), ("cleared", "WARN")]
 
 
-def drawn(document: ReportDocument, tmp_path: Path) -> str:
-    table = LiveTable(lambda: "waiting")
+def drawn(document: ReportDocument, width: int = 200) -> str:
+    table, console = LiveTable(lambda: "waiting"), Console(width=width)
     table.add(document.to_json())
-    with (tmp_path / "table.txt").open("w", encoding="utf-8") as file:
-        Console(file=file, width=200).print(table)
-    return (tmp_path / "table.txt").read_text(encoding="utf-8")
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get()
 
 
-def test_the_live_table_begins_with_the_state(tmp_path: Path) -> None:
+def test_the_live_table_begins_with_the_state() -> None:
     at_act = next(document for document in documents() if document.health and document.health.state is Level.ACT)
-    lines = drawn(at_act, tmp_path).splitlines()
+    lines = drawn(at_act).splitlines()
     assert lines[0].startswith("ACT since ")
     assert "winding: short circuit between turns of the winding" in lines[0]
     assert lines[1].split()[:2] == ["winding", "ACT"]
-    assert "plan a replacement of the winding" in " ".join(drawn(at_act, tmp_path).split())
-    assert drawn(documents()[0], tmp_path).startswith("OK since ")
+    assert "plan a replacement of the winding" in " ".join(drawn(at_act).split())
+    assert drawn(documents()[0]).startswith("OK since ")
+
+
+def test_a_narrow_terminal_cuts_no_number() -> None:
+    document = documents()[0]
+    wide = ParameterDocument(
+        value=1.23456e9, sd=1.25e7, unit="Pa*s^2/m^6", nominal=6e8, status=Status.UNESTIMATED
+    )  # the longest cells
+    text = drawn(document.model_copy(update={"parameters": {"h_2": wide}}), width=60)
+    assert "…" not in text
+    assert all(cell in text for cell in value_cells(wide) if cell != wide.unit)

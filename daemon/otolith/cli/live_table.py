@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, Group, OverflowMethod, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
@@ -104,11 +104,15 @@ def state_lines(document: ReportDocument) -> list[Text]:
 
 
 def parameter_table(*columns: str) -> Table:
-    """A table of parameters: the columns of :func:`value_cells`, then ``columns``; status counts are numbers."""
+    """A table of parameters: the columns of :func:`value_cells`, then ``columns``; status counts are numbers.
+
+    In a narrow terminal words are folded first, as a truncated number would be a wrong one.
+    """
     table = Table(expand=False)
     for column in (*VALUE_COLUMNS, *columns):
         right = column in RIGHT or column in set(Status)
-        table.add_column(column, justify="right" if right else "left", no_wrap=True)
+        overflow: OverflowMethod = "ellipsis" if column in RIGHT else "fold"
+        table.add_column(column, justify="right" if right else "left", no_wrap=column in RIGHT, overflow=overflow)
     return table
 
 
@@ -125,11 +129,13 @@ def _title_lines(document: ReportDocument) -> list[Text]:
 def _parameters(
     parameters: Mapping[str, ParameterDocument], histories: Mapping[str, tuple[float, ...]], width: int
 ) -> Table:
-    table = parameter_table("status", "history")
-    length = max(8, width - OTHER_COLUMNS)
+    length = width - OTHER_COLUMNS
+    curve = ("history",) if length > len("history") else ()  # below, numbers need the room
+    table = parameter_table("status", *curve)
     for name, parameter in parameters.items():
         status = Text(parameter.status, style=STYLES[parameter.status])
-        table.add_row(name, *value_cells(parameter), status, sparkline(histories.get(name, ())[-length:]))
+        cells = [sparkline(histories.get(name, ())[-length:]) for _ in curve]
+        table.add_row(name, *value_cells(parameter), status, *cells)
     return table
 
 
