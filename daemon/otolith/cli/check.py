@@ -88,7 +88,8 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     for free in problem.free:
         bounds = f"from {free.low:g} to {free.high:g} {free.unit}, starting at {free.nominal:g} {free.unit}"
         lines.append(f"estimated: {free.name} {bounds} ({free.meaning}){_origin(free.name, file.parameters)}")
-        lines += [f"limits of {free.name}: {text}" for text in [machine.plan.parameters[free.name].limits_text] if text]
+        limits = machine.plan.parameters[free.name].limits_text
+        lines += [f"limits of {free.name}: {limits}"] if limits else []
     for name, site in machine.plan.sites.items():
         lines += [f"limits of components at {name}: {site.limits_text}"] if site.limits else []
     for output, noise in zip(twin.outputs, problem.noise, strict=True):

@@ -138,6 +138,11 @@ class EventDocument(StrictModel):
     source: str = ""
     evidence: EvidenceDocument
 
+    @property
+    def is_urgent(self) -> bool:
+        """Whether its part is at :attr:`Level.ACT` because of it."""
+        return self.state is Level.ACT and self.end is None
+
 
 class PartDocument(StrictModel):
     """State of a part or of the machine."""

@@ -6,7 +6,6 @@ from otolith.acquisition.quality import time_text
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import (
     ComponentDocument,
-    EventChange,
     EventDocument,
     FindingDocument,
     HealthDocument,
@@ -64,11 +63,12 @@ def finding_text(finding: FindingDocument) -> str:
 
 def event_text(event: EventDocument, when: Callable[[float], str] = time_text) -> str:
     """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text."""
-    if event.change is EventChange.CLEARED or event.end is not None:
-        return f"cleared: {event.part}: {event.condition}, from {when(event.start)} to {when(event.end or 0.0)}"
-    certainty = event.evidence.probability
-    share = "over 99.9" if certainty is not None and certainty > 0.999 else f"{100.0 * (certainty or 0.0):.3g}"
-    sure = "" if certainty is None else f" (with {share} % probability)"
+    if event.end is not None:
+        return f"cleared: {event.part}: {event.condition}, from {when(event.start)} to {when(event.end)}"
+    sure = ""
+    if (probability := event.evidence.probability) is not None:
+        share = "over 99.9" if probability > 0.999 else f"{100.0 * probability:.3g}"
+        sure = f" (with {share} % probability)"
     advice = f"; {event.advice}" if event.advice else ""
     return f"{event.state}: {event.part}: {event.condition} since {when(event.since)}: {event.text}{sure}{advice}"
 

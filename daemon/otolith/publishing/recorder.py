@@ -19,10 +19,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from otolith.acquisition.window import Array, Verdict
-from otolith.estimation.information import QUANTILE
-from otolith.health.limits import Level
 from otolith.health.schema import Report, ReportDocument, Status
-from otolith.health.text import announcements, event_text, headline
+from otolith.health.text import announcements, event_text, headline, value_text
 from otolith.machine import RecordedMachine
 from otolith.twin.definition import Definition, Parameter
 
@@ -133,27 +131,20 @@ def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
         if parameter.status is not Status.ESTIMATED and not reasons:
             yield f"{name} {parameter.status}: {parameter.reason}", "INFO"
     for event in announcements(document):
-        yield event_text(event), "ERROR" if event.state is Level.ACT and event.end is None else "WARN"
+        yield event_text(event), "ERROR" if event.is_urgent else "WARN"
     if document.fit is not None and not document.fit.explained:
         yield "the twin does not explain the window up to the noise", "INFO"
 
 
 def _table(document: ReportDocument) -> str:
     """Return the report as a Markdown table."""
-    state = [headline(document.health)] if document.health is not None else []
-    rows = [
-        f"# {document.machine} at {document.site}",
-        "",
-        *state,
-        "",
-        "| parameter | value | status |",
-        "|---|---|---|",
+    rows = [f"# {document.machine} at {document.site}", ""]
+    rows += [] if document.health is None else [headline(document.health), ""]
+    rows += ["| parameter | value | status |", "|---|---|---|"]
+    rows += [
+        f"| {name} | {value_text(parameter)} | {parameter.status} {parameter.reason} |"
+        for name, parameter in document.parameters.items()
     ]
-    for name, parameter in document.parameters.items():
-        value = "unknown"
-        if parameter.value is not None and parameter.sd is not None:
-            value = f"{parameter.value:.5g} {parameter.unit} ± {QUANTILE * parameter.sd:.2g}"
-        rows.append(f"| {name} | {value} | {parameter.status} {parameter.reason} |")
     if document.components:
         rows += ["", "| component | equation | status |", "|---|---|---|"]
         rows += [f"| {row.meaning} | {row.equation} | {row.status} {row.approval} |" for row in document.components]

@@ -22,7 +22,6 @@ from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
-from otolith.health.limits import Level
 from otolith.health.schema import CountersDocument, DriverDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
@@ -222,8 +221,7 @@ class Service:
     def _log(self, document: ReportDocument, now: float) -> None:
         """Log the events that the window changed, and once per hour the window; in a terminal each window."""
         for event in announcements(document):
-            is_fault = event.state is Level.ACT and event.end is None
-            log.log(logging.ERROR if is_fault else logging.WARNING, "%s", event_text(event))
+            log.log(logging.ERROR if event.is_urgent else logging.WARNING, "%s", event_text(event))
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
         self._summarised_at = now if is_due else self._summarised_at
         self._notifier.send(f"STATUS={line}")
