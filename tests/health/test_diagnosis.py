@@ -2,7 +2,7 @@
 
 import pytest
 
-from otolith.health.diagnosis import FindingFeatures, FindingKind, Rule, diagnose, matching, severity
+from otolith.health.diagnosis import KEYS, FindingFeatures, FindingKind, Rule, diagnose, matching, severity
 from otolith.machine import find_twin, library_twins, load_rules
 from otolith.twin.component_families import FAMILY_NAMES
 
@@ -14,9 +14,7 @@ SITES = {site.name for twin in TWINS.values() for site in twin.sites}
 
 def example(rule: Rule) -> FindingFeatures:
     """Return a finding that the row must match, and no row that rests on more evidence."""
-    first = {
-        key: next(iter(getattr(rule, key)), "") for key in ("twin", "subject", "side", "manner", "family", "input")
-    }
+    first = {key: next(iter(getattr(rule, key)), "") for key in KEYS}
     return FindingFeatures(rule.finding, **first, order=None if rule.order is None else sum(rule.order) / 2.0)
 
 

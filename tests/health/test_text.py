@@ -2,8 +2,6 @@
 
 import pytest
 
-from otolith.acquisition.window import Verdict
-from otolith.discovery.decision import WindowDecision
 from otolith.health.diagnosis import FindingKind
 from otolith.health.limits import Level
 from otolith.health.schema import (
@@ -15,13 +13,11 @@ from otolith.health.schema import (
     HealthDocument,
     ParameterDocument,
     PartDocument,
-    QualityDocument,
-    ReportDocument,
     Severity,
     Status,
-    WindowDocument,
 )
 from otolith.health.text import announcements, event_text, finding_text, headline, summary, value_cells, value_text
+from tests.health.test_events import report
 
 ESTIMATED = ParameterDocument(value=5.98561, sd=0.00382, unit="ohm", nominal=6.5, status=Status.ESTIMATED)
 UNKNOWN = ParameterDocument(unit="ohm", nominal=6.5, status=Status.UNESTIMATED, reason="no current")
@@ -57,18 +53,11 @@ def test_finding_text_has_severity_and_advice() -> None:
 
 
 def test_summary_is_one_line_with_reasons_and_warnings() -> None:
-    quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
-    report = ReportDocument(
-        machine="m",
-        site="s",
-        twin="dc_motor",
-        window=WindowDocument(index=3, start=1.0, end=3.0, records=200, quality=quality),
-        decision=WindowDecision.LEARNED,
-        parameters={"R_a": ESTIMATED, "L_a": UNKNOWN},
-        findings=(LEAK,),
-        driver=DriverDocument(up=False, reason="unplugged", warnings=("slow", "late", "odd")),
+    driver = DriverDocument(up=False, reason="unplugged", warnings=("slow", "late", "odd"))
+    document = report(3).model_copy(
+        update={"parameters": {"R_a": ESTIMATED, "L_a": UNKNOWN}, "findings": (LEAK,), "driver": driver}
     )
-    assert summary(report) == (
+    assert summary(document) == (
         "window 3 good, R_a 5.9856 ohm ± 0.0075, L_a unknown (unestimated: no current), fault: a leak Close it., "
         "no connection: unplugged, slow, and 2 more warnings"
     )
@@ -113,14 +102,5 @@ def test_the_headline_names_the_parts_in_the_state_of_the_machine() -> None:
 
 
 def test_only_a_change_is_announced() -> None:
-    quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
-    report = ReportDocument(
-        machine="m",
-        site="s",
-        twin="dc_motor",
-        window=WindowDocument(index=3, start=1.0, end=3.0, records=200, quality=quality),
-        decision=WindowDecision.LEARNED,
-        parameters={},
-        events=(EVENT, EVENT.model_copy(update={"change": None})),
-    )
-    assert announcements(report) == [EVENT]
+    document = report(3).model_copy(update={"events": (EVENT, EVENT.model_copy(update={"change": None}))})
+    assert announcements(document) == [EVENT]
