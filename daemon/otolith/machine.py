@@ -360,8 +360,9 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         name: _monitored(row, file.parameters.get(name, LimitsTable()), ("parameters", name), context)
         for name, row in free.items()
     }
-    amplitudes = {name: Parameter(name, row.unit, 0.0, 0.0, math.inf, row.meaning, part=row.part or name)
-                  for name, row in sites.items()}  # fmt: skip
+    amplitudes = {
+        name: Parameter(name, row.unit, 0.0, 0.0, math.inf, row.meaning, part=row.part) for name, row in sites.items()
+    }
     components = {
         name: _monitored(row, file.components.get(name, LimitsTable()), ("components", name), context)
         for name, row in amplitudes.items()

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.acquisition.samples import Check
 from otolith_drivers.base import Sampling
-from otolith_drivers.config_files import StrictModel, one_or_two
+from otolith_drivers.config_files import Limits, StrictModel
 from otolith_drivers.units import Quantity
 
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
@@ -41,9 +41,7 @@ def _expand_value(written: object) -> object:
 Name = Annotated[str, AfterValidator(_name)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 RawQuantity = str | float | None
-"""A quantity as written in the file. It is converted once the twin tells its unit; a number without unit is refused."""
-RawLimits = Annotated[tuple[str | float, ...] | None, BeforeValidator(one_or_two)]
-"""One limit or two, relative to the nominal value or with a unit; an empty list for none."""
+"""A quantity as written in the file. It is converted once the twin gives its unit; a number without unit is refused."""
 WindowLength = Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))]
 
 
@@ -64,8 +62,8 @@ class TwinTable(StrictModel):
 class LimitsTable(StrictModel):
     """Limits of a parameter, or of the amplitude of components at a site; without any, those of the twin."""
 
-    watch: RawLimits = None
-    act: RawLimits = None
+    watch: Limits | None = None
+    act: Limits | None = None
 
 
 class ParameterTable(LimitsTable):

@@ -7,9 +7,9 @@ import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from otolith_drivers.errors import ConfigurationError, nearest
 
@@ -38,11 +38,15 @@ KINDS = {
 """By the key that only this kind of file has: its name, and the command that reads it."""
 
 
-def one_or_two(written: object) -> object:
+def _one_or_two(written: object) -> object:
     """Return a value that may be written alone or in a list of two as a list; raise ValueError for a longer one."""
     if isinstance(written, list | tuple) and len(written) > 2:
         raise ValueError(f"{written!r} are {len(written)} limits: write one, or two in a list")
     return written if isinstance(written, list | tuple) else (written,)
+
+
+Limits = Annotated[tuple[str | float, ...], BeforeValidator(_one_or_two)]
+"""One limit or a list of two, relative to the nominal value or with a unit."""
 
 
 class StrictModel(BaseModel):
@@ -183,25 +187,26 @@ def line_of(text: str, location: Location) -> int | None:
 
 
 def _faults(error: ValidationError, data: Any, model: type[BaseModel]) -> Iterator[tuple[tuple[int | str, ...], str]]:
-    """Yield location and message of each fault."""
-    faults = [(_written(data, fault["loc"]), fault) for fault in error.errors()]
-    for at, fault in faults:
+    """Yield location and message of each fault; where a union fails, that of its first member."""
+    faults: dict[tuple[int | str, ...], Any] = {}
+    for fault in error.errors():
+        faults.setdefault(_written(data, fault["loc"], is_missing=fault["type"] == "missing"), fault)
+    for at, fault in faults.items():
         # A table that fails because of its content adds nothing to the fault of the content.
-        if not any(len(other) > len(at) and other[: len(at)] == at for other, _ in faults):
+        if not any(len(other) > len(at) and other[: len(at)] == at for other in faults):
             yield at, _message(dict(fault), at, model)
 
 
-def _written(data: Any, location: Location) -> tuple[int | str, ...]:
-    """Return ``location`` without the keys that pydantic adds for the members of a union."""
+def _written(data: Any, location: Location, *, is_missing: bool) -> tuple[int | str, ...]:
+    """Return ``location`` without what pydantic adds to it for unions and converted values; its end may be missing."""
     written: list[int | str] = []
     for position, key in enumerate(location):
-        inside = data[key] if isinstance(key, int) and isinstance(data, list | tuple) and key < len(data) else None
-        if isinstance(data, dict):
-            if key not in data and position < len(location) - 1:
-                continue
-            inside = data.get(key)
-        written.append(key)
-        data = inside
+        is_entry = isinstance(data, dict) and key in data
+        is_item = isinstance(data, list | tuple) and isinstance(key, int) and key < len(data)
+        is_present = is_entry or is_item
+        if is_present or (is_missing and position == len(location) - 1):
+            written.append(key)
+            data = data[key] if is_present else None
     return tuple(written)
 
 

@@ -21,6 +21,7 @@ class Outer(StrictModel):
     name: str
     inner: Inner = Inner()
     entries: tuple[Inner, ...] = ()
+    quantity: float | str = 0.0
     named: dict[str, Annotated[Inner, BeforeValidator(lambda value: value)]] | None = None
 
 
@@ -35,6 +36,7 @@ FAULTS = [
     ("name = 'x'\n[[entries]]\nspeed = 1.0\n[[entries]]\nspeed = 'fast'\n", "5: entries[1].speed: 'fast': the value"),
     ("name = 'x'\n[named.a]\ntorqe = 1.0\n", "3: named.a.torqe: unknown key 'torqe': did you mean 'torque'?"),
     ("name = 'x'\ninner = { speed = inf }\n", "2: inner.speed: inf: the value should be a finite number"),
+    ("name = 'x'\nquantity = [1]\n", "2: quantity: [1]: the value should be a valid number"),
     ("name = 'x'\nname = 'y'\n", "not valid TOML: "),
     ("[inner]\nspeed = 1.0\n", ": name: missing: this key must be set"),
 ]
@@ -50,12 +52,19 @@ def test_fault_names_file_line_key_and_remedy(tmp_path: Path, text: str, sentenc
     assert sentence in str(caught.value)
 
 
-def test_each_fault_is_a_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "faults"),
+    [
+        ("nam = 'x'\n[inner]\nsped = 1\n", 3),  # the misspelt name is also a missing one
+        ("name = 'x'\nquantity = { low = 1 }\n", 1),  # neither a number nor a text
+    ],
+)
+def test_each_fault_is_a_line(tmp_path: Path, text: str, faults: int) -> None:
     path = tmp_path / "file.toml"
-    path.write_text("nam = 'x'\n[inner]\nsped = 1\n", encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
         load(path)
-    assert len(str(caught.value).splitlines()) == 3  # the misspelt name is also a missing one
+    assert len(str(caught.value).splitlines()) == faults
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"a" * (2 << 20)])

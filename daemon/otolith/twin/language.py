@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, StateVariable
 from otolith.twin.dimensions import NONE, Dimension, describe, dimension_of, infer_dimension
 from otolith.twin.expressions import ExpressionError, check_known, check_name, names_in, parse
-from otolith_drivers.config_files import Location, SourceFile, StrictModel, expect, one_or_two, validate
+from otolith_drivers.config_files import Limits, Location, SourceFile, StrictModel, expect, validate
 from otolith_drivers.config_files import parse as parse_toml
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import Quantity, limit_values, to_base
@@ -49,8 +49,6 @@ def _no_boolean(written: object) -> object:
 Unit = Annotated[str, AfterValidator(_unit)]
 Number = Annotated[float | str, BeforeValidator(_no_boolean)]
 Bounds = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
-Limits = Annotated[tuple[str | float, ...], BeforeValidator(one_or_two)]
-"""One limit or a list of two, relative or with a unit."""
 
 
 class _HeadTable(StrictModel):
