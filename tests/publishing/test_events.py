@@ -6,7 +6,7 @@ import socket
 import pytest
 from rich.console import Console
 
-from otolith.cli.live_table import LiveTable
+from otolith.cli.live_table import LEVEL_STYLES, LiveTable, event_style
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import value_cells
@@ -87,6 +87,13 @@ def test_the_live_table_begins_with_the_state() -> None:
     assert lines[1].split()[:2] == ["winding", "ACT"]
     assert "plan a replacement of the winding" in " ".join(drawn(at_act).split())
     assert drawn(documents()[0]).startswith("OK since ")
+
+
+def test_a_cleared_event_has_the_style_of_what_is_well() -> None:
+    levels = {None: Level.ACT, EventChange.CLEARED: Level.OK}
+    events = [event for document in documents()[12:] for event in document.events if event.change in levels]
+    assert {event.change for event in events} == set(levels)
+    assert all(event_style(event) == LEVEL_STYLES[levels[event.change]] for event in events)
 
 
 def test_a_narrow_terminal_cuts_no_number() -> None:

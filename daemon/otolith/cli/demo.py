@@ -25,8 +25,8 @@ from rich.table import Table
 from otolith.acquisition.window import Verdict
 from otolith.adaptation.state import initial_state
 from otolith.cli.common import INTERRUPTED, drain, local_time
-from otolith.cli.live_table import LEVEL_STYLES, LiveTable
-from otolith.health.schema import ComponentDocument, ReportDocument, Status
+from otolith.cli.live_table import LEVEL_STYLES, LiveTable, event_style
+from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
 from otolith.health.text import announcements, event_text, half_width_text, headline, summary
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import REPORT, Listener
@@ -236,9 +236,8 @@ class Demo:
     def _add(self, reports: Iterable[ReportDocument | None], *, echo: bool) -> None:
         for report in filter(None, reports):
             self._reports.append(report)
-            for event in announcements(report) if echo else ():
-                self._print(event_text(event, local_time), LEVEL_STYLES[event.state])
             if echo:
+                self._print_events(announcements(report))
                 self._print(summary(report))
 
     def _refuse_ended(self) -> None:
@@ -281,18 +280,22 @@ class Demo:
             self._print(f"{unknown} of {len(rows)} windows have no estimate", "yellow" if known else "red")
         for unbalance in unbalances:
             self._print(str(unbalance), "green" if unbalance.right else "red")
-        self._print_events()
+        events = {event.id: event for report in self._reports for event in report.events}  # each as it was last
+        self._print_events(sorted(events.values(), key=lambda event: event.start))
+        if (health := self._health) is not None:
+            self._print(f"state of the machine: {headline(health, local_time)}", LEVEL_STYLES[health.state])
         self._print(f"recording: {self._recording}")
         self._print(f"open it with: {Path(sys.executable).with_name('otolith')} view {self._recording}")
         return 0 if right else 1
 
-    def _print_events(self) -> None:
-        """What was announced, each event once as it was last, and the state at the end."""
-        events = {event.id: event for report in self._reports for event in report.events}
-        for event in sorted(events.values(), key=lambda event: event.start):
-            self._print(event_text(event, local_time), LEVEL_STYLES[event.state])
-        if self._reports and (health := self._reports[-1].health) is not None:
-            self._print(f"state of the machine: {headline(health, local_time)}", LEVEL_STYLES[health.state])
+    def _print_events(self, events: Iterable[EventDocument]) -> None:
+        for event in events:
+            self._print(event_text(event, local_time), event_style(event))
+
+    @property
+    def _health(self) -> HealthDocument | None:
+        """State of the machine at the end."""
+        return self._reports[-1].health if self._reports else None
 
     def _unbalances(self) -> list[UnbalanceComparison]:
         """Those that began early enough to be discovered, against the components of the last report."""
@@ -305,7 +308,7 @@ class Demo:
 
     def _print_json(self, rows: list[Comparison], unbalances: list[UnbalanceComparison], *, right: bool) -> None:
         verdict = {
-            "state": self._reports[-1].health.model_dump() if self._reports and self._reports[-1].health else None,
+            "state": self._health and self._health.model_dump(),
             "events": [event.model_dump() for report in self._reports for event in announcements(report)],
             "components": [{"right": unbalance.right, "text": str(unbalance)} for unbalance in unbalances],
             "right": right,

@@ -13,7 +13,7 @@ from otolith.acquisition.window import Verdict
 from otolith.cli.common import local_time
 from otolith.health.diagnosis import FindingKind
 from otolith.health.limits import Level
-from otolith.health.schema import DriverDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import event_text, headline, interval_text, value_cells
 
 HISTORY = 200  # windows that the curve of a parameter can show
@@ -90,6 +90,11 @@ def title(document: ReportDocument, rest: str = "") -> Text:
     return Text.assemble((document.machine, "bold"), text)
 
 
+def event_style(event: EventDocument) -> str:
+    """The style of the text of an event: that of its state until it is cleared."""
+    return LEVEL_STYLES[event.state if event.end is None else Level.OK]
+
+
 def state_lines(document: ReportDocument) -> list[Text]:
     """State of the machine, then its parts, then the events that are not cleared."""
     health = document.health
@@ -99,7 +104,7 @@ def state_lines(document: ReportDocument) -> list[Text]:
     for name, part in health.parts.items():
         parts.append(f"{name} ").append(part.state, style=LEVEL_STYLES[part.state]).append("  ")
     current = [event for event in document.events if event.end is None]
-    events = [Text(event_text(event, local_time), style=LEVEL_STYLES[event.state]) for event in current]
+    events = [Text(event_text(event, local_time), style=event_style(event)) for event in current]
     return [Text(headline(health, local_time), style=LEVEL_STYLES[health.state]), parts, *events]
 
 

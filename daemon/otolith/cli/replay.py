@@ -14,7 +14,7 @@ from rich.text import Text
 
 from otolith.acquisition.quality import ReasonCounts, time_text
 from otolith.cli.common import echo_warnings, progress_line
-from otolith.cli.live_table import LEVEL_STYLES, STYLES, parameter_table, title
+from otolith.cli.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, title
 from otolith.discovery.decision import WindowDecision
 from otolith.health.diagnosis import FindingKind
 from otolith.health.schema import EventDocument, ReportDocument, Status
@@ -72,7 +72,7 @@ class ReplaySummary:
         for component in last.components:
             yield Text(f"{component_text(component)}, since {time_text(component.onset)}", style="bold red")
         for event in self._events.values():
-            yield Text(event_text(event), style=LEVEL_STYLES[event.state])
+            yield Text(event_text(event), style=event_style(event))
         for finding in last.findings:
             if finding.kind is FindingKind.OPEN:
                 yield Text(finding_text(finding), style="magenta")
