@@ -28,7 +28,7 @@ LEAK = FindingDocument(
     condition="leak",
     text="a leak",
     since=0.0,
-    advice="Close it.",
+    advice="close it",
 )
 
 
@@ -48,7 +48,7 @@ def test_zero_change_text_has_no_sign(value: float) -> None:
 
 
 def test_finding_text_has_severity_and_advice() -> None:
-    assert finding_text(LEAK) == "fault: a leak Close it."
+    assert finding_text(LEAK) == "fault: a leak; close it"
     assert finding_text(LEAK.model_copy(update={"advice": ""})) == "fault: a leak"
 
 
@@ -58,7 +58,7 @@ def test_summary_is_one_line_with_reasons_and_warnings() -> None:
         update={"parameters": {"R_a": ESTIMATED, "L_a": UNKNOWN}, "findings": (LEAK,), "driver": driver}
     )
     assert summary(document) == (
-        "window 3 good, R_a 5.9856 ohm ± 0.0075, L_a unknown (unestimated: no current), fault: a leak Close it., "
+        "window 3 good, R_a 5.9856 ohm ± 0.0075, L_a unknown (unestimated: no current), fault: a leak; close it, "
         "no connection: unplugged, slow, and 2 more warnings"
     )
 

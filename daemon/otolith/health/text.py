@@ -58,7 +58,7 @@ def component_text(component: ComponentDocument) -> str:
 
 def finding_text(finding: FindingDocument) -> str:
     """Severity, text and advice of a finding."""
-    return " ".join(filter(None, [f"{finding.severity}: {finding.text}", finding.advice]))
+    return "; ".join(filter(None, [f"{finding.severity}: {finding.text}", finding.advice]))
 
 
 def event_text(event: EventDocument, when: Callable[[float], str] = time_text) -> str:
