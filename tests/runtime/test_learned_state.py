@@ -114,7 +114,7 @@ def test_an_open_event_goes_on_after_a_restart(tmp_path: Path) -> None:
     assert warm.health == state.health
     torque = Faults(torque=lambda _, angle, *__: 0.004 * math.sin(angle))
     _, reports = run(warm, windows(simulate_motor("sweep", 8.0, torque, seed=4), START + 60.0))
-    open_before = {record.event.id for record in state.health.records.values() if record.event is not None}
+    open_before = {event.id for event in state.health.open_events}
     assert open_before
     for report in reports:
         assert {event.id for event in report.events} == open_before

@@ -4,12 +4,23 @@ import json
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from otolith.acquisition.window import Verdict
 from otolith.adaptation.state import OperatorDecisions
-from otolith.health.schema import ReportDocument, Status
+from otolith.health.events import ConditionRecord, HealthState
+from otolith.health.limits import Level
+from otolith.health.schema import (
+    EventDocument,
+    EvidenceDocument,
+    QualityDocument,
+    ReportDocument,
+    Status,
+    WindowDocument,
+)
 from otolith.machine import load_machine
 from otolith.runtime.service import Service
 from otolith.runtime.state_store import StateStore
@@ -149,3 +160,22 @@ def test_a_state_that_windows_contradict_is_not_saved(healthy: OwnMachine, monke
     assert requested == [state]
     service._save(1e6 + 61.0)
     assert requested == [state, state]
+
+
+def test_an_event_is_saved_at_once(healthy: OwnMachine, monkeypatch: pytest.MonkeyPatch) -> None:
+    service, requested = Service(load_machine(healthy.machine)), list[object]()
+    monkeypatch.setattr(service._writer, "save", requested.append)
+    service._supervisor.finished += 1
+    service._save(1e6)
+    quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
+    window = WindowDocument(index=3, start=0.0, end=2.0, records=200, quality=quality)
+    for state in (Level.WATCH, Level.ACT):
+        event = EventDocument(
+            id="limit/R_a@0.0", part="winding", state=state, start=0.0, since=0.0, condition="", text="",
+            evidence=EvidenceDocument(windows=(window.index, window.index)),
+        )  # fmt: skip
+        health = HealthState(records={"limit/R_a": ConditionRecord(state, ((state, window),), event)})
+        service._supervisor.state = replace(service._supervisor.state, health=health)
+        service._save(1e6 + 1.0)
+        service._save(1e6 + 2.0)
+    assert len(requested) == 3

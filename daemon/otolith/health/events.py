@@ -57,6 +57,11 @@ class HealthState:
     document: HealthDocument | None = None
     """The states in the report before."""
 
+    @property
+    def open_events(self) -> tuple[EventDocument, ...]:
+        """The events that are not cleared."""
+        return tuple(record.event for record in self.records.values() if record.event is not None)
+
 
 def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
     """Return the state after ``report``, and the report with states and events."""

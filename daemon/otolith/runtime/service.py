@@ -143,14 +143,18 @@ class Service:
             notes.append(f"started without the operator's decisions: {error}")
         for text in notes:
             log.warning("%s", text)
-        self._notes, self._saved = tuple(notes), tuple(known.component.key for known in state.adopted)
+        self._notes, self._saved = tuple(notes), _keys(state)
         if math.isfinite(end := state.posterior.belief.end):
             log.info(
                 "started with what was learned up to %s", datetime.fromtimestamp(end, UTC).isoformat(" ", "seconds")
             )
-        if self._saved:
+        if state.adopted:
             remedy = "'otolith components forget' removes those that no longer exist"
-            log.info("started with saved components: %s; %s", ", ".join(self._saved), remedy)
+            log.info(
+                "started with saved components: %s; %s",
+                ", ".join(known.component.key for known in state.adopted),
+                remedy,
+            )
         return state
 
     def _step(self) -> None:
@@ -228,12 +232,12 @@ class Service:
         log.log(logging.INFO if is_due or sys.stderr.isatty() else logging.DEBUG, "%s", line)
 
     def _save(self, now: float) -> None:
-        """Request a save if components were added or removed, or the last save is ``SAVE_INTERVAL`` ago.
+        """Request a save if components or open events have changed, or the last save is ``SAVE_INTERVAL`` ago.
 
         A state that windows contradict is not saved: it might not be restored as what it was.
         """
         state = self._supervisor.state
-        keys = tuple(known.component.key for known in state.adopted)
+        keys = _keys(state)
         is_due = keys != self._saved or now - self._saved_at >= SAVE_INTERVAL
         if self._supervisor.finished and state.is_valid and is_due:
             self._writer.save(state)
@@ -269,3 +273,9 @@ class Service:
         writable(self._recording.parent)
         self._recorder.start(self._recording, machine.recorded(machine.driver.sampling))
         log.info("recording to %s", self._recording)
+
+
+def _keys(state: AdaptationState) -> tuple[str, ...]:
+    """Return what is saved at once when it changes: the components, and the open events with their states."""
+    events = (f"{event.id} {event.state}" for event in state.health.open_events)
+    return (*(known.component.key for known in state.adopted), *events)
