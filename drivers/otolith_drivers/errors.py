@@ -9,6 +9,10 @@ Each message names the file or device, the key or signal, the value, the bound o
 raised where the fault is detected; only ``otolith.__main__`` prints it, as one line, and turns it into an exit code.
 """
 
+from collections.abc import Sequence
+
+MAX_NAMES = 12  # names of messages, arbitration IDs or signals in a line
+
 
 class OtolithError(Exception):
     """Base of all errors whose text is written for the user."""
@@ -45,6 +49,12 @@ class ServiceError(OtolithError):
 def counted(number: int, noun: str) -> str:
     """Return the number and its noun, which takes an ``s`` unless the number is one."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Return the first ``MAX_NAMES`` names, and how many more there are."""
+    more = len(names) - MAX_NAMES
+    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def nearest(word: str, known: list[str]) -> str:

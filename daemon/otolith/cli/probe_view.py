@@ -15,7 +15,7 @@ from rich.text import Text
 
 from otolith_drivers.canbus import probe as canbus
 from otolith_drivers.canbus.bus import BusOptions
-from otolith_drivers.errors import counted
+from otolith_drivers.errors import counted, some_names
 from otolith_drivers.modbus import probe as modbus
 from otolith_drivers.modbus import probe_numbers
 from otolith_drivers.modbus.client import FUNCTION_CODES
@@ -27,7 +27,6 @@ GAP = 2  # characters between columns
 TEXT_COLUMNS = ("what", "remark")  # aligned left and wrapped
 TEXT_WIDTH = 24  # characters to which a text column may shrink
 MIN_ZERO_RUN = 3  # registers in a row that are always zero and share a row of the table
-MAX_NAMES = 12  # messages or arbitration IDs named in a line
 STYLES = {"*": "bold green", "?": "yellow", "!": "bold red", "·": "dim"}  # by the first character of a cell
 MARKS = {LayoutVerdict.CERTAIN: "*", LayoutVerdict.COUNTER: "*", LayoutVerdict.LIKELY: "?"}
 MODBUS_LEGEND = "* inferred from its changes    ? likely, but it hardly changes    · not a plausible number"
@@ -331,12 +330,7 @@ def remarks(picture: canbus.Picture) -> Iterator[str]:
     if picture.left_out:
         yield f"not shown: {counted(picture.left_out, 'frame')} of further arbitration IDs"
     if missing := [message.name for message in picture.missing()]:
-        yield f"in the database, but not received: {_names(missing)}"
-
-
-def _names(names: Sequence[str]) -> str:
-    more = len(names) - MAX_NAMES
-    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
+        yield f"in the database, but not received: {some_names(missing)}"
 
 
 def show_bus(
@@ -355,20 +349,7 @@ def show_bus(
 def _can_lines(picture: canbus.Picture, options: BusOptions, database: Path | None) -> list[str]:
     """The tables ``[driver]`` and ``[signals]``."""
     driver = canbus.can_driver_lines(options, picture, str(database.absolute()) if database else None)
-    lines = [*driver, "", *canbus.can_signal_lines(picture)]
-    unknown = [frames for frames in picture.ordered() if frames.message is None]
-    if any(canbus.fields_of(frames) for frames in unknown):
-        lines.append("# lines with ? are candidates among numbers of whole bytes: compare each with the machine")
-    selected = {frames.name: canbus.selector_of(frames) for frames in unknown}
-    lines += [
-        f"# {name} seems multiplexed by {selector}: no candidates, as they would mix several signals"
-        for name, selector in selected.items()
-        if selector
-    ]
-    still = [frames.name for frames in unknown if not selected[frames.name] and not canbus.fields_of(frames)]
-    if still:
-        lines.append(f"# no number changes smoothly in {_names(still)}: move the machine and probe again")
-    return lines
+    return [*driver, "", *canbus.can_signal_lines(picture)]
 
 
 def can_document(picture: canbus.Picture, options: BusOptions, database: Path | None, seconds: float) -> dict[str, Any]:

@@ -7,7 +7,7 @@ becomes a fault of the file, of a message or of a signal; only a fault of a requ
 import logging
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from cantools.database import Signal as CanSignal
 from cantools.database.can.database import Database
 
 from otolith_drivers.config_files import content
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, some_names
 
 SIZE_LIMIT = 4 << 20  # bytes; databases of large vehicles have 2 MB, and take some seconds each
 MAX_MESSAGE_LENGTH = 4096  # bytes; CAN FD has 64, the transport protocol of SAE J1939 1785
@@ -98,18 +98,19 @@ def load_database(path: Path) -> CanDatabase:
     if excess := _excess(text):
         raise ConfigurationError(f"{path}: not a CAN database: {excess}", KEY)
     kind = FORMATS.get(path.suffix.lower())
-    if kind in (None, "dbc"):
+    multiplexed: set[tuple[int, int, int]] = set()
+    if is_dbc := kind in (None, "dbc"):
         text, flagged = _with_extended_flags(text)
-        faults += [DatabaseFault(fault) for fault in flagged]
+        faults += flagged
+        multiplexed = _multiplexed_places(text)
     unread: dict[str, str] = {}
-    multiplexed = _multiplexed_places(text) if kind in (None, "dbc") else set()
     try:
         parsed = _parse(text, kind, strict=True)
     except Exception as strict_error:  # noqa: BLE001 - parsers raise exceptions of many types
         try:
             parsed = _parse(text, kind, strict=False)
         except Exception as error:
-            parsed, unread = _parse_each_message(text) if kind in (None, "dbc") else ([], {})
+            parsed, unread = _parse_each_message(text) if is_dbc else ([], {})
             if not parsed:
                 raise ConfigurationError(f"{path}: not a CAN database: {_cause(strict_error)}", KEY) from error
             faults.append(DatabaseFault(f"only its messages could be read: {_cause(error)}"))
@@ -153,13 +154,16 @@ def _excess(text: str) -> str:
     return ""
 
 
-def _with_extended_flags(text: str) -> tuple[str, list[str]]:
+def _dbc_messages(text: str) -> Iterator[tuple[str, str, str]]:
+    """Identifier, name and text of each message of a DBC; the identifier is empty if the first line is incomplete."""
+    for block in DBC_MESSAGE.findall(text):
+        words = block.split(None, 3)
+        yield (words[1], words[2].rstrip(":"), block) if len(words) > 2 else ("", block[:40].strip(), block)
+
+
+def _with_extended_flags(text: str) -> tuple[str, list[DatabaseFault]]:
     """A DBC with bit 31 in each identifier that needs 29 bits, as the format asks for; and what was changed."""
-    names = [
-        words[2].rstrip(":")
-        for words in (block.split(None, 3) for block in DBC_MESSAGE.findall(text))
-        if len(words) > 2 and words[1].isdecimal() and _needs_flag(int(words[1]))
-    ]
+    names = [name for number, name, _ in _dbc_messages(text) if number.isdecimal() and _needs_flag(int(number))]
     if not names:
         return text, []
 
@@ -167,8 +171,8 @@ def _with_extended_flags(text: str) -> tuple[str, list[str]]:
         identifier = int(match[2])
         return f"{match[1]}{identifier | EXTENDED_FLAG if _needs_flag(identifier) else identifier}"
 
-    some = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-    return DBC_REFERENCE.sub(flag, text), [f"identifiers over 11 bits without bit 31 are read as extended: {some}"]
+    fault = f"identifiers over 11 bits without bit 31 are read as extended: {some_names(names)}"
+    return DBC_REFERENCE.sub(flag, text), [DatabaseFault(fault)]
 
 
 def _needs_flag(identifier: int) -> bool:
@@ -195,9 +199,7 @@ def _parse_each_message(text: str) -> tuple[list[Message], dict[str, str]]:
         extras[match[1]].append(match[0])
     read: list[Message] = []
     unread: dict[str, str] = {}
-    for block in DBC_MESSAGE.findall(text):
-        words = block.split(None, 3)
-        identifier, name = (words[1], words[2].rstrip(":")) if len(words) > 2 else ("", block[:40].strip())
+    for identifier, name, block in _dbc_messages(text):
         alone = "\n".join(['VERSION ""', "NS_ :", "BS_:", "BU_:", block, *extras[identifier], ""])
         try:
             read += _parse(alone, "dbc", strict=False)
@@ -234,9 +236,9 @@ def _layout_faults(message: Message) -> list[DatabaseFault]:
 def _multiplexed_places(text: str) -> set[tuple[int, int, int]]:
     """Arbitration ID, start and length of the multiplexed signals of a DBC: cantools takes some for plain ones."""
     return {
-        (int(words[1]) % EXTENDED_FLAG, int(match[1]), int(match[2]))
-        for block in DBC_MESSAGE.findall(text)
-        if len(words := block.split(None, 2)) > 2 and words[1].isdecimal()
+        (int(number) % EXTENDED_FLAG, int(match[1]), int(match[2]))
+        for number, _, block in _dbc_messages(text)
+        if number.isdecimal()
         for match in DBC_MULTIPLEXED.finditer(block)
     }
 

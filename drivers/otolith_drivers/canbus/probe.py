@@ -6,7 +6,7 @@ No clock in here: the time of a frame is an argument. The last functions write l
 import math
 import re
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +21,7 @@ from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import STATES
 from otolith_drivers.canbus.monitoring import error_classes
 from otolith_drivers.canbus.signals import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
+from otolith_drivers.errors import some_names
 from otolith_drivers.number_inference import FRAMES, Layout, LayoutVerdict, Part, number_text, parts, quoted, spread
 
 MAX_IDENTIFIERS = 2048  # that are kept apart; a bus with standard identifiers has no more
@@ -244,50 +245,48 @@ def canopen_name(identifier: int) -> str:
     return f"{what} of node {node}" if node and what else ""
 
 
-def fields_of(observed: ObservedFrames) -> list[tuple[Part, Layout]]:
-    """Candidates for numbers in the frames of one arbitration ID, without counters and without what jumps.
-
-    There are none before ``MIN_FRAMES`` frames, and none in a multiplexed payload.
-    """
+def _payloads(observed: ObservedFrames) -> NDArray[np.uint8] | None:
+    """The data of the frames as long as the latest, a row each; None if there are fewer than ``MIN_FRAMES``."""
     history = [data for data in observed.history if len(data) == len(observed.latest)]
-    if len(history) < MIN_FRAMES or not observed.latest or selector_of(observed):
-        return []
-    data = np.frombuffer(b"".join(history), dtype=np.uint8).reshape(len(history), -1)
+    if len(history) < MIN_FRAMES or not observed.latest:
+        return None
+    return np.frombuffer(b"".join(history), dtype=np.uint8).reshape(len(history), -1)
+
+
+def _fields(payloads: NDArray[np.uint8]) -> list[tuple[Part, Layout]]:
+    """Candidates for numbers in the frames of one arbitration ID, without counters and without what jumps."""
     return [
         (part, part.layout)
-        for part in parts(data, FRAMES, 1)
+        for part in parts(payloads, FRAMES, 1)
         if part.layout is not None and part.verdict in (LayoutVerdict.CERTAIN, LayoutVerdict.LIKELY)
     ]
 
 
-def selector_of(observed: ObservedFrames) -> str:
-    """The byte, or half of one, that selects what the others mean; empty if there seems to be none.
-
-    Under a selector, another byte changes by far fewer bits from frame to frame of one value than from frame to frame.
-    """
-    history = [data for data in observed.history if len(data) == len(observed.latest)]
-    if len(history) < MIN_FRAMES or not observed.latest:
+def _selector(payloads: NDArray[np.uint8]) -> str:
+    """The byte, or half of one, that selects what the others mean; empty if there seems to be none."""
+    data = payloads.astype(np.int64)
+    bits = _change_bits(data)
+    if not np.any(bits >= MIN_SELECTED_BITS):
         return ""
-    data = np.frombuffer(b"".join(history), dtype=np.uint8).reshape(len(history), -1).astype(np.int64)
-    whole = _change_bits(data)
-    for place in range(data.shape[1] if np.any(whole >= MIN_SELECTED_BITS) else 0):
-        byte = data[:, place]
-        for values, name in (
-            (byte, "byte"),
-            (byte & 0x0F, "the low half of byte"),
-            (byte >> 4, "the high half of byte"),
-        ):
-            order = np.argsort(values, kind="stable")
-            count = len(np.unique(values))
-            if not 1 < count <= MAX_SELECTED or np.count_nonzero(np.diff(values)) < MIN_SELECTED_SHARE * len(values):
-                continue
-            within_value = np.diff(values[order]) == 0
-            grouped = _change_bits(data[order], within_value)
-            selected = (whole >= MIN_SELECTED_BITS) & (grouped <= MAX_GROUPED_SHARE * whole)
-            selected[place] = False
-            if selected.any():
+    for place, byte in enumerate(data.T):
+        halves = {"byte": byte, "the low half of byte": byte & 0x0F, "the high half of byte": byte >> 4}
+        for name, values in halves.items():
+            if np.any(np.delete(_is_selected(data, bits, values), place)):
                 return f"{name} {place}"
     return ""
+
+
+def _is_selected(data: NDArray[np.int64], bits: NDArray[np.float64], values: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether each byte depends on a selector with ``values``.
+
+    If so, it changes by far fewer bits between frames of one value than between frames in a row (``bits``).
+    """
+    switches = np.count_nonzero(np.diff(values))
+    if not 1 < len(np.unique(values)) <= MAX_SELECTED or switches < MIN_SELECTED_SHARE * len(values):
+        return np.zeros(len(bits), dtype=np.bool_)
+    order = np.argsort(values, kind="stable")
+    grouped = _change_bits(data[order], np.diff(values[order]) == 0)
+    return (bits >= MIN_SELECTED_BITS) & (grouped <= MAX_GROUPED_SHARE * bits)
 
 
 def _change_bits(data: NDArray[np.int64], counted: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
@@ -314,7 +313,7 @@ def can_driver_lines(options: BusOptions, picture: Picture, database: str | None
 
 
 def can_signal_lines(picture: Picture) -> Iterator[str]:
-    """The table ``[signals]``: signals of the database by name, other numbers by their bits."""
+    """The table ``[signals]``: signals of the database by name, other numbers by their bits; and remarks."""
     yield "[signals]"
     signals = [
         (observed, signal, value)
@@ -328,9 +327,27 @@ def can_signal_lines(picture: Picture) -> Iterator[str]:
         keys += "" if signal.unit else ', unit = "?"'
         unit = f"{signal.unit}, " if signal.unit else ""
         yield f"NAME = {{ {keys} }}  # {unit}{value_text(signal, value.latest)} now"
-    for observed in picture.ordered():
-        if observed.message is None:
-            yield from (_field_line(observed, part, layout) for part, layout in fields_of(observed))
+    yield from _candidate_lines([observed for observed in picture.ordered() if observed.message is None])
+
+
+def _candidate_lines(unknown: Sequence[ObservedFrames]) -> Iterator[str]:
+    """Candidates for numbers in frames that no database describes, and remarks on the frames without any."""
+    multiplexed, still = [], []
+    for observed in unknown:
+        payloads = _payloads(observed)
+        if payloads is not None and (selector := _selector(payloads)):
+            multiplexed.append(
+                f"# {observed.name} seems multiplexed by {selector}: no candidates, as they would mix several signals"
+            )
+        elif payloads is not None and (fields := _fields(payloads)):
+            yield from (_field_line(observed, part, layout) for part, layout in fields)
+        else:
+            still.append(observed.name)
+    if len(multiplexed) + len(still) < len(unknown):
+        yield "# lines with ? are candidates among numbers of whole bytes: compare each with the machine"
+    yield from multiplexed
+    if still:
+        yield f"# no number changes smoothly in {some_names(still)}: move the machine and probe again"
 
 
 def value_text(signal: CanSignal, number: float) -> str:
