@@ -37,8 +37,7 @@ class ReadOnlyClient:
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
         self._options = options
         self._aborted = threading.Event()
-        is_tcp = options.host is not None and options.framing == "tcp"
-        self._headers = _HeaderFilter(options) if is_tcp else None
+        self._headers = _HeaderFilter(options) if options.is_tcp else None
         self._client = _client(options, self._aborted, self._headers or _EchoFilter())
 
     def connect(self) -> None:
@@ -106,7 +105,7 @@ class ReadOnlyClient:
 
         Serial frames have no transaction number: the line must first have been silent for one timeout.
         """
-        if self._options.host is None or self._options.framing == "rtu":
+        if not self._options.is_tcp:
             now = time.monotonic()
             silent_at, latest = now + self._options.timeout, now + MAX_DRAIN * self._options.timeout
             while not self._aborted.is_set() and (now := time.monotonic()) < min(silent_at, latest):

@@ -187,30 +187,33 @@ class ModbusPoller:
         Raises:
             ExceptionReplyError, NoReplyError, ConnectionLostError: see :meth:`ReadOnlyClient.read`.
         """
-        for reopened in (False, True):
-            sent = time.monotonic()
-            try:
-                registers = self._client.read(request.device, request.table, request.address, request.count)
-            except ConnectionLostError:
-                if not self._answers or self._stop.is_set():
-                    raise
-                self._closings += self._answers == 1
-                if self._closings == MAX_FAILURES:
-                    log.warning("%s: closes the connection after each answer", self._options.title())
-                self._client.close()
-                self._client.connect()
-                self._answers = 0
-                continue
-            except ExceptionReplyError:
-                self._answers += 1
-                raise
-            now = time.monotonic()
+        sent = time.monotonic()
+        try:
+            registers = self._client.read(request.device, request.table, request.address, request.count)
+        except ExceptionReplyError:
             self._answers += 1
-            self._reconnects += reopened
-            self._closings = self._closings if self._answers == 1 else 0
-            self._trips.append(now - sent)
-            return registers, 0.5 * (sent + now)
-        raise ConnectionLostError("the connection was closed")
+            raise
+        except ConnectionLostError:
+            if not self._answers or self._stop.is_set():
+                raise
+            self._reopen()
+            return self._request(request)  # not a third time, as the new connection has no answer yet
+        received = time.monotonic()
+        self._answers += 1
+        if self._answers > 1:
+            self._closings = 0
+        self._trips.append(received - sent)
+        return registers, 0.5 * (sent + received)
+
+    def _reopen(self) -> None:
+        """Open the connection that the device closed."""
+        self._closings += self._answers == 1
+        if self._closings == MAX_FAILURES:
+            log.warning("%s: closes the connection after each answer", self._options.title())
+        self._client.close()
+        self._client.connect()
+        self._answers = 0
+        self._reconnects += 1
 
     def _read(self, request: Request, deliver: Deliver) -> bool:
         """Read one request and deliver its samples; return whether all registers repeat the previous values."""

@@ -51,9 +51,14 @@ class LineOptions(StrictModel):
     def _host_or_serial(self) -> Self:
         if (self.host is None) == (self.serial is None):
             raise ValueError('write either host = "192.168.0.10" or serial = "/dev/ttyUSB0"')
-        if (self.serial or self.framing == "rtu") and not self.reply_device is self.reply_transaction is None:
+        if not self.is_tcp and (self.reply_device is not None or self.reply_transaction is not None):
             raise ValueError("reply_device and reply_transaction are of Modbus TCP, which repeats both numbers")
         return self
+
+    @property
+    def is_tcp(self) -> bool:
+        """Whether the frames are those of Modbus TCP, with a header instead of a checksum."""
+        return self.host is not None and self.framing == "tcp"
 
     def title(self) -> str:
         """Return the line in a few words."""

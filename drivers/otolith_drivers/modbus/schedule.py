@@ -182,7 +182,7 @@ class RequestSet:
         return all(self._by_device[request.device].paused for request in self.requests)
 
     def warnings(self, now: float) -> list[str]:
-        """Return a line for each paused device and request."""
+        """Return a line for each paused device and request, and for each request that the device is too busy for."""
         lines = [
             f"device {number} does not answer for {now - backoff.since:.0f} s: {backoff.fault}; retried"
             for number, backoff in list(self._by_device.items())

@@ -151,8 +151,11 @@ def counted(driver: ModbusPoller) -> tuple[int, int, int]:
 
 def test_the_table_has_a_row_for_each_quirk() -> None:
     text = DOCS.read_text(encoding="utf-8")
-    rows = re.findall(r"^\| ([a-z0-9 ,-]+) \| ", text[text.index("## Quirks") :], re.MULTILINE)
-    assert rows[1:] == list(QUIRKS)
+    rows = re.findall(r"^\| ([a-z0-9 ,-]+) \| .* \| (.*) \|$", text[text.index("## Quirks") :], re.MULTILINE)[1:]
+    assert [name for name, _ in rows] == list(QUIRKS)
+    for name, lost in rows:
+        assert (lost == "all") is (QUIRKS[name].lost == 1.0), name
+        assert not lost.startswith("0") or QUIRKS[name].lost <= 0.1, name
 
 
 def test_a_device_that_closes_each_time_loses_nothing_and_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
