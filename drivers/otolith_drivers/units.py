@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 MAX_LENGTH = 100  # characters of a quantity: engineering choice; bounds the time of the patterns below
 RELATIVE = re.compile(r"([+-]?)\s*((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*%")
 NUMBER_AND_UNIT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*)")
+FACTOR_NAME = re.compile(r"[^\W\d][\w°%µμΩ]*|[°º%℃℉][^\W\d]*")
 # Unit names with one small exponent each, joined by * or /. A larger exponent would keep pint busy for minutes.
-FACTOR = r"[( ]*(?:1|[^\W\d][\w°%µμΩ]*|[°º%℃℉][^\W\d]*)(?: ?(?:\^|\*\*) ?\(?-?\d(?:\.\d{1,3})?\)?)?[) ]*"
+FACTOR = rf"[( ]*(?:1|{FACTOR_NAME.pattern})(?: ?(?:\^|\*\*) ?\(?-?\d(?:\.\d{{1,3}})?\)?)?[) ]*"
 UNIT = re.compile(rf"{FACTOR}(?:[*/· ]{FACTOR}){{0,12}}")
 
-FACTOR_NAME = re.compile(r"[^\W\d][\w°%µμΩ]*|[°º%℃℉][^\W\d]*")
-RATES: tuple[dict[str, int], ...] = ({}, {"[time]": -1}, {"[time]": -2})
-"""Dimensions in which pint cannot tell angles from numbers: of an angle, its rate and its acceleration."""
+TURNS = ("turn", "rpm", "turn/s^2")
+"""Units of an angle, its rate and its acceleration, which pint does not distinguish from 1, 1/s and 1/s^2."""
 
 
 class UnitNameError(ValueError):
@@ -117,11 +117,18 @@ def to_base(text: str) -> tuple[float, float]:
 
 
 def _check_dimension(source: str, target: str) -> None:
-    if unit(source).dimensionality != unit(target).dimensionality:
-        raise ValueError(f"unit {source!r} does not measure what {target!r} does: expected a unit like {target!r}")
+    dimension = unit(target).dimensionality
     # pint treats angles as dimensionless, so 1 Hz would become 1 rad/s: wrong by 2π if turns are meant.
-    if _is_angular(target) != _is_angular(source) and unit(target).dimensionality in RATES:
-        raise ValueError(f"unit {source!r} leaves open whether turns or radians are meant: write {target!r} or 'rpm'")
+    turns = next((name for name in TURNS if unit(name).dimensionality == dimension), "")
+    if unit(source).dimensionality != dimension:
+        raise ValueError(f"unit {source!r} does not measure what {target!r} does: expected a unit like {target!r}")
+    if not turns or _is_angular(source) == _is_angular(target):
+        return
+    if _is_angular(source):
+        raise ValueError(f"unit {source!r} has turns or radians, but {target!r} has none: write {target!r}")
+    raise UnitNameError(
+        f"unit {source!r} leaves open whether turns or radians are meant: write {target!r} or {turns!r}"
+    )
 
 
 def _is_angular(text: str) -> bool:

@@ -1,6 +1,7 @@
 """Units as databases of drives and vehicles write them: converted, or refused with a request to write them out."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,13 @@ def test_ambiguous_unit_names_its_meanings() -> None:
         unit("grad")
     with pytest.raises(ValueError, match=r"'MV' would be megavolt: write"):
         unit("MV")
+    for written, target, turns in (("counts", "rad", "turn"), ("1/s", "rad/s", "rpm"), ("1/s2", "rad/s2", "turn/s^2")):
+        with pytest.raises(
+            ValueError, match=f"whether turns or radians are meant: write '{target}' or '{re.escape(turns)}'"
+        ):
+            factor(written, target)
+    with pytest.raises(ValueError, match="'rpm' has turns or radians, but 'Hz' has none: write 'Hz'"):
+        factor("rpm", "Hz")
 
 
 @pytest.mark.parametrize("written", ["C", "F", "g", "kn", "S"])
@@ -132,6 +140,8 @@ def test_ambiguous_unit_of_a_database_asks_for_unit(tmp_path: Path) -> None:
     text = dbc('BO_ 385 Motor: 8 Drive\n SG_ Angle : 0|16@1- (0.5,0) [0|0] "grad" Monitor')
     with pytest.raises(ConfigurationError, match=r"Motor\.Angle: 'grad' may be .*; set 'unit' beside it"):
         decoder(tmp_path, {"phi": ("rad", {"signal": "Angle"})}, text)
+    with pytest.raises(ConfigurationError, match=r"'1/s' leaves open .*; set 'unit' beside it"):
+        decoder(tmp_path, {"omega": ("rad/s", {"signal": "Angle"})}, text.replace("grad", "1/s"))
     read = decoder(tmp_path, {"phi": ("rad", {"signal": "Angle", "unit": "degree"})}, text)
     (sample,) = read.decode(frame(385, bytes([180, 0, 0, 0, 0, 0, 0, 0])), 0.0)
     assert sample.value == pytest.approx(math.pi / 2)

@@ -19,7 +19,7 @@ from otolith_drivers.errors import counted, some_names
 from otolith_drivers.modbus import probe as modbus
 from otolith_drivers.modbus import probe_numbers
 from otolith_drivers.modbus.client import FUNCTION_CODES
-from otolith_drivers.modbus.protocol import LETTERS, TypeName
+from otolith_drivers.modbus.protocol import BUSY_CODES, EXCEPTIONS, LETTERS, TypeName
 from otolith_drivers.number_inference import LayoutVerdict, number_text
 
 PLAIN_WIDTH = 200  # columns of output that goes into a file
@@ -117,8 +117,10 @@ def show_device(probe: DeviceProbe, console: Console, *, wide: bool) -> None:
         console.print(line)
     if not survey.blocks:
         other = "input" if place.table == "holding" else "holding"
-        missing = f"the device is there, but not these registers: try others by --registers, or --table {other}"
-        console.print(missing if survey.refused else "ended before anything was read")
+        remedy = f"the device is there, but not these registers: try others by --registers, or --table {other}"
+        if set(survey.refused.values()) <= {EXCEPTIONS[code] for code in BUSY_CODES}:
+            remedy = "the device is there, but busy: try again later"
+        console.print(remedy if survey.refused else "ended before anything was read")
         return
     for line in _speed_lines(probe):
         console.print(line)

@@ -15,6 +15,7 @@ import cantools
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
 from cantools.database.can.database import Database
+from cantools.database.errors import UnsupportedDatabaseFormatError
 
 from otolith_drivers.config_files import content
 from otolith_drivers.errors import ConfigurationError, some_names
@@ -210,8 +211,10 @@ def _parse_each_message(text: str) -> tuple[list[Message], dict[str, str]]:
 
 
 def _cause(error: BaseException) -> str:
+    if isinstance(error, UnsupportedDatabaseFormatError):  # of each parser that was tried; most databases are DBC
+        causes = (error.e_dbc, error.e_kcd, error.e_sym, error.e_arxml)
+        error = next((cause for cause in causes if cause is not None), error)
     text = " ".join(str(error).split())
-    text = re.sub(r'^(?:DBC|KCD|SYM|ARXML): "(.*)"$', r"\1", text)
     return text[:200] or type(error).__name__
 
 

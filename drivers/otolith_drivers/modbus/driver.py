@@ -175,6 +175,8 @@ class ModbusPoller:
     def _refused(self, request: Request, error: ExceptionReplyError) -> list[Request]:
         """Return the request if the device is busy and can be asked again before the next round; else note it."""
         log.debug("%s: %s", request.describe(), error)
+        if not self._up:
+            self._reason = f"requests are refused: {error}"
         now, schedule = time.monotonic(), self._schedule
         if error.code in BUSY_CODES and now + 2.0 * schedule.period / BUSY_PAUSES < schedule.due:
             return [request]

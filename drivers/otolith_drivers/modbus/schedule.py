@@ -194,7 +194,7 @@ class RequestSet:
                 lines.append(f"{names}: {request.describe()} refused: {backoff.fault}; retried after a pause")
             elif backoff.failures >= MAX_FAILURES:
                 where, seconds = request.describe(), now - backoff.since
-                lines.append(f"{where}: no answer for {seconds:.0f} s: {backoff.fault}; repeated in each round")
+                lines.append(f"{where}: no values for {seconds:.0f} s: {backoff.fault}; repeated in each round")
         return lines
 
 

@@ -131,6 +131,7 @@ def test_quirk_is_handled_as_the_table_says(
         begun = counted(driver)
         wait_for(lambda: sum(counted(driver)) >= (STARTING + ROUNDS) * len(quirk.sources))
         received, bad, lost = (now - then for now, then in zip(counted(driver), begun, strict=True))
+        assert driver.link().up or quirk.lost == 1.0
         if quirk.reported:
             listener.wait(lambda link: bool(re.search(quirk.reported, " ".join((*link.warnings, link.plan)))))
         else:
@@ -203,6 +204,12 @@ def test_a_decimals_register_moves_the_point(place: int) -> None:
         wait_for(lambda: listener.driver.counters().bad > counters.bad + 3)
     assert {sample.value for sample in listener.of("s0") if sample.value == sample.value} == {24.15, 2.415}
     assert "with the decimals of register" in listener.driver.describe()[1]
+
+
+def test_the_reason_of_a_link_that_is_down_is_what_the_device_answers() -> None:
+    behaviour, port = Behaviour(WORDS, refuse=lambda *_: 6), free_port(socket.SOCK_STREAM)
+    with odd_server(behaviour, port), Listener(poller(port, TWO, 0.02)) as listener:
+        listener.wait(lambda link: not link.up and "server device busy" in link.reason)
 
 
 def test_reply_numbers_are_of_tcp_only() -> None:

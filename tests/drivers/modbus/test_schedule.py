@@ -170,7 +170,7 @@ def test_busy_device_is_reported_and_never_paused(code: int) -> None:
         assert requests.warnings(1.0) == []
         requests.refused(only, ExceptionReplyError(code), 1.0)
         assert requests.due(1.0) == [only]
-    assert "no answer for 2 s: exception" in requests.warnings(3.0)[0]
+    assert "no values for 2 s: exception" in requests.warnings(3.0)[0]
     assert "repeated in each round" in requests.warnings(3.0)[0]
     requests.answered(only)
     assert requests.warnings(3.0) == []
