@@ -76,6 +76,7 @@ class RecordingReader(Reader):
         self._delays: dict[str, int] = {}  # ns; subtracted from the recorded times, so that the readings came later
         self._units, self._chunks = units, dict.fromkeys(units, 0)
         written = self._scan()
+        self._bad_begins, self._bad_ends = np.array(sorted(self._bad_windows)).reshape(-1, 2).T
         self._scales = {name: self._scale(name, unit, written) for name, unit in units.items()}
 
     def _check_in_a_child(self) -> None:
@@ -204,9 +205,8 @@ class RecordingReader(Reader):
     def _in_bad_window(self, times: Integers) -> Mask:
         if not self._bad_windows:
             return np.zeros(len(times), dtype=np.bool_)
-        begins, ends = np.array(sorted(self._bad_windows)).T
-        at = np.searchsorted(begins, times, side="right") - 1
-        inside: Mask = (at >= 0) & (times < ends[at])
+        at = np.searchsorted(self._bad_begins, times, side="right") - 1
+        inside: Mask = (at >= 0) & (times < self._bad_ends[at])
         return inside
 
     def describe(self) -> list[str]:
