@@ -326,29 +326,30 @@ def _digit_bits(layout: Layout, ranks: Ranks, numbers: Floats) -> float:
 
 
 def _judged(part: Part, rivals: Sequence[tuple[float, Part]]) -> Part:
-    """Return ``part`` with the rivals that cost hardly more and have other values, the cheapest first."""
+    """Return ``part`` with its probability and the cheapest rivals that cost hardly more and have other values.
+
+    A rival's odds are 1 to 2 per bit of its cost, scaled so that the margin of a certain number is ``CERTAIN_MARGIN``.
+    """
     if part.verdict is not LayoutVerdict.CERTAIN:
         return part
     changes = int(np.count_nonzero(np.diff(part.numbers)))
     weights: dict[tuple[int, tuple[int, ...]], float] = {}
     others: dict[tuple[int, tuple[int, ...]], Other] = {}  # a signed and an unsigned number count as one
     for cost, rival in sorted(rivals, key=lambda rival: rival[0]):
-        per_change = CERTAIN_MARGIN_PER_CHANGE if max(part.width, rival.width) > 2 else 0.0
         if rival.layout is None:
             continue
+        key, equal = (rival.start, rival.layout.positions), np.array_equal(rival.numbers, part.numbers)
+        per_change = CERTAIN_MARGIN_PER_CHANGE if max(part.width, rival.width) > 2 else 0.0
         margin = max(CERTAIN_MARGIN, per_change * changes)
-        if not np.array_equal(rival.numbers, part.numbers):
-            weights.setdefault(
-                (rival.start, rival.layout.positions), 2.0 ** (-CERTAIN_MARGIN * max(cost, 0.0) / margin)
-            )
+        if not equal:
+            weights.setdefault(key, 2.0 ** (-CERTAIN_MARGIN * max(cost, 0.0) / margin))
         if cost >= margin:
             continue
         # If the high half is constant, the integer has the values of its low half, up to a constant.
         extends = rival.width > part.width and not rival.layout.is_float
-        same = np.array_equal(rival.numbers, part.numbers) and (extends or rival.start == part.start)
+        same = equal and (extends or rival.start == part.start)
         if not same and not (extends and np.abs(part.numbers).max() < LOW_HALF_SIZE):
-            other = Other(rival.start, rival.layout, rival.latest)
-            others.setdefault((rival.start, rival.layout.positions), other)
+            others.setdefault(key, Other(rival.start, rival.layout, rival.latest))
     verdict = LayoutVerdict.LIKELY if others or len(part.numbers) < MIN_READINGS else LayoutVerdict.CERTAIN
     probability = min(1.0 / (1.0 + sum(weights.values())), MAX_PROBABILITY)
     return replace(part, verdict=verdict, others=tuple(others.values())[:MAX_OTHERS], probability=probability)

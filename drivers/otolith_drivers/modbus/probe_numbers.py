@@ -42,7 +42,7 @@ class Number:
 
     address: int
     part: Part
-    word: int | None = None
+    word: int
     """The latest content of its first register."""
 
     @property
@@ -172,7 +172,7 @@ def _longer_readings(place: Place, number: Number, numbers: Sequence[Number]) ->
     kind = layout.kind.replace("16", "32")
     for offset, order in ((-1, ""), (1, " CDAB")):
         high = next((other for other in numbers if other.address == number.address + offset), None)
-        if high is not None and high.part.verdict is LayoutVerdict.STILL and high.word is not None:
+        if high is not None and high.part.verdict is LayoutVerdict.STILL:
             whole = (high.word << 16) + (int(number.part.latest) & 0xFFFF)
             whole -= 1 << 32 if layout.signed and high.word >> 15 else 0
             texts.append(f"{kind}{order} of register {place.shown(min(number.address, high.address))} ({whole})")
