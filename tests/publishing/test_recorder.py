@@ -162,6 +162,21 @@ def test_a_recording_of_another_application_is_refused(tmp_path: Path) -> None:
         RecordingReader(path, UNITS)
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["", "{}", '{"sampling": "true"}', '{"sampling": "guessed", "delays": {}}', '{"sampling": "true", "delays": 1}'],
+)
+def test_a_recording_whose_times_mean_something_unknown_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "run.rrd"
+    stream = rr.RecordingStream("otolith", recording_id="x")
+    stream.save(path)
+    stream.log("times", rr.TextDocument(text), static=True)
+    stream.log("signals/i", rr.Scalars([1.0]))
+    stream.disconnect()
+    with pytest.raises(ConfigurationError, match="/times does not state what the times mean"):
+        RecordingReader(path, {"i": "A"})
+
+
 def test_the_error_names_a_signal_that_was_not_recorded(tmp_path: Path, rows: Lines) -> None:
     path = record(tmp_path, rows)
     with pytest.raises(ConfigurationError, match=r"no signal 'p' \(Pa\) was recorded: it has T_load, V_a, i, omega"):

@@ -5,7 +5,6 @@ clock, not those of the arrivals; a window may have been bad because of when its
 windows are left out. Delays that the machine file declared are added again, because a replay subtracts them.
 """
 
-import json
 import re
 import subprocess
 import sys
@@ -36,6 +35,14 @@ FOLDER, WINDOWS, TIMES = "/signals/", "/windows", "/times"
 TEXT = "TextDocument:text"
 READ_ALL = "import sys; from rerun.chunk import RrdReader; [None for _ in RrdReader(sys.argv[1]).stream()]"
 NAME = re.compile(r".* measured \[(.*)\]")  # of a series; the group is the unit
+
+
+class TimesRecord(StrictModel):
+    """What the times of a recording mean, as the recorder writes it."""
+
+    sampling: Sampling
+    delays: dict[str, float]
+    """By signal, s."""
 
 
 class RecordingSource(StrictModel):
@@ -123,16 +130,21 @@ class RecordingReader(Reader):
             elif name in self._chunks:
                 self._chunks[name] += 1
             elif str(chunk.entity_path) == TIMES:
-                self._guarded(self._note_times, chunk.to_record_batch().column(TEXT).to_pylist()[0][0])
+                self._note_times(self._guarded(chunk.to_record_batch).column(TEXT).to_pylist()[0][0])
             elif str(chunk.entity_path) == WINDOWS and not chunk.is_static:
                 self._note_windows(chunk.to_record_batch().column(VALUES).to_pylist())
         return units
 
     def _note_times(self, text: str) -> None:
-        """Note what the times mean; an unknown text is a ``ValueError``."""
-        written = json.loads(text)
-        self.sampling = Sampling(written["sampling"])
-        self._delays = {name: round(1e9 * delay) for name, delay in written["delays"].items()}
+        """Note what the times mean."""
+        try:
+            written = TimesRecord.model_validate_json(text)
+        except ValueError as error:
+            known = ", ".join(Sampling)
+            remedy = f"it needs sampling ({known}) and delays: was it written by a newer Otolith?"
+            raise ConfigurationError(f"{self.path}: {TIMES} does not state what the times mean: {remedy}") from error
+        self.sampling = written.sampling
+        self._delays = {name: round(1e9 * delay) for name, delay in written.delays.items()}
 
     def _note_windows(self, windows: list[Any]) -> None:
         for window in windows:
