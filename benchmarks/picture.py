@@ -14,7 +14,7 @@ from rich.console import Console
 from benchmarks.motor import CONFIG, RECORDS, windows
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.cli.live_table import LiveTable
+from otolith.cli.operation.live_table import LiveTable
 from otolith.machine import load_machine
 from otolith_drivers.plant.scenario import load_scenario
 

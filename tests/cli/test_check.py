@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from otolith.cli.check import check_machine
+from otolith.cli.commissioning.check import check_machine
 from tests.conftest import OwnMachine
 
 

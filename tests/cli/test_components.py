@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state, restore_components
 from otolith.cli.main import cli
 from otolith.machine import load_machine
-from otolith.runtime.state_store import StateStore
+from otolith.storage.state_store import StateStore
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.cli.replays import MACHINE
 from tests.conftest import EXAMPLES

@@ -11,8 +11,8 @@ from benchmarks.sampling.measure import some_motor, write_machine
 from benchmarks.sampling.schedules import Schedule, Timing, record
 from click.testing import CliRunner, Result
 
+from otolith.cli.commissioning.noise import evenly_spread
 from otolith.cli.main import cli
-from otolith.cli.noise import evenly_spread
 from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario

@@ -135,7 +135,7 @@ def test_json_of_a_device(drive: int) -> None:
 
 
 def test_a_narrow_terminal_gets_several_tables(drive: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("otolith.cli.probe_view.PLAIN_WIDTH", 80)
+    monkeypatch.setattr("otolith.cli.commissioning.probe_view.PLAIN_WIDTH", 80)
     text = probe("modbus", f"127.0.0.1:{drive}", "--registers", "0..10", "--seconds", 0.2, "--wide").stdout
     tables = text[: text.index("[driver]")]
     assert all(len(line) <= 80 or "*" in line[:2] for line in tables.splitlines()[5:])
@@ -304,7 +304,7 @@ def test_ctrl_c_ends_reading_with_the_values_so_far() -> None:
 
 
 def test_no_probe_can_send() -> None:
-    paths = [*ROOT.glob("drivers/otolith_drivers/*/probe*.py"), *ROOT.glob("daemon/otolith/cli/probe*.py")]
+    paths = [path for root in ("drivers", "daemon") for path in (ROOT / root).glob("**/probe*.py")]
     assert len(paths) >= 4
     for path in paths:
         text = path.read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.cli.check import describe
+from otolith.cli.commissioning.check import describe
 from otolith.machine import load_machine, load_twin
 from otolith.twin.expressions import FUNCTIONS
 from otolith.twin.identifiability import structural_identifiability

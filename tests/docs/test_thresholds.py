@@ -11,7 +11,7 @@ DRIVERS, DAEMON = ROOT / "drivers" / "otolith_drivers", ROOT / "daemon" / "otoli
 SOURCES = {
     "acquisition": [DAEMON / "acquisition"],
     "canbus": [DRIVERS / "canbus"],
-    "cli": [DAEMON / "cli", DAEMON / "health"],
+    "cli": [DAEMON / "cli", DAEMON / "cli" / "commissioning", DAEMON / "cli" / "operation", DAEMON / "health"],
     "commissioning": [DAEMON / "commissioning"],
     "discovery": [DAEMON / "discovery"],
     "drivers": [DRIVERS],
@@ -21,6 +21,7 @@ SOURCES = {
     "plant": [DRIVERS / "plant"],
     "replay": [DRIVERS / "replay"],
     "runtime": [DAEMON / "runtime", DAEMON / "publishing", DAEMON],
+    "storage": [DAEMON / "storage"],
     "twin": [DAEMON / "twin"],
 }
 PAGES = sorted((ROOT / "docs" / "reference").glob("thresholds-*.md"))

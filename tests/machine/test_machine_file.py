@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from otolith.cli.check import describe
+from otolith.cli.commissioning.check import describe
 from otolith.health.limits import Level, MonitoringPlan
 from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError, OtolithError

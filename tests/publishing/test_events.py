@@ -6,7 +6,7 @@ import socket
 import pytest
 from rich.console import Console
 
-from otolith.cli.live_table import LEVEL_STYLES, LiveTable, event_style
+from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_style
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import value_cells

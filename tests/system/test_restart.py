@@ -23,7 +23,7 @@ from otolith.health.schema import (
 )
 from otolith.machine import load_machine
 from otolith.runtime.service import Service
-from otolith.runtime.state_store import StateStore
+from otolith.storage.state_store import StateStore
 from tests.conftest import OwnMachine
 from tests.system.conftest import OTOLITH, Running, is_estimated
 from tests.waiting import PATIENCE, wait_for

@@ -20,8 +20,8 @@ from otolith.estimation.problem import Component
 from otolith.machine import RecordedMachine, find_twin, load_machine
 from otolith.publishing import recorder
 from otolith.runtime.service import STALL_TIMEOUT, Service
-from otolith.runtime.state_store import StateStore
 from otolith.runtime.worker import COMPILE_TIMEOUT
+from otolith.storage.state_store import StateStore
 from otolith_drivers.base import Sampling
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running

@@ -25,7 +25,7 @@ from rich.table import Table
 from otolith.acquisition.window import Verdict
 from otolith.adaptation.state import initial_state
 from otolith.cli.common import INTERRUPTED, drain, local_time
-from otolith.cli.live_table import LEVEL_STYLES, LiveTable, event_style
+from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_style
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
 from otolith.health.text import announcements, event_text, half_width_text, headline, summary
 from otolith.machine import LoadedMachine, load_machine

@@ -13,6 +13,10 @@ from typing import Any
 import click
 
 from otolith import __version__
+from otolith.cli.commissioning.components import commission, components, reset
+from otolith.cli.commissioning.noise import noise
+from otolith.cli.commissioning.probe import probe
+from otolith.cli.commissioning.twin import twin
 from otolith.cli.common import (
     DATA_FILES,
     FILE,
@@ -22,10 +26,6 @@ from otolith.cli.common import (
     examples_directory,
     log_to_stderr,
 )
-from otolith.cli.components import commission, components, reset
-from otolith.cli.noise import noise
-from otolith.cli.probe import probe
-from otolith.cli.twin import twin
 
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.realtime.NODES, which is slow to import
 EXIT_CODES = """\b
@@ -139,7 +139,7 @@ def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
       otolith check --no-device config/dc-motor.toml
       otolith check my-machine.toml monday.csv
     """
-    from otolith.cli.check import check_data, check_machine
+    from otolith.cli.commissioning.check import check_data, check_machine
 
     if data is not None:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # so that Ctrl-C removes the line of progress
@@ -195,7 +195,7 @@ def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
       otolith watch
       otolith watch --json | jq .parameters.R_a
     """
-    from otolith.cli.watch import watch_reports
+    from otolith.cli.operation.watch import watch_reports
 
     stop = StopSignal()
     watch_reports(connect, machine, as_json=as_json, stopped=stop.received)
@@ -213,7 +213,7 @@ def view(file: Path | None, only_list: bool) -> int:
       otolith view
       otolith view --list
     """
-    from otolith.cli.watch import list_recordings, open_viewer
+    from otolith.cli.operation.watch import list_recordings, open_viewer
 
     if only_list:
         list_recordings()

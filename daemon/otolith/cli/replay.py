@@ -14,7 +14,7 @@ from rich.text import Text
 
 from otolith.acquisition.quality import ReasonCounts, time_text
 from otolith.cli.common import echo_warnings, progress_line
-from otolith.cli.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, title
+from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, title
 from otolith.discovery.decision import WindowDecision
 from otolith.health.diagnosis import FindingKind
 from otolith.health.schema import EventDocument, ReportDocument, Status

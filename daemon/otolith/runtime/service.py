@@ -27,9 +27,9 @@ from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS, ChildProcess
-from otolith.runtime.state_store import StateStore, WriterThread
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
+from otolith.storage.state_store import StateStore, WriterThread
 from otolith_drivers.errors import OtolithError
 from otolith_drivers.user_dirs import writable
 

@@ -13,7 +13,7 @@ import pytest
 from cantools.database import Message
 from cantools.database.can.database import Database
 
-from otolith.cli.probe_view import can_document
+from otolith.cli.commissioning.probe_view import can_document
 from otolith_drivers.base import Signal
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import read_eds

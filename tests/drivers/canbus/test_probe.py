@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from otolith.cli.probe_view import can_document, marked, remarks, tables
+from otolith.cli.commissioning.probe_view import can_document, marked, remarks, tables
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.database import load_dbc
 from otolith_drivers.canbus.probe import MAX_IDENTIFIERS, Picture, can_driver_lines, can_signal_lines, canopen_name

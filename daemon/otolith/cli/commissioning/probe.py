@@ -13,7 +13,7 @@ import click
 from otolith.cli.common import AS_JSON, FILE, StopSignal, progress_line
 
 if TYPE_CHECKING:
-    from otolith.cli.probe_view import DeviceProbe
+    from otolith.cli.commissioning.probe_view import DeviceProbe
     from otolith_drivers.canbus.bus import BusOptions
     from otolith_drivers.canbus.probe import Picture
     from otolith_drivers.modbus.probe import Answer
@@ -113,7 +113,7 @@ def modbus(
       otolith probe modbus /dev/ttyUSB0 --baudrate 9600 --parity N --device 5
       otolith probe modbus /dev/ttyUSB0 --scan
     """
-    from otolith.cli.probe_view import modbus_document, show_device, stdout_console
+    from otolith.cli.commissioning.probe_view import modbus_document, show_device, stdout_console
     from otolith_drivers.config_files import validated
     from otolith_drivers.modbus.options import LineOptions
     from otolith_drivers.modbus.probe_numbers import Place
@@ -191,7 +191,7 @@ def _read(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> 
     Raises:
         DeviceError: the line cannot be opened, or the device does not answer.
     """
-    from otolith.cli.probe_view import DeviceProbe
+    from otolith.cli.commissioning.probe_view import DeviceProbe
     from otolith_drivers.modbus.options import HIGHEST_ADDRESS
     from otolith_drivers.modbus.probe import ProbeClient, opened, speeds, survey, watch
     from otolith_drivers.modbus.probe_numbers import numbers_of
@@ -242,7 +242,7 @@ def can_(
       otolith probe can --channel can0 --database drive.dbc
       otolith probe can --interface pcan --channel PCAN_USBBUS1 --bitrate 500000
     """
-    from otolith.cli.probe_view import can_document, remarks, show_bus, stdout_console
+    from otolith.cli.commissioning.probe_view import can_document, remarks, show_bus, stdout_console
     from otolith_drivers.canbus.bus import BusOptions
     from otolith_drivers.config_files import validated
 
@@ -271,7 +271,7 @@ def _listen(options: "BusOptions", database: Path | None, seconds: float, stop: 
     from rich.console import Group
     from rich.live import Live
 
-    from otolith.cli.probe_view import bus_title, stdout_console, tables
+    from otolith.cli.commissioning.probe_view import bus_title, stdout_console, tables
     from otolith_drivers.canbus.bus import open_bus
     from otolith_drivers.canbus.database import load_dbc
     from otolith_drivers.canbus.probe import Picture

@@ -16,7 +16,7 @@ from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, 
 if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
     from otolith.machine import LoadedMachine
-    from otolith.runtime.state_store import StateStore
+    from otolith.storage.state_store import StateStore
 
 
 @click.group()
@@ -186,7 +186,7 @@ def reset(file: Path, names: tuple[str, ...], dry_run: bool) -> None:
 
 def _store(file: Path) -> "tuple[LoadedMachine, StateStore]":
     from otolith.machine import load_machine
-    from otolith.runtime.state_store import StateStore
+    from otolith.storage.state_store import StateStore
 
     machine = load_machine(file, with_driver=False)
     names = machine.file.machine
@@ -217,7 +217,7 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
 
 def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windows: int, *, approve_all: bool) -> None:
-    from otolith.cli.noise import identified_noise, noise_lines
+    from otolith.cli.commissioning.noise import identified_noise, noise_lines
 
     state = _replayed(machine, data)
     _, identified = identified_noise(machine, data, windows)

@@ -18,7 +18,7 @@ from typing import Annotated, TypeVar
 from pydantic import Field, ValidationError
 
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
-from otolith.runtime.learned_state import (
+from otolith.storage.learned_state import (
     VERSION,
     LearnedState,
     check_components,

@@ -19,8 +19,8 @@ from otolith.adaptation.state import (
 from otolith.discovery.adopted import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import load_machine
-from otolith.runtime import state_store
-from otolith.runtime.state_store import StateStore, WriterThread
+from otolith.storage import state_store
+from otolith.storage.state_store import StateStore, WriterThread
 from otolith_drivers.errors import OtolithError, ServiceError
 from tests.cli.replays import MACHINE
 from tests.waiting import PATIENCE, wait_for, within

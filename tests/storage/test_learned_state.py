@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from otolith.adaptation.state import EVERYTHING, AdaptationState, OperatorDecisions, apply_decisions, component_records
 from otolith.health.schema import EventChange, ReportDocument, Status
-from otolith.runtime.state_store import MAX_KEPT, MAX_STATE_BYTES, StateStore
+from otolith.storage.state_store import MAX_KEPT, MAX_STATE_BYTES, StateStore
 from otolith_drivers.errors import OtolithError
 from tests.runtime.motors import NAMES, PROBLEM, START, UNBALANCE, fresh, healthy, noisy, run, unbalanced, windows
 

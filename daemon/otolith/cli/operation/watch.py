@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.live import Live
 
 from otolith.cli.common import drain
-from otolith.cli.live_table import LiveTable
+from otolith.cli.operation.live_table import LiveTable
 from otolith.publishing.zenoh_session import REPORT, Listener
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import cache_directory, state_directory

@@ -1,0 +1,1 @@
+"""The commands by which a machine is described and commissioned."""

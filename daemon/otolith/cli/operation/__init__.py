@@ -1,0 +1,1 @@
+"""The commands for machines in operation."""
