@@ -191,6 +191,7 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "phase": (with_value("filter", "phase", "by", value=[1e300]), "too large"),
     "phases": (with_value("filter", "phase", "by", value=[]), "phase"),
     "noise": (with_value("filter", "noise", value=[1e9, 1e9]), "noise"),
+    "steps": (with_value("filter", "steps", value=[-0.1, 0.0]), "steps"),
     "status": (with_value("filter", "previous", 0, "status", value="splendid"), "status"),
 }
 

@@ -25,7 +25,7 @@ from otolith.acquisition.quality import time_text
 from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array, Mask, Verdict, Window
 from otolith.estimation.imm_filter import nis_limit
-from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, adc_step
+from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, adc_step, rounding_variance
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
@@ -238,8 +238,10 @@ def _frozen_run(predicted: Posterior, window: Window, name: str, runs: list[Indi
     index = [output.name for output in problem.twin.outputs].index(name)
     values, noise = window.column(name)[present], problem.noise[index]
     step = _step(values)
-    if step != adc_step(values):  # the objective would leave so few levels out
-        with_rounding = float(np.sqrt(noise**2 + step**2 / 12.0))
+    known = problem.steps[index] if problem.steps else 0.0
+    lacking = step**2 / 12.0 - rounding_variance(values, known)
+    if lacking > 0.0:  # the objective leaves so few levels out
+        with_rounding = float(np.sqrt(noise**2 + lacking))
         problem = replace(problem, noise=(*problem.noise[:index], with_rounding, *problem.noise[index + 1 :]))
     hidden = _without(window, name, np.concatenate([run[1:] for run in runs]))
     rest = _fit(predicted, problem, hidden)

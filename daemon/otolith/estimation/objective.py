@@ -221,8 +221,11 @@ class Objective:
     def _noise_model(self, problem: Problem, window: Window) -> NoiseModel:
         twin = problem.twin.base or problem.twin
         measured = zip(self.measured.T, self.present.T, strict=True)
-        steps = np.array([adc_step(values[present]) for values, present in measured])
-        outputs = np.sqrt(np.array(problem.noise) ** 2 + steps**2 / 12.0)
+        known = problem.steps or (0.0,) * len(twin.outputs)
+        rounding = [
+            rounding_variance(values[present], step) for (values, present), step in zip(measured, known, strict=True)
+        ]
+        outputs = np.sqrt(np.array(problem.noise) ** 2 + np.array(rounding))
         states = np.array(problem.process_noise or [0.0] * len(twin.states))
         inputs = np.array(problem.input_noise or [0.0] * len(twin.inputs))
         error = window.bridge_error
@@ -249,18 +252,35 @@ def input_matrix(twin: Definition, window: Window) -> Array:
     return np.hstack(columns)
 
 
+def rounding_variance(values: Array, known_step: float) -> float:
+    """Return the variance that rounding to the steps of a converter adds to ``values`` (n,), in their unit squared.
+
+    Each error has a twelfth of the squared step (B. Widrow, I. Kollar, Quantization Noise, section 4.4). The errors of
+    a run of equal values are one error, so that the variance of a mean is larger by the mean length of the runs.
+    Values on too few levels to show a step have the ``known_step`` of the windows before, or 0.
+    """
+    if len(values) == 0:
+        return 0.0
+    step = adc_step(values) or (known_step if len(np.unique(values)) < MIN_ADC_LEVELS else 0.0)
+    return step**2 / 12.0 * len(values) / _runs(values)
+
+
 def adc_step(values: Array) -> float:
     """Return the step of the converter behind ``values`` (n,), or 0 if the values show none.
 
-    Rounding to steps adds a twelfth of the squared step to the variance (B. Widrow, I. Kollar, Quantization Noise,
-    section 4.4).
+    Fewer than ``MIN_ADC_LEVELS`` show it if a level comes again: a sensor that fails jumps to another level once.
     """
     levels = np.unique(values)
-    if len(levels) < MIN_ADC_LEVELS:
+    if len(levels) < 2 or (len(levels) < MIN_ADC_LEVELS and _runs(values) <= len(levels)):
         return 0.0
     steps = np.diff(levels)
     multiples = steps / steps.min()
     return float(steps.min()) if np.abs(multiples - np.rint(multiples)).max() <= ADC_TOLERANCE else 0.0
+
+
+def _runs(values: Array) -> int:
+    """Return in how many runs of equal values ``values`` (n,) come."""
+    return 1 + int(np.count_nonzero(np.diff(values)))
 
 
 def _initial_state(twin: Definition, measured: Array, present: Mask, noise: Array) -> tuple[Array, Array, Array]:

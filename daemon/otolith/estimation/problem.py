@@ -98,6 +98,8 @@ class Problem:
     """Standard deviation of the sensor of each output."""
     stated_noise: tuple[float, ...] = ()
     """The same as the machine file states it, where the windows have shown that it is larger; empty otherwise."""
+    steps: tuple[float, ...] = ()
+    """Step of the converter of each output, as the windows have shown it; 0 or empty for none."""
     input_noise: tuple[float, ...] = ()
     """Standard deviation of each input; empty for none."""
     process_noise: tuple[float, ...] = ()

@@ -56,6 +56,8 @@ class FilterRecord(StrictModel):
     phase: PhaseAdvance | None
     noise: tuple[float, ...]
     """Of the outputs; empty unless it was accepted as larger than the machine file states."""
+    steps: tuple[float, ...] = ()
+    """See :attr:`otolith.estimation.problem.Problem.steps`."""
     previous: tuple[PreviousStatus, ...]
     records: int
     learned: int
@@ -150,6 +152,7 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
         variance_ratio=belief.variance_ratio,
         phase=state.posterior.phase,
         noise=problem.noise if problem.stated_noise else (),
+        steps=problem.steps,
         previous=tuple(state.previous.get(label, PreviousStatus()) for label in labels),
         **{name: getattr(state, name) for name in SCALARS},
     )
@@ -178,7 +181,8 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
     if record is None:
         known = restore_components(state, document.components)
         return replace(known, resets=document.resets, health=document.health)
-    posterior, window = _posterior(record, _with_noise(problem, record.noise)), problem.window
+    problem = _with_steps(_with_noise(problem, record.noise), record.steps)
+    posterior, window = _posterior(record, problem), problem.window
     if record.end > now:
         posterior = replace(posterior, belief=replace(posterior.belief, end=now - (record.end - now)))
     kept = {name: getattr(record, name) for name in SCALARS}
@@ -233,6 +237,13 @@ def _with_noise(problem: Problem, noise: tuple[float, ...]) -> Problem:
     ratios = [accepted / stated for accepted, stated in zip(noise, problem.noise, strict=True)]
     _require(1.0 <= min(ratios) <= max(ratios) <= MAX_NOISE_RATIO, "noise: not plausible")
     return replace(problem, noise=noise, stated_noise=problem.noise)
+
+
+def _with_steps(problem: Problem, steps: tuple[float, ...]) -> Problem:
+    """Return the problem with the ``steps`` of converters that windows have shown; empty for none."""
+    outputs = len(problem.base_model.outputs)
+    _require(len(steps) in (0, outputs) and min(steps, default=0.0) >= 0.0, "steps: not plausible")
+    return replace(problem, steps=steps)
 
 
 def _posterior(record: FilterRecord, problem: Problem) -> Posterior:
