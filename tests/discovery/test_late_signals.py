@@ -1,6 +1,8 @@
 """A signal that is late is named, and its delay is not turned into a parameter."""
 
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +11,18 @@ from benchmarks.sampling.measure import FREE, replayed, some_motor, write_machin
 from benchmarks.sampling.plant import Motor
 from benchmarks.sampling.schedules import Recording, Samples, Schedule, Timing, record
 
+from otolith.acquisition.window import Window
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import initial_state
 from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.discovery.hypotheses import FaultType
-from otolith.health.schema import ReportDocument
-from otolith.machine import load_machine
+from otolith.estimation.problem import Problem
+from otolith.health.schema import ReportDocument, Status
+from otolith.machine import find_twin, load_machine
+from otolith_drivers.plant.dc_motor import MotorScenario
 
+Cut = Callable[..., list[tuple[Window, float]]]
+MOTOR, ALL = find_twin("dc_motor"), ("R_a", "L_a", "J", "D")
 DEVIATIONS = 4.0  # standard deviations: several hundred values are compared
 ROWS, SLOW_OMEGA = Schedule(rows=Timing(0.01)), Schedule(omega=Timing(0.05))
 FINDING = re.compile(
@@ -115,3 +124,24 @@ def test_a_declared_delay_gives_the_estimates_of_no_delay(tmp_path: Path, name: 
         assert own.sd is not None
         assert abs(own.value - other.value) < 2.0 * own.sd
         assert own.value == pytest.approx(getattr(recording.motor, parameter), abs=3.3 * own.sd)
+
+
+@pytest.mark.parametrize(("seed", "since"), [(1, 5), (2, 5)])
+def test_windows_that_do_not_show_a_delay_do_not_give_it_up(
+    scenario: MotorScenario, windows: Cut, seed: int, since: int
+) -> None:
+    """The load moves in few windows. Between them J explains its delay as well, and it must not win alone."""
+    cut = [window for window, _ in windows(scenario.model_copy(update={"faults": (), "seed": seed}), 20)]
+    whole, load = np.concatenate([window.values for window in cut]), 1
+    first, late = since * len(cut[0].values), whole.copy()
+    late[first:, load] = whole[first - 10 : -10, load]  # 100 ms
+    known = tuple((row.name, row.nominal) for row in MOTOR.parameters if row.name not in ALL)
+    free = tuple(row for row in MOTOR.parameters if row.name in ALL)
+    state = initial_state("motor", "bench", Problem(MOTOR, known, free, (0.005, 0.02), input_noise=(0.0, 0.0002)))
+    for window, values in zip(cut, np.split(late, len(cut)), strict=True):
+        state, report = adapt(state, replace(window, values=values))
+        inertia = report.document.parameters["J"]
+        if inertia.value is not None and inertia.status is Status.ESTIMATED:
+            assert inertia.value == pytest.approx(1.1714e-3, rel=0.2), window.index
+    explanations = report.document.explanations
+    assert any(each.reason is FaultType.TIMING and each.text.startswith("T_load") for each in explanations)

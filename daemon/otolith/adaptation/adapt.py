@@ -12,7 +12,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.reporting import WindowResult, make_report
-from otolith.adaptation.state import AdaptationState, with_posterior, with_steps
+from otolith.adaptation.state import AdaptationState, with_posterior
 from otolith.adaptation.unbridged_gap import unbridged_gap
 from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
 from otolith.discovery.ambiguity import mixture
@@ -47,8 +47,10 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     posterior = state.posterior.without_expired(window.start)
     if posterior is not state.posterior:
         state = with_posterior(state, posterior)
-    state = with_steps(state, window)
-    predicted = state.posterior.predict(window)
+    posterior = state.posterior.with_steps(window)
+    if posterior is not state.posterior:  # the hypotheses of an open test were compared with other noise
+        state = replace(state, posterior=posterior, test=None)
+    predicted = posterior.predict(window)
     checked = check_window(window, predicted)
     act = _estimate if checked.is_usable else _reject
     result = replace(act(state, predicted, checked), notes=checked.notes)

@@ -5,11 +5,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from otolith.acquisition.window import Window
 from otolith.discovery.adopted import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.augmented import augment, indices, slot_of, without
-from otolith.estimation.objective import adc_step
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
 from otolith.health.events import HealthState
@@ -93,18 +91,6 @@ def cleared(state: AdaptationState) -> AdaptationState:
 def with_problem(state: AdaptationState, problem: Problem) -> AdaptationState:
     """Return the state with other options of the problem; its free parameters must be the same."""
     return replace(state, posterior=replace(state.posterior, problem=problem))
-
-
-def with_steps(state: AdaptationState, window: Window) -> AdaptationState:
-    """Return the state with the steps of converters that ``window`` shows.
-
-    An open test is dropped where they are new: its hypotheses were compared with other noise.
-    """
-    problem = state.problem
-    before = problem.steps or (0.0,) * len(problem.base_model.outputs)
-    shown = [adc_step(window.column(row.name)[~window.missing_in(row.name)]) for row in problem.base_model.outputs]
-    steps = tuple(min(pair) if all(pair) else max(pair) for pair in zip(before, shown, strict=True))
-    return state if steps == before else replace(with_problem(state, replace(problem, steps=steps)), test=None)
 
 
 def with_sample_grid(state: AdaptationState, configured: WindowOptions, ratio: float) -> AdaptationState:

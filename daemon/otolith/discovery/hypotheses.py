@@ -383,9 +383,11 @@ def _significance(posterior: Posterior) -> Array:
 
 
 def _equals_null(tracked: TrackedHypothesis, null: TrackedHypothesis) -> bool:
-    """Whether neither its additional components nor its shifts of parameters are significant."""
+    """Whether neither its additional components nor its delay nor its shifts of parameters are significant."""
     known, own = ([item.key for item in each.problem.components] for each in (null, tracked))
     if own[: len(known)] != known:  # it states that a component is gone
+        return False
+    if any(abs(delay) * np.sqrt(tracked.delay_information) >= SIGNIFICANT for _, delay in tracked.problem.delays):
         return False
     added = _significance(tracked.posterior)[len(known) :]
     return bool((added < SIGNIFICANT).all() and (_shifts(tracked, null) < SIGNIFICANT).all())

@@ -265,6 +265,15 @@ def rounding_variance(values: Array, known_step: float) -> float:
     return step**2 / 12.0 * len(values) / _runs(values)
 
 
+def converter_steps(problem: Problem, window: Window) -> tuple[float, ...]:
+    """Return the steps of converters that ``window`` or those before show, per output; empty if there are none."""
+    outputs = [output.name for output in problem.base_model.outputs]
+    shown = [adc_step(window.column(name)[~window.missing_in(name)]) for name in outputs]
+    before = problem.steps or (0.0,) * len(outputs)
+    steps = tuple(min(pair) if all(pair) else max(pair) for pair in zip(before, shown, strict=True))
+    return steps if any(steps) else ()
+
+
 def adc_step(values: Array) -> float:
     """Return the step of the converter behind ``values`` (n,), or 0 if the values show none.
 

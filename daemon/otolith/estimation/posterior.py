@@ -14,6 +14,7 @@ from otolith.estimation import imm_filter
 from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
 from otolith.estimation.augmented import indices, source_of, without
 from otolith.estimation.imm_filter import FIRST_LEVEL, ImmPosterior
+from otolith.estimation.objective import converter_steps
 from otolith.estimation.problem import Problem
 
 START_TOLERANCE = 0.5  # mean steps by which a window may start early or late and still follow its predecessor
@@ -184,6 +185,11 @@ class Posterior:
             return remapped
         by = tuple(advance for index, advance in enumerate(self.phase.by) if index != slot)
         return replace(remapped, phase=replace(self.phase, by=by))
+
+    def with_steps(self, window: Window) -> "Posterior":
+        """Return the posterior with the steps of converters that ``window`` shows."""
+        steps = converter_steps(self.problem, window)
+        return self if steps == self.problem.steps else replace(self, problem=replace(self.problem, steps=steps))
 
     def without_expired(self, start: float) -> "Posterior":
         """Return what is known without components over time that are not periodic and too old at ``start`` (Unix s).
