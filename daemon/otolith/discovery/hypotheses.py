@@ -13,6 +13,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.discovery.candidates import Candidate
+from otolith.discovery.screening import DECISIVE
 from otolith.estimation.arrival_cost import Evidence, Prior, extend_prior, initial_prior
 from otolith.estimation.augmented import amplitude_indices, augment, equation, indices, site_of
 from otolith.estimation.information import QUANTILE, orthonormal_basis
@@ -347,7 +348,8 @@ def prune(tracked: Sequence[TrackedHypothesis], deviances: Sequence[float]) -> l
     """Drop hypotheses that have become equal to the null hypothesis and explained the window no better.
 
     A window that was itself wrong may be explained by something that does not return. Quiet windows do not
-    discriminate, so evidence alone would keep such a hypothesis for ever.
+    discriminate, so evidence alone would keep such a hypothesis for ever. A parameter of the null hypothesis follows a
+    ramp too late: one that has moved stays as long as all windows together are decisively for it.
     """
     at = next((at for at, item in enumerate(tracked) if item.type is FaultType.NOTHING), None)
     if at is None:
@@ -356,7 +358,10 @@ def prune(tracked: Sequence[TrackedHypothesis], deviances: Sequence[float]) -> l
     return [
         item
         for item, deviance in zip(tracked, deviances, strict=True)
-        if item is null or deviance < deviances[at] - DISCRIMINATES or not _equals_null(item, null)
+        if item is null
+        or deviance < deviances[at] - DISCRIMINATES
+        or (item.type is FaultType.PARAMETER and item.deviance < null.deviance - DECISIVE)
+        or not _equals_null(item, null)
     ]
 
 
