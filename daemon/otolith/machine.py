@@ -60,6 +60,8 @@ class RecordedMachine:
     """Meaning of the times of its samples."""
     delays: Mapping[str, float]
     """Of its signals, s: they are subtracted from the times of the records."""
+    all_curves: bool = False
+    """Whether every curve has all records, instead of the extremes of some."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +103,8 @@ class LoadedMachine:
     def recorded(self, sampling: Sampling) -> RecordedMachine:
         """Return what a recording has beside the reports; ``sampling`` is the meaning of the times of the source."""
         delays = {name: self.signal_tables[name].delay for name in self.twin.signals}
-        return RecordedMachine(self.title, self.twin, self.problem.free, sampling, delays)
+        all_curves = self.file.recording.all_curves
+        return RecordedMachine(self.title, self.twin, self.problem.free, sampling, delays, all_curves)
 
     @property
     def limits(self) -> QualityLimits:

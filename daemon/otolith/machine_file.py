@@ -148,6 +148,7 @@ class RecordingTable(StrictModel):
 
     enabled: bool = True
     folder: Path | None = None
+    all_curves: bool = False
 
 
 class MachineFile(StrictModel):

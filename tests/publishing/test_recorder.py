@@ -133,7 +133,7 @@ def test_an_unclosed_recording_is_read_a_torn_one_repaired(
         "import os, sys; from pathlib import Path\n"
         "import otolith.publishing.recorder as module, otolith.cli.replay as replaying\n"
         "close = module.Recording.close\n"
-        "module.Recording.close = lambda self: (self._stream.flush(timeout_sec=5.0), os.kill(os.getpid(), 9))\n"
+        "module.Recording.close = lambda self: (self.write(), os.kill(os.getpid(), 9))\n"
         "machine, data, path = map(Path, sys.argv[1:])\n"
         "replaying.replay(machine, [data], path, as_json=True, stopped=lambda: False)\n"
     )

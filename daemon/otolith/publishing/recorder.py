@@ -1,8 +1,8 @@
-"""The recorder process: writes reports and their traces into a Rerun recording.
+"""The recorder process: writes reports and their traces into Rerun recordings.
 
-It runs beside the daemon, so that neither disk nor viewer can delay acquisition. It makes one ``send_columns`` call per
-entity and window; an output's entity carries measured and predicted side by side. The recording contains all signals,
-so that it can be replayed.
+It runs beside the daemon, so that neither disk nor viewer can delay acquisition. Some windows are written together, in
+one ``send_columns`` call per entity, because each call costs a kilobyte. ``samples`` has all measured records, packed,
+for a replay; the curves in ``signals`` are for the viewer, and most of the time they have the extremes only.
 """
 
 import json
@@ -10,6 +10,9 @@ import logging
 import math
 import re
 import shutil
+import tempfile
+import time
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,19 +20,29 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array, Verdict
 from otolith.health.schema import Report, ReportDocument, Status
 from otolith.health.text import announcements, event_text, headline, value_text
 from otolith.machine import RecordedMachine
 from otolith.twin.definition import Definition, Parameter
+from otolith_drivers.replay.packed_window import packed
 
 log = logging.getLogger(__name__)
 
 APPLICATION = "otolith"
 TIMELINE = "time"
 TIMES = "times"  # entity with the meaning of the times, for otolith_drivers.replay.recording
-MIN_FREE_BYTES = 100 << 20  # kept free on the disk, see docs/reference/thresholds-runtime.md
+SAMPLES, LOG, REPORT = "samples", "log", "report"  # entities
+Times = NDArray[np.int64]  # ns
+
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+MIN_FREE_BYTES = 100 << 20  # kept free on the disk
+BATCH_WINDOWS, BATCH_SECONDS = 30, 300.0  # windows that are written together, and s after which fewer are
+FULL_CURVES = 15  # windows with all records in their curves, at the begin of a file and after a change of an event
+CURVE_BUCKET = 40  # records of which a curve has the smallest and the largest otherwise
+FLUSH_TIMEOUT = 2.0  # s
 MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
 
 
@@ -55,15 +68,37 @@ def has_room(path: Path) -> bool:
 
 
 class Recording:
-    """One ``.rrd`` file."""
+    """A stream of windows into ``.rrd`` files, one after the other."""
 
     def __init__(self, path: Path, source: RecordedMachine) -> None:
-        twin, parameters = source.twin, source.parameters
-        self._stream = rr.RecordingStream(APPLICATION, recording_id=path.stem)
+        self._source = source
+        self._stream = rr.RecordingStream(APPLICATION, recording_id=re.sub(r"\W+", "_", source.title))
         self._stream.set_log_time_enabled(False)
-        self._stream.save(path, default_blueprint=blueprint(twin, parameters))
+        self._layout = tempfile.TemporaryDirectory(prefix="otolith-")
+        self._rows: defaultdict[str, list[tuple[Times, Any]]] = defaultdict(list)
+        self.open(path)
+
+    def open(self, path: Path) -> None:
+        """Finish the present file, and go on in the file ``path``."""
+        self.write()
+        self._stream.save(path)
+        # Rerun's default_blueprint would keep two threads and 0.5 MB for each file.
+        layout = Path(self._layout.name) / "layout.rbl"
+        if not layout.exists():
+            blueprint(self._source.twin, self._source.parameters).save(APPLICATION, layout)
+        self._stream.log_file_from_path(layout)
+        self._log_static()
+        self._windows, self._full_curves = 0, FULL_CURVES
+        self._written_at = time.monotonic()
+        self._lines: set[str] = set()
+        self._statuses: object = None
+
+    def _log_static(self) -> None:
+        """Log what each file must have: names, units, and what the times mean."""
+        source, twin = self._source, self._source.twin
         self._stream.send_recording_name(source.title)
-        times = json.dumps({"sampling": source.sampling, "delays": dict(source.delays)})
+        units = {name: twin.unit_of(name) for name in twin.signals}
+        times = json.dumps({"sampling": source.sampling, "delays": dict(source.delays), "signals": units})
         self._stream.log(TIMES, rr.TextDocument(times), static=True)
         for signal in twin.inputs:
             self._style(f"signals/{signal.name}", [f"{signal.name} measured [{signal.unit}]"], [MEASURED])
@@ -71,56 +106,115 @@ class Recording:
             names = [f"{output.name} measured [{output.unit}]", f"{output.name} twin [{output.unit}]"]
             self._style(f"signals/{output.name}", names, [MEASURED, TWIN])
         self._style("residual", [f"{output.name} / noise" for output in twin.outputs], None)
-        for parameter in parameters:
+        for parameter in source.parameters:
             names = ["95 % low", "95 % high", f"{parameter.name} [{parameter.unit}]"]  # the last is drawn on top
             self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, TWIN])
         self._style("windows", ["is good", "start [s]", "end [s]", "records"], None)
 
     def add(self, report: Report) -> None:
-        """Append a window."""
-        self._add_traces(report)
+        """Append a window; it is written with those that follow, but at once if it changes an event."""
         document = report.document
-        window = document.window
-        self._stream.set_time(TIMELINE, timestamp=window.end)
-        good = window.quality.verdict is Verdict.GOOD
-        self._scalars("windows", float(good), window.start, window.end, float(window.records))
-        for name, parameter in document.parameters.items():
-            if parameter.value is not None and parameter.low is not None and parameter.high is not None:
-                self._scalars(f"parameters/{name}", parameter.low, parameter.high, parameter.value)
-        for component in document.components:
-            amplitude = component.values["amplitude"]
-            path = re.sub(r"\W+", "_", component.id)  # '/' and brackets have a meaning in the path of an entity
-            self._scalars(f"components/{path}", amplitude.low, amplitude.high, amplitude.value)
-        for text, level in _log_lines(document):
-            self._stream.log("log", rr.TextLog(f"window {window.index}: {text}", level=level))
-        self._stream.log("report", rr.TextDocument(_table(document), media_type=rr.MediaType.MARKDOWN))
+        if announcements(document):
+            self._full_curves = max(self._full_curves, FULL_CURVES)
+        self._add_traces(report)
+        self._add_document(document)
+        self._windows += 1
+        age = time.monotonic() - self._written_at
+        if self._windows >= BATCH_WINDOWS or age >= BATCH_SECONDS or announcements(document):
+            self.write()
+
+    def write(self) -> None:
+        """Write the windows that wait."""
+        for entity, rows in self._rows.items():
+            times = np.concatenate([times for times, _ in rows]).astype("datetime64[ns]")
+            self._stream.send_columns(entity, [rr.TimeColumn(TIMELINE, timestamp=times)], _columns(entity, rows))
+        self._rows.clear()
+        self._windows, self._written_at = 0, time.monotonic()
+        self._stream.flush(timeout_sec=FLUSH_TIMEOUT)
 
     def close(self) -> None:
         """Write everything out."""
-        self._stream.flush(timeout_sec=2.0)
+        self.write()
         self._stream.disconnect()
+        self._layout.cleanup()
+
+    def _add_document(self, document: ReportDocument) -> None:
+        window = document.window
+        end = np.array([round(window.end * 1e9)])
+
+        def row(entity: str, *values: float) -> None:
+            self._rows[entity].append((end, np.array([values])))
+
+        row("windows", float(window.quality.verdict is Verdict.GOOD), window.start, window.end, float(window.records))
+        for name, parameter in document.parameters.items():
+            if parameter.value is not None and parameter.low is not None and parameter.high is not None:
+                row(f"parameters/{name}", parameter.low, parameter.high, parameter.value)
+        for component in document.components:
+            amplitude = component.values["amplitude"]
+            path = re.sub(r"\W+", "_", component.id)  # '/' and brackets have a meaning in the path of an entity
+            row(f"components/{path}", amplitude.low, amplitude.high, amplitude.value)
+        lines = dict(_log_lines(document))
+        for text in lines.keys() - self._lines:  # what continues is logged once
+            self._rows[LOG].append((end, (f"window {window.index}: {text}", lines[text])))
+        self._lines = set(lines)
+        if (statuses := _statuses(document)) != self._statuses or not self._rows[REPORT]:  # once per batch at least
+            self._rows[REPORT].append((end, _table(document)))
+        self._statuses = statuses
 
     def _add_traces(self, report: Report) -> None:
         window, traces = report.document.window, report.traces
         times = round(window.start * 1e9) + np.rint(traces.offsets * 1e9).astype(np.int64)  # ns
-        index = [rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))]
-
-        def send(entity: str, values: Array) -> None:
-            self._stream.send_columns(entity, indexes=index, columns=rr.Scalars.columns(scalars=values))
+        measured = {name: traces.driving[:, column] for column, name in enumerate(traces.inputs)}
+        measured |= {name: traces.measured[:, column] for column, name in enumerate(traces.outputs)}
+        good = window.quality.verdict is Verdict.GOOD
+        packet = packed(times, [measured[name] for name in self._source.twin.signals], good=good)
+        self._rows[SAMPLES].append((np.array([round(window.start * 1e9)]), packet))
 
         predicted = np.full(traces.measured.shape, math.nan) if traces.predicted is None else traces.predicted
-        for column, name in enumerate(traces.inputs):
-            send(f"signals/{name}", traces.driving[:, column : column + 1])
-        for column, name in enumerate(traces.outputs):
-            send(f"signals/{name}", np.column_stack([traces.measured[:, column], predicted[:, column]]))
-        if traces.predicted is not None:
-            send("residual", (traces.measured - traces.predicted) / np.asarray(traces.noise))
-
-    def _scalars(self, entity: str, *values: float) -> None:
-        self._stream.log(entity, rr.Scalars(list(values)))
+        is_full, self._full_curves = self._source.all_curves or self._full_curves > 0, max(0, self._full_curves - 1)
+        for name, values in measured.items():
+            kept = slice(None) if is_full else extremes(values, CURVE_BUCKET)
+            twin = [predicted[:, traces.outputs.index(name)]] if name in traces.outputs else []
+            if len(times[kept]):
+                self._rows[f"signals/{name}"].append((times[kept], np.column_stack([values, *twin])[kept]))
+        if traces.predicted is not None and len(times):
+            squares = ((traces.measured - traces.predicted) / np.asarray(traces.noise)) ** 2
+            counts = np.maximum(np.isfinite(squares).sum(axis=0), 1)
+            rms = np.sqrt(np.nansum(squares, axis=0) / counts)
+            self._rows["residual"].append((times[-1:], rms[None]))
 
     def _style(self, entity: str, names: list[str], colors: list[list[int]] | None) -> None:
         self._stream.log(entity, rr.SeriesLines(names=names, colors=colors), static=True)
+
+
+def extremes(values: Array, bucket: int) -> Times:
+    """Return the indices, in order, of the smallest and the largest value of every ``bucket`` values."""
+    kept: set[int] = set()
+    for begin in range(0, len(values), bucket):
+        part = values[begin : begin + bucket]
+        if np.isfinite(part).any():
+            kept |= {begin + int(np.nanargmin(part)), begin + int(np.nanargmax(part))}
+    return np.array(sorted(kept), dtype=np.int64)
+
+
+def _columns(entity: str, rows: list[tuple[Times, Any]]) -> Any:
+    """Return the columns of an entity in Rerun's form."""
+    values = [value for _, value in rows]
+    if entity == SAMPLES:
+        return rr.AnyValues.columns(window=values)  # one column: 'rerun rrd optimize' separates large ones
+    if entity == LOG:
+        texts, levels = zip(*values, strict=True)
+        return rr.TextLog.columns(text=list(texts), level=list(levels))
+    if entity == REPORT:
+        return rr.TextDocument.columns(text=values, media_type=[rr.MediaType.MARKDOWN] * len(values))
+    return rr.Scalars.columns(scalars=np.concatenate(values))
+
+
+def _statuses(document: ReportDocument) -> object:
+    """Return what the table of a report shows beside values."""
+    rows = [(row.status, row.reason) for row in document.parameters.values()]
+    events = [(event.id, event.state, event.end) for event in document.events]
+    return rows, [(row.id, row.status, row.approval) for row in document.components], events
 
 
 def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
@@ -164,7 +258,7 @@ def blueprint(twin: Definition, parameters: Sequence[Parameter]) -> rrb.Blueprin
     ]
     inputs = [series(origin=f"/signals/{row.name}", name=f"{row.meaning} [{row.unit}]") for row in twin.inputs]
     components = series(origin="/components", name="components that the twin lacked: amplitudes")
-    residual = series(origin="/residual", name="residual in units of the noise")
+    residual = series(origin="/residual", name="root mean square of the residuals in units of the noise")
     texts = rrb.TextDocumentView(origin="/report", name="report"), rrb.TextLogView(origin="/log", name="log")
     return rrb.Blueprint(
         rrb.Horizontal(
