@@ -149,6 +149,10 @@ class RecordingTable(StrictModel):
     enabled: bool = True
     folder: Path | None = None
     all_curves: bool = False
+    max_gigabytes: Annotated[float, Field(gt=0.0, le=100_000.0)] = 10.0
+    max_days: Annotated[float, Field(gt=0.0, le=3650.0)] = 14.0
+    rotate_megabytes: Annotated[float, Field(ge=1.0, le=10_000.0)] = 256.0
+    rotate_minutes: Annotated[float, Field(ge=1.0, le=1440.0)] = 60.0
 
 
 class MachineFile(StrictModel):

@@ -21,8 +21,8 @@ from otolith.adaptation.state import initial_state
 from otolith.cli.replay import replay
 from otolith.health.schema import ReportDocument
 from otolith.machine import load_machine
-from otolith.publishing.recorder import MIN_FREE_BYTES
 from otolith.runtime.replay import Replay
+from otolith.storage.recording_files import MIN_FREE_BYTES
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import tables as table
@@ -151,7 +151,7 @@ def test_a_recording_is_written(tmp_path: Path, rows: Lines, capsys: pytest.Capt
 def test_a_full_disk_ends_a_recording_with_an_error(
     tmp_path: Path, rows: Lines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("otolith.publishing.recorder.MIN_FREE_BYTES", MIN_FREE_BYTES << 40)
+    monkeypatch.setattr("otolith.storage.recording_files.MIN_FREE_BYTES", MIN_FREE_BYTES << 40)
     with pytest.raises(OtolithError, match="MB are free on its disk"):
         replay(MACHINE, [written(tmp_path, rows)], tmp_path / "run.rrd", as_json=True, stopped=lambda: False)
 

@@ -283,7 +283,8 @@ class CountersDocument(StrictModel):
     """Windows not estimated from because the worker was down or busy."""
     worker_restarts: int = 0
     recordings_dropped: int = 0
-    """Windows that the recorder did not accept in time."""
+    """Windows that the recorder did not accept in time, or lost when it ended."""
+    recorder_restarts: int = 0
 
 
 class ReportDocument(StrictModel):

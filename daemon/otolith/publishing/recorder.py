@@ -9,7 +9,6 @@ import json
 import logging
 import math
 import re
-import shutil
 import tempfile
 import time
 from collections import defaultdict
@@ -26,6 +25,7 @@ from otolith.acquisition.window import Array, Verdict
 from otolith.health.schema import Report, ReportDocument, Status
 from otolith.health.text import announcements, event_text, headline, value_text
 from otolith.machine import RecordedMachine
+from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
 from otolith.twin.definition import Definition, Parameter
 from otolith_drivers.replay.packed_window import packed
 
@@ -38,7 +38,7 @@ SAMPLES, LOG, REPORT = "samples", "log", "report"  # entities
 Times = NDArray[np.int64]  # ns
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-MIN_FREE_BYTES = 100 << 20  # kept free on the disk
+CHECK_INTERVAL = 60.0  # s between two checks of the budget; the disk is checked for each window
 BATCH_WINDOWS, BATCH_SECONDS = 30, 300.0  # windows that are written together, and s after which fewer are
 FULL_CURVES = 15  # windows with all records in their curves, at the begin of a file and after a change of an event
 CURVE_BUCKET = 40  # records of which a curve has the smallest and the largest otherwise
@@ -46,25 +46,75 @@ FLUSH_TIMEOUT = 2.0  # s
 MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
 
 
-def main(connection: Any, path: Path, source: RecordedMachine) -> None:
-    """Record reports until None comes, the connection closes or the disk is full."""
+def main(connection: Any, path: Path, source: RecordedMachine, folder: RecordingFolder | None = None) -> None:
+    """Record reports until None comes, the connection closes or the disk is full.
+
+    Without ``folder`` all goes into the file ``path``. Each report is answered with the number of windows that are not
+    yet written.
+    """
     if not has_room(path):
         return
-    recording = Recording(path, source)
+    recording = RotatedRecording(path, source, folder, time.time())
     try:
-        while (report := connection.recv()) is not None and has_room(path):
-            recording.add(report)
+        while (report := connection.recv()) is not None and recording.has_room(time.time()):
+            recording.add(report, time.time())
+            connection.send(recording.waiting)
     finally:
         recording.close()
 
 
 def has_room(path: Path) -> bool:
-    """Return whether the disk of ``path`` has room: Rerun's writer ends without an error on a full disk."""
-    free = shutil.disk_usage(path.parent).free
-    if free < MIN_FREE_BYTES:
-        bounds = f"{free >> 20} MB free in {path.parent}, at least {MIN_FREE_BYTES >> 20} MB are kept free"
-        log.warning("recording stopped: %s", bounds)
-    return free >= MIN_FREE_BYTES
+    """Return whether the disk of ``path`` has room for any recording."""
+    return shortage_of(path.parent) <= 0
+
+
+class RotatedRecording:
+    """A recording in one file, or in a folder with a new file when one is full. Times are Unix seconds."""
+
+    def __init__(self, path: Path, source: RecordedMachine, folder: RecordingFolder | None, now: float) -> None:
+        self.path = path
+        self._folder = folder
+        self._begin = self._checked_at = now
+        self._marked_until = -math.inf
+        self._recording = Recording(path, source)
+        self._set_mode()
+
+    @property
+    def waiting(self) -> int:
+        """Number of windows that are not yet written."""
+        return self._recording.waiting
+
+    def add(self, report: Report, now: float) -> None:
+        """Append a window, in a new file if the present one is full."""
+        if self._folder is None:
+            self._recording.add(report)
+            return
+        if self._folder.budget.is_full(now - self._begin, self.path.stat().st_size):
+            self.path, self._begin = self._folder.new_path(now, marked=now < self._marked_until), now
+            self._recording.open(self.path)
+            self._set_mode()
+        if announcements(report.document):
+            self._marked_until = now + EVENT_MARGIN
+            self.path = self._folder.mark(now, self.path)
+        self._recording.add(report)
+
+    def has_room(self, now: float) -> bool:
+        """Return whether the disk has room, after deleting files that the budget does not allow."""
+        if self._folder is None:
+            return has_room(self.path)
+        is_due = abs(now - self._checked_at) >= CHECK_INTERVAL
+        if not is_due and shortage_of(self.path.parent, MIN_FREE_SHARE) <= 0:
+            return True
+        self._checked_at = now
+        return self._folder.make_room(now, self.path) <= 0
+
+    def close(self) -> None:
+        """Write everything out."""
+        self._recording.close()
+
+    def _set_mode(self) -> None:
+        if self._folder is not None:
+            self.path.chmod(FILE_MODE)
 
 
 class Recording:
@@ -76,6 +126,8 @@ class Recording:
         self._stream.set_log_time_enabled(False)
         self._layout = tempfile.TemporaryDirectory(prefix="otolith-")
         self._rows: defaultdict[str, list[tuple[Times, Any]]] = defaultdict(list)
+        self.waiting = 0
+        """Number of windows that are not yet written."""
         self.open(path)
 
     def open(self, path: Path) -> None:
@@ -88,7 +140,7 @@ class Recording:
             blueprint(self._source.twin, self._source.parameters).save(APPLICATION, layout)
         self._stream.log_file_from_path(layout)
         self._log_static()
-        self._windows, self._full_curves = 0, FULL_CURVES
+        self.waiting, self._full_curves = 0, FULL_CURVES
         self._written_at = time.monotonic()
         self._lines: set[str] = set()
         self._statuses: object = None
@@ -118,9 +170,9 @@ class Recording:
             self._full_curves = max(self._full_curves, FULL_CURVES)
         self._add_traces(report)
         self._add_document(document)
-        self._windows += 1
+        self.waiting += 1
         age = time.monotonic() - self._written_at
-        if self._windows >= BATCH_WINDOWS or age >= BATCH_SECONDS or announcements(document):
+        if self.waiting >= BATCH_WINDOWS or age >= BATCH_SECONDS or announcements(document):
             self.write()
 
     def write(self) -> None:
@@ -129,7 +181,7 @@ class Recording:
             times = np.concatenate([times for times, _ in rows]).astype("datetime64[ns]")
             self._stream.send_columns(entity, [rr.TimeColumn(TIMELINE, timestamp=times)], _columns(entity, rows))
         self._rows.clear()
-        self._windows, self._written_at = 0, time.monotonic()
+        self.waiting, self._written_at = 0, time.monotonic()
         self._stream.flush(timeout_sec=FLUSH_TIMEOUT)
 
     def close(self) -> None:

@@ -21,6 +21,7 @@ from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
 from otolith.machine import LoadedMachine, RecordedMachine, driver_config
 from otolith.runtime.worker import perform
+from otolith.storage.recording_files import MIN_FREE_BYTES, shortage_of
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError, counted
@@ -301,11 +302,11 @@ class ReplayRecorder:
         """
         if self._path is None:
             return
-        from otolith.publishing.recorder import MIN_FREE_BYTES, Recording, has_room  # noqa: PLC0415 - takes 0.5 s
+        from otolith.publishing.recorder import Recording  # noqa: PLC0415 - takes 0.5 s
 
         if self._recording is None:
             writable(self._path.parent)
-        if not has_room(self._path):
+        if shortage_of(self._path.parent) > 0:
             raise ServiceError(f"{self._path}: less than {MIN_FREE_BYTES >> 20} MB are free on its disk")
         if self._recording is None:
             self._recording = Recording(self._path, self._source)

@@ -26,12 +26,12 @@ from otolith.health.schema import CountersDocument, DriverDocument, Report, Repo
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
 from otolith.publishing.zenoh_session import Publisher
-from otolith.runtime.process import SIGNALS, ChildProcess
+from otolith.runtime.process import SIGNALS
+from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.state_store import StateStore, WriterThread
 from otolith_drivers.errors import OtolithError
-from otolith_drivers.user_dirs import writable
 
 log = logging.getLogger(__name__)
 
@@ -41,13 +41,11 @@ RING_RATE = 4  # times the grid's rate at which a source may send for that to ho
 MAX_WAIT = 0.1  # s; bounds the reaction time to a stop signal, a dead process and an outage
 MIN_WAIT = 0.005  # s; bounds the CPU load while a window is overdue
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
-RECORDER_ROOM = 32  # windows that wait for the recorder
 RECORDER_FLUSH, WRITER_FLUSH = 1.5, 0.5  # s to finish writing at the end
 STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths; the watchdog is not fed afterwards
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
-RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
 
 
 class Service:
@@ -73,12 +71,11 @@ class Service:
         self._saved_at = -math.inf
         state = initial_state(file.machine.name, file.machine.site, machine.problem, machine.plan)
         self._supervisor = Supervisor(state, longest * period)
-        self._recorder = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
-        self._recording = recording
+        self._recorder = RecorderSupervisor(machine, recording)
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
         self._stop_signal: int | None = None
-        self._windows = self._windows_bad = self._recordings_dropped = self._finished = 0
+        self._windows = self._windows_bad = self._finished = 0
         self._started_at = self._progress_at = self._fed_at = 0.0
         self._summarised_at = -math.inf
 
@@ -114,7 +111,7 @@ class Service:
         self._writer.start()
         self._supervisor.start()
         if self._machine.file.recording.enabled:
-            self._start_recorder()
+            self._recorder.start(time.monotonic())
         self._started_at = self._progress_at = time.monotonic()
         self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
         log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, ", ".join(self._listen))
@@ -170,7 +167,7 @@ class Service:
             self._save(time.monotonic())
         self._feed_watchdog(time.monotonic())
         if self._machine.file.recording.enabled:
-            self._supervise_recorder(time.monotonic())
+            self._recorder.poll(time.monotonic())
 
     def _cut(self, now: float) -> None:
         window = self._windower.cut(self._rings, time.time() - time.monotonic())
@@ -210,7 +207,8 @@ class Service:
             windows_bad=self._windows_bad,
             windows_missed=self._supervisor.missed,
             worker_restarts=self._supervisor.restarts,
-            recordings_dropped=self._recordings_dropped,
+            recordings_dropped=self._recorder.dropped,
+            recorder_restarts=self._recorder.restarts,
         )
         document = document.model_copy(
             update={"cost": cost, "counters": counters, "driver": driver, "notes": self._notes}
@@ -218,8 +216,7 @@ class Service:
         if self._publisher is not None:
             self._publisher.publish(document)
         if self._machine.file.recording.enabled:
-            recorded = self._recorder.alive and self._recorder.offer(Report(document, report.traces))
-            self._recordings_dropped += not recorded
+            self._recorder.offer(Report(document, report.traces), time.monotonic())
         self._log(document, time.monotonic())
 
     def _log(self, document: ReportDocument, now: float) -> None:
@@ -253,26 +250,6 @@ class Service:
         if self._notifier.watchdog and not stalled and now - self._fed_at > self._notifier.watchdog / 4:
             self._fed_at = now
             self._notifier.send("WATCHDOG=1")
-
-    def _supervise_recorder(self, now: float) -> None:
-        """Restart a dead recorder with a new file."""
-        if self._recorder.alive and self._recorder.age > RECORDER_HEALTHY_AGE:
-            self._recorder.reset_backoff()
-        if self._recorder.may_restart(now):
-            try:
-                self._start_recorder()
-            except OtolithError as error:  # monitoring continues without recording
-                log.warning("no recording: %s", error)
-                self._recorder.count_failed_start()
-
-    def _start_recorder(self) -> None:
-        machine = self._machine
-        if self._recording is None or self._recorder.starts:  # a restarted recorder must not overwrite its first file
-            stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
-            self._recording = machine.recording_folder / f"{machine.file.machine.name}-{stamp}-{os.getpid()}.rrd"
-        writable(self._recording.parent)
-        self._recorder.start(self._recording, machine.recorded(machine.driver.sampling))
-        log.info("recording to %s", self._recording)
 
 
 def _keys(state: AdaptationState) -> tuple[str, ...]:

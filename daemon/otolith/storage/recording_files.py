@@ -1,0 +1,161 @@
+"""Recordings of a machine on disk: their names, when a new one begins, and which are deleted for the others.
+
+The names of files sort by time. A file with minutes before or after an event has a mark in its name, and is deleted
+last.
+"""
+
+import contextlib
+import logging
+import os
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from otolith_drivers.user_dirs import writable
+
+log = logging.getLogger(__name__)
+
+# Thresholds: docs/reference/thresholds-storage.md has the origin of each.
+MIN_FREE_BYTES = 100 << 20  # kept free on any disk
+MIN_FREE_SHARE = 0.05  # of the disk, kept free from recordings that the daemon makes by itself
+RESUME_FACTOR = 1.1  # times what is kept free, for recording to go on
+EVENT_MARGIN = 300.0  # s before and after a change of an event whose files are marked
+MAX_EVENT_SHARE = 0.5  # of the budget, for marked files
+DAY, MEGABYTE, GIGABYTE = 86_400.0, 1e6, 1e9  # s, bytes
+
+STAMP, EVENT = "%Y%m%dT%H%M%S", "-event"
+NAME = re.compile(r"(?P<key>[^/]+)-(?P<stamp>\d{8}T\d{6})-\d+(-\d+)?(?P<event>-event)?\.rrd")
+FILE_MODE, FOLDER_MODE = 0o640, 0o750  # the group may read
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingBudget:
+    """What the recordings of a machine may take, and when a new file begins."""
+
+    max_bytes: float
+    max_age: float
+    """s"""
+    rotate_bytes: float
+    rotate_age: float
+    """s"""
+
+    def is_full(self, age: float, size: int) -> bool:
+        """Return whether a file of ``age`` (s) and ``size`` (bytes) is complete; the clock may have been set back."""
+        return abs(age) >= self.rotate_age or size >= self.rotate_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingFile:
+    """A recording on disk."""
+
+    path: Path
+    key: str
+    """Site and machine."""
+    begin: float
+    """Unix seconds, as is ``end``."""
+    end: float
+    size: int
+    is_marked: bool
+    """Whether it holds minutes around an event."""
+
+
+def recording_file(path: Path) -> RecordingFile | None:
+    """Return what name and status tell about ``path``; None for a file of another name, or one that is gone.
+
+    Raises:
+        PermissionError: the folder must not be searched.
+    """
+    match = NAME.fullmatch(path.name)
+    try:
+        status = path.stat()
+        begin = datetime.strptime(match["stamp"], STAMP).replace(tzinfo=UTC).timestamp() if match else 0.0
+    except (FileNotFoundError, ValueError):
+        return None
+    if match is None:
+        return None
+    return RecordingFile(path, match["key"], begin, status.st_mtime, status.st_size, bool(match["event"]))
+
+
+def expendable(
+    files: Sequence[RecordingFile], budget: RecordingBudget, now: float, size: int, shortage: int
+) -> Iterator[RecordingFile]:
+    """Yield the files to delete, in order: the oldest first, marked ones after all others.
+
+    ``size`` is that of the file that is being written, which is not among ``files``; ``shortage`` is how many bytes
+    more must be free on the disk. Marked files have no greatest age, but a share of the budget.
+    """
+    ordered = sorted(files, key=lambda file: (file.is_marked, file.begin, file.path.name))
+    gone = {file for file in ordered if not file.is_marked and now - file.end > budget.max_age}
+    excess = sum(file.size for file in ordered if file.is_marked) - MAX_EVENT_SHARE * budget.max_bytes
+    for file in ordered:
+        if file.is_marked and excess > 0:
+            gone.add(file)
+            excess -= file.size
+    freed = sum(file.size for file in gone)
+    excess = max(size + sum(file.size for file in ordered) - budget.max_bytes, shortage) - freed
+    yield from sorted(gone, key=ordered.index)
+    for file in ordered:
+        if excess > 0 and file not in gone:
+            yield file
+            excess -= file.size
+
+
+def shortage_of(folder: Path, share: float = 0.0, factor: float = 1.0) -> int:
+    """Return how many bytes more must be free on the disk of ``folder``; Rerun gives no error on a full one."""
+    usage = shutil.disk_usage(folder)
+    return round(factor * max(MIN_FREE_BYTES, share * usage.total)) - usage.free
+
+
+class RecordingFolder:
+    """The recordings of one machine in a folder."""
+
+    def __init__(self, folder: Path, key: str, budget: RecordingBudget, *, set_mode: bool = True) -> None:
+        """``key`` is site and machine; with ``set_mode`` the group of the folder may read it."""
+        self._folder, self._key, self._set_mode = folder, key, set_mode
+        self.budget = budget
+
+    def new_path(self, now: float, *, marked: bool = False) -> Path:
+        """Return an unused path for a file that begins ``now``, and create the folder.
+
+        Raises:
+            ServiceError: the folder cannot be created or is not writable.
+        """
+        writable(self._folder)
+        if self._set_mode:
+            with contextlib.suppress(OSError):  # a folder of another user that this one may write
+                self._folder.chmod(FOLDER_MODE)
+        stem = f"{self._key}-{datetime.fromtimestamp(now, UTC).strftime(STAMP)}-{os.getpid()}"
+        taken = {path.name.removesuffix(".rrd").removesuffix(EVENT) for path in self._folder.glob(f"{stem}*.rrd")}
+        count = 1
+        while (own := f"{stem}-{count}" if count > 1 else stem) in taken:
+            count += 1
+        return self._folder / f"{own}{EVENT if marked else ''}.rrd"
+
+    def files(self) -> list[RecordingFile]:
+        """Return the recordings of the machine."""
+        candidates = (recording_file(path) for path in self._folder.glob("*.rrd"))
+        return [file for file in candidates if file is not None and file.key == self._key]
+
+    def make_room(self, now: float, current: Path | None = None, factor: float = 1.0) -> int:
+        """Delete what the budget and the disk demand, but not ``current``; return how many bytes are still missing."""
+        files, missing = self.files(), shortage_of(self._folder, MIN_FREE_SHARE, factor)
+        size = sum(file.size for file in files if file.path == current)
+        others = [file for file in files if file.path != current]
+        for file in expendable(others, self.budget, now, size, missing):
+            log.info("recording deleted for the budget: %s", file.path)
+            with contextlib.suppress(OSError):
+                file.path.unlink()
+        return shortage_of(self._folder, MIN_FREE_SHARE, factor)
+
+    def mark(self, now: float, current: Path) -> Path:
+        """Mark the files with the minutes before ``now``; return the new path of ``current``."""
+        for file in self.files():
+            if not file.is_marked and (file.path == current or abs(now - file.end) <= EVENT_MARGIN):
+                path = file.path.with_name(f"{file.path.stem}{EVENT}.rrd")
+                with contextlib.suppress(OSError):  # the disk is read-only, or the file gone: it keeps its name
+                    file.path.rename(path)
+                    current = path if file.path == current else current
+        return current

@@ -1,0 +1,120 @@
+"""The recorder process under supervision: stopped, killed, on a full disk. Times of the supervisor are simulated."""
+
+import logging
+import os
+import shutil
+import signal
+from collections import namedtuple
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from otolith.machine import LoadedMachine, load_machine
+from otolith.runtime.recorder_supervisor import RECORDER_TIMEOUT, RecorderSupervisor
+from otolith_drivers.replay.recording import RecordingReader
+from tests.conftest import EXAMPLES
+from tests.publishing.test_recording_size import UNITS, noise
+from tests.waiting import wait_for
+
+Usage = namedtuple("Usage", ["total", "used", "free"])
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> LoadedMachine:
+    loaded = load_machine(EXAMPLES / "dc-motor-in-process.toml")
+    recording = loaded.file.recording.model_copy(update={"folder": tmp_path / "recordings"})
+    return replace(loaded, file=loaded.file.model_copy(update={"recording": recording}))
+
+
+@pytest.fixture
+def supervisor(machine: LoadedMachine) -> Iterator[RecorderSupervisor]:
+    running = RecorderSupervisor(machine)
+    yield running
+    running.stop(0.0)
+
+
+def answered(supervisor: RecorderSupervisor, now: float) -> Callable[[], bool]:
+    def is_answered() -> bool:
+        supervisor.poll(now)
+        return supervisor._unanswered == 0
+
+    return is_answered
+
+
+def test_a_stopped_recorder_is_killed_and_counted(
+    supervisor: RecorderSupervisor, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, *rest = noise(4)
+    supervisor.start(0.0)
+    supervisor.offer(first, 1.0)
+    wait_for(answered(supervisor, 2.0))
+    stopped = supervisor._process._process.pid
+    os.kill(stopped, signal.SIGSTOP)
+    for index, one in enumerate(rest):
+        supervisor.offer(one, 100.0 + 2.0 * index)
+    supervisor.poll(100.0 + RECORDER_TIMEOUT)
+    assert (supervisor.restarts, supervisor.dropped) == (0, 0)
+    supervisor.poll(100.1 + RECORDER_TIMEOUT)
+    assert not Path(f"/proc/{stopped}").exists()
+    assert (supervisor.restarts, supervisor.dropped) == (1, 4)  # one was received, but not yet written
+    assert "the recorder has not answered for 60.1 s and is killed" in caplog.text
+    supervisor.offer(first, 200.0)
+    wait_for(answered(supervisor, 201.0))
+    supervisor.stop(10.0)
+    _, second = sorted((tmp_path / "recordings").iterdir())
+    with RecordingReader(second, UNITS) as reader:
+        assert sum(len(part.times) for part in reader.chunks()) == 200
+
+
+def test_a_recorder_without_work_does_not_hang(supervisor: RecorderSupervisor) -> None:
+    supervisor.start(0.0)
+    supervisor.offer(next(noise(1)), 1.0)
+    wait_for(answered(supervisor, 2.0))
+    supervisor.poll(1e6)
+    supervisor.offer(next(noise(1)), 1e6)
+    supervisor.poll(1e6 + 0.9 * RECORDER_TIMEOUT)
+    assert (supervisor.restarts, supervisor.dropped) == (0, 0)
+
+
+def test_a_full_disk_gives_one_warning_and_one_line_when_it_has_room(
+    supervisor: RecorderSupervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """``disk_usage`` is replaced. A day of polls; another program deletes and writes a little all the time."""
+    free = [4 * 10**9]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**11, 10**11 - free[0], free[0]))
+    report = next(noise(1))
+    with caplog.at_level(logging.INFO, "otolith"):
+        supervisor.start(0.0)
+        for minute in range(1440):
+            free[0] = int(5e9 + (minute % 7 - 3) * 1e8)  # around the 5 % that are kept free
+            supervisor.poll(60.0 * minute)
+            supervisor.offer(report, 60.0 * minute)
+        (line,) = caplog.messages
+        assert "recording pauses until" in line
+        assert "MB more free" in line
+        assert supervisor.dropped == 1440
+        assert not any((tmp_path / "recordings").iterdir())
+        free[0] = 6 * 10**9
+        supervisor.poll(1e6)
+    assert len(caplog.messages) == 2
+    assert caplog.messages[1].startswith("recording to ")
+    assert supervisor.restarts == 0
+
+
+def test_a_folder_that_cannot_be_written_is_logged_once(
+    supervisor: RecorderSupervisor, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "recordings").write_text("a file", encoding="utf-8")
+    for minute in range(100):
+        supervisor.poll(60.0 * minute)
+    (line,) = caplog.messages
+    assert line.startswith("no recording: ")
+
+
+def test_a_file_is_never_larger_than_an_eighth_of_the_budget(machine: LoadedMachine) -> None:
+    recording = machine.file.recording.model_copy(update={"max_gigabytes": 0.8})
+    small = replace(machine, file=machine.file.model_copy(update={"recording": recording}))
+    assert RecorderSupervisor(machine)._folder().budget.rotate_bytes == 256e6
+    assert RecorderSupervisor(small)._folder().budget.rotate_bytes == 0.1e9
