@@ -26,6 +26,7 @@ from otolith.cli.common import (
     examples_directory,
     log_to_stderr,
 )
+from otolith.cli.operation.view import view
 
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.realtime.NODES, which is slow to import
 EXIT_CODES = """\b
@@ -203,25 +204,6 @@ def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
 
 
 @cli.command()
-@click.argument("file", type=FILE, required=False)
-@click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
-def view(file: Path | None, only_list: bool) -> int:
-    """Open FILE, or the newest recording, in the Rerun viewer.
-
-    \b
-    Examples:
-      otolith view
-      otolith view --list
-    """
-    from otolith.cli.operation.watch import list_recordings, open_viewer
-
-    if only_list:
-        list_recordings()
-        return 0
-    return open_viewer(file)
-
-
-@cli.command()
 @click.argument("scenario", type=FILE)
 @click.option("--as", "transport", type=click.Choice(TRANSPORTS), default="can",
               help="A node on the CAN bus, or a Modbus drive on its own port or serial line.")  # fmt: skip
@@ -280,5 +262,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, components, noise, probe, reset, twin):
+for command in (commission, components, noise, probe, reset, twin, view):
     cli.add_command(command)

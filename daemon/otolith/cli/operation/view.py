@@ -1,0 +1,193 @@
+"""``otolith view``: recordings of one's own daemons and of services, listed, or opened in the Rerun viewer."""
+
+import getpass
+import os
+import subprocess
+import sysconfig
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+from otolith.cli.common import local_time
+from otolith.storage.recording_files import MEGABYTE, RecordingFile, recording_file
+from otolith_drivers.errors import ConfigurationError, ServiceError
+from otolith_drivers.user_dirs import cache_directory, state_directory
+
+SERVICES = Path("/var/lib/otolith")  # state directories of the instances of systemd/otolith@.service
+MAGIC = b"RRF2"  # first bytes of Rerun's files
+LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all interfaces
+
+
+@click.command()
+@click.argument("recording", metavar="[MACHINE|FILE]", required=False)
+@click.option("--since", metavar="TIME", help='All recordings of the last TIME, as "2h" or "3 days".')
+@click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
+@click.option("--web", is_flag=True, help="For a browser on this computer, instead of a window.")
+def view(recording: str | None, since: str | None, only_list: bool, web: bool) -> int:
+    """Open the newest recording, of MACHINE if given, or FILE, in the Rerun viewer.
+
+    MACHINE is the name of a machine, with or without its site, or of an instance of the service.
+
+    \b
+    Examples:
+      otolith view
+      otolith view press-3 --since 2h
+      otolith view press-3 --list
+      otolith view --web
+    """
+    path = Path(recording) if recording and (recording.endswith(".rrd") or Path(recording).is_file()) else None
+    if path is not None:
+        if since or only_list:
+            raise click.UsageError("--since and --list choose among the recordings of a machine, not of a file")
+        return open_viewer([path], web=web)
+    seconds = _seconds(since)
+    known = Recordings.search(recording or "")
+    files = [file for file in known.files if seconds is None or file.end >= time.time() - seconds]
+    if only_list:
+        click.echo("".join(f"{_row(file)}\n" for file in files), nl=False)
+        for line in known.unreadable if files else [known.none_text(since)]:
+            click.echo(line, err=True)
+        return 0
+    if not files:
+        raise ConfigurationError(known.none_text(since))
+    return open_viewer([file.path for file in (files[:1] if seconds is None else reversed(files))], web=web)
+
+
+def _seconds(text: str | None) -> float | None:
+    from otolith_drivers.units import Quantity
+
+    try:
+        return None if text is None else Quantity("s", 0.0)(text)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; write it like 2h or '3 days'", param_hint="'--since'") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Recordings:
+    """The recordings that this user can read, the newest first."""
+
+    machine: str
+    places: tuple[Path, ...]
+    files: tuple[RecordingFile, ...]
+    unreadable: tuple[str, ...]
+    """Folders that this user must not read, and the way out, a line each."""
+
+    @classmethod
+    def search(cls, machine: str) -> "Recordings":
+        """Return the recordings of ``machine``, or of all machines if it is empty."""
+        own = state_directory()
+        services = sorted(SERVICES.iterdir()) if os.access(SERVICES, os.R_OK | os.X_OK) else []
+        files: dict[Path, RecordingFile] = {}
+        unreadable = [unreadable_text(SERVICES)] if SERVICES.is_dir() and not services else []
+        for place in (own, *(folder for folder in services if folder.is_dir())):
+            closed = next((folder for folder in (place, place / "recordings") if _is_closed(folder)), None)
+            if closed is not None:
+                unreadable.append(unreadable_text(closed))
+                continue
+            of_place = {file.path.resolve(): file for path in place.rglob("*.rrd") for file in _described(path)}
+            is_instance = machine == place.name and place != own
+            files |= {path: file for path, file in of_place.items() if is_instance or _is_of(file, machine)}
+        newest_first = sorted(files.values(), key=lambda file: file.end, reverse=True)
+        return cls(machine, (own, SERVICES), tuple(newest_first), tuple(unreadable))
+
+    def none_text(self, since: str | None) -> str:
+        """Return why there is nothing to open, and what to do."""
+        of = f" of {self.machine}" if self.machine else ""
+        span = f" of the last {since}" if since else ""
+        where = " and ".join(map(str, self.places))
+        remedy = "'otolith run' makes one, or 'otolith replay --recording FILE.rrd'"
+        return "; ".join([f"{where}: no recording{of}{span}", *(self.unreadable or (remedy,))])
+
+
+def _described(path: Path) -> Iterator[RecordingFile]:
+    """Yield what is known of a recording; one of another name has no machine."""
+    try:
+        status = path.stat()
+    except OSError:  # deleted meanwhile
+        return
+    other = RecordingFile(path, "", status.st_mtime, status.st_mtime, status.st_size, is_marked=False)
+    yield recording_file(path) or other
+
+
+def _is_of(file: RecordingFile, machine: str) -> bool:
+    return not machine or machine in (file.key, file.key.partition(".")[2])
+
+
+def _is_closed(path: Path) -> bool:
+    return path.exists() and not os.access(path, os.R_OK | os.X_OK if path.is_dir() else os.R_OK)
+
+
+def unreadable_text(path: Path) -> str:
+    """Return that this user must not read ``path``, and which group may."""
+    try:
+        group = path.group()
+    except (OSError, KeyError):
+        group = "otolith"
+    join = f"'sudo usermod -aG {group} {getpass.getuser()}', and log in again"
+    return f"{path}: not readable for this user: join group {group}: {join}"
+
+
+def _row(file: RecordingFile) -> str:
+    """Return the line of a list: begin, length, size, machine, mark, path."""
+    minutes = max(0.0, file.end - file.begin) / 60.0
+    mark = "event" if file.is_marked else ""
+    size = f"{file.size / MEGABYTE:8.1f} MB"
+    return f"{local_time(file.begin)}  {minutes:5.0f} min  {size}  {file.key or '-':<24}  {mark:<5}  {file.path}"
+
+
+def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:
+    """Show recordings of which each may still be written; returns the exit code of the viewer.
+
+    Raises:
+        ConfigurationError: there is no such recording.
+        ServiceError: there is no display, or the viewer is not installed.
+    """
+    for path in paths:
+        _check(path)
+    if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        remedy = "'otolith view --web' serves it to a browser, through a tunnel like 'ssh -L'"
+        raise ServiceError(f"no display here: {remedy}; or copy {paths[0]} to a computer with one")
+    program = Path(sysconfig.get_path("scripts")) / "rerun"
+    if not program.exists():
+        raise ServiceError(f"{program}: the Rerun viewer is not installed; copy {paths[0]} to a computer that has it")
+    # Only 'rerun analytics disable' switches its analytics off, by a file; a folder of ours keeps the user's settings.
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(cache_directory("viewer"))}
+    subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)  # noqa: S603
+    with tempfile.TemporaryDirectory(prefix="otolith-view-") as folder:
+        whole = list(_whole(program, paths, Path(folder)))
+        target = ("--serve-web", "--web-viewer-port", "0") if web else ()
+        command = [str(program), *LOOPBACK, *target, *map(str, whole)]
+        try:
+            return subprocess.run(command, env=environment, check=False).returncode  # noqa: S603
+        except KeyboardInterrupt:
+            return 0
+
+
+def _check(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise ConfigurationError(f"{path}: not a Rerun recording")
+    except PermissionError as error:
+        raise ConfigurationError(unreadable_text(path)) from error
+    except OSError as error:
+        raise ConfigurationError(f"{path}: no such file; 'otolith view --list' lists the recordings") from error
+
+
+def _whole(program: Path, paths: Sequence[Path], folder: Path) -> Iterator[Path]:
+    """Yield each path, or of a file that was not finished what is whole of it: the viewer refuses a torn one."""
+    done = subprocess.run(  # noqa: S603
+        [program, "rrd", "verify", *paths], capture_output=True, text=True, check=False
+    )
+    for number, path in enumerate(paths):
+        if done.returncode == 0 or f'"{path}"' not in done.stderr:
+            yield path
+            continue
+        copy = folder / f"{number}-{path.name}"
+        command = [str(program), "rrd", "optimize", "--continue-on-error", str(path), "-o", str(copy)]
+        subprocess.run(command, capture_output=True, check=False)  # noqa: S603
+        yield copy if copy.exists() else path

@@ -1,0 +1,148 @@
+"""``otolith view``: which recordings it finds, and what it gives to the viewer, which a script stands in for."""
+
+import os
+import stat
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from otolith.cli.main import cli
+from otolith.cli.operation import view as module
+from otolith.cli.operation.view import MAGIC
+
+STAMP = "%Y%m%dT%H%M%S"
+BOUND = "--bind 127.0.0.1 --port auto"
+
+
+@pytest.fixture
+def services(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "services"
+    folder.mkdir()
+    monkeypatch.setattr(module, "SERVICES", folder)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "own"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":0")
+    return folder
+
+
+@pytest.fixture
+def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A log of the arguments of the viewer; it finds every file whole that is not in a folder ``torn``."""
+    program, log = tmp_path / "bin" / "rerun", tmp_path / "shown.txt"
+    program.parent.mkdir()
+    program.write_text(
+        f"""#!{sys.executable}
+import shutil, sys
+if sys.argv[1:3] == ["rrd", "verify"]:
+    torn = [path for path in sys.argv[3:] if "/torn/" in path]
+    sys.exit("".join(f'"{{path}}": Missing RRD footer\\n' for path in torn) or 0)
+if sys.argv[1:3] == ["rrd", "optimize"]:
+    shutil.copy(sys.argv[4], sys.argv[6])
+else:
+    open({str(log)!r}, "a").write(" ".join(sys.argv[1:]) + "\\n")
+""",
+        encoding="utf-8",
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr("sysconfig.get_path", lambda _: str(program.parent))
+    return log
+
+
+def made(folder: Path, key: str, age: float, mark: str = "") -> Path:
+    """A file that ended ``age`` s ago, and began ten minutes before."""
+    folder.mkdir(parents=True, exist_ok=True)
+    end = time.time() - age
+    path = folder / f"{key}-{time.strftime(STAMP, time.gmtime(end - 600.0))}-17{mark}.rrd"
+    path.write_bytes(MAGIC + bytes(2_000_000))
+    os.utime(path, (end, end))
+    return path
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["view", *arguments], standalone_mode=False)
+
+
+def arguments_of(shown: Path) -> str:
+    return shown.read_text(encoding="utf-8").splitlines()[-1]
+
+
+def test_recordings_of_a_service_and_of_oneself_are_listed(services: Path, tmp_path: Path) -> None:
+    service = made(services / "press-3" / "recordings", "hall.motor", 3600.0, "-event")
+    own = made(tmp_path / "own" / "otolith" / "recordings", "site.pump", 60.0)
+    other = own.with_name("replayed.rrd")
+    other.write_bytes(MAGIC)
+    os.utime(other, (1e9, 1e9))
+    lines = run("--list").output.splitlines()
+    assert [Path(line.split()[-1]) for line in lines] == [own, service, other]
+    assert "10 min" in lines[0]
+    assert "2.0 MB  site.pump" in lines[0]
+    assert "event" in lines[1]
+    assert [run(name, "--list").stdout.count("\n") for name in ("pump", "hall.motor", "motor", "press-3", "mot")] == [
+        *[1] * 4,
+        0,
+    ]
+
+
+def test_the_newest_or_all_of_a_span_are_opened_in_order(services: Path, shown: Path) -> None:
+    folder = services / "press-3" / "recordings"
+    paths = [made(folder, "hall.motor", hours * 3600.0 + 60.0) for hours in range(5)]
+    made(folder, "hall.pump", 0.0)
+    assert run("motor").exit_code == 0
+    assert arguments_of(shown) == f"{BOUND} {paths[0]}"
+    run("motor", "--since", "2h")
+    assert arguments_of(shown) == f"{BOUND} {paths[1]} {paths[0]}"
+    run("motor", "--since", "1 day", "--web")
+    assert arguments_of(shown) == f"{BOUND} --serve-web --web-viewer-port 0 " + " ".join(map(str, reversed(paths)))
+    run(str(paths[3]))
+    assert arguments_of(shown) == f"{BOUND} {paths[3]}"
+
+
+def test_of_a_torn_file_the_viewer_gets_what_is_whole(services: Path, shown: Path) -> None:
+    torn, whole = (
+        made(services / "torn" / "recordings", "s.m", 99.0),
+        made(services / "whole" / "recordings", "s.m", 9.0),
+    )
+    run("m", "--since", "1h")
+    first, second = arguments_of(shown).split()[-2:]
+    assert (Path(first).name, second) == (f"0-{torn.name}", str(whole))
+    assert Path(first) != torn
+    assert not Path(first).exists()  # it was a copy
+
+
+def test_what_may_not_be_read_names_the_group(services: Path, monkeypatch: pytest.MonkeyPatch, shown: Path) -> None:
+    """The tests may run as root, who may read everything: ``os.access`` is replaced."""
+    path = made(services / "press-3" / "recordings", "hall.motor", 0.0)
+    group = path.group()
+    join = f"not readable for this user: join group {group}: 'sudo usermod -aG {group} "
+    real = os.access
+    closed = path.parent
+    monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != closed and real(place, mode))
+    for name in ("motor", ""):
+        error = str(run(name).exception)
+        assert "no recording" in error
+        assert f"{closed}: {join}" in error
+    closed = path
+    monkeypatch.setattr(Path, "open", lambda *_: (_ for _ in ()).throw(PermissionError(13, "Permission denied")))
+    assert join in str(run(str(path)).exception)
+    assert not shown.exists()
+
+
+def test_errors_name_the_way_out(services: Path, shown: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert "no recording of motor of the last 2h" in str(run("motor", "--since", "2h").exception)
+    assert "write it like 2h" in str(run("--since", "2 V").exception)
+    (tmp_path / "other.rrd").write_text("nothing", encoding="utf-8")
+    assert "not a Rerun recording" in str(run(str(tmp_path / "other.rrd")).exception)
+    path = made(services / "press-3" / "recordings", "hall.motor", 0.0)
+    assert "choose among the recordings of a machine" in str(run(str(path), "--since", "2h").exception)
+    monkeypatch.delenv("DISPLAY")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert "no display here: 'otolith view --web'" in str(run().exception)
+    assert not shown.exists()
+    program = Path(shown.parent / "bin" / "rerun")
+    assert program.stat().st_mode & stat.S_IXUSR
+    program.unlink()
+    assert "is not installed" in str(run("--web").exception)
