@@ -58,6 +58,12 @@ def test_marked_files_leave_room_for_the_newest() -> None:
     assert left[:3] == files[:3]
 
 
+def test_files_around_an_event_are_not_deleted_in_vain() -> None:
+    files = [made(hours * HOUR, 100, marked=hours > 1) for hours in range(5)]
+    assert kept(files, shortage=300) == files[2:4]
+    assert kept(files, shortage=600) == files[2:]
+
+
 FILES = st.lists(st.builds(made, st.floats(-DAY, 20 * DAY), st.integers(0, 500), marked=st.booleans()), max_size=12)
 
 
@@ -66,7 +72,8 @@ def test_the_budget_is_kept_whatever_there_is(files: list[RecordingFile], size: 
     """A plain file goes before a marked one, an older one before a newer one of its kind."""
     left = kept(files, size, shortage)
     assert size + sum(file.size for file in left) <= BUDGET.max_bytes or not left
-    assert sum(file.size for file in files) - sum(file.size for file in left) >= shortage or not left
+    freed, total = sum(file.size for file in files) - sum(file.size for file in left), sum(file.size for file in files)
+    assert freed >= shortage or (shortage > total and all(file.is_marked for file in left if file.size))
     for marked in (False, True):
         own = sorted((file for file in files if file.is_marked is marked), key=lambda file: file.begin)
         begins = [file.begin for file in own if file in left]

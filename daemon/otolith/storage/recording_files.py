@@ -85,7 +85,8 @@ def expendable(
     """Yield the files to delete, in order: the oldest first, marked ones after all others.
 
     ``size`` is that of the file that is being written, which is not among ``files``; ``shortage`` is how many bytes
-    more must be free on the disk. Marked files have no greatest age, but a share of the budget.
+    more must be free on the disk. Marked files have no greatest age, but a share of the budget; they are not deleted
+    for a disk that even so would not have room.
     """
     ordered = sorted(files, key=lambda file: (file.is_marked, file.begin, file.path.name))
     gone = {file for file in ordered if not file.is_marked and now - file.end > budget.max_age}
@@ -94,8 +95,9 @@ def expendable(
         if file.is_marked and excess > 0:
             gone.add(file)
             excess -= file.size
-    freed = sum(file.size for file in gone)
-    excess = max(size + sum(file.size for file in ordered) - budget.max_bytes, shortage) - freed
+    total, unmarked = sum(file.size for file in ordered), sum(file.size for file in ordered if not file.is_marked)
+    needed = shortage if shortage <= total else min(shortage, unmarked)
+    excess = max(size + total - budget.max_bytes, needed) - sum(file.size for file in gone)
     yield from sorted(gone, key=ordered.index)
     for file in ordered:
         if excess > 0 and file not in gone:
@@ -145,9 +147,9 @@ class RecordingFolder:
         size = sum(file.size for file in files if file.path == current)
         others = [file for file in files if file.path != current]
         for file in expendable(others, self.budget, now, size, missing):
-            log.info("recording deleted for the budget: %s", file.path)
             with contextlib.suppress(OSError):
                 file.path.unlink()
+                log.info("recording deleted for the budget: %s", file.path)
         return shortage_of(self._folder, MIN_FREE_SHARE, factor)
 
     def mark(self, now: float, current: Path) -> Path:
