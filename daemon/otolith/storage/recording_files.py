@@ -95,14 +95,14 @@ def expendable(
         if file.is_marked and excess > 0:
             gone.add(file)
             excess -= file.size
-    total, unmarked = sum(file.size for file in ordered), sum(file.size for file in ordered if not file.is_marked)
-    needed = shortage if shortage <= total else min(shortage, unmarked)
-    excess = max(size + total - budget.max_bytes, needed) - sum(file.size for file in gone)
     yield from sorted(gone, key=ordered.index)
+    total, freed = sum(file.size for file in ordered), sum(file.size for file in gone)
     for file in ordered:
-        if excess > 0 and file not in gone:
+        in_vain = file.is_marked and shortage > total
+        is_needed = size + total - freed > budget.max_bytes or (shortage > freed and not in_vain)
+        if is_needed and file not in gone:
             yield file
-            excess -= file.size
+            freed += file.size
 
 
 def shortage_of(folder: Path, share: float = 0.0, factor: float = 1.0) -> int:
