@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,8 @@ class RecordedMachine:
     """Of its signals, s: they are subtracted from the times of the records."""
     all_curves: bool = False
     """Whether every curve has all records, instead of the extremes of some."""
+    plan: MonitoringPlan = field(default_factory=MonitoringPlan)
+    """Limits of its parameters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,7 @@ class LoadedMachine:
         """Return what a recording has beside the reports; ``sampling`` is the meaning of the times of the source."""
         delays = {name: self.signal_tables[name].delay for name in self.twin.signals}
         all_curves = self.file.recording.all_curves
-        return RecordedMachine(self.title, self.twin, self.problem.free, sampling, delays, all_curves)
+        return RecordedMachine(self.title, self.twin, self.problem.free, sampling, delays, all_curves, self.plan)
 
     @property
     def limits(self) -> QualityLimits:

@@ -65,12 +65,16 @@ def event_text(event: EventDocument, when: Callable[[float], str] = time_text) -
     """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text."""
     if event.end is not None:
         return f"cleared: {event.part}: {event.condition}, from {when(event.start)} to {when(event.end)}"
-    sure = ""
-    if (probability := event.evidence.probability) is not None:
-        share = "over 99.9" if probability > 0.999 else f"{100.0 * probability:.3g}"
-        sure = f" (with {share} % probability)"
+    sure = f" ({probability})" if (probability := probability_text(event)) else ""
     advice = f"; {event.advice}" if event.advice else ""
     return f"{event.state}: {event.part}: {event.condition} since {when(event.since)}: {event.text}{sure}{advice}"
+
+
+def probability_text(event: EventDocument) -> str:
+    """How sure it is that the limit is passed; empty if the event has none."""
+    if (probability := event.evidence.probability) is None:
+        return ""
+    return f"with {'over 99.9' if probability > 0.999 else f'{100.0 * probability:.3g}'} % probability"
 
 
 def announcements(document: ReportDocument) -> list[EventDocument]:

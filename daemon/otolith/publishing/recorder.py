@@ -12,30 +12,40 @@ import re
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array, Verdict
+from otolith.health.limits import MACHINE, MonitoredQuantity
 from otolith.health.schema import Report, ReportDocument, Status
-from otolith.health.text import announcements, event_text, headline, value_text
+from otolith.health.text import announcements, event_text
 from otolith.machine import RecordedMachine
+from otolith.publishing.recording_layout import (
+    LIMIT,
+    MEASURED,
+    STATES,
+    TIMELINE,
+    TWIN,
+    blueprint,
+    limit_lines,
+    operator_text,
+    report_text,
+)
 from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
-from otolith.twin.definition import Definition, Parameter
 from otolith_drivers.replay.packed_window import packed
 
 log = logging.getLogger(__name__)
 
 APPLICATION = "otolith"
-TIMELINE = "time"
 TIMES = "times"  # entity with the meaning of the times, for otolith_drivers.replay.recording
-SAMPLES, LOG, REPORT = "samples", "log", "report"  # entities
+SAMPLES, LOG, EVENTS, REPORT, OPERATOR = "samples", "log", "events", "report", "operator"  # entities
 Times = NDArray[np.int64]  # ns
+INTERVAL, ESTIMATE_WIDTHS = ["95 % low", "95 % high"], [1.0, 1.0, 2.5]  # names; widths of the three lines, points
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 CHECK_INTERVAL = 60.0  # s between two checks of the budget; the disk is checked for each window
@@ -43,7 +53,6 @@ BATCH_WINDOWS, BATCH_SECONDS = 30, 300.0  # windows that are written together, a
 FULL_CURVES = 15  # windows with all records in their curves, at the begin of a file and after a change of an event
 CURVE_BUCKET = 40  # records of which a curve has the smallest and the largest otherwise
 FLUSH_TIMEOUT = 2.0  # s
-MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
 
 
 def main(connection: Any, path: Path, source: RecordedMachine, folder: RecordingFolder | None = None) -> None:
@@ -126,6 +135,10 @@ class Recording:
         self._stream.set_log_time_enabled(False)
         self._layout = tempfile.TemporaryDirectory(prefix="otolith-")
         self._rows: defaultdict[str, list[tuple[Times, Any]]] = defaultdict(list)
+        self._limits: dict[str, tuple[float, ...]] = {}
+        self._states: dict[str, str] = {}
+        self._styled: set[str] = set()
+        self._operator_text = ""
         self.waiting = 0
         """Number of windows that are not yet written."""
         self.open(path)
@@ -137,13 +150,14 @@ class Recording:
         # Rerun's default_blueprint would keep two threads and 0.5 MB for each file.
         layout = Path(self._layout.name) / "layout.rbl"
         if not layout.exists():
-            blueprint(self._source.twin, self._source.parameters).save(APPLICATION, layout)
+            blueprint(self._source).save(APPLICATION, layout)
         self._stream.log_file_from_path(layout)
         self._log_static()
         self.waiting, self._full_curves = 0, FULL_CURVES
         self._written_at = time.monotonic()
         self._lines: set[str] = set()
         self._statuses: object = None
+        self._states, self._styled, self._operator_text = {}, set(), ""
 
     def _log_static(self) -> None:
         """Log what each file must have: names, units, and what the times mean."""
@@ -159,8 +173,13 @@ class Recording:
             self._style(f"signals/{output.name}", names, [MEASURED, TWIN])
         self._style("residual", [f"{output.name} / noise" for output in twin.outputs], None)
         for parameter in source.parameters:
-            names = ["95 % low", "95 % high", f"{parameter.name} [{parameter.unit}]"]  # the last is drawn on top
+            names = [*INTERVAL, f"{parameter.name} [{parameter.unit}]"]  # the last is drawn on top
             self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, TWIN])
+            lines = limit_lines(
+                source.plan.parameters.get(parameter.name, MonitoredQuantity(nominal=parameter.nominal))
+            )
+            self._limits[parameter.name] = tuple(value for _, value, _ in lines)
+            self._style(f"limits/{parameter.name}", [name for name, _, _ in lines], [colour for _, _, colour in lines])
         self._style("windows", ["is good", "start [s]", "end [s]", "records"], None)
 
     def add(self, report: Report) -> None:
@@ -193,25 +212,56 @@ class Recording:
     def _add_document(self, document: ReportDocument) -> None:
         window = document.window
         end = np.array([round(window.end * 1e9)])
-
-        def row(entity: str, *values: float) -> None:
-            self._rows[entity].append((end, np.array([values])))
-
-        row("windows", float(window.quality.verdict is Verdict.GOOD), window.start, window.end, float(window.records))
-        for name, parameter in document.parameters.items():
-            if parameter.value is not None and parameter.low is not None and parameter.high is not None:
-                row(f"parameters/{name}", parameter.low, parameter.high, parameter.value)
-        for component in document.components:
-            amplitude = component.values["amplitude"]
-            path = re.sub(r"\W+", "_", component.id)  # '/' and brackets have a meaning in the path of an entity
-            row(f"components/{path}", amplitude.low, amplitude.high, amplitude.value)
+        good = float(window.quality.verdict is Verdict.GOOD)
+        self._add_row("windows", end, good, window.start, window.end, float(window.records))
+        self._add_estimates(document, end)
+        self._add_state(document, end)
         lines = dict(_log_lines(document))
-        for text in lines.keys() - self._lines:  # what continues is logged once
-            self._rows[LOG].append((end, (f"window {window.index}: {text}", lines[text])))
+        for text, level in lines.items():
+            if text not in self._lines:  # what continues is logged once
+                self._rows[LOG].append((end, (f"window {window.index}: {text}", level)))
         self._lines = set(lines)
         if (statuses := _statuses(document)) != self._statuses or not self._rows[REPORT]:  # once per batch at least
-            self._rows[REPORT].append((end, _table(document)))
+            self._rows[REPORT].append((end, report_text(document)))
         self._statuses = statuses
+
+    def _add_row(self, entity: str, end: Times, *values: float) -> None:
+        self._rows[entity].append((end, np.array([values])))
+
+    def _add_estimates(self, document: ReportDocument, end: Times) -> None:
+        """Append parameters and amplitudes with their intervals, and the limits of the parameters."""
+        for name, parameter in document.parameters.items():
+            if parameter.value is not None and parameter.low is not None and parameter.high is not None:
+                self._add_row(f"parameters/{name}", end, parameter.low, parameter.high, parameter.value)
+            self._add_row(f"limits/{name}", end, *self._limits.get(name, (parameter.nominal,)))
+        for component in document.components:
+            amplitude = component.values["amplitude"]
+            # '/' and brackets have a meaning in the path of an entity.
+            entity = "components/" + re.sub(r"\W+", "_", component.id)
+            if entity not in self._styled:
+                what = f"{component.meaning}, {component.family} [{amplitude.unit}]"
+                self._style(entity, [*INTERVAL, what], [LIMIT, LIMIT, MEASURED])
+                self._styled.add(entity)
+            self._add_row(entity, end, amplitude.low, amplitude.high, amplitude.value)
+
+    def _add_state(self, document: ReportDocument, end: Times) -> None:
+        """Append what the operator sees, where it has changed."""
+        for event in announcements(document):
+            self._rows[EVENTS].append((end, (event_text(event), "ERROR" if event.is_urgent else "WARN")))
+        health = document.health
+        parts = {} if health is None else {MACHINE: health, **health.parts}
+        for part, row in parts.items():
+            lane = "state/" + re.sub(r"\W+", "_", part)
+            if lane not in self._states:
+                names, colours = [str(level) for level in STATES], list(STATES.values())
+                configuration = rr.StateConfiguration(values=names, labels=names, colors=colours)
+                self._stream.log(lane, configuration, static=True)
+            if self._states.get(lane) != row.state:
+                self._rows[lane].append((end, str(row.state)))
+                self._states[lane] = row.state
+        if (text := operator_text(document)) != self._operator_text:
+            self._rows[OPERATOR].append((end, text))
+            self._operator_text = text
 
     def _add_traces(self, report: Report) -> None:
         window, traces = report.document.window, report.traces
@@ -236,7 +286,8 @@ class Recording:
             self._rows["residual"].append((times[-1:], rms[None]))
 
     def _style(self, entity: str, names: list[str], colors: list[list[int]] | None) -> None:
-        self._stream.log(entity, rr.SeriesLines(names=names, colors=colors), static=True)
+        widths = ESTIMATE_WIDTHS if names[:2] == INTERVAL else None
+        self._stream.log(entity, rr.SeriesLines(names=names, colors=colors, widths=widths), static=True)
 
 
 def extremes(values: Array, bucket: int) -> Times:
@@ -254,10 +305,12 @@ def _columns(entity: str, rows: list[tuple[Times, Any]]) -> Any:
     values = [value for _, value in rows]
     if entity == SAMPLES:
         return rr.AnyValues.columns(window=values)  # one column: 'rerun rrd optimize' separates large ones
-    if entity == LOG:
+    if entity in (LOG, EVENTS):
         texts, levels = zip(*values, strict=True)
         return rr.TextLog.columns(text=list(texts), level=list(levels))
-    if entity == REPORT:
+    if entity.startswith("state/"):
+        return rr.StateChange.columns(state=values)
+    if entity in (REPORT, OPERATOR):
         return rr.TextDocument.columns(text=values, media_type=[rr.MediaType.MARKDOWN] * len(values))
     return rr.Scalars.columns(scalars=np.concatenate(values))
 
@@ -280,46 +333,3 @@ def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
         yield event_text(event), "ERROR" if event.is_urgent else "WARN"
     if document.fit is not None and not document.fit.explained:
         yield "the twin does not explain the window up to the noise", "INFO"
-
-
-def _table(document: ReportDocument) -> str:
-    """Return the report as a Markdown table."""
-    rows = [f"# {document.machine} at {document.site}", ""]
-    rows += [] if document.health is None else [headline(document.health), ""]
-    rows += ["| parameter | value | status |", "|---|---|---|"]
-    rows += [
-        f"| {name} | {value_text(parameter)} | {parameter.status} {parameter.reason} |"
-        for name, parameter in document.parameters.items()
-    ]
-    if document.components:
-        rows += ["", "| component | equation | status |", "|---|---|---|"]
-        rows += [f"| {row.meaning} | {row.equation} | {row.status} {row.approval} |" for row in document.components]
-    rows += [f"\n{event_text(event)}" for event in document.events if event.end is None]
-    return "\n".join(rows)
-
-
-def blueprint(twin: Definition, parameters: Sequence[Parameter]) -> rrb.Blueprint:
-    """Return the layout of the viewer: parameters and residual, then signals, then report and log."""
-    series = rrb.TimeSeriesView
-    estimates = [
-        series(origin=f"/parameters/{row.name}", name=f"{row.meaning} {row.name} [{row.unit}]") for row in parameters
-    ]
-    outputs = [
-        series(origin=f"/signals/{row.name}", name=f"{row.meaning} [{row.unit}]: measured and twin")
-        for row in twin.outputs
-    ]
-    inputs = [series(origin=f"/signals/{row.name}", name=f"{row.meaning} [{row.unit}]") for row in twin.inputs]
-    components = series(origin="/components", name="components that the twin lacked: amplitudes")
-    residual = series(origin="/residual", name="root mean square of the residuals in units of the noise")
-    texts = rrb.TextDocumentView(origin="/report", name="report"), rrb.TextLogView(origin="/log", name="log")
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(*estimates, components, residual),
-            rrb.Vertical(*outputs, *inputs),
-            rrb.Vertical(*texts),
-            column_shares=[3, 3, 2],
-        ),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-    )
