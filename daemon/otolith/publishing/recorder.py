@@ -138,7 +138,7 @@ class Recording:
         self._limits: dict[str, tuple[float, ...]] = {}
         self._states: dict[str, str] = {}
         self._styled: set[str] = set()
-        self._operator_text = ""
+        self._latest: ReportDocument | None = None
         self.waiting = 0
         """Number of windows that are not yet written."""
         self.open(path)
@@ -157,7 +157,7 @@ class Recording:
         self._written_at = time.monotonic()
         self._lines: set[str] = set()
         self._statuses: object = None
-        self._states, self._styled, self._operator_text = {}, set(), ""
+        self._states, self._styled = {}, set()
 
     def _log_static(self) -> None:
         """Log what each file must have: names, units, and what the times mean."""
@@ -196,6 +196,7 @@ class Recording:
 
     def write(self) -> None:
         """Write the windows that wait."""
+        self._add_texts()
         for entity, rows in self._rows.items():
             times = np.concatenate([times for times, _ in rows]).astype("datetime64[ns]")
             self._stream.send_columns(entity, [rr.TimeColumn(TIMELINE, timestamp=times)], _columns(entity, rows))
@@ -221,9 +222,18 @@ class Recording:
             if text not in self._lines:  # what continues is logged once
                 self._rows[LOG].append((end, (f"window {window.index}: {text}", level)))
         self._lines = set(lines)
-        if (statuses := _statuses(document)) != self._statuses or not self._rows[REPORT]:  # once per batch at least
-            self._rows[REPORT].append((end, report_text(document)))
+        self._latest = document
+        if (statuses := _statuses(document)) != self._statuses:
+            self._add_texts()
         self._statuses = statuses
+
+    def _add_texts(self) -> None:
+        """Append the texts about the latest window, if it has none yet."""
+        if (document := self._latest) is not None:
+            end = np.array([round(document.window.end * 1e9)])
+            self._rows[REPORT].append((end, report_text(document)))
+            self._rows[OPERATOR].append((end, operator_text(document)))
+        self._latest = None
 
     def _add_row(self, entity: str, end: Times, *values: float) -> None:
         self._rows[entity].append((end, np.array([values])))
@@ -259,9 +269,6 @@ class Recording:
             if self._states.get(lane) != row.state:
                 self._rows[lane].append((end, str(row.state)))
                 self._states[lane] = row.state
-        if (text := operator_text(document)) != self._operator_text:
-            self._rows[OPERATOR].append((end, text))
-            self._operator_text = text
 
     def _add_traces(self, report: Report) -> None:
         window, traces = report.document.window, report.traces
@@ -316,10 +323,11 @@ def _columns(entity: str, rows: list[tuple[Times, Any]]) -> Any:
 
 
 def _statuses(document: ReportDocument) -> object:
-    """Return what the table of a report shows beside values."""
+    """Return what the texts about a report show beside values."""
     rows = [(row.status, row.reason) for row in document.parameters.values()]
     events = [(event.id, event.state, event.end) for event in document.events]
-    return rows, [(row.id, row.status, row.approval) for row in document.components], events
+    components = [(row.id, row.status, row.approval) for row in document.components]
+    return rows, components, events, None if document.health is None else document.health.state
 
 
 def _log_lines(document: ReportDocument) -> Iterator[tuple[str, str]]:
