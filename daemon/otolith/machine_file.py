@@ -150,6 +150,18 @@ class RecordingTable(StrictModel):
     folder: Path | None = None
 
 
+class HistoryTable(StrictModel):
+    """The history of estimates, reports and events."""
+
+    enabled: bool = True
+    max_megabytes: Annotated[int, Field(ge=20, le=1_000_000)] = 200
+    """Size of its files."""
+    days: Annotated[int, Field(ge=1, le=36_500)] = 3650
+    """Age of what is kept longest: daily values, events and findings."""
+    resend_hours: Annotated[int, Field(ge=1, le=8760)] = 24
+    """Age of whole reports, for subscribers that were away."""
+
+
 class MachineFile(StrictModel):
     """The whole file."""
 
@@ -175,3 +187,4 @@ class MachineFile(StrictModel):
     swarm: SwarmTable = SwarmTable()
     zenoh: ZenohTable = ZenohTable()
     recording: RecordingTable = RecordingTable()
+    history: HistoryTable = HistoryTable()
