@@ -118,7 +118,8 @@ class Service:
         self._start_history()
         self._windower.records = self._supervisor.records
         identity, driver = self._machine.file.machine, self._machine.driver
-        self._publisher = Publisher(identity.site, identity.name, self._listen, self._machine.file.zenoh.connect)
+        connect = self._machine.file.zenoh.connect
+        self._publisher = Publisher(identity.site, identity.name, self._listen, connect, self._history)
         driver.open(self._rings.deliver)
         self._writer.start()
         self._supervisor.start()
