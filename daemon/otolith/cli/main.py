@@ -26,6 +26,7 @@ from otolith.cli.common import (
     examples_directory,
     log_to_stderr,
 )
+from otolith.cli.operation.history import history
 
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.realtime.NODES, which is slow to import
 EXIT_CODES = """\b
@@ -288,5 +289,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, components, noise, probe, reset, twin):
+for command in (commission, components, history, noise, probe, reset, twin):
     cli.add_command(command)
