@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from otolith.publishing.catch_up import MAX_REPLIES, time_range
 from otolith.publishing.subscriber import MessageOrder, Subscriber
-from otolith.publishing.zenoh_session import EVENT, REPORT, Publisher, session
+from otolith.publishing.zenoh_session import EVENT, REPORT, Publisher, Topic, session
 from otolith.storage.history import SUFFIX
 from otolith.storage.history_retention import Bounds
 from otolith.storage.history_writer import HistoryWriter
@@ -147,6 +147,29 @@ def test_everything_comes_once_and_in_order_over_an_hour_without_router_and_a_ki
     with Subscriber([endpoint], again.append, MACHINE, after=middle):  # another process went on with its own work
         wait_for(lambda: bool(again) and sequences(again)[-1] == last)
     assert again == reports[701:]
+
+
+@pytest.mark.parametrize("topics", [(EVENT,), (REPORT, EVENT)])
+def test_the_first_event_is_not_missed(
+    topics: tuple[Topic, ...], start: Callable[..., Process], tmp_path: Path
+) -> None:
+    """The subscriber has seen none when it is cut off."""
+    endpoint, path = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", tmp_path / f"{SITE}.{MACHINE}{SUFFIX}"
+    router, daemon = start(ROUTER, endpoint), start(DAEMON, path, endpoint, START)
+    events: list[str] = []
+    daemon.ask(20)
+
+    def receive(text: str) -> None:
+        if "schema" not in json.loads(text):
+            events.append(text)
+
+    with Subscriber([endpoint], receive, topics=topics) as subscriber:
+        wait_for(lambda: bool(subscriber.order.keys))
+        router.kill()
+        wait_for(lambda: not subscriber.connected)
+        daemon.ask(200)
+        start(ROUTER, endpoint)
+        wait_for(lambda: len(events) == 2)
 
 
 def test_a_slow_subscriber_misses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

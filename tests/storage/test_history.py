@@ -94,6 +94,35 @@ def test_a_simulated_month_stays_within_its_size(opened: Callable[..., Simulated
     assert finding["count"] == 30 * DAY / length / 2
 
 
+def test_beyond_the_size_reports_go_before_values_of_minutes(opened: Callable[..., Simulated]) -> None:
+    history, noise = opened(Bounds(20 * MEGABYTE, 3650, 8760)), np.random.default_rng(1)
+    for report in documents(6000, length=30.0):
+        history.writer.add(history.numbers.number(report.model_copy(update={"notes": (noise.bytes(2500).hex(),)})))
+        if report.window.index % 100 == 99:
+            history.writer._write_waiting()
+            history.writer._retention.by_size(report.window.end)
+    reader, end = history.writer.reader, START + 6000 * 30.0
+    assert 1800 <= len(numbers_of(reader)) < 5000
+    assert reader.first(MINUTE) == START // MINUTE * MINUTE
+    first = reader.first(WINDOW)
+    assert first is not None
+    assert START + HOUR < first < end - HOUR
+
+
+def test_a_lower_limit_makes_the_file_smaller(opened: Callable[..., Simulated], path: Path) -> None:
+    history, noise = opened(Bounds(40 * MEGABYTE, 3650, 8760)), np.random.default_rng(1)
+    reports = [report.model_copy(update={"notes": (noise.bytes(5000).hex(),)}) for report in documents(2600)]
+    for index in range(0, len(reports), 200):
+        history.write(*reports[index : index + 200])
+    history.writer._close()
+    assert path.stat().st_size > 20 * MEGABYTE
+    lower = opened(Bounds(20 * MEGABYTE, 3650, 8760))
+    lower.write(document(0, START + 20_000.0))
+    lower.writer._retention.by_size(START + 20_000.0)
+    lower.writer._close()
+    assert path.stat().st_size <= 18 * MEGABYTE
+
+
 def test_windows_are_kept_for_a_day_and_reports_as_long_as_configured(opened: Callable[..., Simulated]) -> None:
     history = opened(Bounds(100 * MEGABYTE, 40, 6))
     for report in documents(480, length=HOUR / 8):

@@ -24,7 +24,8 @@ MAX_KEYS = 1000  # of machines, of which the position is kept
 class MessageOrder:
     """Passes on each message of a key once and in order; ``query`` returns the messages after a sequence number.
 
-    A message has a sequence number and that of the one before it. One without numbers is passed on as it comes.
+    A message has a sequence number and that of the one before it. One without numbers is passed on as it comes. The
+    topics of a machine share their numbers, so that the first report also says from where on events can be missing.
     """
 
     def __init__(
@@ -33,9 +34,11 @@ class MessageOrder:
         on_message: Callable[[str], None],
         pause: Callable[[], bool],
         after: int | None,
+        topics: tuple[Topic, ...] = (REPORT,),
     ) -> None:
         """``pause`` waits between two queries and returns whether to stop; ``after`` is where unknown keys begin."""
         self._query, self._on_message, self._pause, self._after = query, on_message, pause, after
+        self._topics = topics
         self._last: dict[str, int] = {}
         self.missed = 0
         """Gaps that no query could fill."""
@@ -44,6 +47,13 @@ class MessageOrder:
     def keys(self) -> tuple[str, ...]:
         """The keys of which messages were passed on."""
         return tuple(self._last)
+
+    def begin(self, key: str, text: str) -> None:
+        """Begin with the number of a message, whether or not its topic is subscribed, where nothing is known yet."""
+        sequence, _ = _numbers(text)
+        if sequence is not None and self._after is None:
+            for topic in self._topics:
+                self._last.setdefault(f"{key.rpartition('/')[0]}/{topic.key}", sequence)
 
     def take(self, key: str, text: str) -> None:
         """Pass a message on, after those before it that are missing."""
@@ -82,9 +92,11 @@ class MessageOrder:
 
     def _pass_on(self, key: str, text: str, sequence: int | None) -> None:
         if sequence is not None:
+            if key not in self._last and key.endswith(f"/{REPORT.key}"):
+                self.begin(key, text)
             self._last.pop(key, None)
             self._last[key] = sequence
-            if len(self._last) > MAX_KEYS:
+            while len(self._last) > MAX_KEYS:
                 del self._last[next(iter(self._last))]
         self._on_message(text)
 
@@ -104,7 +116,7 @@ class Subscriber:
         self._topics = topics
         self._waiting: queue.Queue[tuple[str, str | None]] = queue.Queue(MAX_BEHIND)
         self._stopping, self._is_behind = threading.Event(), threading.Event()
-        self.order = MessageOrder(self._query, on_message, lambda: self._stopping.wait(QUERY_PAUSE), after)
+        self.order = MessageOrder(self._query, on_message, lambda: self._stopping.wait(QUERY_PAUSE), after, topics)
         self._machine, self._from_now = machine, after is None
         self._endpoints, self._sessions = list(connect), list[zenoh.Session]()
         self._declared: list[object] = []
@@ -147,8 +159,8 @@ class Subscriber:
         self._declared += [opened.declare_subscriber(key, self._receive) for key in keys]
         alive = ALIVE.under("*", self._machine)
         self._declared.append(opened.liveliness().declare_subscriber(alive, self._receive_alive, history=True))
-        for key in keys if self._from_now else ():
-            for reply in opened.get(key, timeout=1.0):
+        if self._from_now:
+            for reply in opened.get(REPORT.under("*", self._machine), timeout=1.0):
                 if reply.ok is not None:
                     self._receive(reply.ok)
 
@@ -176,7 +188,8 @@ class Subscriber:
                     self._catch_up(self.order.keys)
                 continue
             if text is not None:
-                self.order.take(key, text)
+                is_subscribed = any(key.endswith(f"/{topic.key}") for topic in self._topics)
+                (self.order.take if is_subscribed else self.order.begin)(key, text)
             else:
                 _, site, machine, _ = key.split("/")
                 self._catch_up(f"{prefix(site, machine)}/{topic.key}" for topic in self._topics)

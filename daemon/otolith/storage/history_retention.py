@@ -1,7 +1,9 @@
 """How the history of a machine stays bounded: by age and by size."""
 
+import math
 import sqlite3
 from dataclasses import dataclass
+from functools import partial
 
 from otolith.storage.history import DAY, HOUR, MINUTE, WINDOW
 
@@ -11,6 +13,7 @@ MAX_LEAP = 1.0 * DAY  # s by which the clock may pass the time that the daemon r
 LEAP_PATIENCE = 1.0 * DAY  # s of operation after which a clock that leapt is believed
 MAX_AHEAD = 1.0 * DAY  # s after the present from which a time is that of a wrong clock
 HARD_SHARE, PRUNED_SHARE = 0.9, 0.8  # of the size limit: never exceeded, and kept by deleting
+MIN_REPORTS = 1800  # that are kept before coarser values go
 CHUNK = 1000  # rows of a table in one transaction
 PAGES_AT_ONCE = 1000  # that are given back to the file system in one transaction
 
@@ -33,8 +36,7 @@ class Retention:
     def __init__(self, connection: sqlite3.Connection, bounds: Bounds) -> None:
         self._connection, self._bounds = connection, bounds
         (self._page_size,) = connection.execute("PRAGMA page_size").fetchone()
-        pages = int(HARD_SHARE * bounds.max_bytes / self._page_size)
-        connection.execute(f"PRAGMA max_page_count = {pages}").fetchone()
+        self._limit()
 
     def by_age(self, now: float, elapsed: float) -> None:
         """Delete what is too old at the Unix time ``now``, ``elapsed`` s of operation after the last call."""
@@ -57,11 +59,22 @@ class Retention:
         if not self._is_too_large():
             return
         self._delete("DELETE FROM sample WHERE time > ?", now + MAX_AHEAD)
-        while self._is_too_large():
-            details = self._delete_reports("TRUE") + sum(map(self._delete_samples, (WINDOW, MINUTE)))
-            if not details and not self._delete_rest():
-                break
+        steps = (
+            partial(self._delete_details, MIN_REPORTS, now - HOUR),
+            partial(self._delete_samples, MINUTE),
+            partial(self._delete_details, 1, math.inf),
+            self._delete_rest,
+        )
+        for step in steps:
+            while self._is_too_large() and step():
+                pass
         self._give_back()
+
+    def _limit(self) -> int:
+        """Set the size that SQLite never exceeds; a file that is larger keeps its size. Returns it in pages."""
+        pages = int(HARD_SHARE * self._bounds.max_bytes / self._page_size)
+        self._connection.execute(f"PRAGMA max_page_count = {pages}").fetchone()
+        return pages
 
     def _clock(self, now: float, elapsed: float) -> float:
         """Return ``now``, or after a leap of the clock the time until it is believed; a wrong clock deletes nothing."""
@@ -81,11 +94,25 @@ class Retention:
         (free,) = self._connection.execute("PRAGMA freelist_count").fetchone()
         return bool((pages - free) * self._page_size > PRUNED_SHARE * self._bounds.max_bytes)
 
-    def _delete_samples(self, resolution: int, before: float = float("inf")) -> int:
+    def _delete_samples(self, resolution: int, before: float = math.inf) -> int:
         """Delete at most ``CHUNK`` of the oldest values of a resolution."""
         chosen = "SELECT time, series FROM sample WHERE resolution = ?1 AND time < ?2 ORDER BY time LIMIT ?3"
         query = f"DELETE FROM sample WHERE resolution = ?1 AND (time, series) IN ({chosen})"  # noqa: S608
         return self._delete(query, resolution, before, CHUNK)
+
+    def _delete_details(self, keep: int, latest: float) -> int:
+        """Delete the oldest reports, but not the newest ``keep``, and values of their windows before ``latest``."""
+        execute = self._connection.execute
+        first = execute("SELECT sequence FROM report ORDER BY sequence DESC LIMIT 1 OFFSET ?", (keep - 1,)).fetchone()
+        query = "SELECT sequence, time FROM report WHERE sequence < ? ORDER BY sequence LIMIT ?"
+        oldest = execute(query, (first[0] if first else 0, CHUNK)).fetchall()
+        if not oldest:
+            return self._delete_samples(WINDOW, latest)
+        count, before = len(oldest), min(latest, max(time for _, time in oldest))
+        self._delete("DELETE FROM report WHERE sequence <= ?", oldest[-1][0])
+        while deleted := self._delete_samples(WINDOW, before):
+            count += deleted
+        return count
 
     def _delete_reports(self, condition: str, *values: float) -> int:
         """Delete at most ``CHUNK`` of the oldest reports; the newest stays, as the next one refers to it."""
@@ -106,6 +133,9 @@ class Retention:
             return self._connection.execute(query, values).rowcount
 
     def _give_back(self) -> None:
-        (free,) = self._connection.execute("PRAGMA freelist_count").fetchone()
-        for _ in range(0, free, PAGES_AT_ONCE):
-            self._connection.execute(f"PRAGMA incremental_vacuum({PAGES_AT_ONCE})").fetchall()
+        """Make the file smaller if it is larger than it may be: the limit was lowered."""
+        (pages,) = self._connection.execute("PRAGMA page_count").fetchone()
+        for _ in range(0, pages - self._limit(), PAGES_AT_ONCE):
+            # Not by execute, which would stop after the first page.
+            self._connection.executescript(f"PRAGMA incremental_vacuum({PAGES_AT_ONCE})")
+        self._limit()

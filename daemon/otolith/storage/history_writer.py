@@ -135,7 +135,7 @@ class HistoryWriter:
             if stopping or time.monotonic() >= self._retry_at:
                 try:
                     self._work(time.monotonic())
-                except (sqlite3.Error, OtolithError, OSError) as error:  # monitoring continues
+                except Exception as error:  # noqa: BLE001 - monitoring continues, and what is lost is counted
                     self._fail(error)
             if stopping:
                 self._close()
@@ -204,7 +204,6 @@ class HistoryWriter:
             self._connect()
         except (sqlite3.Error, ValueError) as error:
             if isinstance(error, sqlite3.Error) and _code(error) not in {*DAMAGED, sqlite3.SQLITE_ERROR}:
-                self._close()
                 raise
             note = self._begin_anew(str(error))
             log.warning("%s", note)
@@ -240,8 +239,14 @@ class HistoryWriter:
             handle = os.open(self._path.name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600, dir_fd=folder)
             give_to(os.fstat(folder), handle)
             os.close(handle)
-        connection = sqlite3.connect(self._path, timeout=BUSY_TIMEOUT, check_same_thread=False)
-        self._connection = connection
+        self._connection = sqlite3.connect(self._path, timeout=BUSY_TIMEOUT, check_same_thread=False)
+        try:
+            self._prepare(self._connection)
+        except BaseException:
+            self._close()
+            raise
+
+    def _prepare(self, connection: sqlite3.Connection) -> None:
         if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             create(connection, self.reader.site, self.reader.machine)
         check(connection, self.reader.site, self.reader.machine)

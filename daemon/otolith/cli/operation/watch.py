@@ -8,6 +8,7 @@ import queue
 import subprocess
 import sys
 import sysconfig
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -39,9 +40,10 @@ def watch_reports(
     """
     key = REPORT.under("*", machine)
     texts: queue.Queue[str] = queue.Queue(MAX_QUEUED)
+    ended = threading.Event()
 
     def receive(text: str) -> None:
-        while not stopped():  # meanwhile the history keeps the reports for a slow reader
+        while not (stopped() or ended.is_set()):  # meanwhile the history keeps the reports for a slow reader
             try:
                 texts.put(text, timeout=PAUSE)
             except queue.Full:
@@ -54,14 +56,17 @@ def watch_reports(
             missing = "no daemon reached yet; --connect sets where to look"
             return f"{f'connected, waiting for {key}' if subscriber.connected else missing} ({', '.join(connect)})"
 
-        if as_json:
-            _stream(texts, state, stopped)
-            return
-        table = LiveTable(state)
-        with Live(table, console=Console(), refresh_per_second=5):
-            while not stopped():
-                for text in drain(texts, PAUSE):
-                    table.add(text)
+        try:
+            if as_json:
+                _stream(texts, state, stopped)
+                return
+            table = LiveTable(state)
+            with Live(table, console=Console(), refresh_per_second=5):
+                while not stopped():
+                    for text in drain(texts, PAUSE):
+                        table.add(text)
+        finally:
+            ended.set()
 
 
 def _stream(texts: "queue.Queue[str]", state: Callable[[], str], stopped: Callable[[], bool]) -> None:
