@@ -265,6 +265,24 @@ def test_kept_databases_take_no_more_than_a_history_and_the_newest_stays(
     assert [kept.stat().st_size // MEGABYTE for kept in sorted(path.parent.glob(f"*{KEPT}"))] == [30]
 
 
+def test_a_database_that_is_deleted_meanwhile_is_made_again(opened: Callable[..., Simulated], path: Path) -> None:
+    history = opened()
+    history.write(*documents(3))
+    shutil.rmtree(path.parent)
+    for report in documents(2, start=START + 100.0):
+        history.writer.add(history.numbers.number(report))
+        history.writer._work(0.0)
+    assert len(numbers_of(history.writer.reader)) == 2
+
+
+def test_quick_restarts_do_not_run_ahead_of_the_clock(opened: Callable[..., Simulated]) -> None:
+    for index in range(100):
+        history = opened(now=START + 5.0 * index)
+        history.write(document(index, START + 5.0 * index))
+        history.writer._close()
+    assert history.numbers.start == int((START + 5.0 * 99) * 1e3)
+
+
 def test_a_link_to_another_file_is_not_followed(path: Path, tmp_path: Path) -> None:
     path.parent.mkdir()
     (tmp_path / "other").write_bytes(b"")

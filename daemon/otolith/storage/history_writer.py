@@ -26,7 +26,7 @@ KEPT = ".kept.sqlite"
 DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 """Primary codes of a database that cannot be used as it is; most others are faults of disk and permissions."""
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
-NUMBER_LEAP = 1_000_000  # numbers skipped at a start: more than a daemon publishes without saving
+NUMBER_LEAP = 4000  # numbers skipped at a start: more than a daemon publishes without saving
 MAX_WAITING = 256  # reports that wait for the disk
 BATCH = 64  # reports in one transaction
 PRUNE_INTERVAL = 60.0  # s between two deletions by age
@@ -143,6 +143,8 @@ class HistoryWriter:
 
     def _work(self, now: float) -> None:
         """Write what is waiting, and delete what is too old or too much."""
+        if self._connection is not None and not self._is_in_place():
+            self._close()
         if self._connection is None:
             self._open()
         self._limit_log()
@@ -188,6 +190,12 @@ class HistoryWriter:
             log.warning("%s: no history is written: %s: check the disk and its permissions", self._path, error)
         self._last_error, self._retry_at = str(error), time.monotonic() + WRITE_RETRY
         self._written.set()
+
+    def _is_in_place(self) -> bool:
+        """Return whether the file was neither deleted nor moved by somebody: what is written there would be lost."""
+        with contextlib.suppress(OSError):
+            return os.path.samestat(self._path.stat(), self._file)
+        return False
 
     def _limit_log(self) -> None:
         """Raise ServiceError if a process that reads keeps the write-ahead log from being merged."""
@@ -238,6 +246,7 @@ class HistoryWriter:
         with opened_folder(self._path.parent) as folder:  # SQLite gives its own files the owner of this one
             handle = os.open(self._path.name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600, dir_fd=folder)
             give_to(os.fstat(folder), handle)
+            self._file = os.fstat(handle)
             os.close(handle)
         self._connection = sqlite3.connect(self._path, timeout=BUSY_TIMEOUT, check_same_thread=False)
         try:
