@@ -293,6 +293,20 @@ def test_whatever_is_lost_or_repeated_is_passed_on_once_and_in_order(
 def test_messages_without_numbers_are_passed_on() -> None:
     passed: list[str] = []
     order = MessageOrder(lambda *_: [], passed.append, lambda: False, None)
-    for text in ("no json", "[1]", '{"sequence": "x"}', "{}"):
+    for text in ("no json", "[1]", '{"sequence": "x"}', "{}", "[" * 200_000, f'{{"sequence": {"9" * 5000}}}'):
         order.take("key", text)
-    assert len(passed) == 4
+    assert len(passed) == 6
+
+
+def test_a_payload_that_is_no_text_ends_no_subscriber() -> None:
+    endpoint, passed = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", list[str]()
+    with session([endpoint]) as other, Subscriber([endpoint], passed.append) as subscriber:
+        wait_for(lambda: subscriber.connected)
+
+        def received() -> bool:
+            other.put(REPORT.under(SITE, MACHINE), b"\xff\xfe")
+            other.put(REPORT.under(SITE, MACHINE), "text")
+            return "text" in passed
+
+        wait_for(received)
+    assert "\ufffd\ufffd" in passed

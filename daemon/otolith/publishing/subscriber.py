@@ -166,7 +166,7 @@ class Subscriber:
 
     def _receive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            self._put(str(sample.key_expr), sample.payload.to_string())
+            self._put(str(sample.key_expr), _text(sample))
 
     def _receive_alive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
@@ -203,7 +203,7 @@ class Subscriber:
         for each in tuple(self._sessions):
             try:
                 replies = each.get(f"{key}?after={after}", timeout=QUERY_TIMEOUT, consolidation=none)
-                texts = [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
+                texts = [_text(reply.ok) for reply in replies if reply.ok is not None]
             except zenoh.ZError:  # the session was closed
                 continue
             if texts:
@@ -211,11 +211,16 @@ class Subscriber:
         return []
 
 
+def _text(sample: zenoh.Sample) -> str:
+    """Return the payload as text; anybody may publish anything."""
+    return sample.payload.to_bytes().decode(errors="replace")
+
+
 def _numbers(text: str) -> tuple[int | None, int | None]:
     """Return sequence number and previous one of a message; None where it has none."""
     try:
         message = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None, None
     values = (message.get(name) if isinstance(message, dict) else None for name in ("sequence", "previous"))
     sequence, previous = (value if isinstance(value, int) else None for value in values)

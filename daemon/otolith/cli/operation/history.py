@@ -219,7 +219,8 @@ def _print_table(
 
     console = Console()
     first = min((sample.time for sample in samples), default=since)
-    console.print(f"{reader.machine} at {reader.site}, since {local_time(max(first, since))}, values per {interval}")
+    values = f", values per {interval}" if samples else ""
+    console.print(f"{reader.machine} at {reader.site}, since {local_time(max(first, since))}{values}")
     if samples:
         console.print(_table(samples, console.width))
     for event in events[-MAX_EVENTS:]:
@@ -230,7 +231,7 @@ def _print_table(
         span = f"{local_time(finding['first'])} to {local_time(finding['last'])}"
         console.print(f"finding: {finding['text']}, {span}, in {finding['count']} windows", markup=False)
     if not samples and not events:
-        click.echo("nothing was kept since then", err=True)
+        click.echo("no values or events since then", err=True)
 
 
 def _table(samples: "Sequence[HistorySample]", width: int) -> object:
