@@ -10,7 +10,7 @@ from typing import Self
 import zenoh
 
 from otolith.publishing.catch_up import MAX_REPLIES
-from otolith.publishing.zenoh_session import ALIVE, REPORT, Topic, prefix, session
+from otolith.publishing.zenoh_session import ALIVE, REPORT, Topic, session
 from otolith_drivers.errors import ServiceError
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
@@ -25,7 +25,7 @@ class MessageOrder:
     """Passes on each message of a key once and in order; ``query`` returns the messages after a sequence number.
 
     A message has a sequence number and that of the one before it. One without numbers is passed on as it comes. The
-    topics of a machine share their numbers, so that the first report also says from where on events can be missing.
+    topics of a machine share their numbers, so that the first report also shows from where on events can be missing.
     """
 
     def __init__(
@@ -155,14 +155,10 @@ class Subscriber:
             self._stopping.wait(QUERY_PAUSE)
 
     def _declare(self, opened: zenoh.Session) -> None:
-        keys = [topic.under("*", self._machine) for topic in self._topics]
-        self._declared += [opened.declare_subscriber(key, self._receive) for key in keys]
+        for topic in {REPORT, *self._topics}:  # a report also shows from where on events can be missing
+            self._declared.append(opened.declare_subscriber(topic.under("*", self._machine), self._receive))
         alive = ALIVE.under("*", self._machine)
         self._declared.append(opened.liveliness().declare_subscriber(alive, self._receive_alive, history=True))
-        if self._from_now:
-            for reply in opened.get(REPORT.under("*", self._machine), timeout=1.0):
-                if reply.ok is not None:
-                    self._receive(reply.ok)
 
     def _receive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
@@ -188,21 +184,35 @@ class Subscriber:
                     self._catch_up(self.order.keys)
                 continue
             if text is not None:
-                is_subscribed = any(key.endswith(f"/{topic.key}") for topic in self._topics)
-                (self.order.take if is_subscribed else self.order.begin)(key, text)
+                self._take(key, text)
             else:
-                _, site, machine, _ = key.split("/")
-                self._catch_up(f"{prefix(site, machine)}/{topic.key}" for topic in self._topics)
+                self._begin_or_catch_up(key.rpartition("/")[0])
+
+    def _take(self, key: str, text: str) -> None:
+        is_subscribed = any(key.endswith(f"/{topic.key}") for topic in self._topics)
+        (self.order.take if is_subscribed else self.order.begin)(key, text)
+
+    def _begin_or_catch_up(self, machine: str) -> None:
+        """Take the latest report of a daemon that is new here, or what was published while it was not connected."""
+        keys = [f"{machine}/{topic.key}" for topic in self._topics]
+        if self._from_now and not set(keys) & set(self.order.keys):
+            for text in self._get(f"{machine}/{REPORT.key}"):
+                self._take(f"{machine}/{REPORT.key}", text)
+        else:
+            self._catch_up(keys)
 
     def _catch_up(self, keys: Iterable[str]) -> None:
         for key in keys:
             self.order.catch_up(key)
 
     def _query(self, key: str, after: int) -> list[str]:
+        return self._get(f"{key}?after={after}")
+
+    def _get(self, selector: str) -> list[str]:
         none = zenoh.ConsolidationMode.NONE  # by default only the latest message of a key would be passed on
         for each in tuple(self._sessions):
             try:
-                replies = each.get(f"{key}?after={after}", timeout=QUERY_TIMEOUT, consolidation=none)
+                replies = each.get(selector, timeout=QUERY_TIMEOUT, consolidation=none)
                 texts = [_text(reply.ok) for reply in replies if reply.ok is not None]
             except zenoh.ZError:  # the session was closed
                 continue
