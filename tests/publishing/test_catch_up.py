@@ -2,6 +2,7 @@
 
 import json
 import queue
+import signal
 import socket
 import subprocess
 import sys
@@ -310,3 +311,26 @@ def test_a_payload_that_is_no_text_ends_no_subscriber() -> None:
 
         wait_for(received)
     assert "\ufffd\ufffd" in passed
+
+
+def test_watch_prints_every_report_once_although_it_was_stopped(tmp_path: Path, start: Callable[..., Process]) -> None:
+    """The command itself, as another process; its reader is slow as well."""
+    endpoint, path = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", tmp_path / f"{SITE}.{MACHINE}{SUFFIX}"
+    start(ROUTER, endpoint)
+    daemon = start(DAEMON, path, endpoint, START)
+    daemon.ask(30)
+    command = [sys.executable, "-m", "otolith", "watch", "--json", "--connect", endpoint, "--after", "0"]
+    watch = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert watch.stdout is not None
+    lines = [watch.stdout.readline() for _ in range(30)]
+    watch.send_signal(signal.SIGSTOP)
+    last = int(daemon.ask(700))
+    watch.send_signal(signal.SIGCONT)
+    while sequences(lines[-1:]) != [last]:
+        lines.append(watch.stdout.readline())
+    watch.send_signal(signal.SIGINT)
+    assert watch.wait(PATIENCE) == 130
+    assert watch.stdout.read() == ""
+    watch.stdout.close()
+    assert len(lines) == 730
+    assert sequences(lines) == sorted(set(sequences(lines)))
