@@ -145,6 +145,8 @@ class HistoryWriter:
         """Write what is waiting, and delete what is too old or too much."""
         if self._connection is not None and not self._is_in_place():
             self._close()
+            if not self._path.parent.parent.is_dir():
+                raise ServiceError("the state directory was removed")
         if self._connection is None:
             self._open()
         self._limit_log()
