@@ -155,6 +155,18 @@ class RecordingTable(StrictModel):
     rotate_minutes: Annotated[float, Field(ge=1.0, le=1440.0)] = 60.0
 
 
+class HistoryTable(StrictModel):
+    """The history of estimates, reports and events."""
+
+    enabled: bool = True
+    max_megabytes: Annotated[int, Field(ge=20, le=1_000_000)] = 200
+    """Size of its files."""
+    days: Annotated[int, Field(ge=1, le=36_500)] = 3650
+    """Age of what is kept longest: daily values, events and findings."""
+    resend_hours: Annotated[int, Field(ge=1, le=8760)] = 24
+    """Age of whole reports, for subscribers that were away."""
+
+
 class MachineFile(StrictModel):
     """The whole file."""
 
@@ -180,3 +192,4 @@ class MachineFile(StrictModel):
     swarm: SwarmTable = SwarmTable()
     zenoh: ZenohTable = ZenohTable()
     recording: RecordingTable = RecordingTable()
+    history: HistoryTable = HistoryTable()

@@ -30,6 +30,7 @@ TABLES: list[tuple[str, str, type[BaseModel]]] = [
     ("[swarm]", "key", machine_file.SwarmTable),
     ("[zenoh]", "key", machine_file.ZenohTable),
     ("[recording]", "key", machine_file.RecordingTable),
+    ("[history]", "key", machine_file.HistoryTable),
     ('type = "can"', "key", can.Options),
     ('type = "can"', "key of `[[driver.pdo]]`", PdoTable),
     ('type = "can"', "key of `[driver.messages.Name]`", MessageTable),

@@ -23,6 +23,7 @@ from otolith.health.schema import (
 )
 from otolith.machine import load_machine
 from otolith.runtime.service import Service
+from otolith.storage.history import HistoryReader, history_path
 from otolith.storage.state_store import StateStore
 from tests.conftest import OwnMachine
 from tests.system.conftest import OTOLITH, Running, is_estimated
@@ -90,6 +91,13 @@ def test_the_first_reports_after_a_restart_hold_the_truth(
     assert reports[0].parameters["R_a"].status in {Status.ESTIMATED, Status.HELD}
     assert "started with what was learned up to" in second.log.read_text()
     assert reports[0].notes == ()
+    before, after = first.reports[-1].sequence, reports[0].sequence
+    assert before is not None
+    assert after is not None
+    assert before <= (reports[0].previous or 0) < after  # the history has what was published after the last one here
+    history = HistoryReader(history_path("demo", "dc-motor"))
+    expected = {report.to_json() for report in (*first.reports, *reports)}
+    wait_for(lambda: expected <= set(history.messages("report", 1000)))  # the last one may still be written
 
 
 def test_a_second_daemon_of_the_same_name_ends_with_an_error(start: Start, healthy: OwnMachine) -> None:

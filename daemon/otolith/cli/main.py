@@ -26,6 +26,7 @@ from otolith.cli.common import (
     examples_directory,
     log_to_stderr,
 )
+from otolith.cli.operation.history import history
 from otolith.cli.operation.view import view
 
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.realtime.NODES, which is slow to import
@@ -188,18 +189,26 @@ def replay(
               metavar="ENDPOINT", help="Where daemons publish; may be repeated.")  # fmt: skip
 @click.option("--machine", default="*", callback=_machine_name, metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
-def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
+@click.option("--after", type=click.IntRange(0), metavar="NUMBER",
+              help="With --json: begin after the report with this sequence number.")  # fmt: skip
+def watch(connect: tuple[str, ...], machine: str, as_json: bool, after: int | None) -> int:
     """Show the live table of running daemons, over Zenoh.
+
+    With --json each report is printed once and in order, also those that were
+    published while the connection was down.
 
     \b
     Examples:
       otolith watch
       otolith watch --json | jq .parameters.R_a
+      otolith watch --json --machine press-3 --after 1790000000000
     """
+    if after is not None and not as_json:
+        raise click.UsageError("--after needs --json")
     from otolith.cli.operation.watch import watch_reports
 
     stop = StopSignal()
-    watch_reports(connect, machine, as_json=as_json, stopped=stop.received)
+    watch_reports(connect, machine, as_json=as_json, after=after, stopped=stop.received)
     return stop.code()
 
 
@@ -262,5 +271,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, components, noise, probe, reset, twin, view):
+for command in (commission, components, history, noise, probe, reset, twin, view):
     cli.add_command(command)

@@ -122,6 +122,10 @@ class EventDocument(StrictModel):
 
     id: str
     """What it is about, and when it began: the same in each of its reports."""
+    sequence: int | None = None
+    """Of a change: see :attr:`ReportDocument.sequence`."""
+    previous: int | None = None
+    """Of a change: the sequence number of the change of an event before it."""
     part: str
     state: Level
     change: EventChange | None = None
@@ -285,12 +289,18 @@ class CountersDocument(StrictModel):
     recordings_dropped: int = 0
     """Windows that the recorder did not accept in time, or lost when it ended."""
     recorder_restarts: int = 0
+    history_dropped: int = 0
+    """Windows that the history did not take: its disk was full or too slow."""
 
 
 class ReportDocument(StrictModel):
     """The report of one window."""
 
     schema_: Literal["otolith.report/1"] = SCHEMA
+    sequence: int | None = None
+    """Rises from message to message of a machine, also after a restart; None in a replay."""
+    previous: int | None = None
+    """Sequence number of the report before it; None for the first one."""
     machine: str
     site: str
     twin: str

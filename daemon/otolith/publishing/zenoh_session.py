@@ -6,16 +6,18 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 import zenoh
 
 from otolith.health.schema import ReportDocument
 from otolith.health.text import announcements
+from otolith.publishing.catch_up import Archive, answer
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ServiceError
 
 LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
+CLIENT_TIMEOUT = 1000  # ms for a client to connect
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +33,11 @@ class Topic:
 
 
 REPORT = Topic("report")
-"""JSON document ``otolith.report/1``, once per window; a query returns the latest one."""
+"""JSON document ``otolith.report/1``, once per window; a query returns the latest one, or those that it selects."""
 PARAMETER = Topic("parameter/*")
 """JSON object, once per window: what the report says of one parameter."""
 EVENT = Topic("event")
-"""JSON object, once when a window raises, changes or clears an event."""
+"""JSON object, once when a window raises, changes or clears an event; a query returns those that it selects."""
 ALIVE = Topic("alive")
 """Liveliness token, while the daemon runs."""
 
@@ -47,14 +49,18 @@ def prefix(site: str, machine: str) -> str:
     return f"otolith/{site}/{machine}"
 
 
-def session(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> zenoh.Session:
-    """Open a session in peer mode that uses only the given endpoints: no scouting, no shared memory.
+def session(
+    listen: Iterable[str] = (), connect: Iterable[str] = (), mode: Literal["peer", "client"] = "peer"
+) -> zenoh.Session:
+    """Open a session that uses only the given endpoints: no scouting, no shared memory.
+
+    A router passes messages on to clients, not from peer to peer. A client needs an endpoint that answers.
 
     Raises:
-        ServiceError: an endpoint to listen on is in use, or one is malformed.
+        ServiceError: an endpoint to listen on is in use, one is malformed, or a client reaches none.
     """
     settings = {
-        "mode": "peer",
+        "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "listen/endpoints": list(listen),
@@ -65,6 +71,8 @@ def session(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> zenoh.Se
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE,
     }
+    if mode == "client":
+        settings["connect/timeout_ms"] = CLIENT_TIMEOUT
     try:
         config = zenoh.Config()
         for key, value in settings.items():
@@ -83,9 +91,13 @@ def _cause(message: str) -> str:
 
 
 class Publisher:
-    """Publishes the reports of one machine and answers queries for the latest one."""
+    """Publishes the reports of one machine and answers queries for the latest one, and for earlier ones."""
 
-    def __init__(self, site: str, machine: str, listen: Iterable[str], connect: Iterable[str]) -> None:
+    def __init__(
+        self, site: str, machine: str, listen: Iterable[str], connect: Iterable[str], archive: Archive | None = None
+    ) -> None:
+        """Queries for earlier reports and events are answered from ``archive``."""
+        self._archive = archive
         self._session = session(listen, connect)
         self._site, self._machine = site, machine
         self._lock = threading.Lock()
@@ -94,7 +106,10 @@ class Publisher:
         self._reports = self._session.declare_publisher(
             key, encoding=zenoh.Encoding.APPLICATION_JSON, congestion_control=zenoh.CongestionControl.DROP
         )
-        self._queryable = self._session.declare_queryable(key, self._answer, complete=True)
+        self._queryables = [
+            self._session.declare_queryable(key, self._answer, complete=True),
+            self._session.declare_queryable(EVENT.under(site, machine), self._answer_events, complete=True),
+        ]
         self._token = self._session.liveliness().declare_token(ALIVE.under(site, machine))
 
     def publish(self, document: ReportDocument) -> None:
@@ -120,9 +135,14 @@ class Publisher:
         self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
 
     def _answer(self, query: zenoh.Query) -> None:
-        with query, self._lock:
-            if self._latest is not None:
-                query.reply(REPORT.under(self._site, self._machine), self._latest, encoding="application/json")
+        with self._lock:
+            latest = self._latest
+        with query:
+            answer(query, REPORT.under(self._site, self._machine), "report", latest, self._archive)
+
+    def _answer_events(self, query: zenoh.Query) -> None:
+        with query:
+            answer(query, EVENT.under(self._site, self._machine), "event", None, self._archive)
 
 
 class Listener:

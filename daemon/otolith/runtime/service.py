@@ -30,6 +30,9 @@ from otolith.runtime.process import SIGNALS
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
+from otolith.storage.history import history_path
+from otolith.storage.history_retention import Bounds
+from otolith.storage.history_writer import HistoryWriter, Numbers
 from otolith.storage.state_store import StateStore, WriterThread
 from otolith_drivers.errors import OtolithError
 
@@ -66,6 +69,11 @@ class Service:
             file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
         )
         self._writer = WriterThread(self._store, self._store.decisions_time())
+        self._history: HistoryWriter | None = None
+        if (bounds := file.history).enabled:
+            kept = Bounds(bounds.max_megabytes * 1_000_000, bounds.days, bounds.resend_hours)
+            self._history = HistoryWriter(history_path(file.machine.site, file.machine.name), kept)
+        self._numbers = Numbers(time.time())
         self._notes: tuple[str, ...] = ()
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
@@ -104,9 +112,11 @@ class Service:
         sys.setswitchinterval(SWITCH_INTERVAL)
         self._store.lock()
         self._supervisor.state = self._restored(self._supervisor.state)
+        self._start_history()
         self._windower.records = self._supervisor.records
         identity, driver = self._machine.file.machine, self._machine.driver
-        self._publisher = Publisher(identity.site, identity.name, self._listen, self._machine.file.zenoh.connect)
+        connect = self._machine.file.zenoh.connect
+        self._publisher = Publisher(identity.site, identity.name, self._listen, connect, self._history)
         driver.open(self._rings.deliver)
         self._writer.start()
         self._supervisor.start()
@@ -123,6 +133,8 @@ class Service:
             steps.callback(self._notifier.close)
             if self._publisher is not None:
                 steps.callback(self._publisher.close)
+            if self._history is not None:
+                steps.callback(self._history.stop, WRITER_FLUSH)
             steps.callback(self._writer.stop, WRITER_FLUSH)
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
             steps.callback(self._supervisor.worker.kill)
@@ -153,6 +165,12 @@ class Service:
                 remedy,
             )
         return state
+
+    def _start_history(self) -> None:
+        if self._history is not None:
+            self._numbers, note = self._history.open(time.time())
+            self._notes += (note,) if note else ()
+            self._history.start()
 
     def _step(self) -> None:
         """Cut due windows, hand them to the worker, publish finished reports, supervise the processes."""
@@ -209,10 +227,14 @@ class Service:
             worker_restarts=self._supervisor.restarts,
             recordings_dropped=self._recorder.dropped,
             recorder_restarts=self._recorder.restarts,
+            history_dropped=0 if self._history is None else self._history.dropped,
         )
         document = document.model_copy(
             update={"cost": cost, "counters": counters, "driver": driver, "notes": self._notes}
         )
+        document = self._numbers.number(document)
+        if self._history is not None:
+            self._history.add(document)
         if self._publisher is not None:
             self._publisher.publish(document)
         if self._machine.file.recording.enabled:

@@ -84,9 +84,9 @@ class StateStore:
             return
         handle = -1
         try:
-            with _opened(self.lock_path.parent) as folder:
+            with opened_folder(self.lock_path.parent) as folder:
                 handle = os.open(self.lock_path.name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600, dir_fd=folder)
-                _give_to(os.fstat(folder), handle)
+                give_to(os.fstat(folder), handle)
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             holder = os.read(handle, PROCESS_ID_BYTES).decode("ascii", "replace").strip()
@@ -290,7 +290,7 @@ def _write(path: Path, model: StrictModel, temporary: str) -> None:
     """
     try:
         data = _limited((model.model_dump_json() + "\n").encode())
-        with _opened(path.parent) as folder:
+        with opened_folder(path.parent) as folder:
             with contextlib.suppress(FileNotFoundError):  # left by a process that was killed
                 os.unlink(temporary, dir_fd=folder)
             try:
@@ -298,7 +298,7 @@ def _write(path: Path, model: StrictModel, temporary: str) -> None:
                 with os.fdopen(handle, "wb") as stream:
                     stream.write(data)
                     stream.flush()
-                    _give_to(os.fstat(folder), handle)
+                    give_to(os.fstat(folder), handle)
                     os.fsync(handle)
                 os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
                 os.fsync(folder)
@@ -313,19 +313,19 @@ def _write(path: Path, model: StrictModel, temporary: str) -> None:
 
 
 @contextlib.contextmanager
-def _opened(folder: Path) -> Iterator[int]:
+def opened_folder(folder: Path) -> Iterator[int]:
     """Descriptor of ``folder``, which is created if it is missing."""
     is_new = not folder.exists()
     handle = os.open(writable(folder), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         if is_new:
-            _give_to(folder.parent.stat(), handle)
+            give_to(folder.parent.stat(), handle)
         yield handle
     finally:
         os.close(handle)
 
 
-def _give_to(owner: os.stat_result, handle: int) -> None:
+def give_to(owner: os.stat_result, handle: int) -> None:
     """Give what root has opened to an owner: the daemon runs as another user and must be able to use it."""
     if os.geteuid() == 0:
         os.fchown(handle, owner.st_uid, owner.st_gid)

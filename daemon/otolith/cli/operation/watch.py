@@ -2,6 +2,7 @@
 
 import queue
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 
@@ -10,38 +11,51 @@ from rich.live import Live
 
 from otolith.cli.common import drain
 from otolith.cli.operation.live_table import LiveTable
-from otolith.publishing.zenoh_session import REPORT, Listener
+from otolith.publishing.subscriber import Subscriber
+from otolith.publishing.zenoh_session import REPORT
 
 # Engineering choices without a test of their own.
-MAX_QUEUED = 100  # reports kept for a slow terminal; the oldest are dropped
+MAX_QUEUED = 100  # reports that wait for a slow terminal; later ones come from the history
 PAUSE = 0.2  # s; how late a stop is noticed
 PATIENCE = 5.0  # s without a report until the stream prints what it waits for
 
 
-def watch_reports(connect: Sequence[str], machine: str, *, as_json: bool, stopped: Callable[[], bool]) -> None:
-    """Show reports until ``stopped``; wait for a daemon that is not there yet."""
+def watch_reports(
+    connect: Sequence[str], machine: str, *, as_json: bool, after: int | None, stopped: Callable[[], bool]
+) -> None:
+    """Show reports until ``stopped``; wait for a daemon that is not there yet.
+
+    As JSON each report is printed once and in order, beginning after the sequence number ``after``.
+    """
     key = REPORT.under("*", machine)
     texts: queue.Queue[str] = queue.Queue(MAX_QUEUED)
+    ended = threading.Event()
 
     def receive(text: str) -> None:
-        if texts.full():
-            texts.get_nowait()
-        texts.put_nowait(text)
+        while not (stopped() or ended.is_set()):  # meanwhile the history keeps the reports for a slow reader
+            try:
+                texts.put(text, timeout=PAUSE)
+            except queue.Full:
+                continue
+            return
 
-    with Listener(connect, key, receive) as listener:
+    with Subscriber(connect, receive, machine, after=after) as subscriber:
 
         def state() -> str:
             missing = "no daemon reached yet; --connect sets where to look"
-            return f"{f'connected, waiting for {key}' if listener.connected else missing} ({', '.join(connect)})"
+            return f"{f'connected, waiting for {key}' if subscriber.connected else missing} ({', '.join(connect)})"
 
-        if as_json:
-            _stream(texts, state, stopped)
-            return
-        table = LiveTable(state)
-        with Live(table, console=Console(), refresh_per_second=5):
-            while not stopped():
-                for text in drain(texts, PAUSE):
-                    table.add(text)
+        try:
+            if as_json:
+                _stream(texts, state, stopped)
+                return
+            table = LiveTable(state)
+            with Live(table, console=Console(), refresh_per_second=5):
+                while not stopped():
+                    for text in drain(texts, PAUSE):
+                        table.add(text)
+        finally:
+            ended.set()
 
 
 def _stream(texts: "queue.Queue[str]", state: Callable[[], str], stopped: Callable[[], bool]) -> None:

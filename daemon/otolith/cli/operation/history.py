@@ -1,0 +1,257 @@
+"""``otolith history``: what was estimated and announced, from the database of a machine."""
+
+import csv
+import json
+import re
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from otolith.cli.common import AS_JSON, FILE, local_time
+
+if TYPE_CHECKING:
+    from otolith.health.schema import EventDocument
+    from otolith.storage.history import HistoryReader, HistorySample
+
+SPANS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
+INTERVALS = ("window", "minute", "hour", "day")
+# Engineering choices, see docs/reference/thresholds-cli.md.
+LONGEST = {"window": 7200.0, "minute": 2 * 86_400.0, "hour": 60 * 86_400.0}  # s that are shown at a resolution
+MAX_EVENTS = 20  # in the table
+MIN_CURVE = 8  # characters of a curve
+OTHER_COLUMNS = 84  # characters that the table needs beside it
+
+
+def _since(_: click.Context, __: click.Parameter, text: str) -> float:
+    """Return the Unix time that ``text`` means: an age like ``30d``, or a date and time of this computer's zone."""
+    if match := re.fullmatch(r"(\d{1,9}(?:\.\d+)?)\s*([smhdw])", text.strip()):
+        return time.time() - float(match[1]) * SPANS[match[2]]
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError) as error:
+        raise click.BadParameter(f"{text!r}: write an age like 12h, 30d or 8w, or a date like 2026-01-31") from error
+
+
+def _new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+    if path is not None and path.exists():
+        raise click.BadParameter(f"{str(path)!r} exists and would be overwritten")
+    return path
+
+
+@click.command()
+@click.argument("machine", metavar="FILE|MACHINE")
+@click.option("--since", default="1d", callback=_since, metavar="AGE|DATE", help="Begin here, like 12h, 30d, 8w.")
+@click.option("--parameter", "names", multiple=True, metavar="NAME", help="Only this one; may be repeated.")
+@click.option("--every", type=click.Choice(INTERVALS), show_default=False,
+              help="Values of each window, minute, hour or day.  [default: as --since needs]")  # fmt: skip
+@click.option("--events", "only_events", is_flag=True, help="Only events and findings.")
+@click.option("--csv", "as_csv", is_flag=True, help="Print the values, or the events, as CSV.")
+@AS_JSON
+@click.option("--parquet", type=FILE, callback=_new_file, help="Write the values into this Parquet file.")
+def history(
+    machine: str,
+    since: float,
+    names: tuple[str, ...],
+    every: str | None,
+    only_events: bool,
+    as_csv: bool,
+    as_json: bool,
+    parquet: Path | None,
+) -> None:
+    """Show what was estimated and announced before.
+
+    FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
+    Windows are kept for a day, minutes for 14 days, hours for a year, days and
+    events for ten years, unless the machine file says otherwise.
+
+    \b
+    Examples:
+      otolith history my-machine.toml
+      otolith history press-3 --since 30d --parameter R_a
+      otolith history press-3 --since 1w --events
+      otolith history press-3 --since 2026-01-31 --every hour --csv > press-3.csv
+    """
+    if as_csv + as_json + (parquet is not None) > 1:
+        raise click.UsageError("give one of --csv, --json and --parquet")
+    if only_events and parquet is not None:
+        raise click.UsageError("--parquet has values only: give --csv or --json with --events")
+    reader = _reader(machine)
+    _check_names(names, reader.names())
+    events = [] if names and not only_events else reader.events(since)
+    if only_events and as_csv:
+        _print_events(events)
+        return
+    interval = every or _interval(reader, since)
+    samples = [] if only_events else _samples(reader, interval, since, names)
+    if as_csv:
+        _print_samples(samples)
+    elif parquet is not None:
+        _write_parquet(samples, parquet)
+    elif as_json:
+        _print_json(reader, interval, since, samples, events)
+    else:
+        _print_table(reader, interval, since, samples, events, with_findings=only_events or not names)
+
+
+def _reader(machine: str) -> "HistoryReader":
+    """Return the history of a machine file, or of a machine by its name.
+
+    Raises:
+        ConfigurationError: the file is wrong, or there is no history, or several, of that name.
+    """
+    from otolith.storage.history import SUFFIX, HistoryReader, history_directory, history_path
+    from otolith_drivers.errors import ConfigurationError, nearest
+
+    if machine.endswith(".toml") or "/" in machine or Path(machine).is_file():
+        from otolith.machine import load_machine
+
+        names = load_machine(Path(machine), with_driver=False).file.machine
+        return HistoryReader(history_path(names.site, names.name))
+    known = [HistoryReader(path) for path in sorted(history_directory().glob(f"*{SUFFIX}"))]
+    chosen = [reader for reader in known if reader.machine == machine]
+    if not chosen:
+        hint = nearest(machine, [reader.machine for reader in known])
+        raise ConfigurationError(f"no history of a machine {machine!r} in {history_directory()}: {hint}")
+    if len(chosen) > 1:
+        sites = ", ".join(reader.site for reader in chosen)
+        raise ConfigurationError(f"several machines are named {machine!r}, at {sites}: give the machine file")
+    return chosen[0]
+
+
+def _check_names(names: Sequence[str], known: list[str]) -> None:
+    from otolith_drivers.errors import ConfigurationError, nearest
+
+    for name in names:
+        if name not in known:
+            raise ConfigurationError(f"no value of {name!r} in the history: {nearest(name, known)}")
+
+
+def _interval(reader: "HistoryReader", since: float) -> str:
+    """Return the resolution that shows the time since then, as far as there are values."""
+    from otolith.storage.history import DAY
+
+    first = reader.first(DAY)
+    span = time.time() - max(since, since if first is None else first)
+    return next((name for name, longest in LONGEST.items() if span <= longest), "day")
+
+
+def _samples(reader: "HistoryReader", interval: str, since: float, names: Sequence[str]) -> "list[HistorySample]":
+    from otolith.storage.history import RESOLUTIONS
+
+    seconds = next(seconds for seconds, name in RESOLUTIONS.items() if name == interval)
+    return reader.samples(seconds, since - seconds, names)  # with the interval that contains it
+
+
+def _utc(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _print_samples(samples: "Iterable[HistorySample]") -> None:
+    columns = ("name", "unit", "time", "count", "min", "mean", "max", "last", "low", "high", "status")
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(("parameter", *columns[1:]))
+    for sample in samples:
+        writer.writerow([_utc(sample.time) if name == "time" else getattr(sample, name) for name in columns])
+
+
+def _print_events(events: "Iterable[EventDocument]") -> None:
+    columns = ("change", "part", "state", "condition", "cause", "text", "advice", "id")
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(("time", *columns))
+    for event in events:
+        writer.writerow([_utc(event.end or event.since), *(getattr(event, name) for name in columns)])
+
+
+def _write_parquet(samples: "Sequence[HistorySample]", path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = [asdict(sample) for sample in samples]
+    fields = [pa.field("parameter", pa.string()), pa.field("unit", pa.string())]
+    fields += [pa.field("time", pa.timestamp("us", tz="UTC")), pa.field("count", pa.int64())]
+    fields += [pa.field(name, pa.float64()) for name in ("min", "mean", "max", "last", "low", "high")]
+    schema = pa.schema([*fields, pa.field("status", pa.string())])
+    for row in rows:
+        row["parameter"] = row.pop("name")
+        row["time"] = datetime.fromtimestamp(row["time"], UTC)
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), path)
+
+
+def _print_json(
+    reader: "HistoryReader",
+    interval: str,
+    since: float,
+    samples: "Iterable[HistorySample]",
+    events: "Iterable[EventDocument]",
+) -> None:
+    content = {
+        "machine": reader.machine,
+        "site": reader.site,
+        "since": since,
+        "every": interval,
+        "values": [asdict(sample) for sample in samples],
+        "events": [event.model_dump(mode="json", exclude_none=True) for event in events],
+        "findings": reader.findings(since),
+        "counters": reader.counters(since),
+    }
+    click.echo(json.dumps(content, ensure_ascii=False))
+
+
+def _print_table(
+    reader: "HistoryReader",
+    interval: str,
+    since: float,
+    samples: "Sequence[HistorySample]",
+    events: "Sequence[EventDocument]",
+    *,
+    with_findings: bool,
+) -> None:
+    from rich.console import Console
+
+    from otolith.cli.operation.live_table import event_style
+    from otolith.health.text import event_text
+
+    console = Console()
+    first = min((sample.time for sample in samples), default=since)
+    values = f", values per {interval}" if samples else ""
+    console.print(f"{reader.machine} at {reader.site}, since {local_time(max(first, since))}{values}")
+    if samples:
+        console.print(_table(samples, console.width))
+    for event in events[-MAX_EVENTS:]:
+        console.print(f"{event.change}: {event_text(event, local_time)}", style=event_style(event), markup=False)
+    if len(events) > MAX_EVENTS:
+        console.print(f"and {len(events) - MAX_EVENTS} earlier changes of events: --events --csv has them")
+    for finding in reader.findings(since) if with_findings else ():
+        span = f"{local_time(finding['first'])} to {local_time(finding['last'])}"
+        console.print(f"finding: {finding['text']}, {span}, in {finding['count']} windows", markup=False)
+    if not samples and not events:
+        click.echo("no values or events since then", err=True)
+
+
+def _table(samples: "Sequence[HistorySample]", width: int) -> object:
+    """A row for each parameter: last value and interval, change and range of the means, and their curve."""
+    from otolith.cli.operation.live_table import parameter_table, sparkline
+
+    length = max(width - OTHER_COLUMNS, MIN_CURVE)
+    table = parameter_table("min", "max", "history")
+    first, last = samples[0].time, samples[-1].time
+    series: dict[tuple[str, str], list[HistorySample]] = {}
+    for sample in samples:
+        series.setdefault((sample.name, sample.unit), []).append(sample)
+    for (name, unit), row in series.items():
+        bins: dict[int, list[float]] = {}
+        for sample in row:
+            bins.setdefault(int((sample.time - first) / max(last - first, 1.0) * (length - 1)), []).append(sample.mean)
+        curve = sparkline(tuple(sum(values) / len(values) for _, values in sorted(bins.items())))
+        end, begin = row[-1], row[0].mean
+        half = "" if end.low is None or end.high is None else f"{0.5 * (end.high - end.low):.2g}"
+        change = f"{row[-1].mean / begin - 1.0:+.2%}" if begin else ""
+        low, high = min(sample.min for sample in row), max(sample.max for sample in row)
+        table.add_row(name, f"{end.last:.5g}", half, unit, change, f"{low:.5g}", f"{high:.5g}", curve)
+    return table

@@ -1,0 +1,237 @@
+"""A subscriber that gets each message once and in order, also those that were published while it was away."""
+
+import json
+import queue
+import threading
+from collections.abc import Callable, Iterable
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from otolith.publishing.catch_up import MAX_REPLIES
+from otolith.publishing.zenoh_session import ALIVE, REPORT, Topic, session
+from otolith_drivers.errors import ServiceError
+
+# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+QUERY_TIMEOUT = 5.0  # s
+QUERY_TRIES = 5  # queries for what is missing
+QUERY_PAUSE = 0.5  # s between them
+MAX_BEHIND = 1000  # messages that wait for on_message; later ones come from the history
+MAX_KEYS = 1000  # of machines, of which the position is kept
+
+
+class MessageOrder:
+    """Passes on each message of a key once and in order; ``query`` returns the messages after a sequence number.
+
+    A message has a sequence number and that of the one before it. One without numbers is passed on as it comes. The
+    topics of a machine share their numbers, so that the first report also shows from where on events can be missing.
+    """
+
+    def __init__(
+        self,
+        query: Callable[[str, int], list[str]],
+        on_message: Callable[[str], None],
+        pause: Callable[[], bool],
+        after: int | None,
+        topics: tuple[Topic, ...] = (REPORT,),
+    ) -> None:
+        """``pause`` waits between two queries and returns whether to stop; ``after`` is where unknown keys begin."""
+        self._query, self._on_message, self._pause, self._after = query, on_message, pause, after
+        self._topics = topics
+        self._last: dict[str, int] = {}
+        self.missed = 0
+        """Gaps that no query could fill."""
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys of which messages were passed on."""
+        return tuple(self._last)
+
+    def begin(self, key: str, text: str) -> None:
+        """Begin with the number of a message, whether or not its topic is subscribed, where nothing is known yet."""
+        sequence, _ = _numbers(text)
+        if sequence is not None and self._after is None:
+            for topic in self._topics:
+                self._last.setdefault(f"{key.rpartition('/')[0]}/{topic.key}", sequence)
+
+    def take(self, key: str, text: str) -> None:
+        """Pass a message on, after those before it that are missing."""
+        sequence, previous = _numbers(text)
+        last = self._last.get(key, self._after)
+        if sequence is not None and last is not None:
+            if previous is not None and previous > last:
+                self._fill_gap(key, previous)
+                last = self._last.get(key, last)
+            if sequence <= last:
+                return
+            self.missed += previous is not None and previous > last
+        self._pass_on(key, text, sequence)
+
+    def catch_up(self, key: str) -> None:
+        """Query the messages after the last one, and pass them on."""
+        last = self._last.get(key, self._after)
+        is_full = last is not None
+        while is_full and last is not None:
+            texts = self._query(key, last)
+            for number, text in sorted((_numbers(text)[0] or 0, text) for text in texts):
+                if number > last:
+                    last = number
+                    self._pass_on(key, text, number)
+            is_full = len(texts) >= MAX_REPLIES
+
+    def _fill_gap(self, key: str, previous: int) -> None:
+        """Pass on what is missing up to the message ``previous``.
+
+        A complete answer ends with the message that showed the gap, even if it lacks the ones before.
+        """
+        for _ in range(QUERY_TRIES):
+            self.catch_up(key)
+            if self._last.get(key, 0) >= previous or self._pause():
+                return
+
+    def _pass_on(self, key: str, text: str, sequence: int | None) -> None:
+        if sequence is not None:
+            if key not in self._last and key.endswith(f"/{REPORT.key}"):
+                self.begin(key, text)
+            self._last.pop(key, None)
+            self._last[key] = sequence
+            while len(self._last) > MAX_KEYS:
+                del self._last[next(iter(self._last))]
+        self._on_message(text)
+
+
+class Subscriber:
+    """Passes the messages of machines to ``on_message``, which may block; it runs in a thread of its own."""
+
+    def __init__(
+        self,
+        connect: Iterable[str],
+        on_message: Callable[[str], None],
+        machine: str = "*",
+        topics: tuple[Topic, ...] = (REPORT,),
+        after: int | None = None,
+    ) -> None:
+        """Begin after a sequence number, or without it with the latest report; ``machine`` may be ``*``."""
+        self._topics = topics
+        self._waiting: queue.Queue[tuple[str, str | None]] = queue.Queue(MAX_BEHIND)
+        self._stopping, self._is_behind = threading.Event(), threading.Event()
+        self.order = MessageOrder(self._query, on_message, lambda: self._stopping.wait(QUERY_PAUSE), after, topics)
+        self._machine, self._from_now = machine, after is None
+        self._endpoints, self._sessions = list(connect), list[zenoh.Session]()
+        self._declared: list[object] = []
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._connect, self._run)]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def connected(self) -> bool:
+        """Whether a daemon or a router is connected."""
+        return any(each.info.peers_zid() or each.info.routers_zid() for each in self._sessions)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopping.set()
+        for thread in self._threads:  # a session that is left open would keep the process alive
+            thread.join(QUERY_TIMEOUT)
+        for each in self._sessions:
+            each.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+
+    def _connect(self) -> None:
+        """Open a session for each endpoint, as soon as something answers there; it reconnects by itself."""
+        while self._endpoints and not self._stopping.is_set():
+            for endpoint in tuple(self._endpoints):
+                try:
+                    opened = session(connect=[endpoint], mode="client")
+                except ServiceError:
+                    continue
+                self._sessions.append(opened)
+                self._endpoints.remove(endpoint)
+                self._declare(opened)
+            self._stopping.wait(QUERY_PAUSE)
+
+    def _declare(self, opened: zenoh.Session) -> None:
+        for topic in {REPORT, *self._topics}:  # a report also shows from where on events can be missing
+            self._declared.append(opened.declare_subscriber(topic.under("*", self._machine), self._receive))
+        alive = ALIVE.under("*", self._machine)
+        self._declared.append(opened.liveliness().declare_subscriber(alive, self._receive_alive, history=True))
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._put(str(sample.key_expr), _text(sample))
+
+    def _receive_alive(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._put(str(sample.key_expr), None)
+
+    def _put(self, key: str, text: str | None) -> None:
+        try:
+            self._waiting.put_nowait((key, text))
+        except queue.Full:
+            self._is_behind.set()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                key, text = self._waiting.get(timeout=QUERY_PAUSE)
+            except queue.Empty:
+                if self._is_behind.is_set():
+                    self._is_behind.clear()
+                    self._catch_up(self.order.keys)
+                continue
+            if text is not None:
+                self._take(key, text)
+            else:
+                self._begin_or_catch_up(key.rpartition("/")[0])
+
+    def _take(self, key: str, text: str) -> None:
+        is_subscribed = any(key.endswith(f"/{topic.key}") for topic in self._topics)
+        (self.order.take if is_subscribed else self.order.begin)(key, text)
+
+    def _begin_or_catch_up(self, machine: str) -> None:
+        """Take the latest report of a daemon that is new here, or what was published while it was not connected."""
+        keys = [f"{machine}/{topic.key}" for topic in self._topics]
+        if self._from_now and not set(keys) & set(self.order.keys):
+            for text in self._get(f"{machine}/{REPORT.key}"):
+                self._take(f"{machine}/{REPORT.key}", text)
+        else:
+            self._catch_up(keys)
+
+    def _catch_up(self, keys: Iterable[str]) -> None:
+        for key in keys:
+            self.order.catch_up(key)
+
+    def _query(self, key: str, after: int) -> list[str]:
+        return self._get(f"{key}?after={after}")
+
+    def _get(self, selector: str) -> list[str]:
+        none = zenoh.ConsolidationMode.NONE  # by default only the latest message of a key would be passed on
+        for each in tuple(self._sessions):
+            try:
+                replies = each.get(selector, timeout=QUERY_TIMEOUT, consolidation=none)
+                texts = [_text(reply.ok) for reply in replies if reply.ok is not None]
+            except zenoh.ZError:  # the session was closed
+                continue
+            if texts:
+                return texts
+        return []
+
+
+def _text(sample: zenoh.Sample) -> str:
+    """Return the payload as text; anybody may publish anything."""
+    return sample.payload.to_bytes().decode(errors="replace")
+
+
+def _numbers(text: str) -> tuple[int | None, int | None]:
+    """Return sequence number and previous one of a message; None where it has none."""
+    try:
+        message = json.loads(text)
+    except (ValueError, RecursionError):
+        return None, None
+    values = (message.get(name) if isinstance(message, dict) else None for name in ("sequence", "previous"))
+    sequence, previous = (value if isinstance(value, int) else None for value in values)
+    return sequence, previous

@@ -1,0 +1,254 @@
+"""The history of one machine in an SQLite database: what it keeps, and how it is read.
+
+A value of each parameter and window is kept, and merged into its minute, hour and day at once, so that nothing has to
+be summarised later. Times are Unix seconds. The writer is :mod:`otolith.storage.history_writer`, retention is
+:mod:`otolith.storage.history_retention`; any number of processes may read meanwhile.
+"""
+
+import contextlib
+import json
+import sqlite3
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from otolith.health.schema import EventDocument, NumberDocument, ParameterDocument, ReportDocument
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.user_dirs import state_directory
+
+SCHEMA_VERSION = 1
+APPLICATION_ID = 0x4F544F4C  # marks the file as ours: "OTOL"
+SUFFIX = ".history.sqlite"
+WINDOW, MINUTE, HOUR, DAY = 0, 60, 3600, 86_400
+RESOLUTIONS = {WINDOW: "window", MINUTE: "minute", HOUR: "hour", DAY: "day"}
+"""Seconds of an interval, and its name; 0 for the windows themselves."""
+# Thresholds: docs/reference/thresholds-storage.md has the origin of each.
+BUSY_TIMEOUT = 2.0  # s to wait for another process that reads or writes
+CHECKPOINT_PAGES = 250  # pages after which the write-ahead log is merged
+COMPRESSION = 1  # level of zlib
+FINDING_PAUSE = 3600.0  # s after which a finding that returns is a new one
+
+_SCHEMA = """
+CREATE TABLE identity (site TEXT NOT NULL, machine TEXT NOT NULL);
+CREATE TABLE series (id INTEGER PRIMARY KEY, name TEXT NOT NULL, unit TEXT NOT NULL, UNIQUE (name, unit));
+CREATE TABLE sample (
+    resolution INTEGER NOT NULL, time REAL NOT NULL, series INTEGER NOT NULL, count INTEGER NOT NULL,
+    min REAL NOT NULL, mean REAL NOT NULL, max REAL NOT NULL, last REAL NOT NULL, low REAL, high REAL,
+    status TEXT NOT NULL, PRIMARY KEY (resolution, time, series)) WITHOUT ROWID;
+CREATE TABLE report (sequence INTEGER PRIMARY KEY, time REAL NOT NULL, text BLOB NOT NULL);
+CREATE TABLE event (sequence INTEGER PRIMARY KEY, time REAL NOT NULL, text TEXT NOT NULL);
+CREATE TABLE finding (
+    id TEXT NOT NULL, first REAL NOT NULL, last REAL NOT NULL, count INTEGER NOT NULL, text TEXT NOT NULL,
+    PRIMARY KEY (id, first)) WITHOUT ROWID;
+CREATE TABLE counters (hour REAL NOT NULL, run INTEGER NOT NULL, text TEXT NOT NULL, PRIMARY KEY (hour, run));
+CREATE TABLE clock (retention REAL NOT NULL, waited REAL NOT NULL);
+CREATE TABLE start (sequence INTEGER NOT NULL);
+"""
+_SAMPLE = """
+INSERT INTO sample VALUES (?, ?, ?, 1, ?4, ?4, ?4, ?4, ?5, ?6, ?7) ON CONFLICT DO UPDATE SET
+    count = count + 1, min = min(min, excluded.min), mean = mean + (excluded.mean - mean) / (count + 1),
+    max = max(max, excluded.max), last = excluded.last, low = excluded.low, high = excluded.high,
+    status = excluded.status
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class HistorySample:
+    """A parameter in an interval of time."""
+
+    name: str
+    unit: str
+    time: float
+    """Begin of the interval; of a window its end."""
+    count: int
+    """Windows in it."""
+    min: float
+    mean: float
+    max: float
+    last: float
+    low: float | None
+    """Lower end of the 95 % interval of ``last``."""
+    high: float | None
+    status: str
+    """Of the last window; of a component ``adopted`` or ``fading``."""
+
+
+def history_directory() -> Path:
+    """Return the folder of the databases.
+
+    Raises:
+        ServiceError: the state directory cannot be created or is not writable.
+    """
+    return state_directory() / "history"
+
+
+def history_path(site: str, machine: str) -> Path:
+    """Return the path of a machine's database; raises as :func:`history_directory`."""
+    return history_directory() / f"{site}.{machine}{SUFFIX}"
+
+
+def create(connection: sqlite3.Connection, site: str, machine: str) -> None:
+    """Make an empty database a history."""
+    connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
+    with connection:
+        connection.execute("INSERT INTO identity VALUES (?, ?)", (site, machine))
+
+
+def check(connection: sqlite3.Connection, site: str, machine: str) -> None:
+    """Check that an open database is the history of this machine.
+
+    Raises:
+        ValueError: it is not, or another version wrote it.
+        sqlite3.Error: it is damaged or cannot be read.
+    """
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    if application != APPLICATION_ID:
+        raise ValueError("it is no history of Otolith")
+    if version != SCHEMA_VERSION:
+        raise ValueError(f"version {version} of the format: this Otolith reads {SCHEMA_VERSION}")
+    identities = connection.execute("SELECT site, machine FROM identity").fetchall()
+    if identities != [(site, machine)]:
+        other = ", ".join(f"{name} at {place}" for place, name in identities) or "no machine"
+        raise ValueError(f"it is of {other}")
+
+
+class Tables:
+    """Writes reports into the tables of an open database; the caller commits."""
+
+    def __init__(self, connection: sqlite3.Connection, run: int) -> None:
+        """``run`` distinguishes the counters of this daemon from those before: they begin at zero with each start."""
+        self._connection, self._run = connection, run
+        self._series: dict[tuple[str, str], int] = {}
+
+    def add(self, document: ReportDocument) -> None:
+        """Write a report, its values, its events that changed, its findings and its counters."""
+        execute, end = self._connection.execute, document.window.end
+        text = zlib.compress(document.to_json().encode(), COMPRESSION)
+        execute("INSERT OR REPLACE INTO report VALUES (?, ?, ?)", (document.sequence, end, text))
+        for name, parameter in document.parameters.items():
+            self._add_value(name, end, parameter, parameter.status)
+        for component in document.components:
+            self._add_value(component.id, end, component.values["amplitude"], component.status)
+        for event in document.events:
+            if event.change is not None:
+                row = (event.sequence, end, event.model_dump_json(exclude_none=True))
+                execute("INSERT OR REPLACE INTO event VALUES (?, ?, ?)", row)
+        for finding in document.findings:
+            text_of = finding.model_dump_json(exclude_none=True)
+            known = execute(
+                "UPDATE finding SET last = ?, count = count + 1, text = ? WHERE id = ? AND last BETWEEN ? AND ?",
+                (end, text_of, finding.id, end - FINDING_PAUSE, end + FINDING_PAUSE),
+            ).rowcount
+            if not known:
+                execute("INSERT OR REPLACE INTO finding VALUES (?, ?, ?, 1, ?)", (finding.id, end, end, text_of))
+        if document.counters is not None:
+            row_of = (end // HOUR * HOUR, self._run, document.counters.model_dump_json())
+            execute("INSERT OR REPLACE INTO counters VALUES (?, ?, ?)", row_of)
+
+    def forget_series(self) -> None:
+        """Read the numbers of the series again: a transaction that added some was rolled back."""
+        self._series.clear()
+
+    def _add_value(self, name: str, end: float, item: ParameterDocument | NumberDocument, status: str) -> None:
+        if item.value is None:
+            return
+        series, rest = self._number(name, item.unit), (item.value, item.low, item.high, status)
+        rows = [(length, end // length * length if length else end, series, *rest) for length in RESOLUTIONS]
+        self._connection.executemany(_SAMPLE, rows)
+
+    def _number(self, name: str, unit: str) -> int:
+        key = name, unit
+        if key not in self._series:
+            self._connection.execute("INSERT OR IGNORE INTO series (name, unit) VALUES (?, ?)", key)
+            query = "SELECT id FROM series WHERE name = ? AND unit = ?"
+            (self._series[key],) = self._connection.execute(query, key).fetchone()
+        return self._series[key]
+
+
+class HistoryReader:
+    """Reads the history of a machine, also while a daemon writes; each call opens the database for itself."""
+
+    def __init__(self, path: Path) -> None:
+        """``path`` as :func:`history_path` returns it."""
+        self.path = path
+        self.site, _, self.machine = path.name.removesuffix(SUFFIX).partition(".")
+
+    def names(self) -> list[str]:
+        """Return the names of all series; these and the following methods raise ConfigurationError.
+
+        Raises:
+            ConfigurationError: the database is missing, damaged, unreadable or of another version.
+        """
+        return [name for (name,) in self._rows("SELECT DISTINCT name FROM series ORDER BY id")]
+
+    def samples(self, resolution: int, since: float, names: Sequence[str] = ()) -> list[HistorySample]:
+        """Return the values since a time, of the parameters ``names`` or of all, in the order of time."""
+        chosen = f"AND name IN ({', '.join('?' * len(names))})" if names else ""
+        columns = "name, unit, time, count, min, mean, max, last, low, high, status"
+        query = (
+            f"SELECT {columns} FROM sample JOIN series ON series.id = series "  # noqa: S608 - no text of a user
+            f"WHERE resolution = ? AND time >= ? {chosen} ORDER BY time, series.id"
+        )
+        return [HistorySample(*row) for row in self._rows(query, resolution, since, *names)]
+
+    def first(self, resolution: int) -> float | None:
+        """Return the time of the oldest value of a resolution; None if there is none."""
+        ((time,),) = self._rows("SELECT min(time) FROM sample WHERE resolution = ?", resolution)
+        return None if time is None else float(time)
+
+    def events(self, since: float) -> list[EventDocument]:
+        """Return the changes of events since a time, in the order in which they were published."""
+        rows = self._rows("SELECT text FROM event WHERE time >= ? ORDER BY sequence", since)
+        return [EventDocument.model_validate_json(text) for (text,) in rows]
+
+    def findings(self, since: float) -> list[dict[str, Any]]:
+        """Return the findings since a time: ``first``, ``last``, ``count`` of windows, and the latest document."""
+        query = "SELECT first, last, count, text FROM finding WHERE last >= ? ORDER BY first"
+        rows = self._rows(query, since)
+        return [{"first": first, "last": last, "count": count, **json.loads(text)} for first, last, count, text in rows]
+
+    def counters(self, since: float) -> list[dict[str, Any]]:
+        """Return the last counters of each hour and start of the daemon since a time."""
+        rows = self._rows("SELECT hour, text FROM counters WHERE hour >= ? ORDER BY run, hour", since - HOUR)
+        return [{"hour": hour, **json.loads(text)} for hour, text in rows]
+
+    def messages(
+        self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
+    ) -> list[str]:
+        """Return the first ``limit`` documents of a ``kind``, ``report`` or ``event``, as they were published.
+
+        They have a sequence number above ``after``, and their windows end from ``start`` to ``end``.
+        """
+        query = (
+            f"SELECT text FROM {'event' if kind == 'event' else 'report'} "  # noqa: S608 - no text of a user
+            "WHERE sequence > ?1 AND (?2 IS NULL OR time >= ?2) AND (?3 IS NULL OR time <= ?3) "
+            "ORDER BY sequence LIMIT ?4"
+        )
+        rows = self._rows(query, after, start, end, limit)
+        return [zlib.decompress(text).decode() if isinstance(text, bytes) else text for (text,) in rows]
+
+    def _rows(self, query: str, *values: object) -> list[tuple[Any, ...]]:
+        if not self.path.exists():
+            raise ConfigurationError(f"{self.path}: no such file; 'otolith run' makes the history of a machine")
+        try:
+            with self._opened() as connection:
+                check(connection, self.site, self.machine)
+                return connection.execute(query, values).fetchall()
+        except (sqlite3.Error, ValueError) as error:
+            raise ConfigurationError(f"{self.path}: cannot be read: {error}") from error
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        """Open for reading; without the write-ahead log, the file does not change and needs no other file beside it."""
+        still = "" if self.path.with_name(f"{self.path.name}-wal").exists() else "&immutable=1"
+        connection = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro{still}", uri=True, timeout=BUSY_TIMEOUT)
+        try:
+            yield connection
+        finally:
+            connection.close()

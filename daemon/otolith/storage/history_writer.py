@@ -1,0 +1,290 @@
+"""The daemon's side of the history: numbers the reports, and writes them in the background.
+
+The main thread only appends to a queue. A disk that is full or slow costs history, never monitoring: what does not fit
+into the queue is dropped and counted.
+"""
+
+import contextlib
+import logging
+import os
+import sqlite3
+import threading
+import time
+from collections import deque
+from datetime import UTC, datetime
+from pathlib import Path
+
+from otolith.health.schema import EventDocument, ReportDocument
+from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_PAGES, HistoryReader, Tables, check, create
+from otolith.storage.history_retention import Bounds, Retention
+from otolith.storage.state_store import WRITE_RETRY, give_to, opened_folder
+from otolith_drivers.errors import OtolithError, ServiceError
+
+log = logging.getLogger(__name__)
+
+KEPT = ".kept.sqlite"
+DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
+"""Primary codes of a database that cannot be used as it is; most others are faults of disk and permissions."""
+# Thresholds: docs/reference/thresholds-storage.md has the origin of each.
+NUMBER_LEAP = 4000  # numbers skipped at a start: more than a daemon publishes without saving
+MAX_WAITING = 256  # reports that wait for the disk
+BATCH = 64  # reports in one transaction
+PRUNE_INTERVAL = 60.0  # s between two deletions by age
+MAX_LOG_BYTES = 32 << 20  # of the write-ahead log, which a reader that never ends keeps from being merged
+QUERY_WAIT = 1.0  # s that a query waits for what is not yet written
+
+
+class Numbers:
+    """The sequence numbers of a machine: they rise, also over restarts, whatever was not saved before."""
+
+    def __init__(self, now: float, report: int | None = None, event: int | None = None, start: int = 0) -> None:
+        """``report`` and ``event`` are the newest numbers in the history, ``start`` where the last daemon began.
+
+        A daemon that was killed may have published numbers that are not in the history, or the history may be lost. So
+        the first number is that of the Unix time ``now`` in ms, and far above the numbers in the history.
+        """
+        self._report, self._event = report, event
+        self.start = max(max(report or 0, event or 0, start) + NUMBER_LEAP, int(now * 1e3))
+        self._next = self.start
+
+    def number(self, document: ReportDocument) -> ReportDocument:
+        """Return the report with its sequence numbers, and those of the events that it changed."""
+        numbers, self._report = {"sequence": self._take(), "previous": self._report}, self._next - 1
+        events = tuple(event if event.change is None else self._numbered(event) for event in document.events)
+        return document.model_copy(update={**numbers, "events": events})
+
+    def _numbered(self, event: EventDocument) -> EventDocument:
+        numbers, self._event = {"sequence": self._take(), "previous": self._event}, self._next - 1
+        return event.model_copy(update=numbers)
+
+    def _take(self) -> int:
+        self._next += 1
+        return self._next - 1
+
+
+class HistoryWriter:
+    """The history of one machine while its daemon runs."""
+
+    def __init__(self, path: Path, bounds: Bounds) -> None:
+        """``path`` as :func:`otolith.storage.history.history_path` returns it."""
+        self.reader = HistoryReader(path)
+        self._path, self._bounds = path, bounds
+        self._connection: sqlite3.Connection | None = None
+        self._waiting: deque[ReportDocument] = deque()
+        self._lock, self._wakeup, self._stopping = threading.Lock(), threading.Event(), threading.Event()
+        self._written = threading.Event()
+        self._retry_at, self._pruned_at, self._last_error = 0.0, 0.0, ""
+        self._thread = threading.Thread(target=self._run, name="history", daemon=True)
+        self.dropped = 0
+        """Reports that were not written."""
+
+    def open(self, now: float) -> tuple[Numbers, str]:
+        """Open or create the database, and return where its numbers continue, and why it begins anew; empty if not.
+
+        ``now`` in Unix s. A disk that refuses is no error here: the thread tries again.
+        """
+        numbers, note = Numbers(now), ""
+        try:
+            note = self._open()
+            numbers = self._begin_numbers(now)
+        except (sqlite3.Error, OtolithError, OSError) as error:
+            self._fail(error)
+        return numbers, note
+
+    def start(self) -> None:
+        """Start the thread that writes."""
+        self._pruned_at = time.monotonic()
+        self._thread.start()
+
+    def add(self, document: ReportDocument) -> None:
+        """Request that a report is written; if too many wait, the oldest is dropped."""
+        with self._lock:
+            if len(self._waiting) >= MAX_WAITING:
+                self._waiting.popleft()
+                self.dropped += 1
+            self._waiting.append(document)
+            if not self._last_error:
+                self._written.clear()
+        self._wakeup.set()
+
+    def messages(
+        self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
+    ) -> list[str]:
+        """Return what :meth:`HistoryReader.messages` does, after what is waiting was written; none on an error."""
+        self._written.wait(QUERY_WAIT)
+        try:
+            return self.reader.messages(kind, limit, after, start, end)
+        except OtolithError as error:
+            log.debug("%s", error)
+            return []
+
+    def stop(self, seconds: float) -> None:
+        """Write what is waiting, for up to ``seconds``, and end the thread."""
+        self._stopping.set()
+        self._wakeup.set()
+        if self._thread.is_alive():
+            self._thread.join(seconds)
+            if self._thread.is_alive():
+                log.warning("the last reports may not be in the history: writing took over %.1f s", seconds)
+
+    def _run(self) -> None:
+        while True:
+            self._wakeup.wait(PRUNE_INTERVAL)
+            self._wakeup.clear()
+            stopping = self._stopping.is_set()
+            if stopping or time.monotonic() >= self._retry_at:
+                try:
+                    self._work(time.monotonic())
+                except Exception as error:  # noqa: BLE001 - monitoring continues, and what is lost is counted
+                    self._fail(error)
+            if stopping:
+                self._close()
+                return
+
+    def _work(self, now: float) -> None:
+        """Write what is waiting, and delete what is too old or too much."""
+        if self._connection is not None and not self._is_in_place():
+            self._close()
+            if not self._path.parent.parent.is_dir():
+                raise ServiceError("the state directory was removed")
+        if self._connection is None:
+            self._open()
+        self._limit_log()
+        try:
+            self._write_waiting()
+        except sqlite3.Error as error:
+            if _code(error) in DAMAGED:
+                log.warning("%s", self._begin_anew(str(error)))
+            elif _code(error) == sqlite3.SQLITE_FULL:
+                self._retention.by_size(time.time())
+            else:
+                raise
+            self._write_waiting()
+        self._retention.by_size(time.time())
+        if now - self._pruned_at >= PRUNE_INTERVAL:
+            self._retention.by_age(time.time(), now - self._pruned_at)
+            self._pruned_at = now
+        self._retry_at, self._last_error = 0.0, ""
+
+    def _write_waiting(self) -> None:
+        assert self._connection is not None  # noqa: S101 - for mypy
+        while True:
+            with self._lock:
+                batch = [self._waiting[index] for index in range(min(BATCH, len(self._waiting)))]
+                if not batch:
+                    self._written.set()
+                    return
+            try:
+                with self._connection:
+                    for document in batch:
+                        self._tables.add(document)
+            except BaseException:
+                self._tables.forget_series()
+                raise
+            with self._lock:
+                written = {id(document) for document in batch}
+                while self._waiting and id(self._waiting[0]) in written:
+                    self._waiting.popleft()
+
+    def _fail(self, error: Exception) -> None:
+        """Log a fault once, and try again later; queries do not wait meanwhile."""
+        if str(error) != self._last_error:
+            log.warning("%s: no history is written: %s: check the disk and its permissions", self._path, error)
+        self._last_error, self._retry_at = str(error), time.monotonic() + WRITE_RETRY
+        self._written.set()
+
+    def _is_in_place(self) -> bool:
+        """Return whether the file was neither deleted nor moved by somebody: what is written there would be lost."""
+        with contextlib.suppress(OSError):
+            return os.path.samestat(self._path.stat(), self._file)
+        return False
+
+    def _limit_log(self) -> None:
+        """Raise ServiceError if a process that reads keeps the write-ahead log from being merged."""
+        assert self._connection is not None  # noqa: S101 - for mypy
+        file = self._path.with_name(f"{self._path.name}-wal")
+        if file.exists() and file.stat().st_size > MAX_LOG_BYTES:
+            self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            if file.stat().st_size > MAX_LOG_BYTES:
+                raise ServiceError("another process keeps it open for reading: end it")
+
+    def _open(self) -> str:
+        """Open the database; one that cannot be used is kept under another name. Returns why, or nothing."""
+        try:
+            self._connect()
+        except (sqlite3.Error, ValueError) as error:
+            if isinstance(error, sqlite3.Error) and _code(error) not in {*DAMAGED, sqlite3.SQLITE_ERROR}:
+                raise
+            note = self._begin_anew(str(error))
+            log.warning("%s", note)
+            return note
+        return ""
+
+    def _begin_anew(self, reason: str) -> str:
+        """Keep the database under another name, and open a new one. Returns what was done and why."""
+        self._close()
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")
+        kept = self._path.with_name(f"{self.reader.site}.{self.reader.machine}.{stamp}{KEPT}")
+        for suffix in ("-wal", ""):  # the log belongs to it
+            with contextlib.suppress(FileNotFoundError):
+                self._path.with_name(f"{self._path.name}{suffix}").rename(kept.with_name(f"{kept.name}{suffix}"))
+        self._path.with_name(f"{self._path.name}-shm").unlink(missing_ok=True)
+        self._limit_kept()
+        self._connect()
+        return f"{self._path}: begun anew: {reason}; the file is kept as {kept.name}"
+
+    def _limit_kept(self) -> None:
+        """Delete the oldest kept databases beyond the size of a history; the newest stays."""
+        names = self._path.parent.glob(f"{self.reader.site}.{self.reader.machine}.*{KEPT}")
+        newest, *others = sorted(names, reverse=True)
+        total = newest.stat().st_size
+        for path in others:
+            total += path.stat().st_size
+            if total > self._bounds.max_bytes:
+                path.unlink()
+                path.with_name(f"{path.name}-wal").unlink(missing_ok=True)
+
+    def _connect(self) -> None:
+        with opened_folder(self._path.parent) as folder:  # SQLite gives its own files the owner of this one
+            handle = os.open(self._path.name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600, dir_fd=folder)
+            give_to(os.fstat(folder), handle)
+            self._file = os.fstat(handle)
+            os.close(handle)
+        self._connection = sqlite3.connect(self._path, timeout=BUSY_TIMEOUT, check_same_thread=False)
+        try:
+            self._prepare(self._connection)
+        except BaseException:
+            self._close()
+            raise
+
+    def _prepare(self, connection: sqlite3.Connection) -> None:
+        if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+            create(connection, self.reader.site, self.reader.machine)
+        check(connection, self.reader.site, self.reader.machine)
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_PAGES}").fetchall()
+        connection.execute("PRAGMA journal_size_limit = 0").fetchall()
+        self._tables, self._retention = Tables(connection, int(time.time())), Retention(connection, self._bounds)
+
+    def _begin_numbers(self, now: float) -> Numbers:
+        """Return where the numbers continue; it is saved before the first of them is published."""
+        assert self._connection is not None  # noqa: S101 - for mypy
+        tables = "report", "event", "start"
+        queries = (f"SELECT coalesce(max(sequence), 0) FROM {table}" for table in tables)  # noqa: S608 - our own names
+        report, event, start = (self._connection.execute(query).fetchone()[0] for query in queries)
+        numbers = Numbers(now, report or None, event or None, start)
+        with self._connection:
+            self._connection.execute("DELETE FROM start")
+            self._connection.execute("INSERT INTO start VALUES (?)", (numbers.start,))
+        return numbers
+
+    def _close(self) -> None:
+        if self._connection is not None:
+            with contextlib.suppress(sqlite3.Error):
+                self._connection.close()
+            self._connection = None
+
+
+def _code(error: sqlite3.Error) -> int:
+    """Return the primary code of SQLite; 0 for an error of the Python module itself."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF

@@ -1,0 +1,139 @@
+"""``otolith history``: table, CSV, JSON and Parquet, with a daemon running or not, and what cannot be read."""
+
+import csv
+import json
+import sqlite3
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from click.testing import CliRunner, Result
+
+from otolith.cli.main import cli
+from otolith.storage.history import HOUR, history_path
+from otolith.storage.history_retention import Bounds
+from otolith.storage.history_writer import HistoryWriter
+from otolith_drivers.errors import ConfigurationError
+from tests.storage.histories import MACHINE, SITE, documents
+
+COUNT, LENGTH = 400, 30.0
+
+
+@pytest.fixture
+def written() -> Iterator[HistoryWriter]:
+    """A history of the last 200 minutes, with four events; the daemon still has it open."""
+    now = time.time()
+    writer = HistoryWriter(history_path(SITE, MACHINE), Bounds(20_000_000, 3650, 24))
+    numbers, _ = writer.open(now - COUNT * LENGTH)
+    for report in documents(COUNT, start=now - COUNT * LENGTH, length=LENGTH):
+        writer.add(numbers.number(report))
+        writer._write_waiting()
+    yield writer
+    writer._close()
+
+
+def run(*arguments: str, width: int = 120) -> Result:
+    return CliRunner().invoke(cli, ["history", *arguments], env={"COLUMNS": str(width)}, standalone_mode=False)
+
+
+@pytest.mark.parametrize("is_running", [True, False])
+def test_the_table_has_values_events_and_findings(written: HistoryWriter, is_running: bool) -> None:
+    if not is_running:
+        written._close()
+    lines = run(MACHINE).stdout.splitlines()
+    assert lines[0].startswith(f"{MACHINE} at {SITE}, since ")
+    assert lines[0].endswith("values per minute")
+    (row,) = [line for line in lines if "R_a" in line and "│" in line]
+    assert [cell.strip() for cell in row.split("│")][1:6] == ["R_a", "6.5004", "0.02", "ohm", "+0.01%"]
+    assert "▁" in row
+    assert "█" in row
+    text = " ".join(lines)
+    assert text.count("raised: WATCH: winding") == 4
+    assert "finding: new torque on the shaft" in text
+    assert f"in {COUNT // 2} windows" in text
+
+
+def test_a_narrow_terminal_cuts_no_number(written: HistoryWriter) -> None:
+    del written
+    assert "…" not in run(MACHINE, width=60).stdout
+
+
+def test_csv_json_and_parquet_have_the_same_values(written: HistoryWriter, tmp_path: Path) -> None:
+    del written
+    rows = list(csv.DictReader(run(MACHINE, "--csv", "--every", "hour").stdout.splitlines()))
+    document = json.loads(run(MACHINE, "--json", "--every", "hour").stdout)
+    file = tmp_path / "values.parquet"
+    assert run(MACHINE, "--parquet", str(file), "--every", "hour").exit_code == 0
+    table = pq.read_table(file).to_pylist()
+    assert len(rows) == len(document["values"]) == len(table) >= 4
+    for row, value, record in zip(rows, document["values"], table, strict=True):
+        assert row["parameter"] == value["name"] == record["parameter"] == "R_a"
+        times = datetime.fromisoformat(row["time"]).timestamp(), record["time"].timestamp()
+        assert times == (value["time"], value["time"])
+        assert float(row["mean"]) == value["mean"] == record["mean"]
+        assert int(row["count"]) == value["count"] == record["count"]
+    assert sum(value["count"] for value in document["values"]) == COUNT
+    assert [event["change"] for event in document["events"]] == ["raised"] * 4
+    assert document["findings"][0]["count"] == COUNT // 2
+    assert document["counters"][-1]["windows"] == COUNT - 1
+
+
+def test_events_alone(written: HistoryWriter) -> None:
+    del written
+    rows = list(csv.DictReader(run(MACHINE, "--events", "--csv").stdout.splitlines()))
+    assert [row["part"] for row in rows] == ["winding"] * 4
+    assert json.loads(run(MACHINE, "--events", "--json").stdout)["values"] == []
+    assert "R_a │" not in run(MACHINE, "--events").stdout
+
+
+@pytest.mark.parametrize(("since", "interval"), [("1h", "window"), ("1d", "minute"), ("8w", "minute")])
+def test_the_resolution_follows_the_time_that_is_shown(written: HistoryWriter, since: str, interval: str) -> None:
+    del written  # its values are of the last hours, so that a longer time needs no coarser resolution
+    assert json.loads(run(MACHINE, "--since", since, "--json").stdout)["every"] == interval
+
+
+def test_since_is_an_age_or_a_date(written: HistoryWriter) -> None:
+    del written
+    begin = time.time() - HOUR
+    for since in ("60m", "1h", "3600s", datetime.fromtimestamp(begin).isoformat()):  # noqa: DTZ006 - as a user writes it
+        values = json.loads(run(MACHINE, "--since", since, "--json").stdout)["values"]
+        assert 115 <= len(values) <= 121
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("press-4",), "did you mean 'press-3'"),
+        (("../../etc",), "No such file"),
+        ((MACHINE, "--parameter", "R_b"), "did you mean 'R_a'"),
+        ((MACHINE, "--since", "yesterday"), "write an age"),
+        ((MACHINE, "--csv", "--json"), "give one of"),
+        ((MACHINE, "--events", "--parquet", "x.parquet"), "give --csv or --json"),
+        ((MACHINE, "--parquet", "/dev/null"), "exists"),
+    ],
+)
+def test_a_wrong_argument_names_the_way_out(written: HistoryWriter, arguments: tuple[str, ...], message: str) -> None:
+    del written
+    error = run(*arguments).exception
+    assert error is not None
+    assert message in getattr(error, "message", str(error))
+
+
+def test_machines_of_one_name_ask_for_the_file(written: HistoryWriter) -> None:
+    path = written.reader.path
+    path.with_name(f"hall-2.{MACHINE}.history.sqlite").write_bytes(b"")
+    error = run(MACHINE).exception
+    assert isinstance(error, ConfigurationError)
+    assert "hall-1, hall-2: give the machine file" in str(error)
+
+
+def test_a_history_of_another_version_is_not_read(written: HistoryWriter) -> None:
+    written._close()
+    with sqlite3.connect(written.reader.path) as connection:
+        connection.execute("PRAGMA user_version = 99")
+    error = run(MACHINE).exception
+    assert isinstance(error, ConfigurationError)
+    assert "version 99" in str(error)
