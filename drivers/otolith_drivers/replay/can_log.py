@@ -21,6 +21,17 @@ from otolith_drivers.base import Sample, Sampling, Setup
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.errors import ConfigurationError, counted
+from otolith_drivers.replay.formats import (
+    CANDUMP,
+    CANDUMP_LOG,
+    DIFFERENCES,
+    PYTHON_CAN,
+    SAVVYCAN,
+    head_of,
+    seen,
+    text_log,
+)
+from otolith_drivers.replay.frame_readers import CandumpLines, SavvyCanLines, SqliteFrames
 from otolith_drivers.replay.readers import MAX_TIME, DataFile, Reader, Rows, suffix_of
 
 # Engineering choices, guarded by the tests with garbage and damaged logs in test_can_log.py.
@@ -131,7 +142,9 @@ class CanLogReader(Reader):
     def _why_no_rows(self) -> str:
         if self._first_bad is not None:
             place, cause = self._first_bad
-            return f": {self.place} {place}: {cause}; no frame can be used"
+            kind = seen(head_of(self.path))
+            hint = f" (it looks like {kind})" if kind and not self._frames else ""
+            return f": {self.place} {place}: {cause}; no frame can be used{hint}"
         if not self._frames:
             return "".join([": no frames", *(f": {line}" for line in self._cut_off())])
         wanted = ", ".join(f"0x{identifier:X}" for identifier, _ in self._decoder.identifiers())
@@ -206,18 +219,34 @@ class _TrcReader(can.TRCReader):
 
 
 TEXT_FORMATS = {
-    ".log": TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
     ".asc": TextFormat(can.ASCReader, "Vector ASC", prelude="\n"),
     ".trc": TextFormat(_TrcReader, "PEAK TRC"),
+    CANDUMP_LOG: TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
+    CANDUMP: TextFormat(CandumpLines, "candump, as 'candump -ta' writes it"),
+    SAVVYCAN: TextFormat(SavvyCanLines, SAVVYCAN),
+    PYTHON_CAN: TextFormat(can.CSVReader, PYTHON_CAN, prelude="\n"),
 }
+"""By suffix or, for others, by the format that the first line has."""
 
 
-def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames":
-    """The frames of a log, in the format of its suffix."""
-    kind = TEXT_FORMATS.get(suffix_of(path))
-    if kind is None:
+def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFrames":
+    """The frames of a log, in the format of its suffix or of its first line.
+
+    Raises:
+        ConfigurationError: it is of another format, which the message names.
+    """
+    suffix, head = suffix_of(path), head_of(path)
+    if suffix == ".db":
+        return SqliteFrames(path, head)
+    if suffix == ".blf":
         return BlfFrames(path, data.stream)
-    return TextFrames(path, kind, io.TextIOWrapper(data.stream, encoding="utf-8", errors="replace"))
+    name = suffix if suffix in TEXT_FORMATS else text_log(head) or CANDUMP_LOG
+    if name == DIFFERENCES:
+        raise ConfigurationError(
+            f"{path}: is of {name}, of which a lost line would shift the rest: log with candump -L"
+        )
+    text = io.TextIOWrapper(data.stream, encoding="utf-8-sig", errors="replace")
+    return TextFrames(path, TEXT_FORMATS[name], text)
 
 
 class _NumberedLines:
@@ -315,6 +344,8 @@ class BlfFrames:
         try:
             self._reader = _BlfReader(cast("BinaryIO", self._blocks))
         except (BLFParseError, struct.error) as error:
+            if (kind := seen(head_of(path))) and "BLF" not in kind:
+                raise ConfigurationError(f"{path}: is not a BLF file but {kind}: give it the name of that") from error
             raise ConfigurationError(
                 f"{path}: is not a BLF file, or its writer was killed before it wrote the file header: "
                 "nothing can be read; a candump log (.log) would keep its frames"
