@@ -91,7 +91,7 @@ class CanLogReader(Reader):
 
     def chunks(self) -> Iterator[Rows]:
         """See :meth:`otolith_drivers.replay.readers.Reader.chunks`."""
-        wanted = set(self._decoder.identifiers())
+        wants = self._decoder.wants
         chunk = _FrameChunk(self._signals)
         for place, frame in self._source.frames():
             if isinstance(frame, str):
@@ -100,8 +100,8 @@ class CanLogReader(Reader):
             if not self._frames:
                 self._decoder.begin(frame.timestamp)
             self._frames += 1
-            key = (frame.arbitration_id, frame.is_extended_id)
-            if key not in wanted or frame.is_error_frame or frame.is_remote_frame:
+            is_wanted = wants(frame.arbitration_id, extended=frame.is_extended_id)
+            if not is_wanted or frame.is_error_frame or frame.is_remote_frame:
                 self._others += 1
             elif samples := self._samples(place, frame):
                 chunk.add(place, samples, self._unreadable + self._undecoded)
