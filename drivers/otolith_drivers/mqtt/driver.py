@@ -184,9 +184,10 @@ class MqttListener:
             if self._refusal:
                 raise ConnectionError(self._refusal)
             if code != mqtt.MQTT_ERR_SUCCESS:
-                raise ConnectionError(f"the connection was closed: {mqtt.error_string(code)}")
+                ended = f"the connection was closed: {mqtt.error_string(code)}"
+                raise ConnectionError(ended if self._up else "no answer of a broker: is one there, and is tls right?")
             if not self._up and time.monotonic() - begun > ANSWER_TIMEOUT:
-                raise ConnectionError(f"no answer of a broker within {ANSWER_TIMEOUT:g} s")
+                raise ConnectionError(f"no answer of a broker within {ANSWER_TIMEOUT:g} s: is one there?")
 
     def _come_up(self) -> None:
         self._begun = time.monotonic()

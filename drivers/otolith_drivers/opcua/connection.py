@@ -1,5 +1,6 @@
 """The OPC UA tables of a machine file, and a connected client: security, user, causes of a refusal."""
 
+import asyncio
 import logging
 import os
 import time
@@ -11,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 from urllib.parse import urlsplit
 
-import anyio
 from asyncua import Client, ua
 from asyncua.crypto import security_policies
 from asyncua.ua.ua_binary import struct_from_binary
@@ -184,10 +184,20 @@ async def connected(options: OpcuaOptions, credentials: Credentials) -> AsyncIte
     except ua.UaError as error:
         raise RefusedError(_cause(error, options)) from error
     finally:
-        with anyio.move_on_after(CLOSE_TIMEOUT, shield=True), suppress(Exception):
-            await client.disconnect()
-        with suppress(Exception):
-            client.disconnect_socket()
+        # A task of its own, as the library swallows the cancellation by which a timeout would end it.
+        ending = asyncio.create_task(_end(client))
+        try:
+            await asyncio.wait({ending}, timeout=CLOSE_TIMEOUT)
+        finally:
+            ending.cancel()
+            with suppress(Exception):
+                client.disconnect_socket()
+
+
+async def _end(client: Client) -> None:
+    """End the session and the connection of a server that may no longer answer."""
+    with suppress(Exception):
+        await client.disconnect()
 
 
 async def _secure(client: Client, options: OpcuaOptions, credentials: Credentials) -> None:
@@ -236,7 +246,7 @@ def _cause(error: ua.UaError, options: OpcuaOptions) -> str:
     return f"{name}: {error}"
 
 
-def reason(error: Exception, timeout: float) -> str:
+def reason(error: BaseException, timeout: float) -> str:
     """Return why the connection failed."""
     if isinstance(error, RefusedError):
         return str(error)

@@ -78,6 +78,7 @@ class OpcuaSubscriber:
         self._slow = ""  # what the server grants less than was asked
         self._ended = ""  # why the server has ended the subscription
         self._ahead = math.nan  # s; the server's clock minus this computer's
+        self._clocks_due = 0.0  # s; when they are compared again
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._stop = threading.Event()
@@ -134,9 +135,9 @@ class OpcuaSubscriber:
         while not self._stop.is_set():
             try:
                 await self._session(deliver)
-            except asyncio.CancelledError:
-                return
-            except Exception as error:  # noqa: BLE001 - no answer of a server may end the thread
+            except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - nothing may end the thread
+                if self._stop.is_set():
+                    return
                 backoff = BACKOFF_FIRST if self._up else min(2.0 * backoff, BACKOFF_MAX)
                 self._go_down(reason(error, self._options.timeout))
             try:
@@ -152,7 +153,6 @@ class OpcuaSubscriber:
             await self._learn_units(client)
             interval = await self._subscribe(client, deliver)
             limit = max(MIN_SILENCE, SILENT_INTERVALS * interval)
-            due = time.monotonic() + EXCHANGE_PERIOD
             while True:
                 await asyncio.sleep(0.1 * limit)
                 now = time.monotonic()
@@ -160,13 +160,13 @@ class OpcuaSubscriber:
                     raise ConnectionError(self._ended)
                 if now - self._latest > limit:
                     raise ConnectionError(f"no message of the subscription for {now - self._latest:.1f} s")
-                if now >= due:
+                if now >= self._clocks_due:
                     await self._compare_clocks(client)
-                    due = time.monotonic() + EXCHANGE_PERIOD
 
     async def _compare_clocks(self, client: Client) -> None:
         await exchange(client, self._readings.clock)
         self._ahead = time.monotonic() - time.time() - self._readings.clock.offset
+        self._clocks_due = time.monotonic() + EXCHANGE_PERIOD
 
     async def _learn_units(self, client: Client) -> None:
         """Ask for the units that the machine file leaves out."""
@@ -251,7 +251,8 @@ class OpcuaSubscriber:
                 self._ended = f"the server has ended the subscription: {part.Status.name}"
             elif isinstance(part, ua.DataChangeNotification):
                 values += [(item.ClientHandle, item.Value) for item in part.MonitoredItems]
-        readings.clock.arrival(unix_time(message.PublishTime), now)
+        if not readings.clock.arrival(unix_time(message.PublishTime), now):  # the server's clock was set
+            self._clocks_due = now
         samples = readings.take(message, values, now)
         if samples and not self._stop.is_set():
             self._come_up()

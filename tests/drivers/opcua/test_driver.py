@@ -2,6 +2,7 @@
 
 import json
 import math
+import signal
 import socket
 import time
 from collections.abc import Iterator
@@ -51,21 +52,27 @@ def port() -> int:
     return server_of_this_process()
 
 
-def test_a_server_that_is_killed_and_comes_back_costs_counted_samples(tmp_path: Path) -> None:
+def test_a_server_that_hangs_or_is_killed_and_comes_back_costs_counted_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opcua, "BACKOFF_MAX", 0.3)
     port = free_port(socket.SOCK_STREAM)
-    with opcua_server(port, VALUES) as server:
-        with opened(port, tmp_path) as (driver, samples):
-            wait_for(lambda: len(samples) > 100)
-            server.kill()
-            server.wait()
-            wait_for(lambda: driver.link().reason == "Connection refused")
-            before, gone = len(samples), samples[-1].time
-            with opcua_server(port, VALUES):
-                wait_for(lambda: len(samples) > before + 100)
-                assert driver.link().up
-                counters = driver.counters()
-        first = samples[before].time
-    assert counters.reconnects == 1
+    with opcua_server(port, VALUES) as server, opened(port, tmp_path, timeout="0.5 s") as (driver, samples):
+        wait_for(lambda: len(samples) > 100)
+        server.send_signal(signal.SIGSTOP)
+        wait_for(lambda: "no answer" in driver.link().reason or "no message" in driver.link().reason)
+        server.send_signal(signal.SIGCONT)
+        wait_for(lambda: driver.link().up)
+        server.kill()
+        server.wait()
+        wait_for(lambda: driver.link().reason == "Connection refused")
+        before, gone = len(samples), samples[-1].time
+        with opcua_server(port, VALUES):
+            wait_for(lambda: len(samples) > before + 100)
+            assert driver.link().up
+            counters = driver.counters()
+    first = samples[before].time
+    assert counters.reconnects == 2
     assert counters.lost >= 0.9 * 2 * 100 * (first - gone)
 
 
