@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TextIO, cast
 
-import can
 import numpy as np
-from can.io.blf import BLFParseError
 
 from otolith_drivers.base import Sample, Sampling, Setup
+from otolith_drivers.canbus import can
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.errors import ConfigurationError, counted
@@ -31,7 +30,7 @@ from otolith_drivers.replay.formats import (
     seen,
     text_log,
 )
-from otolith_drivers.replay.frame_readers import CandumpLines, SavvyCanLines, SqliteFrames
+from otolith_drivers.replay.frame_readers import CandumpLines, Mf4Frames, SavvyCanLines, SqliteFrames
 from otolith_drivers.replay.readers import MAX_TIME, DataFile, Reader, Rows, suffix_of
 
 # Engineering choices, guarded by the tests with garbage and damaged logs in test_can_log.py.
@@ -229,13 +228,15 @@ TEXT_FORMATS = {
 """By suffix or, for others, by the format that the first line has."""
 
 
-def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFrames":
+def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFrames | Mf4Frames":
     """The frames of a log, in the format of its suffix or of its first line.
 
     Raises:
         ConfigurationError: it is of another format, which the message names.
     """
     suffix, head = suffix_of(path), head_of(path)
+    if suffix == ".mf4":
+        return Mf4Frames(path, head)
     if suffix == ".db":
         return SqliteFrames(path, head)
     if suffix == ".blf":
@@ -343,7 +344,7 @@ class BlfFrames:
         self._blocks = _CheckedBlocks(file)
         try:
             self._reader = _BlfReader(cast("BinaryIO", self._blocks))
-        except (BLFParseError, struct.error) as error:
+        except (can.io.blf.BLFParseError, struct.error) as error:
             if (kind := seen(head_of(path))) and "BLF" not in kind:
                 raise ConfigurationError(f"{path}: is not a BLF file but {kind}: give it the name of that") from error
             raise ConfigurationError(
@@ -377,7 +378,7 @@ class _CheckedBlocks:
 
     def read(self, size: int) -> bytes:
         if not 0 <= size <= MAX_BLOCK:
-            raise BLFParseError(f"a block of {size} bytes")
+            raise can.io.blf.BLFParseError(f"a block of {size} bytes")
         data = self._file.read(size)
         self.bytes_read += len(data)
         return data
@@ -393,6 +394,6 @@ class _BlfReader(can.BLFReader):
         while (at := data.find(b"LOBJ", at, at + 8)) >= 0 and at + BLF_OBJECT.size <= len(data):
             size = BLF_OBJECT.unpack_from(data, at)[3]
             if size < BLF_OBJECT.size:
-                raise BLFParseError(f"an object of {size} bytes")
+                raise can.io.blf.BLFParseError(f"an object of {size} bytes")
             at += size
         yield from super()._parse_data(data)

@@ -38,6 +38,7 @@ READERS: dict[str, str] = {
     ".blf": CAN_LOG,
     ".db": CAN_LOG,
     ".log": CAN_LOG,
+    ".mf4": CAN_LOG,
     ".trc": CAN_LOG,
     ".rrd": "otolith_drivers.replay.recording",
 }

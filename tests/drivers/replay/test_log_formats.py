@@ -1,7 +1,11 @@
 """CAN logs of other tools: candump on the screen, CSV of SavvyCAN and python-can, SQLite; refusals name the format."""
 
 import base64
+import gc
+import re
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import closing, suppress
 from datetime import UTC, datetime
@@ -15,11 +19,24 @@ from hypothesis import strategies as st
 
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.replay import frame_readers
 from otolith_drivers.replay.formats import HEAD, OTHERS, TEXT_LOGS, seen, text_log
 from otolith_drivers.replay.readers import Rows, holds_frames
 from tests.drivers.logs import frames_of, live, opened, samples_of
 
 Frames = list[can.Message]
+MF4_WRITER = """
+import can
+with can.MF4Writer("bus.mf4") as writer:
+    for frame in can.CanutilsLogReader("bus.log"):
+        writer(frame)
+"""
+SIGNAL_WRITER = """
+from asammdf import MDF, Signal
+file = MDF()
+file.append([Signal([1.0], [0.0], name="Speed")])
+file.save("s.mf4")
+"""
 SCHEMA = """CREATE TABLE messages (ts REAL, arbitration_id INTEGER, extended INTEGER, remote INTEGER, error INTEGER,
 dlc INTEGER, data BLOB)"""
 
@@ -36,6 +53,10 @@ def candump(frames: Frames, *, date: bool = False, colour: bool = False) -> str:
         text = f" ({time})  can0  {frame.arbitration_id:03X}   [{frame.dlc}]  {spaced(frame)}"
         lines.append(f"\x1b[31m{text}\x1b[0m" if colour else text)
     return "\n".join([*lines, ""])
+
+
+def candump_log(frame: can.Message) -> str:
+    return f"({frame.timestamp:.6f}) can0 {frame.arbitration_id:03X}#{frame.data.hex()}\n"
 
 
 def verbose(frames: Frames) -> str:
@@ -104,12 +125,16 @@ def written(folder: Path, frames: Frames, kind: str) -> Path:
             database.execute(SCHEMA)
             database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
         return path
+    if kind == "MF4":  # python-can's writer, which otolith keeps from importing asammdf in this process
+        (folder / "bus.log").write_text("".join(map(candump_log, frames)), encoding="utf-8")
+        subprocess.run([sys.executable, "-c", MF4_WRITER], cwd=folder, check=True)
+        return folder / "bus.mf4"
     name, text = WRITERS[kind]
     (folder / name).write_text(text(frames), encoding="utf-8")
     return folder / name
 
 
-@pytest.mark.parametrize("kind", [*WRITERS, "SQLite"])
+@pytest.mark.parametrize("kind", [*WRITERS, "SQLite", "MF4"])
 def test_samples_equal_live_samples(tmp_path: Path, frames: Frames, kind: str) -> None:
     path = written(tmp_path, frames, kind)
     assert holds_frames(path)
@@ -202,6 +227,32 @@ def test_a_database_without_frames_and_with_damaged_rows_is_no_traceback(tmp_pat
     damaged.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(ConfigurationError, match="damaged"):
         read(damaged)
+
+
+# asammdf fails once more when a file that it could not open is freed.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_mf4_file_of_signals_names_them_and_a_damaged_one_is_no_traceback(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-c", SIGNAL_WRITER], cwd=tmp_path, check=True)
+    with pytest.raises(ConfigurationError, match=r"signals \(Speed\) and no CAN frames"):
+        read(tmp_path / "s.mf4")
+    damaged = tmp_path / "damaged.mf4"
+    damaged.write_bytes((tmp_path / "s.mf4").read_bytes()[:200])
+    with pytest.raises(ConfigurationError, match="damaged or cut off"):
+        read(damaged)
+    gc.collect()
+
+
+def test_a_missing_library_for_mf4_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "bus.mf4").write_bytes(b"MDF     4.10")
+    monkeypatch.setattr(frame_readers, "find_spec", lambda _: None)
+    with pytest.raises(ConfigurationError, match=re.escape("pip install 'otolith[mf4]'")):
+        read(tmp_path / "bus.mf4")
+
+
+def test_python_can_does_not_import_asammdf() -> None:
+    modules = "otolith_drivers.replay.can_log, otolith_drivers.plant.can_node"
+    code = f"import sys, {modules}; sys.exit('asammdf' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("name", ["table.csv", "table.txt"])
