@@ -78,6 +78,7 @@ class OpcuaSubscriber:
         self._slow = ""  # what the server grants less than was asked
         self._ended = ""  # why the server has ended the subscription
         self._ahead = math.nan  # s; the server's clock minus this computer's
+        self._interval = options.interval  # s between two messages
         self._clocks_due = 0.0  # s; when they are compared again
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
@@ -118,7 +119,7 @@ class OpcuaSubscriber:
             plan = f"the server's clock is {abs(self._ahead):.4g} s {where} this computer's, known within {bound}"
             plan += f", set {counted(readings.clock.steps, 'time')}" if readings.clock.steps else ""
             plan += f", {self._slow}" if self._slow else ""
-        return Link(self._up, self._reason, tuple(lines) if self._up else (), plan)
+        return Link(self._up, self._reason, tuple(lines) if self._up else (), plan, latency=self._interval)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
@@ -192,7 +193,7 @@ class OpcuaSubscriber:
         readings.begin(self._options.interval)
         self._latest, self._ended, self._slow = time.monotonic(), "", ""
         result = await session.create_subscription(asked, lambda message: self._take(message, deliver))
-        interval = 1e-3 * float(result.RevisedPublishingInterval)
+        interval = self._interval = 1e-3 * float(result.RevisedPublishingInterval)
         readings.begin(interval)
         wanted = [index for index, node in enumerate(readings.signals) if not node.fault]
         refused = await self._monitor(client, result.SubscriptionId, wanted, by_stamp=True)

@@ -229,3 +229,10 @@ def test_probe_of_no_server_is_one_line() -> None:
         CliRunner().invoke(
             cli, ["probe", "opcua", "opc.tcp://127.0.0.1:9"], standalone_mode=False, catch_exceptions=False
         )
+
+
+def test_windows_wait_for_the_messages_of_a_slow_subscription(port: int, tmp_path: Path) -> None:
+    with opened(port, tmp_path, interval="0.4 s") as (driver, samples):
+        wait_for(lambda: len(samples) > 100)
+        assert driver.link().latency == pytest.approx(0.4)
+        assert driver.counters().lost == 0
