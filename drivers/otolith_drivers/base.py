@@ -81,6 +81,8 @@ class Link:
     """Requested and achieved polling; empty if the machine sends by its own clock."""
     period: float | None = None
     """Achieved sample period in s; None if the machine sends by its own clock, or if it is not known yet."""
+    latency: float = 0.0
+    """Longest time in s by which samples arrive after their times because the source sends many at once."""
 
 
 Deliver = Callable[[Sequence[Sample]], None]

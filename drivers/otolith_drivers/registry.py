@@ -13,9 +13,13 @@ ENTRY_POINT_GROUP = "otolith.drivers"
 DRIVERS: dict[str, str] = {
     "can": "otolith_drivers.canbus.driver",
     "modbus": "otolith_drivers.modbus.driver",
+    "mqtt": "otolith_drivers.mqtt.driver",
+    "opcua": "otolith_drivers.opcua.driver",
     "plant": "otolith_drivers.plant.driver",
     "replay": "otolith_drivers.replay.driver",
 }
+EXTRAS = ("mqtt", "opcua")
+"""Drivers whose libraries come with the extra of the same name."""
 
 
 def known() -> list[str]:
@@ -35,6 +39,9 @@ def find(name: str) -> DriverType:
         for point in entry_points(group=ENTRY_POINT_GROUP, name=name):
             return cast("DriverType", point.load())
     except ImportError as error:
+        if name in EXTRAS:
+            way_out = f"pip install 'otolith[{name}]'"
+            raise ConfigurationError(f"driver {name!r} needs the extra {name!r}: {way_out} ({error})") from error
         raise ConfigurationError(f"driver {name!r} cannot be loaded: {error}") from error
     text = f"unknown driver {name!r}: {nearest(name, known())}; a package that brings its own must be installed here"
     raise ConfigurationError(text)

@@ -129,6 +129,9 @@ def test_an_incomplete_window_is_due_after_the_grace_period() -> None:
     assert windower.begin(rings, 0.48, 0.48)
     assert not windower.due(rings, windower.next_end + 0.9 * GRACE_PERIOD)
     assert windower.due(rings, windower.next_end + GRACE_PERIOD)
+    windower.latency = 0.5  # of a source that sends its samples twice a second
+    assert not windower.due(rings, windower.next_end + 0.5 + 0.9 * GRACE_PERIOD)
+    assert windower.due(rings, windower.next_end + 0.5 + GRACE_PERIOD)
 
 
 def test_the_gap_limit_returns_with_the_fine_grid() -> None:

@@ -18,6 +18,8 @@ SOURCES = {
     "estimation": [DAEMON / "estimation", DAEMON / "estimation" / "timing"],
     "health": [DAEMON / "health", DAEMON / "adaptation"],
     "modbus": [DRIVERS / "modbus"],
+    "mqtt": [DRIVERS / "mqtt"],
+    "opcua": [DRIVERS / "opcua"],
     "plant": [DRIVERS / "plant"],
     "replay": [DRIVERS / "replay"],
     "runtime": [DAEMON / "runtime", DAEMON / "publishing", DAEMON],

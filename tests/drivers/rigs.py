@@ -1,6 +1,7 @@
 """A rig for each driver of the registry: the driver, and a real source for it."""
 
 import struct
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
@@ -13,10 +14,14 @@ from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
 from otolith_drivers.conformance import Rig
 from otolith_drivers.modbus import driver as modbus_driver
+from otolith_drivers.mqtt import driver as mqtt_driver
+from otolith_drivers.opcua import driver as opcua_driver
 from otolith_drivers.plant import driver as plant_driver
 from otolith_drivers.replay import driver as replay_driver
 from tests.conftest import EXAMPLES, OwnMachine
 from tests.drivers.modbus_servers import library_server
+from tests.drivers.mqtt_broker import broker_of_this_process, publisher
+from tests.drivers.opcua_server import server_of_this_process
 
 SIGNALS = (
     Signal("i", "A", can_driver.Source(signal="ArmatureCurrent")),
@@ -58,6 +63,39 @@ def modbus_rig(_: OwnMachine) -> Iterator[Rig]:
         driver = modbus_driver.build(options, replace(SETUP, signals=signals))
         yield Rig(driver, EXPECTED)
         driver.close()
+
+
+@contextmanager
+def opcua_rig(_: OwnMachine) -> Iterator[Rig]:
+    """The server gives the unit of the current."""
+    sources = ({"node": "ns=2;s=i"}, {"node": "nsu=urn:motor;s=omega", "unit": "rad/s"})
+    signals = tuple(
+        replace(signal, source=opcua_driver.Source.model_validate(source))
+        for signal, source in zip(SIGNALS, sources, strict=True)
+    )
+    port = server_of_this_process()
+    options = opcua_driver.Options(endpoint=f"opc.tcp://127.0.0.1:{port}/motor")
+    yield Rig(opcua_driver.build(options, replace(SETUP, signals=signals)), EXPECTED)
+
+
+@contextmanager
+def mqtt_rig(_: OwnMachine) -> Iterator[Rig]:
+    """One topic has a plain number, the other one a document."""
+    port = broker_of_this_process()
+    topic = f"rig/{time.monotonic_ns()}"
+    sources = ({"topic": f"{topic}/i", "unit": "A"}, {"topic": topic, "field": "axes[0].speed", "unit": "rad/s"})
+    signals = tuple(
+        replace(signal, source=mqtt_driver.Source.model_validate(source))
+        for signal, source in zip(SIGNALS, sources, strict=True)
+    )
+    with publisher(port) as client:
+
+        def emit() -> None:
+            client.publish(f"{topic}/i", "2.0")
+            client.publish(topic, '{"axes": [{"speed": 10}]}')
+
+        options = mqtt_driver.Options(host="127.0.0.1", port=port)
+        yield Rig(mqtt_driver.build(options, replace(SETUP, signals=signals)), EXPECTED, emit)
 
 
 PLANT_FAULT = """
@@ -102,6 +140,8 @@ def replay_rig(machine: OwnMachine) -> Iterator[Rig]:
 RIGS: dict[str, Callable[[OwnMachine], AbstractContextManager[Rig]]] = {
     "can": can_rig,
     "modbus": modbus_rig,
+    "mqtt": mqtt_rig,
+    "opcua": opcua_rig,
     "plant": plant_rig,
     "replay": replay_rig,
 }

@@ -19,6 +19,8 @@ DRIVERS = Path(can_driver.__file__).parents[1]
 WRITING_METHODS = {
     *("send", "send_periodic", "sendto", "sendall", "sdo", "nmt", "write_coil", "write_coils", "write_register"),
     *("write_registers", "mask_write_register", "readwrite_registers", "write_file_record"),
+    *("publish", "will_set", "write", "write_value", "write_values", "write_attribute", "write_attributes"),
+    *("call", "call_method", "set_value", "set_writable", "history_update", "add_variable", "delete_nodes"),
 }
 SOURCES = [can_driver.Source(signal="ArmatureCurrent"), can_driver.Source(id=0x281, start=0, length=16, unit="A")]
 

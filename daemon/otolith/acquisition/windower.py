@@ -40,6 +40,7 @@ class Windower:
         self.signals = tuple(self.plans)
         self.records = records
         self.sample_period = sample_period
+        self.latency = 0.0  # s; by which samples arrive after their times because the source sends many at once
         self.counts = WindowerCounts()
         self._limits = limits or QualityLimits()
         self._grace = GRACE_PERIOD
@@ -70,7 +71,7 @@ class Windower:
     @property
     def deadline(self) -> float:
         """Time after which the next window no longer waits for late samples, s."""
-        return self.next_end + max(plan.delay for plan in self.plans.values()) + self._grace
+        return self.next_end + max(plan.delay for plan in self.plans.values()) + self._grace + self.latency
 
     def begin(self, rings: Rings, now: float, waited: float) -> bool:
         """Return whether the first window has begun.

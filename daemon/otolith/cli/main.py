@@ -164,8 +164,8 @@ def replay(
     """Run recorded DATA through the daemon for the machine in FILE.
 
     DATA is a table (CSV: a column 't' in seconds and one for each signal of the twin, in its unit or the one in
-    brackets), a recording (.rrd) or a log of a CAN bus (.log of candump, .asc, .blf, .trc, also with .gz). FILE needs
-    [driver] and [signals] only for a log of a bus: they describe its frames.
+    brackets), a recording (.rrd) or a log of a CAN bus (of candump, SavvyCAN or python-can, .asc, .blf, .trc, .mf4).
+    FILE needs [driver] and [signals] only for a log of a bus: they describe its frames.
     Each of several files is a recording of its own: no window spans two.
 
     \b

@@ -189,7 +189,9 @@ class Service:
 
     def _cut(self, now: float) -> None:
         window = self._windower.cut(self._rings, time.time() - time.monotonic())
-        self._adopt_achieved_period()
+        link = self._machine.driver.link()
+        self._windower.latency = link.latency
+        self._adopt_achieved_period(link.period)
         decisions = self._writer.new_decisions()
         if decisions is not None:
             self._supervisor.revise(lambda state: apply_decisions(state, decisions))
@@ -197,9 +199,9 @@ class Service:
         self._windows_bad += window.quality.verdict is Verdict.BAD
         self._supervisor.submit(window, now)
 
-    def _adopt_achieved_period(self) -> None:
-        """Use the sample period that a polled machine achieves for the following windows."""
-        period, current = self._machine.driver.link().period, self._windower.sample_period
+    def _adopt_achieved_period(self, period: float | None) -> None:
+        """Use the sample period (s) that a polled machine achieves, if it is known, for the following windows."""
+        current = self._windower.sample_period
         if period is None or abs(period / current - 1.0) < MIN_PERIOD_CHANGE:
             return
         configured, ratio = self._machine.problem.window, period / self._machine.file.window.sample_period

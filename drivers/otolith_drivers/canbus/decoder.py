@@ -14,7 +14,8 @@ from cantools.database import Signal as CanSignal
 
 from otolith_drivers.base import Counters, Sample, Setup, Signal
 from otolith_drivers.canbus.canopen import CanopenDrive, FrameHandler, NodeMonitor
-from otolith_drivers.canbus.database import CanDatabase, load_database
+from otolith_drivers.canbus.database import STANDARD_LIMIT, CanDatabase, load_database
+from otolith_drivers.canbus.j1939 import ParameterGroups, fault_of, highest_reading, names_any_source
 from otolith_drivers.canbus.monitoring import (
     MIN_STUCK_FRAMES,
     BusFaults,
@@ -27,6 +28,7 @@ from otolith_drivers.canbus.monitoring import (
 )
 from otolith_drivers.canbus.options import FrameOptions, MessageTable
 from otolith_drivers.canbus.signals import (
+    CLASSIC_LENGTH,
     MAX_VALUE,
     BitRange,
     RawReader,
@@ -61,6 +63,8 @@ class MessageRules:
     """s, declared."""
     length: int = 0
     """Bytes that counter and checksum need."""
+    is_j1939: bool = False
+    """Whether its highest numbers are no readings."""
 
 
 @dataclass(slots=True)
@@ -103,9 +107,11 @@ class MessageReader:
         self._rows: list[Row] = []
         self._groups: dict[tuple[object, ...], _MultiplexedGroup] = {}
         self._rejections: dict[str, _Rejection] = {}
+        self._standard = {request.name: request.signal for request in requests if rules.is_j1939}
         for request in requests:
             self._length = max(self._length, bytes_needed(request.signal))
-            read, limits = raw_reader(request.signal), (request.raw_low, request.raw_high)
+            high = min(request.raw_high, highest_reading(request.signal) if rules.is_j1939 else math.inf)
+            read, limits = raw_reader(request.signal), (request.raw_low, high)
             row = (request.name, read, *limits, request.scale, request.offset, request.target_unit)
             self._rows_of(request).append(row)
 
@@ -199,6 +205,9 @@ class MessageReader:
         why = f"is out of its range from {first:.6g} to {last:.6g} {unit}"
         if not math.isfinite(raw) or abs(raw) >= high >= MAX_VALUE / max(1.0, abs(scale)):
             why = "is no number"
+        if name in self._standard and (meaning := fault_of(raw, self._standard[name])):
+            self._count_rejection(name, time, f"{name} {meaning} (raw number 0x{int(raw):X})")
+            return Sample(name, time, NO_READING)
         self._count_rejection(name, time, f"{name} of {scale * raw + offset:.6g} {unit} {why}")
         return Sample(name, time, NO_READING)
 
@@ -262,13 +271,19 @@ class FrameDecoder:
     """Decodes frames in the order of their arrival."""
 
     def __init__(
-        self, readers: Mapping[int, MessageReader], nodes: Sequence[NodeMonitor] = (), warnings: Sequence[str] = ()
+        self,
+        readers: Mapping[int, MessageReader],
+        nodes: Sequence[NodeMonitor] = (),
+        warnings: Sequence[str] = (),
+        groups: ParameterGroups | None = None,
     ) -> None:
+        """``groups`` are the keys of ``readers`` whose frames may come from any node of J1939."""
         self.faults = BusFaults()
         """What error frames report."""
         self.configuration_warnings = tuple(warnings)
         """What is wrong with the files that describe the frames, a line each."""
         self._readers = dict(readers)
+        self._groups = groups or None
         self._nodes = tuple(nodes)
         self._handlers: dict[int, FrameHandler] = {
             key: handler for node in nodes for key, handler in node.handlers().items()
@@ -294,6 +309,8 @@ class FrameDecoder:
             key = frame.arbitration_id + EXTENDED if frame.is_extended_id else frame.arbitration_id
             if self._handlers and (handler := self._handlers.get(key)) is not None:
                 handler(frame.data, time)
+            if self._groups is not None and key >= EXTENDED and self._groups.wants(frame.arbitration_id):
+                key = self._groups.key(frame.arbitration_id)
             reader = self._readers.get(key)
             return reader.take(frame.data, time) if reader is not None else NO_SAMPLES
         except Exception:  # noqa: BLE001 - interfaces deliver unchecked what was on the wire
@@ -318,7 +335,7 @@ class FrameDecoder:
         """
         if self._begun is None:
             self._begun = now
-        lines = self.faults.warnings(now)
+        lines = self.faults.warnings(now) + (self._groups.warnings() if self._groups is not None else [])
         for reader in self._readers.values():
             lines += reader.warnings(now, self._begun, unused=unused)
         for node in self._nodes:
@@ -333,6 +350,21 @@ class FrameDecoder:
     def identifiers(self) -> list[tuple[int, bool]]:
         """The arbitration IDs that are decoded, and whether each is an extended one."""
         return [(key % EXTENDED, key >= EXTENDED) for key in sorted({*self._readers, *self._handlers})]
+
+    def filters(self) -> list[tuple[int, int, bool]]:
+        """Arbitration ID and mask of the frames that are decoded, and whether they are extended ones."""
+        exact = [
+            (identifier, EXTENDED - 1 if extended else STANDARD_LIMIT, extended)
+            for identifier, extended in self.identifiers()
+        ]
+        groups = self._groups.filters() if self._groups is not None else ()
+        return exact + [(identifier, mask, True) for identifier, mask in groups]
+
+    def wants(self, identifier: int, *, extended: bool) -> bool:
+        """Whether frames of this arbitration ID are decoded."""
+        key = identifier + EXTENDED if extended else identifier
+        is_exact = key in self._readers or key in self._handlers
+        return is_exact or (extended and self._groups is not None and self._groups.wants(identifier))
 
     def describe(self) -> list[str]:
         """What will be read from where, and what is wrong with the files that describe it, a line each."""
@@ -358,13 +390,18 @@ def decoder_of(options: FrameOptions, setup: Setup) -> FrameDecoder:
             content.messages.append(request.message)
     warnings += [line for drive in drives.values() for line in drive.warnings]
     tables = _tables_by_frame(frames, options.messages, databases, warnings)
+    open_sources = [(key, content.messages[0]) for key, content in frames.items() if _is_j1939(content, options)]
+    standard = {key for key, _ in open_sources}
     readers = {
-        key: MessageReader(content.messages, content.requests, _rules(content, tables.get(key, MessageTable())))
+        key: MessageReader(
+            content.messages, content.requests, _rules(content, tables.get(key, MessageTable()), key in standard)
+        )
         for key, content in frames.items()
     }
     if len(warnings) > MAX_WARNINGS:
         warnings = [*warnings[:MAX_WARNINGS], f"... and {len(warnings) - MAX_WARNINGS} more"]
-    return FrameDecoder(readers, [drive.monitor for drive in drives.values()], warnings)
+    groups = ParameterGroups(open_sources, options.source_address)
+    return FrameDecoder(readers, [drive.monitor for drive in drives.values()], warnings, groups)
 
 
 @dataclass(slots=True)
@@ -380,6 +417,24 @@ class _FrameContent:
             return int(name, 0) == self.messages[0].frame_id
         except ValueError:
             return any(message.name == name for message in self.messages)
+
+
+def _is_j1939(content: _FrameContent, options: FrameOptions) -> bool:
+    """Whether the frames come from any node of J1939.
+
+    Raises:
+        ConfigurationError: the message is longer than a frame.
+    """
+    message = content.messages[0]
+    if not options.j1939 or not names_any_source(message):
+        return False
+    if message.length > CLASSIC_LENGTH and not message.is_fd:
+        raise ConfigurationError(
+            f"message {message.name} has {message.length} bytes, which come in several frames (transport protocol of "
+            "J1939): that is not read",
+            ("signals", content.requests[0].name),
+        )
+    return True
 
 
 def _key(message: Message) -> int:
@@ -431,7 +486,7 @@ def _tables_by_frame(
     return by_frame
 
 
-def _rules(content: _FrameContent, table: MessageTable) -> MessageRules:
+def _rules(content: _FrameContent, table: MessageTable, is_j1939: bool) -> MessageRules:
     message = content.messages[0]
     length = max(described.length for described in content.messages)
     counter, checksum, needed = None, None, 0
@@ -449,7 +504,7 @@ def _rules(content: _FrameContent, table: MessageTable) -> MessageRules:
             checksum = checksum_test(signal, table.checksum, max(length, needed))
         except ValueError as error:
             raise ConfigurationError(str(error), ("driver", "messages", message.name, "checksum")) from error
-    return MessageRules(counter, checksum, table.period, needed)
+    return MessageRules(counter, checksum, table.period, needed, is_j1939)
 
 
 def _signal(content: _FrameContent, where: str | BitRange, key: str) -> CanSignal:

@@ -117,8 +117,8 @@ class CanReceiver:
 
     def _connect(self) -> can.BusABC:
         filters: list[can.typechecking.CanFilter] = [
-            {"can_id": identifier, "can_mask": 0x1FFFFFFF if extended else 0x7FF, "extended": extended}
-            for identifier, extended in self._decoder.identifiers()
+            {"can_id": identifier, "can_mask": mask, "extended": extended}
+            for identifier, mask, extended in self._decoder.filters()
         ]
         bus = open_bus(self._options, filters, listen_only=True)
         enlarge_buffer(bus)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.canbus.signals import BitRange, Identifier
+from otolith_drivers.canbus.signals import BitRange, Identifier, whole_number
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.units import Quantity
 
@@ -113,6 +113,11 @@ class FrameOptions(StrictModel):
     pdo: Annotated[tuple[PdoTable, ...], Field(max_length=MAX_PDOS)] = ()
     messages: dict[str, MessageTable] = Field(default_factory=dict)
     """By the name in the database, or by arbitration ID (``"0x181"``)."""
+
+    j1939: bool = True
+    """Whether a message with 29 bits and the source address 0xFE is one of SAE J1939, from any source."""
+    source_address: Annotated[int, BeforeValidator(whole_number), Field(ge=0, le=253)] | None = None
+    """Of the J1939 node that is read; by default the one whose frame comes first."""
 
     def databases(self) -> tuple[Path, ...]:
         """The databases, as written."""

@@ -3,9 +3,9 @@
 import math
 import time
 
-import can
 from cantools.database import Message
 
+from otolith_drivers.canbus import can
 from otolith_drivers.canbus.bus import open_bus
 from otolith_drivers.canbus.database import load_dbc
 from otolith_drivers.errors import ConfigurationError, DeviceError

@@ -13,14 +13,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TextIO, cast
 
-import can
 import numpy as np
-from can.io.blf import BLFParseError
 
 from otolith_drivers.base import Sample, Sampling, Setup
+from otolith_drivers.canbus import can
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.errors import ConfigurationError, counted
+from otolith_drivers.replay.formats import (
+    CANDUMP,
+    CANDUMP_LOG,
+    DIFFERENCES,
+    PYTHON_CAN,
+    SAVVYCAN,
+    head_of,
+    seen,
+    text_log,
+)
+from otolith_drivers.replay.frame_readers import CandumpLines, Mf4Frames, SavvyCanLines, SqliteFrames
 from otolith_drivers.replay.readers import MAX_TIME, DataFile, Reader, Rows, suffix_of
 
 # Engineering choices, guarded by the tests with garbage and damaged logs in test_can_log.py.
@@ -80,7 +90,7 @@ class CanLogReader(Reader):
 
     def chunks(self) -> Iterator[Rows]:
         """See :meth:`otolith_drivers.replay.readers.Reader.chunks`."""
-        wanted = set(self._decoder.identifiers())
+        wants = self._decoder.wants
         chunk = _FrameChunk(self._signals)
         for place, frame in self._source.frames():
             if isinstance(frame, str):
@@ -89,8 +99,8 @@ class CanLogReader(Reader):
             if not self._frames:
                 self._decoder.begin(frame.timestamp)
             self._frames += 1
-            key = (frame.arbitration_id, frame.is_extended_id)
-            if key not in wanted or frame.is_error_frame or frame.is_remote_frame:
+            is_wanted = wants(frame.arbitration_id, extended=frame.is_extended_id)
+            if not is_wanted or frame.is_error_frame or frame.is_remote_frame:
                 self._others += 1
             elif samples := self._samples(place, frame):
                 chunk.add(place, samples, self._unreadable + self._undecoded)
@@ -131,7 +141,9 @@ class CanLogReader(Reader):
     def _why_no_rows(self) -> str:
         if self._first_bad is not None:
             place, cause = self._first_bad
-            return f": {self.place} {place}: {cause}; no frame can be used"
+            kind = seen(head_of(self.path))
+            hint = f" (it looks like {kind})" if kind and not self._frames else ""
+            return f": {self.place} {place}: {cause}; no frame can be used{hint}"
         if not self._frames:
             return "".join([": no frames", *(f": {line}" for line in self._cut_off())])
         wanted = ", ".join(f"0x{identifier:X}" for identifier, _ in self._decoder.identifiers())
@@ -206,18 +218,36 @@ class _TrcReader(can.TRCReader):
 
 
 TEXT_FORMATS = {
-    ".log": TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
     ".asc": TextFormat(can.ASCReader, "Vector ASC", prelude="\n"),
     ".trc": TextFormat(_TrcReader, "PEAK TRC"),
+    CANDUMP_LOG: TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
+    CANDUMP: TextFormat(CandumpLines, "candump, as 'candump -ta' writes it"),
+    SAVVYCAN: TextFormat(SavvyCanLines, SAVVYCAN),
+    PYTHON_CAN: TextFormat(can.CSVReader, PYTHON_CAN, prelude="\n"),
 }
+"""By suffix or, for others, by the format that the first line has."""
 
 
-def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames":
-    """The frames of a log, in the format of its suffix."""
-    kind = TEXT_FORMATS.get(suffix_of(path))
-    if kind is None:
+def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFrames | Mf4Frames":
+    """The frames of a log, in the format of its suffix or of its first line.
+
+    Raises:
+        ConfigurationError: it is of another format, which the message names.
+    """
+    suffix, head = suffix_of(path), head_of(path)
+    if suffix == ".mf4":
+        return Mf4Frames(path, head)
+    if suffix == ".db":
+        return SqliteFrames(path, head)
+    if suffix == ".blf":
         return BlfFrames(path, data.stream)
-    return TextFrames(path, kind, io.TextIOWrapper(data.stream, encoding="utf-8", errors="replace"))
+    name = suffix if suffix in TEXT_FORMATS else text_log(head) or CANDUMP_LOG
+    if name == DIFFERENCES:
+        raise ConfigurationError(
+            f"{path}: is of {name}, of which a lost line would shift the rest: log with candump -L"
+        )
+    text = io.TextIOWrapper(data.stream, encoding="utf-8-sig", errors="replace")
+    return TextFrames(path, TEXT_FORMATS[name], text)
 
 
 class _NumberedLines:
@@ -314,7 +344,9 @@ class BlfFrames:
         self._blocks = _CheckedBlocks(file)
         try:
             self._reader = _BlfReader(cast("BinaryIO", self._blocks))
-        except (BLFParseError, struct.error) as error:
+        except (can.io.blf.BLFParseError, struct.error) as error:
+            if (kind := seen(head_of(path))) and "BLF" not in kind:
+                raise ConfigurationError(f"{path}: is not a BLF file but {kind}: give it the name of that") from error
             raise ConfigurationError(
                 f"{path}: is not a BLF file, or its writer was killed before it wrote the file header: "
                 "nothing can be read; a candump log (.log) would keep its frames"
@@ -346,7 +378,7 @@ class _CheckedBlocks:
 
     def read(self, size: int) -> bytes:
         if not 0 <= size <= MAX_BLOCK:
-            raise BLFParseError(f"a block of {size} bytes")
+            raise can.io.blf.BLFParseError(f"a block of {size} bytes")
         data = self._file.read(size)
         self.bytes_read += len(data)
         return data
@@ -362,6 +394,6 @@ class _BlfReader(can.BLFReader):
         while (at := data.find(b"LOBJ", at, at + 8)) >= 0 and at + BLF_OBJECT.size <= len(data):
             size = BLF_OBJECT.unpack_from(data, at)[3]
             if size < BLF_OBJECT.size:
-                raise BLFParseError(f"an object of {size} bytes")
+                raise can.io.blf.BLFParseError(f"an object of {size} bytes")
             at += size
         yield from super()._parse_data(data)

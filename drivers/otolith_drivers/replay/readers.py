@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from otolith_drivers.base import Sampling, Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.replay.formats import GZIP, head_of, text_log
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
@@ -28,7 +29,6 @@ Integers = NDArray[np.int64]
 # Seconds since 1970 reach 1e11 in the year 5138; milliseconds since 1970 passed it in 1973, so a column of them without
 # its unit is refused. Guarded by tests/golden/replays/nanoseconds.
 MAX_TIME = 1e11  # s
-GZIP = ".gz"
 BUFFER = 1 << 16  # bytes; the start of the file from which its encoding is recognised
 
 # Formats by the end of the file name. The module is imported only when a file asks for it.
@@ -36,7 +36,9 @@ CAN_LOG = "otolith_drivers.replay.can_log"
 READERS: dict[str, str] = {
     ".asc": CAN_LOG,
     ".blf": CAN_LOG,
+    ".db": CAN_LOG,
     ".log": CAN_LOG,
+    ".mf4": CAN_LOG,
     ".trc": CAN_LOG,
     ".rrd": "otolith_drivers.replay.recording",
 }
@@ -168,12 +170,18 @@ def suffix_of(path: Path) -> str:
 
 def holds_frames(path: Path) -> bool:
     """Whether the file is a CAN log, which cannot be read without a description of its frames."""
-    return READERS.get(suffix_of(path)) == CAN_LOG
+    return _module_of(path) == CAN_LOG
+
+
+def _module_of(path: Path) -> str:
+    """The module that reads ``path``: by its suffix, and for a text by its first line."""
+    module = READERS.get(suffix_of(path))
+    return module or (CAN_LOG if text_log(head_of(path)) else TABLE)
 
 
 def format_of(path: Path) -> Format:
     """The module that reads ``path``."""
-    return cast("Format", import_module(READERS.get(suffix_of(path), TABLE)))
+    return cast("Format", import_module(_module_of(path)))
 
 
 class DataFile:

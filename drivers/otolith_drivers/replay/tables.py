@@ -23,6 +23,7 @@ import pyarrow.compute as pc
 from otolith_drivers.base import Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, counted, nearest
+from otolith_drivers.replay.formats import seen
 from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows
 from otolith_drivers.units import factor
 
@@ -197,7 +198,8 @@ def _decoded(path: Path, data: DataFile) -> TextIO:
     """The text of a table with any line ends, in UTF-8 or Windows-1252."""
     start = data.stream.peek()
     if b"\0" in start:
-        raise ConfigurationError(f"{path}: is not text (compressed, a spreadsheet or UTF-16): save it as CSV in UTF-8")
+        kind = seen(start) or "compressed, a spreadsheet or UTF-16"
+        raise ConfigurationError(f"{path}: is not text ({kind}): save it as CSV in UTF-8")
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)
         encoding = "utf-8-sig"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from otolith.cli.commissioning.probe_opcua import opcua
 from otolith.cli.common import AS_JSON, FILE, StopSignal, progress_line
 
 if TYPE_CHECKING:
@@ -62,7 +63,11 @@ def probe() -> None:
       otolith probe can --channel can0 --database drive.dbc
       otolith probe modbus 192.168.0.10
       otolith probe modbus /dev/ttyUSB0 --baudrate 9600 --parity N --scan
+      otolith probe opcua opc.tcp://192.168.0.10:4840
     """
+
+
+probe.add_command(opcua)
 
 
 @probe.command()

@@ -1,0 +1,1 @@
+"""MQTT: a client that subscribes to topics of a broker and never publishes."""

@@ -1,0 +1,336 @@
+"""The OPC UA tables of a machine file, and a connected client: security, user, causes of a refusal."""
+
+import asyncio
+import logging
+import os
+import time
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+from urllib.parse import urlsplit
+
+from asyncua import Client, ua
+from asyncua.crypto import security_policies
+from asyncua.ua.ua_binary import struct_from_binary
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from pydantic import BeforeValidator, Field, model_validator
+
+from otolith_drivers.config_files import StrictModel, content
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.remote_clock import ExchangeClock, unix_time
+from otolith_drivers.scaled import ScaledSource
+from otolith_drivers.units import Quantity
+
+PEM_LIMIT = 1 << 16  # bytes of a certificate or key; a long chain has 10 kB
+CLOSE_TIMEOUT = 0.4  # s for the server to end the session; the driver interface asks for 1 s in all
+MAX_BROWSED = 20_000  # nodes of a server that are looked at
+MODES = {"sign": ua.MessageSecurityMode.Sign, "sign and encrypt": ua.MessageSecurityMode.SignAndEncrypt}
+REFUSALS = {
+    "certificate": (
+        "BadCertificateUntrusted", "BadSecurityChecksFailed", "BadCertificateInvalid", "BadCertificateUriInvalid",
+        "BadCertificateTimeInvalid", "BadCertificateUseNotAllowed", "BadCertificateChainIncomplete",
+    ),
+    "user": ("BadIdentityTokenRejected", "BadIdentityTokenInvalid", "BadUserAccessDenied"),
+}  # fmt: skip
+
+logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs a traceback for each lost connection
+
+
+class OpcuaOptions(StrictModel):
+    """``[driver]`` with ``type = "opcua"``."""
+
+    endpoint: str
+    """``opc.tcp://host:port`` with the path that the server asks for."""
+    security: Literal["none", "Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss"] = "none"
+    mode: Literal["sign", "sign and encrypt"] = "sign and encrypt"
+    certificate: Path | None = None
+    """Of this client, PEM or DER; the server must trust it."""
+    key: Path | None = None
+    """The private key of ``certificate``, PEM or DER, without a password."""
+    server_certificate: Path | None = None
+    """The only certificate that is accepted from the server; without it, any."""
+    user: str | None = None
+    password_file: Path | None = None
+    """A file whose first line is the password."""
+    timeout: Annotated[float, BeforeValidator(Quantity("s", 0.1, 60.0))] = 4.0
+    """Longest time (s) from a request to its answer."""
+    interval: Annotated[float, BeforeValidator(Quantity("s", 0.005, 10.0))] = 0.05
+    """Time (s) from one message with new values to the next."""
+    stamps: Literal["source", "server"] = "source"
+    """Whose time stamps are used; values without a source time stamp have that of the server."""
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        place = urlsplit(self.endpoint)
+        if place.scheme != "opc.tcp" or not place.hostname or "@" in place.netloc:
+            raise ValueError(f'{self.endpoint!r} is no endpoint: write "opc.tcp://192.168.0.10:4840"')
+        if (self.security == "none") == bool(self.certificate or self.key):
+            raise ValueError(
+                'certificate and key belong to security = "Basic256Sha256" or another policy: set all three'
+            )
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together: set both")
+        if (self.user is None) != (self.password_file is None):
+            raise ValueError("user and password_file belong together: set both")
+        return self
+
+    def describe(self) -> list[str]:
+        """Return endpoint and security, and what is not secure, a line each."""
+        secure = "without security" if self.security == "none" else f"{self.security}, {self.mode}"
+        lines = [f"OPC UA {self.endpoint}, {secure}, read only (subscription every {self.interval * 1e3:g} ms)"]
+        if self.security != "none" and self.server_certificate is None:
+            lines.append("warning: any certificate of the server is accepted: set server_certificate to its own")
+        if self.security == "none" and self.user is not None:
+            lines.append(
+                "warning: values are not protected, and the password only if the server encrypts it: set security"
+            )
+        return lines
+
+
+class OpcuaSource(ScaledSource):
+    """Variable of a signal: ``{ node = "ns=2;s=Motor.Speed" }``; its unit is that of the server unless it is given."""
+
+    node: Annotated[str, Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _is_a_node(self) -> Self:
+        try:
+            ua.NodeId.from_string(self.node)
+        except ua.UaError:
+            example = '"ns=2;s=Motor.Speed", "ns=3;i=1001" or "nsu=urn:maker;s=Motor.Speed"'
+            raise ValueError(f"{self.node!r} is no node id: write {example}") from None
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """Certificate, key and password, read from their files."""
+
+    certificate: x509.Certificate | None = None
+    key: Any = None
+    server: x509.Certificate | None = None
+    password: str = ""
+
+    @classmethod
+    def load(cls, options: OpcuaOptions, folder: Path) -> Self:
+        """Return what the files of ``options``, relative to ``folder``, contain.
+
+        Raises:
+            ConfigurationError: a file is missing, has other content, or key and certificate do not belong together.
+        """
+        certificate = server = key = None
+        if options.certificate is not None and options.key is not None:
+            certificate = _certificate(folder / options.certificate, "certificate")
+            key = _key(folder / options.key)
+            if key.public_key() != certificate.public_key():
+                raise ConfigurationError(
+                    f"{options.key}: is not the key of {options.certificate}: give those that belong together",
+                    ("driver", "key"),
+                )
+        if options.server_certificate is not None:
+            server = _certificate(folder / options.server_certificate, "server_certificate")
+        password = ""
+        if options.password_file is not None:
+            where = ("driver", "password_file")
+            lines = content(folder / options.password_file, PEM_LIMIT, where).decode(errors="replace").splitlines()
+            password = lines[0] if lines else ""
+        return cls(certificate, key, server, password)
+
+
+def _certificate(path: Path, key: str) -> x509.Certificate:
+    data = content(path, PEM_LIMIT, ("driver", key))
+    try:
+        is_pem = b"-----BEGIN" in data
+        return x509.load_pem_x509_certificate(data) if is_pem else x509.load_der_x509_certificate(data)
+    except ValueError as error:
+        raise ConfigurationError(f"{path}: is no X.509 certificate in PEM or DER", ("driver", key)) from error
+
+
+def _key(path: Path) -> Any:
+    data = content(path, PEM_LIMIT, ("driver", "key"))
+    load = serialization.load_pem_private_key if b"-----BEGIN" in data else serialization.load_der_private_key
+    try:
+        return load(data, None)
+    except (ValueError, TypeError) as error:
+        raise ConfigurationError(
+            f"{path}: is no private key in PEM or DER without a password", ("driver", "key")
+        ) from error
+
+
+class RefusedError(Exception):
+    """The server refuses the connection; the text has the cause and what to do."""
+
+
+@asynccontextmanager
+async def connected(options: OpcuaOptions, credentials: Credentials) -> AsyncIterator[Client]:
+    """Yield a client with a session, and end both.
+
+    Raises:
+        RefusedError: the server refuses the certificate, the user or the security policy, or its certificate is wrong.
+    """
+    client = Client(options.endpoint, timeout=options.timeout)
+    if options.user is not None:
+        client.set_user(options.user)
+        client.set_password(credentials.password)
+    try:
+        if credentials.certificate is not None:
+            await _secure(client, options, credentials)
+        await client.connect()
+        yield client
+    except ua.UaError as error:
+        raise RefusedError(_cause(error, options)) from error
+    finally:
+        # A task of its own, as the library swallows the cancellation by which a timeout would end it.
+        ending = asyncio.create_task(_end(client))
+        try:
+            await asyncio.wait({ending}, timeout=CLOSE_TIMEOUT)
+        finally:
+            ending.cancel()
+            with suppress(Exception):
+                client.disconnect_socket()
+
+
+async def _end(client: Client) -> None:
+    """End the session and the connection of a server that may no longer answer."""
+    with suppress(Exception):
+        await client.disconnect()
+
+
+async def _secure(client: Client, options: OpcuaOptions, credentials: Credentials) -> None:
+    """Set the security policy with the certificate that the server presents.
+
+    Raises:
+        RefusedError: the server has not the policy, or not the certificate that the machine file names.
+    """
+    certificate = credentials.certificate
+    assert certificate is not None  # noqa: S101 - for the type checker
+    endpoints = await client.connect_and_get_server_endpoints()
+    policy: Any = getattr(security_policies, f"SecurityPolicy{options.security}")
+    suited = [
+        one for one in endpoints if (one.SecurityPolicyUri, one.SecurityMode) == (policy.URI, MODES[options.mode])
+    ]
+    if not suited:
+        offered = {f"{(one.SecurityPolicyUri or '').rpartition('#')[2]} {one.SecurityMode.name}" for one in endpoints}
+        raise RefusedError(
+            f"the server has not {options.security}, {options.mode}; it offers {', '.join(sorted(offered))}"
+        )
+    try:
+        presented = x509.load_der_x509_certificate(suited[0].ServerCertificate)
+    except ValueError:  # the certificate is followed by those of its issuers
+        size = int.from_bytes(suited[0].ServerCertificate[2:4]) + 4
+        presented = x509.load_der_x509_certificate(suited[0].ServerCertificate[:size])
+    if credentials.server is not None and presented != credentials.server:
+        print_of = presented.fingerprint(hashes.SHA256()).hex(":")
+        raise RefusedError(f"the server's certificate is not that of server_certificate: it has the SHA-256 {print_of}")
+    with suppress(x509.ExtensionNotFound):  # the server compares it with the certificate
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        client.application_uri = (*names.get_values_for_type(x509.UniformResourceIdentifier), client.application_uri)[0]
+    client.security_policy = policy(presented, certificate, credentials.key, MODES[options.mode])
+    client.uaclient.set_security(client.security_policy)
+
+
+def _cause(error: ua.UaError, options: OpcuaOptions) -> str:
+    """Return why the server refuses, and what to do."""
+    name = type(error).__name__
+    if name in REFUSALS["certificate"]:
+        return f"the server refuses the certificate {options.certificate} ({name}): let the server trust it"
+    if name in REFUSALS["user"]:
+        who = f"user {options.user!r}: is the password right?" if options.user else "a client without a user: set user"
+        return f"the server refuses {who} ({name})"
+    if "No matching endpoints" in str(error):
+        return "the server has no endpoint without security: set security, certificate and key"
+    return f"{name}: {error}"
+
+
+def reason(error: BaseException, timeout: float) -> str:
+    """Return why the connection failed."""
+    if isinstance(error, RefusedError):
+        return str(error)
+    if isinstance(error, TimeoutError):
+        return f"no answer within {timeout:g} s"
+    if isinstance(error, OSError) and error.errno and error.errno > 0:
+        return os.strerror(error.errno)
+    return str(error) or type(error).__name__
+
+
+async def exchange(client: Client, clock: ExchangeClock) -> None:
+    """Ask the server for its time, which is in the header of each answer, and note it in ``clock``."""
+    protocol = client.uaclient.protocol
+    if protocol is None:
+        raise ConnectionError("the connection was closed")
+    request = ua.ReadRequest()
+    moment = ua.ReadValueId(NodeId=ua.NodeId(ua.ObjectIds.Server_ServerStatus_State), AttributeId=ua.AttributeIds.Value)
+    request.Parameters.NodesToRead = [moment]
+    sent = time.monotonic()
+    data = await protocol.send_request(request)
+    received = time.monotonic()
+    response = struct_from_binary(ua.ReadResponse, data)
+    clock.exchange(sent, unix_time(response.ResponseHeader.Timestamp), received)
+
+
+async def node_id(client: Client, text: str) -> ua.NodeId:
+    """Return the node that ``text`` names; a namespace may be given by its URI.
+
+    Raises:
+        ValueError: the server has no such namespace.
+    """
+    node = ua.NodeId.from_string(text)
+    uri = getattr(node, "NamespaceUri", None)
+    return node if uri is None else ua.NodeId(node.Identifier, await client.get_namespace_index(uri), node.NodeIdType)
+
+
+async def unit_of(client: Client, node: ua.NodeId) -> str:
+    """Return the unit in the property EngineeringUnits of a variable; empty if it has none."""
+    try:
+        unit = await (await client.get_node(node).get_child("0:EngineeringUnits")).read_value()
+    except ua.UaStatusCodeError:
+        return ""
+    text = getattr(getattr(unit, "DisplayName", None), "Text", None)
+    return str(text or "").strip()
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """A variable of a server."""
+
+    node: str
+    path: str
+    """Names from the folder of objects down to it."""
+    value: Any
+    """The present value; None if it has none."""
+    type: str
+    unit: str
+    """Empty if it has none."""
+    status: str
+
+
+async def browse(client: Client, most: int) -> list[Variable]:
+    """Return the variables below the folder of objects, except those of OPC UA itself, ``most`` at most."""
+    waiting: deque[tuple[ua.NodeId, str]] = deque([(client.nodes.objects.nodeid, "")])
+    seen, variables = set[str](), list[Variable]()
+    while waiting and len(variables) < most:
+        parent, path = waiting.popleft()
+        for child in await client.get_node(parent).get_children_descriptions(includesubtypes=True):
+            node = ua.NodeId(child.NodeId.Identifier, child.NodeId.NamespaceIndex, child.NodeId.NodeIdType)
+            if (text := node.to_string()) in seen or not node.NamespaceIndex or len(seen) >= MAX_BROWSED:
+                continue
+            seen.add(text)
+            name = f"{path}/{child.BrowseName.Name}".lstrip("/")
+            if child.NodeClass == ua.NodeClass.Variable:
+                is_property = child.ReferenceTypeId == ua.NodeId(ua.ObjectIds.HasProperty)
+                variables += [] if is_property else [await _variable(client, node, name)]
+            if child.NodeClass in {ua.NodeClass.Object, ua.NodeClass.Variable}:
+                waiting.append((node, name))
+    return variables[:most]
+
+
+async def _variable(client: Client, node: ua.NodeId, path: str) -> Variable:
+    read = await client.get_node(node).read_data_value(raise_on_bad_status=False)
+    variant, status = read.Value, read.StatusCode or ua.StatusCode()
+    kind = variant.VariantType.name if variant is not None and variant.VariantType is not None else ""
+    value = None if variant is None else variant.Value
+    return Variable(node.to_string(), path, value, kind, await unit_of(client, node), status.name)

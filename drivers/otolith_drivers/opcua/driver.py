@@ -1,0 +1,272 @@
+"""The OPC UA driver: subscribes to variables of a server, and reconnects after every fault. It can only read.
+
+The time of a sample is the source's time stamp, which is on the server's clock. That clock is compared with this
+computer's by the times in the answers, so the error of the times is bounded (see ``remote_clock.py``).
+"""
+
+import asyncio
+import logging
+import math
+import random
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from asyncua import Client, ua
+
+from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
+from otolith_drivers.errors import ConfigurationError, counted
+from otolith_drivers.opcua.connection import (
+    Credentials,
+    OpcuaOptions,
+    OpcuaSource,
+    RefusedError,
+    connected,
+    exchange,
+    node_id,
+    reason,
+    unit_of,
+)
+from otolith_drivers.opcua.readings import NodeSignal, Readings
+from otolith_drivers.remote_clock import unix_time
+from otolith_drivers.scaled import Conversion
+
+__all__ = ["OpcuaSubscriber", "Options", "Source", "build"]
+
+log = logging.getLogger(__name__)
+
+Options = OpcuaOptions
+Source = OpcuaSource
+
+BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
+CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s
+FIRST_EXCHANGES = 5  # questions for the server's time before the first value is used
+EXCHANGE_PERIOD = 2.0  # s between two such questions later on
+SILENT_INTERVALS, MIN_SILENCE = 20.0, 2.0  # messages; s: without one, the connection is opened anew
+KEEPALIVE = 1  # intervals without a value, after which the server sends an empty message
+QUEUE_MARGIN = 4  # messages that the server's queue of a variable can hold back
+
+
+def build(options: OpcuaOptions, setup: Setup) -> "OpcuaSubscriber":
+    """Return a subscriber to all signals of ``setup``.
+
+    Raises:
+        ConfigurationError: a unit has the wrong dimension, or a certificate, key or password cannot be read.
+    """
+    credentials = Credentials.load(options, setup.folder)
+    readings = Readings(setup.signals, setup.sample_period, use_server_stamps=options.stamps == "server")
+    for node in readings.signals:
+        if node.source.unit is not None:
+            try:
+                node.conversion = Conversion.of(node.source, node.source.unit, node.signal.unit)
+            except ValueError as error:
+                raise ConfigurationError(str(error), ("signals", node.signal.name)) from error
+    return OpcuaSubscriber(options, credentials, readings, setup.sample_period)
+
+
+class OpcuaSubscriber:
+    """Implements :class:`otolith_drivers.base.Driver` over asyncua, with a thread that runs its event loop."""
+
+    sampling = Sampling.POLLED
+
+    def __init__(self, options: OpcuaOptions, credentials: Credentials, readings: Readings, period: float) -> None:
+        self._options, self._credentials, self._readings, self._period = options, credentials, readings, period
+        self._up, self._was_up, self._reason = False, False, "not opened yet"
+        self._reconnects = 0
+        self._latest = -math.inf  # s; time of the latest message
+        self._slow = ""  # what the server grants less than was asked
+        self._ended = ""  # why the server has ended the subscription
+        self._ahead = math.nan  # s; the server's clock minus this computer's
+        self._interval = options.interval  # s between two messages
+        self._clocks_due = 0.0  # s; when they are compared again
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def open(self, deliver: Deliver) -> None:
+        """See :meth:`otolith_drivers.base.Driver.open`."""
+        self._reason = "not connected yet"
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._run(deliver)), name="opcua-subscribe", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """See :meth:`otolith_drivers.base.Driver.close`."""
+        self._stop.set()
+        if self._loop is not None and self._task is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._task.cancel)
+        if self._thread is not None:
+            self._thread.join(timeout=CLOSE_TIMEOUT)
+
+    def counters(self) -> Counters:
+        """See :meth:`otolith_drivers.base.Driver.counters`."""
+        readings = self._readings
+        return Counters(readings.received, readings.bad, readings.lost, self._reconnects)
+
+    def link(self) -> Link:
+        """See :meth:`otolith_drivers.base.Driver.link`."""
+        readings, now = self._readings, time.monotonic()
+        lines = [line for node in readings.signals for line in node.warnings(now)]
+        if readings.server_stamped:
+            lines.append(f"{readings.server_stamped} values without a source time stamp have that of the server")
+        plan = ""
+        if readings.clock.known:
+            where = "ahead of" if self._ahead > 0.0 else "behind"
+            bound = f"{1e3 * readings.clock.error:.2g} ms"
+            plan = f"the server's clock is {abs(self._ahead):.4g} s {where} this computer's, known within {bound}"
+            plan += f", set {counted(readings.clock.steps, 'time')}" if readings.clock.steps else ""
+            plan += f", {self._slow}" if self._slow else ""
+        return Link(self._up, self._reason, tuple(lines) if self._up else (), plan, latency=self._interval)
+
+    def describe(self) -> list[str]:
+        """See :meth:`otolith_drivers.base.Driver.describe`."""
+        nodes = [
+            f"{node.signal.name} [{node.signal.unit}] from {node.source.node}"
+            f" [{node.source.unit or 'the unit that the server gives'}]"
+            for node in self._readings.signals
+        ]
+        return [*self._options.describe(), *nodes]
+
+    async def _run(self, deliver: Deliver) -> None:
+        self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
+        backoff = BACKOFF_FIRST
+        while not self._stop.is_set():
+            try:
+                await self._session(deliver)
+            except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - nothing may end the thread
+                if self._stop.is_set():
+                    return
+                backoff = BACKOFF_FIRST if self._up else min(2.0 * backoff, BACKOFF_MAX)
+                self._go_down(reason(error, self._options.timeout))
+            try:
+                await asyncio.sleep(backoff * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not a secret
+            except asyncio.CancelledError:
+                return
+
+    async def _session(self, deliver: Deliver) -> None:
+        """Subscribe and take values until the connection fails, which raises."""
+        async with connected(self._options, self._credentials) as client:
+            for _ in range(FIRST_EXCHANGES):
+                await self._compare_clocks(client)
+            await self._learn_units(client)
+            interval = await self._subscribe(client, deliver)
+            limit = max(MIN_SILENCE, SILENT_INTERVALS * interval)
+            while True:
+                await asyncio.sleep(0.1 * limit)
+                now = time.monotonic()
+                if self._ended:
+                    raise ConnectionError(self._ended)
+                if now - self._latest > limit:
+                    raise ConnectionError(f"no message of the subscription for {now - self._latest:.1f} s")
+                if now >= self._clocks_due:
+                    await self._compare_clocks(client)
+
+    async def _compare_clocks(self, client: Client) -> None:
+        await exchange(client, self._readings.clock)
+        self._ahead = time.monotonic() - time.time() - self._readings.clock.offset
+        self._clocks_due = time.monotonic() + EXCHANGE_PERIOD
+
+    async def _learn_units(self, client: Client) -> None:
+        """Ask for the units that the machine file leaves out."""
+        for node in self._readings.signals:
+            node.fault = ""
+            if node.source.unit is not None:
+                continue
+            try:
+                unit = await unit_of(client, await node_id(client, node.source.node))
+                node.conversion = Conversion.of(node.source, unit, node.signal.unit) if unit else None
+                node.fault = "" if unit else f"{node.source.node} has no unit on the server: set 'unit' beside it"
+            except (ua.UaStatusCodeError, ValueError) as error:
+                node.conversion, node.fault = None, f"{node.source.node}: {error}; set 'unit' beside it"
+
+    async def _subscribe(self, client: Client, deliver: Deliver) -> float:
+        """Subscribe to all variables; return the time (s) between two messages."""
+        readings, session = self._readings, client.uaclient.session
+        asked = ua.CreateSubscriptionParameters(
+            RequestedPublishingInterval=self._options.interval * 1e3,
+            RequestedLifetimeCount=10_000,
+            RequestedMaxKeepAliveCount=KEEPALIVE,
+        )
+        readings.begin(self._options.interval)
+        self._latest, self._ended, self._slow = time.monotonic(), "", ""
+        result = await session.create_subscription(asked, lambda message: self._take(message, deliver))
+        interval = self._interval = 1e-3 * float(result.RevisedPublishingInterval)
+        readings.begin(interval)
+        wanted = [index for index, node in enumerate(readings.signals) if not node.fault]
+        refused = await self._monitor(client, result.SubscriptionId, wanted, by_stamp=True)
+        await self._monitor(client, result.SubscriptionId, refused, by_stamp=False)
+        if all(node.fault for node in readings.signals):
+            raise RefusedError(readings.signals[0].fault)
+        return interval
+
+    async def _monitor(self, client: Client, subscription: int, indices: Sequence[int], *, by_stamp: bool) -> list[int]:
+        """Add the signals ``indices`` to the subscription; return those whose filter the server refuses."""
+        if not indices:
+            return []
+        nodes = [self._readings.signals[index] for index in indices]
+        items = [
+            await self._item(client, node, index, by_stamp=by_stamp) for index, node in zip(indices, nodes, strict=True)
+        ]
+        asked = ua.CreateMonitoredItemsParameters(
+            SubscriptionId=subscription, TimestampsToReturn=ua.TimestampsToReturn.Both, ItemsToCreate=items
+        )
+        results = await client.uaclient.session.create_monitored_items(asked)
+        refused = []
+        for index, node, result in zip(indices, nodes, results, strict=True):
+            if by_stamp and "Filter" in result.StatusCode.name:
+                refused.append(index)
+            elif not result.StatusCode.is_good():
+                node.fault = f"{node.source.node}: {result.StatusCode.name}: 'otolith probe opcua' lists the variables"
+            elif result.RevisedSamplingInterval > 1.5e3 * self._period:
+                rates = f"every {result.RevisedSamplingInterval:g} ms instead of {self._period * 1e3:g} ms"
+                self._slow = f"by its own account the server samples {node.signal.name} {rates}"
+        return refused
+
+    async def _item(
+        self, client: Client, node: NodeSignal, index: int, *, by_stamp: bool
+    ) -> ua.MonitoredItemCreateRequest:
+        """Return the request for a variable; with ``by_stamp`` it is also sent when only its time stamp changes."""
+        parameters = ua.MonitoringParameters(
+            ClientHandle=index,
+            SamplingInterval=self._period * 1e3,
+            QueueSize=max(10, math.ceil(QUEUE_MARGIN * self._options.interval / self._period)),
+            DiscardOldest=True,
+        )
+        if by_stamp:
+            parameters.Filter = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
+        where = ua.ReadValueId(NodeId=await node_id(client, node.source.node), AttributeId=ua.AttributeIds.Value)
+        return ua.MonitoredItemCreateRequest(
+            ItemToMonitor=where, MonitoringMode=ua.MonitoringMode.Reporting, RequestedParameters=parameters
+        )
+
+    def _take(self, result: ua.PublishResult, deliver: Deliver) -> None:
+        """Take a message of the subscription; called in the event loop."""
+        now = self._latest = time.monotonic()
+        message, readings = result.NotificationMessage, self._readings
+        values: list[tuple[int, Any]] = []
+        for part in message.NotificationData or ():
+            if isinstance(part, ua.StatusChangeNotification):
+                self._ended = f"the server has ended the subscription: {part.Status.name}"
+            elif isinstance(part, ua.DataChangeNotification):
+                values += [(item.ClientHandle, item.Value) for item in part.MonitoredItems]
+        if not readings.clock.arrival(unix_time(message.PublishTime), now):  # the server's clock was set
+            self._clocks_due = now
+        samples = readings.take(message, values, now)
+        if samples and not self._stop.is_set():
+            self._come_up()
+            deliver(samples)
+
+    def _come_up(self) -> None:
+        if not self._up:
+            self._up, self._reason = True, ""
+            self._reconnects += self._was_up
+            self._was_up = True
+            log.info("OPC UA %s: sends values", self._options.endpoint)
+
+    def _go_down(self, cause: str) -> None:
+        if cause != self._reason:
+            log.warning("OPC UA %s: %s; retried until it answers", self._options.endpoint, cause)
+        self._up, self._reason = False, cause

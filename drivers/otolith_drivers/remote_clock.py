@@ -1,0 +1,82 @@
+"""The clock of another computer on this computer's monotonic clock. No clock in here: every time is an argument.
+
+The *offset* is the local minus the remote time of one moment, in s. A request is sent before its reply is stamped, and
+the reply arrives after that: so each exchange gives a lower and an upper bound of the offset, and a message that was
+only received gives an upper one.
+"""
+
+import math
+from datetime import UTC, datetime
+
+MAX_DRIFT = 2e-4  # s per s between two clocks, beyond the 1e-4 of two quartz oscillators
+BLOCK = 10.0  # s; the fastest message of the last one or two of these gives the offset of a clock that is not asked
+
+
+def unix_time(moment: datetime) -> float:
+    """Return the seconds since 1970 of ``moment``, which is in UTC if it names no time zone."""
+    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
+
+
+class ExchangeClock:
+    """The clock of a server that is asked for its time."""
+
+    def __init__(self) -> None:
+        self._low, self._high, self._time = -math.inf, math.inf, 0.0
+        self.steps = 0
+        """How often the clock was set."""
+
+    @property
+    def known(self) -> bool:
+        """Whether there was an exchange."""
+        return math.isfinite(self._low)
+
+    @property
+    def offset(self) -> float:
+        """Local minus remote time in s; NaN before the first exchange."""
+        return 0.5 * (self._low + self._high) if self.known else math.nan
+
+    @property
+    def error(self) -> float:
+        """Largest error of the offset in s."""
+        return 0.5 * (self._high - self._low)
+
+    def exchange(self, sent: float, stamp: float, received: float) -> None:
+        """Take a reply of the remote time ``stamp`` to a request; ``sent`` and ``received`` are local times (s)."""
+        self._widen(received)
+        low, high = max(self._low, sent - stamp), min(self._high, received - stamp)
+        if low > high:
+            low, high = sent - stamp, received - stamp
+            self.steps += 1
+        self._low, self._high = low, high
+
+    def arrival(self, stamp: float, received: float) -> bool:
+        """Take a message of the remote time ``stamp``; return whether it agrees with the offset."""
+        self._widen(received)
+        if received - stamp < self._low:
+            return False
+        self._high = min(self._high, received - stamp)
+        return True
+
+    def _widen(self, now: float) -> None:
+        drift = MAX_DRIFT * max(0.0, now - self._time)
+        self._low, self._high, self._time = self._low - drift, self._high + drift, max(now, self._time)
+
+
+class ArrivalClock:
+    """The clock of a sender that cannot be asked: its fastest message counts as one that took no time."""
+
+    def __init__(self) -> None:
+        self._begun, self._least, self._previous = -math.inf, math.inf, math.inf
+
+    def arrival(self, stamp: float, received: float) -> None:
+        """Take a message of the remote time ``stamp`` (s) that came at the local time ``received`` (s)."""
+        if received - self._begun >= BLOCK:
+            fresh = received - self._begun < 2.0 * BLOCK
+            self._begun, self._previous = received, self._least if fresh else math.inf
+            self._least = math.inf
+        self._least = min(self._least, received - stamp)
+
+    @property
+    def offset(self) -> float:
+        """Local minus remote time in s, too large by the duration of the fastest message; infinite without any."""
+        return min(self._least, self._previous)

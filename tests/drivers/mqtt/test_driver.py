@@ -1,0 +1,223 @@
+"""The MQTT driver against a real broker in another process: retained and damaged messages, times, faults, TLS."""
+
+import json
+import math
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from otolith_drivers.base import Sample, Sampling, Setup, Signal
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.mqtt import driver as mqtt
+from otolith_drivers.mqtt.topics import MAX_PAYLOAD, Messages, at
+from tests.conftest import free_port
+from tests.drivers.certificates import certificate
+from tests.drivers.mqtt_broker import broker_of_this_process, mqtt_broker, publisher
+from tests.waiting import wait_for
+
+STEP = 0.02  # s
+SPEED = {"topic": "motor", "field": "values.speed", "unit": "rpm"}
+
+
+def setup_of(folder: Path = Path(), **sources: dict[str, Any]) -> Setup:
+    units = {"i": "A", "omega": "rad/s"}
+    signals = [Signal(name, units[name], mqtt.Source.model_validate(source)) for name, source in sources.items()]
+    return Setup(tuple(signals), folder, 0.01)
+
+
+def messages(**keys: Any) -> Messages:
+    options = mqtt.Options.model_validate({"host": "broker"} | keys)
+    return Messages(options, setup_of(omega=SPEED).signals)
+
+
+def document(speed: object, time: object = 0) -> bytes:
+    return json.dumps({"t": time, "values": {"speed": speed}}).encode()
+
+
+@contextmanager
+def opened(port: int, setup: Setup, **keys: Any) -> Iterator[tuple[mqtt.MqttListener, list[Sample]]]:
+    options = mqtt.Options.model_validate({"host": "127.0.0.1", "port": port} | keys)
+    driver, samples = mqtt.build(options, setup), list[Sample]()
+    driver.open(samples.extend)
+    try:
+        yield driver, samples
+    finally:
+        driver.close()
+
+
+def test_a_retained_value_is_no_sample_and_damaged_messages_are_counted() -> None:
+    setup = setup_of(i={"topic": "retained/i", "unit": "mA"})
+    port = broker_of_this_process()
+    with publisher(port) as client:
+        client.publish("retained/i", "7000", retain=True, qos=1).wait_for_publish()
+        with opened(port, setup, qos=1) as (driver, samples):
+            wait_for(lambda: "1 retained message" in driver.link().plan)
+            client.publish("retained/i", b"\xff garbage", qos=1)
+            client.publish("retained/i", "2000", qos=1)
+            wait_for(lambda: len(samples) == 1)
+            assert driver.counters().bad == 1
+            assert "is no number" in driver.link().warnings[0]
+    assert samples[0].value == pytest.approx(2.0)
+
+
+def test_a_broker_that_is_killed_and_comes_back_costs_counted_samples(tmp_path: Path) -> None:
+    port = free_port(socket.SOCK_STREAM)
+    keys = {"time": "t", "time_format": "s"}
+    with mqtt_broker(port, tmp_path) as broker, opened(port, setup_of(omega=SPEED), **keys) as (driver, samples):
+        wait_for(lambda: driver.link().up)
+        _send_until(port, lambda: len(samples) >= 60)
+        broker.kill()
+        broker.wait()
+        wait_for(lambda: driver.link().reason == "Connection refused")
+        with mqtt_broker(port, tmp_path):
+            wait_for(lambda: driver.link().up)
+            _send_until(port, lambda: len(samples) >= 90)
+            counters = driver.counters()
+    # The first sample after the pause, wherever it is: a message may have been on its way when the broker ended.
+    missing = max(after.time - before.time for before, after in pairwise(samples)) / STEP - 1
+    assert counters.reconnects == 1
+    assert counters.lost >= missing - 3
+
+
+def _send_until(port: int, enough: Callable[[], bool]) -> None:
+    """Send a value with a time on a grid of ``STEP``, as it comes, until ``enough``."""
+    sent = 0.0
+    with publisher(port) as client:
+        while not enough():
+            moment = STEP * math.floor(time.time() / STEP)
+            if moment > sent:
+                client.publish("motor", document(60.0, moment))
+                sent = moment
+            time.sleep(0.2 * STEP)
+
+
+# paho-mqtt leaves the socket of a handshake that fails to the garbage collector.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_wrong_authority_is_named_and_the_right_one_accepted(tmp_path: Path) -> None:
+    from cryptography import x509  # noqa: PLC0415 - only here
+    from cryptography.hazmat.primitives.serialization import Encoding  # noqa: PLC0415
+
+    port, pems = free_port(socket.SOCK_STREAM), {}
+    for name in ("broker", "stranger"):
+        der, _ = certificate(tmp_path, name)
+        pems[name] = tmp_path / f"{name}.crt"
+        pems[name].write_bytes(x509.load_der_x509_certificate(der.read_bytes()).public_bytes(Encoding.PEM))
+    setup = setup_of(tmp_path, omega=SPEED)
+    with mqtt_broker(port, tmp_path, tls=(pems["broker"], tmp_path / "broker.pem")):
+        with opened(port, setup, tls=True, ca=pems["stranger"].name) as (driver, _):
+            wait_for(lambda: "certificate is refused" in driver.link().reason)
+        with opened(port, setup, tls=True, ca=pems["broker"].name) as (driver, _):
+            wait_for(lambda: driver.link().up)
+
+
+def test_a_server_that_is_no_broker_and_files_that_are_none_are_named(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        with opened(other.getsockname()[1], setup_of(omega=SPEED)) as (driver, _):
+            with other.accept()[0] as connection:
+                connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+            wait_for(lambda: driver.link().reason != "not connected yet")
+        assert not driver.link().up
+    (tmp_path / "ca").write_text("nothing")
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        mqtt.build(mqtt.Options(host="a", tls=True, ca=Path("ca")), setup_of(tmp_path, omega=SPEED))
+
+
+@pytest.mark.parametrize(("time_format", "unit"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_a_time_field_keeps_the_spacing_of_the_sender(time_format: str, unit: float) -> None:
+    read = messages(time="t", time_format=time_format)
+    samples: list[Sample] = []
+    for index in range(50):
+        delay = 0.002 + 0.03 * (index % 5)
+        stamp = (1.7e9 + 0.01 * index) * unit
+        samples += read.take("motor", document(60.0, stamp), 5.0 + 0.01 * index + delay, retained=False)
+    spacing = [after.time - before.time for before, after in pairwise(samples)]
+    assert spacing == pytest.approx([0.01] * 49, abs=1e-4)
+    assert samples[0].time == pytest.approx(5.002, abs=1e-4)
+    assert read.bad == 0
+
+
+def test_a_time_may_be_iso_8601_and_a_step_back_is_bad() -> None:
+    read = messages(time="t", time_format="iso")
+    assert read.take("motor", document(1.0, "2026-03-02T14:05:12.250+01:00"), 9.0, retained=False)
+    assert read.take("motor", document(1.0, "2026-03-02T13:05:12.260Z"), 9.01, retained=False)
+    assert not read.take("motor", document(1.0, "2026-03-02T13:05:02Z"), 9.02, retained=False)
+    assert not read.take("motor", document(1.0, "yesterday"), 9.03, retained=False)
+    assert "no ISO 8601" in read.topics["motor"].fault
+    assert read.bad == 2
+
+
+def test_senders_with_two_clocks_do_not_move_each_other() -> None:
+    options = mqtt.Options(host="broker", time="t", time_format="s")
+    other = {"topic": "other", "field": "values.speed", "unit": "A"}
+    read = Messages(options, setup_of(omega=SPEED, i=other).signals)
+    for index in range(20):
+        now = 5.0 + 0.01 * index
+        (one,) = read.take("motor", document(1.0, now + 100.0), now + 0.001, retained=False)
+        (two,) = read.take("other", document(1.0, now - 100.0), now + 0.001, retained=False)
+        assert (one.time, two.time) == pytest.approx((now + 0.001, now + 0.001))
+
+
+def test_what_a_message_lacks_is_named() -> None:
+    read = messages()
+    (sample,) = read.take("motor", b'{"values": {"torque": 1}}', 1.0, retained=False)
+    assert math.isnan(sample.value)
+    assert read.topics["motor"].fault == "a message without values.speed: it has torque"
+
+
+@given(st.binary(max_size=200) | st.text(max_size=100).map(str.encode) | st.just(b"[" * 50_000) | st.just(b"1" * 5000))
+def test_no_message_raises(payload: bytes) -> None:
+    read = messages(time="t")
+    read.take("motor", payload, 1.0, retained=False)
+    assert read.bad <= 2
+
+
+def test_a_huge_message_is_refused() -> None:
+    read = messages()
+    assert read.take("motor", b" " * (MAX_PAYLOAD + 1), 1.0, retained=False) == []
+    assert read.bad == 1
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats() | st.text(),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    )
+)
+def test_no_value_in_a_message_raises(value: Any) -> None:
+    (sample,) = messages().take("motor", document(value), 1.0, retained=False)
+    assert math.isnan(sample.value) or isinstance(value, bool | int | float)
+
+
+def test_paths_reach_into_lists() -> None:
+    assert at({"axes": [{"speed": 3}]}, "axes[0].speed") == 3
+    assert at([[1, 2]], "[0][1]") == 2
+
+
+def test_sampling_follows_from_the_times() -> None:
+    for keys, sampling in (({}, Sampling.CYCLIC), ({"time": "t"}, Sampling.POLLED)):
+        options = mqtt.Options.model_validate({"host": "a"} | keys)
+        assert mqtt.build(options, setup_of(omega=SPEED)).sampling is sampling
+
+
+@pytest.mark.parametrize(
+    ("options", "source"),
+    [
+        ({}, {"topic": "motor/+", "unit": "A"}),
+        ({}, {"topic": "motor", "field": "a..b", "unit": "A"}),
+        ({"user": "me"}, {"topic": "motor", "unit": "A"}),
+        ({"ca": "ca.pem"}, {"topic": "motor", "unit": "A"}),
+        ({"time": "t"}, {"topic": "motor", "unit": "A"}),
+        ({}, {"topic": "motor", "unit": "V"}),
+    ],
+)
+def test_what_does_not_fit_is_refused(options: dict[str, Any], source: dict[str, Any]) -> None:
+    with pytest.raises((ValueError, ConfigurationError)):
+        mqtt.build(mqtt.Options.model_validate({"host": "a"} | options), setup_of(i=source))

@@ -1,0 +1,238 @@
+"""The OPC UA driver against asyncua's server in another process: times, faults, security; no server may end it."""
+
+import json
+import math
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from otolith.cli.main import cli
+from otolith_drivers.base import Sample, Setup, Signal
+from otolith_drivers.errors import ConfigurationError, DeviceError
+from otolith_drivers.opcua import driver as opcua
+from otolith_drivers.opcua.readings import MAX_AGE
+from tests.conftest import free_port
+from tests.drivers.certificates import certificate
+from tests.drivers.opcua_server import opcua_server, server_of_this_process
+from tests.waiting import wait_for
+
+VALUES = {"i": (2.0, "A"), "omega": (10.0, "rad/s")}
+
+
+def setup_of(folder: Path, **nodes: str) -> Setup:
+    units = {"i": "A", "omega": "rad/s"}
+    own = {"omega": "rad/s"}  # the unit of the current is that of the server
+    signals = [Signal(name, units[name], opcua.Source(node=node, unit=own.get(name))) for name, node in nodes.items()]
+    return Setup(tuple(signals), folder, 0.01)
+
+
+@contextmanager
+def opened(port: int, folder: Path, *, nodes: dict[str, str] | None = None, **keys: Any) -> Iterator[
+    tuple[opcua.OpcuaSubscriber, list[Sample]]
+]:  # fmt: skip
+    options = opcua.Options.model_validate({"endpoint": f"opc.tcp://127.0.0.1:{port}/motor"} | keys)
+    setup = setup_of(folder, **(nodes or {"i": "ns=2;s=i", "omega": "ns=2;s=omega"}))
+    driver, samples = opcua.build(options, setup), list[Sample]()
+    driver.open(samples.extend)
+    try:
+        yield driver, samples
+    finally:
+        driver.close()
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    return server_of_this_process()
+
+
+def test_a_server_that_hangs_or_is_killed_and_comes_back_costs_counted_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opcua, "BACKOFF_MAX", 0.3)
+    port = free_port(socket.SOCK_STREAM)
+    with opcua_server(port, VALUES) as server, opened(port, tmp_path, timeout="0.5 s") as (driver, samples):
+        wait_for(lambda: len(samples) > 100)
+        server.send_signal(signal.SIGSTOP)
+        wait_for(lambda: "no answer" in driver.link().reason or "no message" in driver.link().reason)
+        server.send_signal(signal.SIGCONT)
+        wait_for(lambda: driver.link().up)
+        server.kill()
+        server.wait()
+        wait_for(lambda: driver.link().reason == "Connection refused")
+        before, gone = len(samples), samples[-1].time
+        with opcua_server(port, VALUES):
+            wait_for(lambda: len(samples) > before + 100)
+            assert driver.link().up
+            counters = driver.counters()
+    first = samples[before].time
+    assert counters.reconnects == 2
+    assert counters.lost >= 0.9 * 2 * 100 * (first - gone)
+
+
+def test_stamps_of_a_clock_an_hour_ahead_are_refused_and_those_of_the_server_used(port: int, tmp_path: Path) -> None:
+    with opened(port, tmp_path, nodes={"i": "ns=2;s=ahead"}) as (driver, samples):
+        wait_for(lambda: driver.counters().bad > 10)
+        assert "known within" in driver.link().plan
+        assert samples == []
+    with opened(port, tmp_path, nodes={"i": "ns=2;s=ahead"}, stamps="server") as (driver, samples):
+        wait_for(lambda: len(samples) > 10)
+        assert driver.counters().bad == 0
+        assert all(abs(time.monotonic() - sample.time) < MAX_AGE for sample in samples)
+
+
+def test_a_value_that_stays_is_repeated_while_the_server_sends_messages(port: int, tmp_path: Path) -> None:
+    with opened(port, tmp_path, nodes={"i": "ns=2;s=still"}) as (driver, samples):
+        wait_for(lambda: len(samples) > 10)
+        assert driver.link().up
+        assert driver.counters().bad == 0
+        now = time.monotonic()
+    assert {sample.value for sample in samples} == {3.0}
+    assert all(sample.time <= now for sample in samples)
+
+
+def test_a_bad_status_is_counted_and_not_used(port: int, tmp_path: Path) -> None:
+    with opened(port, tmp_path, nodes={"i": "ns=2;s=bad", "omega": "ns=2;s=omega"}) as (driver, samples):
+        wait_for(lambda: driver.counters().bad > 10 and len(samples) > 50)
+        assert any("BadSensorFailure" in line for line in driver.link().warnings)
+    assert all(math.isnan(sample.value) for sample in samples if sample.signal == "i")
+
+
+def test_an_unknown_node_and_a_missing_unit_are_named(port: int, tmp_path: Path) -> None:
+    nodes = {"i": "ns=2;s=Current", "omega": "ns=2;s=omega"}
+    with opened(port, tmp_path, nodes=nodes) as (driver, samples):
+        wait_for(lambda: len(samples) > 10)
+        (line,) = driver.link().warnings
+    assert "i: ns=2;s=Current" in line
+    assert {sample.signal for sample in samples} == {"omega"}
+    with opened(port, tmp_path, nodes={"i": "ns=0;i=2267"}) as (driver, _):
+        wait_for(lambda: "set 'unit'" in driver.link().reason)
+
+
+def test_a_server_of_another_kind_and_none_are_named(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with opened(port, tmp_path, timeout="0.2 s") as (driver, _):
+            wait_for(lambda: "no answer within" in driver.link().reason)
+            other.close()
+            wait_for(lambda: driver.link().reason == "Connection refused")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("certificates")
+    for name in ("server", "client", "stranger"):
+        certificate(folder, name)
+    (folder / "trusted").mkdir()
+    (folder / "trusted" / "client.der").write_bytes((folder / "client.der").read_bytes())
+    (folder / "password").write_text("secret\n")
+    (folder / "wrong").write_text("guess\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def secure(folder: Path) -> Iterator[int]:
+    port = free_port(socket.SOCK_STREAM)
+    files = (
+        "--certificate",
+        folder / "server.der",
+        "--key",
+        folder / "server.pem",
+        "--trusted",
+        folder / "trusted",
+    )
+    with opcua_server(port, VALUES, *map(str, files), "--user"):
+        yield port
+
+
+def keys_of(folder: Path, name: str = "client", **changed: Any) -> dict[str, Any]:
+    keys = {"security": "Basic256Sha256", "certificate": folder / f"{name}.der", "key": folder / f"{name}.pem"}
+    user = {"user": "otolith", "password_file": "password", "server_certificate": folder / "server.der"}
+    return keys | user | changed
+
+
+def test_values_come_signed_and_encrypted(secure: int, folder: Path) -> None:
+    with opened(secure, folder, **keys_of(folder)) as (driver, samples):
+        wait_for(lambda: len(samples) > 50)
+        assert driver.link().up
+
+
+@pytest.mark.parametrize(
+    ("name", "changed", "reason"),
+    [
+        ("stranger", {}, "refuses the certificate"),
+        ("client", {"password_file": "wrong"}, "refuses user 'otolith': is the password right?"),
+        ("client", {"server_certificate": "stranger.der"}, "the server's certificate is not that of"),
+        ("client", {"mode": "sign"}, "the server has not Basic256Sha256, sign; it offers"),
+    ],
+)
+def test_each_refusal_is_a_line_with_its_cause(
+    secure: int, folder: Path, name: str, changed: dict[str, Any], reason: str
+) -> None:
+    with opened(secure, folder, **keys_of(folder, name, **changed)) as (driver, samples):
+        wait_for(lambda: driver.link().reason != "not connected yet")
+        assert reason in driver.link().reason
+    assert samples == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "fault"),
+    [
+        ({"key": "stranger.pem"}, "is not the key of"),
+        ({"certificate": "password"}, "is no X.509 certificate"),
+        ({"key": "password"}, "is no private key"),
+        ({"password_file": "absent"}, "absent: cannot be read"),
+    ],
+)
+def test_a_wrong_file_is_refused_before_connecting(folder: Path, changed: dict[str, Any], fault: str) -> None:
+    keys = keys_of(folder, **changed) | {"endpoint": "opc.tcp://127.0.0.1:1"}
+    with pytest.raises(ConfigurationError, match=fault):
+        opcua.build(opcua.Options.model_validate(keys), setup_of(folder, i="ns=2;s=i"))
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"endpoint": "http://plc"},
+        {"endpoint": "opc.tcp://user:secret@plc:4840"},
+        {"endpoint": "opc.tcp://plc", "security": "Basic256Sha256"},
+        {"endpoint": "opc.tcp://plc", "user": "otolith"},
+    ],
+)
+def test_options_that_do_not_fit_are_refused(keys: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=r"endpoint|set"):
+        opcua.Options.model_validate(keys)
+
+
+def test_probe_lists_the_variables_with_value_type_and_unit(port: int) -> None:
+    command = ["probe", "opcua", f"opc.tcp://127.0.0.1:{port}/motor"]
+    result = CliRunner().invoke(cli, command, standalone_mode=False, catch_exceptions=False)
+    assert 'i = { node = "ns=2;s=i" }  # i: 2.0 A, Double' in result.output
+    assert (
+        'bad = { node = "ns=2;s=bad" }  # bad: None A, Double' in result.output or "BadSensorFailure" in result.output
+    )
+    document = json.loads(CliRunner().invoke(cli, [*command, "--json"], standalone_mode=False).output)
+    assert [(one["node"], one["unit"]) for one in document["variables"]][:2] == [
+        ("ns=2;s=i", "A"),
+        ("ns=2;s=omega", ""),
+    ]
+
+
+def test_probe_of_no_server_is_one_line() -> None:
+    with pytest.raises(DeviceError, match="Connection refused"):
+        CliRunner().invoke(
+            cli, ["probe", "opcua", "opc.tcp://127.0.0.1:9"], standalone_mode=False, catch_exceptions=False
+        )
+
+
+def test_windows_wait_for_the_messages_of_a_slow_subscription(port: int, tmp_path: Path) -> None:
+    with opened(port, tmp_path, interval="0.4 s") as (driver, samples):
+        wait_for(lambda: len(samples) > 100)
+        assert driver.link().latency == pytest.approx(0.4)
+        assert driver.counters().lost == 0
