@@ -140,7 +140,7 @@ def transport_of(machine: LoadedMachine) -> str:
     Raises:
         ConfigurationError: the machine is read in a way that no simulated machine offers.
     """
-    driver = machine.file.driver
+    driver = machine.file.drivers[0]
     kind, is_tcp = driver.get("type"), driver.get("framing", "tcp") == "tcp"
     if kind == "can":
         return "can"

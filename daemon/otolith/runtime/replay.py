@@ -19,7 +19,8 @@ from otolith.acquisition.recording_statistics import RecordingStatistics
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
-from otolith.machine import LoadedMachine, RecordedMachine, driver_config
+from otolith.machine import LoadedMachine, RecordedMachine
+from otolith.machine_drivers import driver_configs
 from otolith.runtime.worker import perform
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
@@ -47,14 +48,14 @@ def open_recorded(machine: LoadedMachine, data: Path) -> Reader:
     Raises:
         ConfigurationError: the file or a signal is missing, or the machine file does not describe the frames.
     """
-    kind = machine.file.driver.get("type")
+    kind = machine.file.drivers[0].get("type") if machine.file.drivers else None
     has_frames = holds_frames(data)
     if has_frames and kind not in ("can", "replay"):
         needed = '[driver] with type = "can" and [signals] must describe its frames'
         raise ConfigurationError(f"{data}: a log of a CAN bus, and in {machine.path} {needed}")
     if not has_frames and kind != "replay":
         return _open_by_name(machine, data)
-    config = driver_config(machine.file, machine.twin, read(machine.path))
+    (config,) = driver_configs(machine.file, machine.twin, read(machine.path))
     if kind == "can":
         with config.located_errors():
             return format_of(data).open_log(data, config.setup, config.options)

@@ -22,9 +22,10 @@ from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
-from otolith.health.schema import CountersDocument, DriverDocument, Report, ReportDocument
+from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
+from otolith.publishing.connection import driver_document, with_missing_sources
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS, ChildProcess
 from otolith.runtime.systemd import Notifier
@@ -199,7 +200,7 @@ class Service:
         latency = max(0.0, time.time() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         link = self._machine.driver.link()
-        driver = DriverDocument(up=link.up, reason=link.reason, warnings=link.warnings, plan=link.plan)
+        driver = driver_document(link)
         rings, driver_counters = self._rings.counters(), self._machine.driver.counters()
         counters = CountersDocument(
             received=rings.received,
@@ -212,9 +213,9 @@ class Service:
             worker_restarts=self._supervisor.restarts,
             recordings_dropped=self._recordings_dropped,
         )
-        document = document.model_copy(
-            update={"cost": cost, "counters": counters, "driver": driver, "notes": self._notes}
-        )
+        parameters = with_missing_sources(document.parameters, driver)
+        update = {"cost": cost, "counters": counters, "driver": driver, "parameters": parameters, "notes": self._notes}
+        document = document.model_copy(update=update)
         if self._publisher is not None:
             self._publisher.publish(document)
         if self._machine.file.recording.enabled:

@@ -40,7 +40,8 @@ NAME = re.compile(r".* measured \[(.*)\]")  # of a series; the group is the unit
 class TimesRecord(StrictModel):
     """What the times of a recording mean, as the recorder writes it."""
 
-    sampling: Sampling
+    sampling: Sampling | dict[str, Sampling]
+    """Of all signals, or by signal."""
     delays: dict[str, float]
     """By signal, s."""
 

@@ -11,7 +11,7 @@ from otolith.cli.common import progress_line
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import prefix
 from otolith.runtime.preview import preview_lines, preview_recording
-from otolith_drivers.base import Sample
+from otolith_drivers.base import Link, Sample
 from otolith_drivers.user_dirs import check_writable
 
 # Engineering choices, guarded by tests/cli/test_check.py.
@@ -121,23 +121,33 @@ def _listen(machine: LoadedMachine) -> tuple[Counter[str], list[str]]:
     begun = time.monotonic()
     driver.open(deliver)
     time.sleep(max(LISTEN, MIN_PERIODS * period))
-    while time.monotonic() < begun + PATIENCE and len(counts) < len(signals) and not driver.link().warnings:
+    while time.monotonic() < begun + PATIENCE and len(counts) < len(signals) and not _causes(driver.link()):
         time.sleep(PAUSE)
     link, seconds = driver.link(), time.monotonic() - begun
     driver.close()
+    neighbours = {signal: state.signals for state in link.sources for signal in state.signals}
     lines = []
     for signal in signals:
-        remark = _remark(counts[signal], seconds / period, any_came=bool(counts))
+        any_came = any(counts[other] for other in neighbours.get(signal, signals))
+        remark = _remark(counts[signal], seconds / period, any_came=any_came)
         value = f", now {latest[signal]:.4g} {machine.twin.unit_of(signal)}" if signal in latest else ""
         none_usable = ", none of them a number" if counts[signal] and not value else ""
         lines.append(f"received {signal}: {counts[signal]} samples in {seconds:.1f} s{remark}{value}{none_usable}")
     lines += [f"polling: {link.plan}"] if link.plan else []
     lines += link.warnings
     lines += [] if link.up else [f"no connection: {link.reason}"]
-    kind = machine.file.driver.get("type")
-    if kind in PROBED and len(latest) < len(signals):
-        lines.append(f"'otolith probe {kind}' shows what is on the bus")
+    for table in machine.file.drivers:
+        kind = table.get("type")
+        of_source = next((state.signals for state in link.sources if state.name == table.get("name")), signals)
+        if kind in PROBED and not set(of_source) <= set(latest):
+            lines.append(f"'otolith probe {kind}' shows what is on the bus")
     return counts, lines
+
+
+def _causes(link: Link) -> list[str]:
+    """The warnings of all sources, without those that are not connected yet."""
+    links = [state.link for state in link.sources] or [link]
+    return [warning for each in links for warning in each.warnings]
 
 
 def _remark(count: int, expected: float, *, any_came: bool) -> str:
