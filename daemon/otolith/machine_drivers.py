@@ -25,6 +25,8 @@ class DriverConfig:
     """Of the source; the type of the driver if the file has no name."""
     place: tuple[int | str, ...]
     """Where the file has its table."""
+    kind: str
+    """Its ``type``."""
     module: DriverType
     options: Any
     """Instance of the module's ``Options``."""
@@ -141,7 +143,7 @@ def _driver_config(
         for signal in signals
     )
     setup = Setup(own, source.path.parent, file.window.sample_period)
-    return DriverConfig(table.get("name", kind), place, module, options, setup, source)
+    return DriverConfig(table.get("name", kind), place, kind, module, options, setup, source)
 
 
 def build_driver(configs: Sequence[DriverConfig]) -> Driver:

@@ -5,10 +5,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import cast
 
+import numpy as np
 import pytest
 
 from otolith.estimation.information import Identifiability
-from otolith.health.schema import ParameterDocument, Status
+from otolith.health.schema import ParameterDocument, Status, Traces
 from otolith.publishing.connection import driver_document, with_missing_sources
 from otolith_drivers import conformance
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sample, Sampling
@@ -99,13 +100,29 @@ def parameter(status: Status) -> ParameterDocument:
     )  # fmt: skip
 
 
-def test_a_parameter_that_is_not_estimated_names_the_source_that_is_down() -> None:
+def window(**missing: bool) -> Traces:
+    """The curves of a window in which some signals have no sample."""
+    values = {name: np.where(missing.get(name, False), np.nan, np.ones(3)) for name in ("i", "omega", "V_a")}
+    measured = np.column_stack([values["i"], values["omega"]])
+    return Traces(np.arange(3.0), ("i", "omega"), measured, None, (1.0, 1.0), ("V_a",), values["V_a"][:, None])
+
+
+@pytest.mark.parametrize(
+    ("link", "cause"),
+    [
+        (DOWN, "is down: connection refused"),
+        (UP, "is silent: frame 0x1 is silent"),
+        (Link(up=True), "sent nothing in this window"),
+    ],
+)
+def test_a_parameter_that_is_not_estimated_names_the_source_that_gave_no_sample(link: Link, cause: str) -> None:
     parameters = {"R_a": parameter(Status.ESTIMATED), "J": parameter(Status.HELD)}
-    named = with_missing_sources(parameters, driver_document(both(UP, DOWN)[0].link()))
+    driver = driver_document(both(UP, link)[0].link())
+    named = with_missing_sources(parameters, driver, window(omega=True))
     assert named["R_a"] == parameters["R_a"]
-    missing = "omega missing, because source 'encoder' is down: connection refused"
-    assert named["J"].reason == f"{missing}; the current does not change"
-    assert with_missing_sources(parameters, driver_document(both(UP, UP)[0].link())) == parameters
+    assert named["J"].reason == f"omega missing, because source 'encoder' {cause}; the current does not change"
+    assert with_missing_sources(parameters, driver, window()) == parameters
+    assert with_missing_sources(parameters, driver, window(i=True)) == parameters
 
 
 @contextmanager

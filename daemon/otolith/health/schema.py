@@ -262,6 +262,8 @@ class SourceDocument(StrictModel):
     up: bool
     reason: str = ""
     """Why it is down."""
+    warnings: tuple[str, ...] = ()
+    """What is wrong although it is up, a line each."""
     received: int = 0
     """Samples."""
     bad: int = 0

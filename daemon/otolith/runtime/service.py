@@ -213,7 +213,7 @@ class Service:
             worker_restarts=self._supervisor.restarts,
             recordings_dropped=self._recordings_dropped,
         )
-        parameters = with_missing_sources(document.parameters, driver)
+        parameters = with_missing_sources(document.parameters, driver, report.traces)
         update = {"cost": cost, "counters": counters, "driver": driver, "parameters": parameters, "notes": self._notes}
         document = document.model_copy(update=update)
         if self._publisher is not None:
