@@ -80,6 +80,7 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         *(f"  {name} = {text}" for name, text, _ in twin.definitions),
         *(f"  {left} = {right}" for left, right in twin.equations),
         *(machine.driver.describe() if machine.built_driver else sources),
+        *_delays(machine),
         f"windows of {file.window.length:g} s, {machine.records} records",
     ]
     for name, value in problem.known:
@@ -102,6 +103,14 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     lines.append(f"reports on {endpoints}, keys {prefix(file.machine.site, file.machine.name)}/...")
     lines.append(f"recordings into {machine.recording_folder}" if file.recording.enabled else "no recordings")
     return lines
+
+
+def _delays(machine: LoadedMachine) -> list[str]:
+    """The declared delays; sources without any are unlikely to be equally late."""
+    declared = {name: table.delay for name, table in machine.signal_tables.items() if table.delay}
+    if not declared and len(machine.file.drivers) > 1:
+        return ["no signal has a delay: 'otolith noise' identifies by how much one source is later than another"]
+    return [f"delay of {name}: {1e3 * delay:g} ms" for name, delay in declared.items()]
 
 
 def _origin(name: str, in_file: Container[str]) -> str:
