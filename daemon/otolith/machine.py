@@ -115,6 +115,7 @@ class LoadedMachine:
         twin, problem = self.twin, self.problem
         holds = {driven.name: driven.hold for driven in twin.inputs}
         noise = dict(zip(holds, problem.input_noise, strict=True))
+        has_sources = len(self.file.drivers) > 1
         return tuple(
             SignalPlan(
                 name=name,
@@ -124,7 +125,7 @@ class LoadedMachine:
                 on_change=self.signal_tables[name].on_change,
                 noise=noise.get(name, 0.0),
                 checks=frozenset(self.signal_tables[name].checks),
-                source=self.signal_tables[name].source or "",
+                source=(self.signal_tables[name].source or "") if has_sources else "",
             )
             for name in twin.signals
         )

@@ -135,7 +135,7 @@ class DriverType(Protocol):
     """What a row of the registry points to: a module with these three names."""
 
     Options: type[StrictModel]
-    """The keys of ``[driver]`` except ``type``."""
+    """The keys of ``[driver]`` except ``type`` and ``name``."""
     Source: type[StrictModel]
     """The keys of each signal in ``[signals]``."""
 

@@ -175,3 +175,14 @@ def test_what_was_learned_belongs_to_the_sources_of_the_signals(tmp_path: Path) 
     assert fingerprint('host = "127.0.0.1"', 'host = "192.168.0.7"') == fingerprint()
     assert fingerprint('source = "encoder"', 'source = "drive"') != fingerprint()
     assert fingerprint("port = 1502", 'order = "CDAB"') != fingerprint()
+
+
+def test_one_driver_is_one_source_whether_signals_name_it_or_not(tmp_path: Path) -> None:
+    """Signals of different sources have clocks of their own."""
+    text = (
+        (EXAMPLES / "dc-motor-modbus.toml").read_text(encoding="utf-8").replace("[driver]", '[driver]\nname = "drive"')
+    )
+    path = tmp_path / "machine.toml"
+    path.write_text(text.replace("V_a = { ", 'V_a = { source = "drive", '), encoding="utf-8")
+    machine = load_machine(path)
+    assert {plan.source for plan in machine.plans(machine.driver.sampling)} == {""}
