@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, Verdict
 from otolith.cli.replay import replay
 from otolith.health.schema import ReportDocument, Status
 from otolith_drivers.errors import ConfigurationError
@@ -75,6 +75,36 @@ def test_a_late_speed_with_jitter_costs_little(tmp_path: Path, capsys: pytest.Ca
         assert parameter.sd <= MAX_RATIO * reference.sd, name
     assert not any(report.components for report in two)
     assert two[-1].parameters["R_a"].status is Status.ESTIMATED
+
+
+@pytest.mark.parametrize("gone", ["drive", "encoder"])
+def test_one_source_gone_degrades_only_what_needs_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], gone: str
+) -> None:
+    """Without the drive nothing is estimated; without the encoder the current still gives the resistance."""
+    scenario, hole, count = motor(), (BEGUN + 10.0, BEGUN + 18.0), 2400
+    frames, table = frames_of(scenario, count), speeds(tmp_path, scenario, np.full(count, DELAY))
+    if gone == "drive":
+        frames = [frame for frame in frames if not hole[0] <= frame.timestamp < hole[1]]
+    else:
+        heading, *rows = table.read_text(encoding="utf-8").splitlines()
+        rows = [row for row in rows if not hole[0] <= float(row.split(",")[0]) < hole[1]]
+        table.write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
+    windows = reports(machine(tmp_path), f"drive={written_log(tmp_path, frames, '.log')},encoder={table}", capsys)
+    truth = next(simulate(scenario)).truth
+    for name in windows[-1].parameters:
+        for report in windows:
+            parameter = report.parameters[name]
+            assert parameter.value is not None
+            assert parameter.sd is not None
+            assert abs(parameter.value - truth[name]) <= MAX_DEVIATION * parameter.sd, name
+    before, inside = windows[4], windows[6:8]
+    for report in inside:
+        assert report.window.quality.verdict is (Verdict.BAD if gone == "drive" else Verdict.GOOD)
+        assert report.parameters["R_a"].status is (Status.HELD if gone == "drive" else Status.ESTIMATED)
+        assert (report.parameters["D"].sd or 0.0) > (before.parameters["D"].sd or np.inf)
+    assert (windows[-1].parameters["D"].sd or np.inf) < (inside[-1].parameters["D"].sd or 0.0)
+    assert windows[-1].parameters["R_a"].status is Status.ESTIMATED
 
 
 def test_both_logs_have_the_same_result_in_any_order(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
