@@ -77,6 +77,24 @@ def test_a_late_speed_with_jitter_costs_little(tmp_path: Path, capsys: pytest.Ca
     assert two[-1].parameters["R_a"].status is Status.ESTIMATED
 
 
+def test_a_recording_of_several_sources_gives_the_same_estimates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The recording has what the times of each signal mean."""
+    scenario, path, recording = motor(), machine(tmp_path), tmp_path / "run.rrd"
+    bus = written_log(tmp_path, frames_of(scenario, 1000), ".log")
+    table = speeds(tmp_path, scenario, np.full(1000, DELAY))
+    data = Path(f"drive={bus},encoder={table}")
+    replay(path, [data], recording, as_json=True, stopped=lambda: False)
+    live = [ReportDocument.from_json(line) for line in capsys.readouterr().out.splitlines()]
+    again = reports(path, str(recording), capsys)
+    assert 0 <= len(live) - len(again) <= 1  # the end of the recording may be too short for its last window
+    for name, parameter in live[len(again) - 1].parameters.items():
+        assert parameter.sd is not None
+        assert again[-1].parameters[name].value == pytest.approx(parameter.value, abs=0.2 * parameter.sd)
+        assert again[-1].parameters[name].sd == pytest.approx(parameter.sd, rel=0.05)
+
+
 @pytest.mark.parametrize("gone", ["drive", "encoder"])
 def test_one_source_gone_degrades_only_what_needs_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], gone: str
