@@ -40,6 +40,7 @@ SLOWEST = (
     "system/test_transports.py",
     "discovery/test_experiment_design.py",
     "system/test_service.py",
+    "system/test_two_buses.py",
     "estimation/test_data_checks_sensors.py",
     "system/test_replayed.py",
     "cli/test_replay.py",

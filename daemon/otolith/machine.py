@@ -3,11 +3,10 @@
 Errors name file, line and key.
 """
 
-import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
 from otolith.health.diagnosis import Rule, RulesFile
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan
+from otolith.machine_drivers import build_driver, driver_configs, own_keys
 from otolith.machine_file import (
     DiscoveryTable,
     LimitsTable,
@@ -30,10 +30,9 @@ from otolith.twin.augmentation import sources
 from otolith.twin.component_families import FAMILY_NAMES
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import read_twin
-from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal
-from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
+from otolith_drivers.base import Driver, Sampling, sampling_of
+from otolith_drivers.config_files import Context, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.registry import find
 from otolith_drivers.units import Quantity, limit_values
 from otolith_drivers.user_dirs import state_directory
 
@@ -56,8 +55,8 @@ class RecordedMachine:
     twin: Definition
     parameters: Sequence[Parameter]
     """Those that are estimated."""
-    sampling: Sampling
-    """Meaning of the times of its samples."""
+    sampling: Sampling | Mapping[str, Sampling]
+    """Meaning of the times of its samples, the same for all signals or by signal."""
     delays: Mapping[str, float]
     """Of its signals, s: they are subtracted from the times of the records."""
     all_curves: bool = False
@@ -102,7 +101,7 @@ class LoadedMachine:
         """Records of the first window."""
         return self.problem.window.records
 
-    def recorded(self, sampling: Sampling) -> RecordedMachine:
+    def recorded(self, sampling: Sampling | Mapping[str, Sampling]) -> RecordedMachine:
         """Return what a recording has beside the reports; ``sampling`` is the meaning of the times of the source."""
         delays = {name: self.signal_tables[name].delay for name in self.twin.signals}
         all_curves = self.file.recording.all_curves
@@ -116,20 +115,22 @@ class LoadedMachine:
             window.missing_limit, window.gap_limit, window.jitter_limit, window.surplus_limit, window.irregularity_limit
         )
 
-    def plans(self, sampling: Sampling) -> tuple[SignalPlan, ...]:
+    def plans(self, sampling: Sampling | Mapping[str, Sampling]) -> tuple[SignalPlan, ...]:
         """Return how each signal is sampled; ``sampling`` is the meaning of the times of the source."""
         twin, problem = self.twin, self.problem
         holds = {driven.name: driven.hold for driven in twin.inputs}
         noise = dict(zip(holds, problem.input_noise, strict=True))
+        has_sources = len(self.file.drivers) > 1
         return tuple(
             SignalPlan(
                 name=name,
                 hold=holds.get(name),
-                sampling=self.signal_tables[name].times or self.file.window.times or sampling,
+                sampling=self.signal_tables[name].times or self.file.window.times or sampling_of(sampling, name),
                 delay=self.signal_tables[name].delay,
                 on_change=self.signal_tables[name].on_change,
                 noise=noise.get(name, 0.0),
                 checks=frozenset(self.signal_tables[name].checks),
+                source=(self.signal_tables[name].source or "") if has_sources else "",
             )
             for name in twin.signals
         )
@@ -139,9 +140,13 @@ class LoadedMachine:
         """Hash of everything in the file that signal values depend on; empty if the file has no signals."""
         if not self.file.signals:
             return ""
-        options = {key: self.file.driver.get(key) for key in FINGERPRINT_KEYS}
-        read = {name: _own(table) for name, table in self.file.signals.items()}
-        text = json.dumps([read, options], sort_keys=True, default=str)
+        tables = self.file.drivers or ({},)
+        options: list[Any] = [{key: table.get(key) for key in FINGERPRINT_KEYS} for table in tables]
+        read: dict[str, Any] = {name: own_keys(table) for name, table in self.file.signals.items()}
+        if len(tables) > 1:
+            options = [[table["name"], options[number]] for number, table in enumerate(tables)]
+            read = {name: [table.get("source"), read[name]] for name, table in self.file.signals.items()}
+        text = json.dumps([read, *options], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
@@ -173,10 +178,8 @@ def load_machine(path: Path, *, with_driver: bool = True, for_replay: bool = Fal
     tables = {name: signals.get(name, SignalTable()) for name in twin.signals}
     problem = replace(_problem(file, twin, context), unchecked=_unchecked(tables))
     driver = None
-    if with_driver and (file.driver or file.signals or not for_replay):
-        config = driver_config(file, twin, source)
-        with config.located_errors():
-            driver = config.module.build(config.options, config.setup)
+    if with_driver and (file.drivers or file.signals or not for_replay):
+        driver = build_driver(driver_configs(file, twin, source))
     return LoadedMachine(path, file, twin, problem, _plan(file, twin, problem, context), tables, driver)
 
 
@@ -222,65 +225,6 @@ def _twin(file: MachineFile, path: Path, context: Context) -> Definition:
         return load_twin(path.parent / file.twin.file)
     with context.at("twin", "name"):
         return find_twin(file.twin.name or "")
-
-
-@dataclass(frozen=True, slots=True)
-class DriverConfig:
-    """The driver that a machine file names, with its validated options."""
-
-    module: DriverType
-    options: Any
-    """Instance of the module's ``Options``."""
-    setup: Setup
-    source: SourceFile
-
-    @contextlib.contextmanager
-    def located_errors(self) -> Iterator[None]:
-        """Add file and line to the errors of a driver, which knows only the key."""
-        try:
-            yield
-        except ConfigurationError as error:
-            if error.key:
-                Context(self.source).fail(error.key, str(error))
-            raise
-
-
-def driver_config(file: MachineFile, twin: Definition, source: SourceFile) -> DriverConfig:
-    """Return what ``[driver]`` and ``[signals]`` configure.
-
-    Raises:
-        ConfigurationError: a table is missing, or has an unknown or invalid key, or does not fit the twin.
-    """
-    context = Context(source)
-    if not file.driver:
-        remedy = "write [driver] with type = \"can\" or another driver, and [signals]; only 'otolith replay' needs none"
-        context.fail(("driver",), f"missing: {remedy}")
-    needed = list(twin.signals)
-    for name in file.signals:
-        if name not in needed:
-            context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, needed)}")
-    for name in needed:
-        if name not in file.signals:
-            context.fail(("signals",), f"{name} ({twin.unit_of(name)}) is missing: the twin needs {', '.join(needed)}")
-    with context.at("driver", "type"):
-        kind = file.driver.get("type")
-        if not isinstance(kind, str):
-            raise ValueError('missing: write type = "can" or another driver')  # noqa: TRY004 - a fault of the file
-        module = find(kind)
-    written = {key: value for key, value in file.driver.items() if key != "type"}
-    options = validate(written, module.Options, source, under=("driver",))
-    signals = tuple(
-        Signal(
-            name, twin.unit_of(name), validate(_own(file.signals[name]), module.Source, source, under=("signals", name))
-        )
-        for name in needed
-    )
-    return DriverConfig(module, options, Setup(signals, source.path.parent, file.window.sample_period), source)
-
-
-def _own(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys of a signal by which its driver reads it."""
-    return {key: value for key, value in table.items() if key not in SignalTable.model_fields}
 
 
 def _problem(file: MachineFile, twin: Definition, context: Context) -> Problem:

@@ -17,7 +17,8 @@ from otolith_drivers.units import Quantity
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
 
 
-def _name(text: str) -> str:
+def check_name(text: str) -> str:
+    """Return ``text``, or raise ValueError if it is no valid name."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}", text):
         raise ValueError(
             f"{text!r} is not a valid name: use 1 to 64 letters, digits, '-' and '_', and begin with a letter or digit"
@@ -38,7 +39,7 @@ def _expand_value(written: object) -> object:
     return written if isinstance(written, dict) else {"value": written}
 
 
-Name = Annotated[str, AfterValidator(_name)]
+Name = Annotated[str, AfterValidator(check_name)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 RawQuantity = str | float | None
 """A quantity as written in the file. It is converted once the twin gives its unit; a number without unit is refused."""
@@ -80,6 +81,8 @@ class ParameterTable(LimitsTable):
 class SignalTable(StrictModel):
     """What the daemon needs to know of a signal, beside the keys by which the driver reads it."""
 
+    source: str | None = None
+    """Name of the driver that reads it; needed if there are several."""
     delay: Annotated[float, BeforeValidator(Quantity("s", 0.0, 60.0))] = 0.0
     """Time by which the signal is late against the others; it is subtracted from the time of each sample."""
     times: Sampling | None = None
@@ -171,8 +174,8 @@ class MachineFile(StrictModel):
     """The whole file."""
 
     machine: MachineTable
-    driver: Annotated[dict[str, Any], Field(default_factory=dict)]
-    """``type`` and the options of that driver; a replay does not need it."""
+    driver: Annotated[dict[str, Any] | tuple[dict[str, Any], ...], Field(default_factory=dict)]
+    """``type`` and the options of that driver, or several of them, each with a ``name``; a replay needs none."""
     signals: Annotated[dict[str, dict[str, Any]], Field(default_factory=dict)]
     """Where the driver finds each input and output of the twin, and the keys of :class:`SignalTable`; a replay does not
     need it."""
@@ -193,3 +196,10 @@ class MachineFile(StrictModel):
     zenoh: ZenohTable = ZenohTable()
     recording: RecordingTable = RecordingTable()
     history: HistoryTable = HistoryTable()
+
+    @property
+    def drivers(self) -> tuple[dict[str, Any], ...]:
+        """The tables ``[[driver]]``, or the table ``[driver]`` alone; empty without any."""
+        if isinstance(self.driver, tuple):
+            return self.driver
+        return (self.driver,) if self.driver else ()

@@ -4,7 +4,7 @@ A driver is read-only by construction: the protocol has no method that writes to
 and its reconnect loop, counts the samples that it receives and loses, and lets no exception leave its threads.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -42,6 +42,11 @@ class Sampling(StrEnum):
     """A time is the moment at which the value was true, and is used as it is. A command changes at its samples."""
     POLLED = "polled"
     """As ``TRUE``, but the source is asked by a clock of its own: a command may have changed since the last reading."""
+
+
+def sampling_of(sampling: Sampling | Mapping[str, Sampling], signal: str) -> Sampling:
+    """Return the meaning of the times of a signal; ``sampling`` is that of :attr:`Driver.sampling`."""
+    return sampling if isinstance(sampling, Sampling) else sampling[signal]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +88,18 @@ class Link:
     """Achieved sample period in s; None if the machine sends by its own clock, or if it is not known yet."""
     latency: float = 0.0
     """Longest time in s by which samples arrive after their times because the source sends many at once."""
+    sources: tuple["SourceState", ...] = ()
+    """Of a machine with several sources."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceState:
+    """One of several sources of a machine: its name in the machine file, its signals, and its state."""
+
+    name: str
+    signals: tuple[str, ...]
+    link: Link
+    counters: Counters
 
 
 Deliver = Callable[[Sequence[Sample]], None]
@@ -93,8 +110,8 @@ class Driver(Protocol):
     """A connection to one machine. Built from options, then opened once and closed once."""
 
     @property
-    def sampling(self) -> Sampling:
-        """Meaning of the sample times."""
+    def sampling(self) -> Sampling | Mapping[str, Sampling]:
+        """Meaning of the sample times, the same for all signals or by signal."""
 
     def open(self, deliver: Deliver) -> None:
         """Start to deliver samples. The driver's thread waits for an absent device and reconnects to a lost one.
@@ -120,7 +137,7 @@ class DriverType(Protocol):
     """What a row of the registry points to: a module with these three names."""
 
     Options: type[StrictModel]
-    """The keys of ``[driver]`` except ``type``."""
+    """The keys of ``[driver]`` except ``type`` and ``name``."""
     Source: type[StrictModel]
     """The keys of each signal in ``[signals]``."""
 

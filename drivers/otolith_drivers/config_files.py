@@ -167,15 +167,19 @@ def line_of(text: str, location: Location) -> int | None:
     lines are not followed.
     """
     header: list[int | str] = []
-    tables_seen: dict[tuple[str, ...], int] = {}
+    tables_seen: dict[tuple[int | str, ...], int] = {}
     best, depth = None, 0
     for number, line in enumerate(text.splitlines(), start=1):
         if section := SECTION.match(line):
-            keys = tuple(part.strip().strip("\"'") for part in section[2].split("."))
-            header = list(keys)
-            if section[1] == "[[":
-                tables_seen[keys] = tables_seen.get(keys, -1) + 1
-                header.append(tables_seen[keys])
+            header = []
+            keys = [part.strip().strip("\"'") for part in section[2].split(".")]
+            for position, key in enumerate(keys, start=1):
+                header.append(key)
+                place = tuple(header)
+                if section[1] == "[[" and position == len(keys):
+                    tables_seen[place] = tables_seen.get(place, -1) + 1
+                if place in tables_seen:  # a table in a list of tables belongs to the last of these
+                    header.append(tables_seen[place])
             path = header
         elif assignment := ASSIGNMENT.match(line):
             path = [*header, *(part.strip().strip("\"'") for part in KEY_PART.findall(assignment[1]))]

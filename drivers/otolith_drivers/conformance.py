@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from otolith_drivers.base import Driver, Sample, Sampling
+from otolith_drivers.base import Driver, Sample, Sampling, sampling_of
 
 MIN_SAMPLES = 30  # per check; engineering choice
 SAMPLES_TIMEOUT = 10.0  # s for these samples to arrive; engineering choice, for a busy computer
@@ -114,7 +114,8 @@ def public_names_are_those_of_the_protocol(rig: Rig) -> None:
     """The driver has no public name beside the protocol's, none of which writes to the machine."""
     public = {name for name in dir(rig.driver) if not name.startswith("_")}
     _require(public == PROTOCOL, f"public names that differ from the protocol: {sorted(public ^ PROTOCOL)}")
-    _require(isinstance(rig.driver.sampling, Sampling), "sampling must be one of otolith_drivers.base.Sampling")
+    kinds = {sampling_of(rig.driver.sampling, signal) for signal in rig.expected}
+    _require(kinds <= set(Sampling), "sampling must be one of otolith_drivers.base.Sampling, or one for each signal")
 
 
 CONTRACT: tuple[Callable[[Rig], None], ...] = (

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from otolith.cli.demo import transport_of
+from otolith.cli.demo import transports_of
 from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
@@ -12,16 +12,22 @@ from tests.conftest import EXAMPLES
 
 @pytest.mark.parametrize(
     ("name", "transport"),
-    [("dc-motor", "can"), ("dc-motor-modbus", "modbus-tcp"), ("pump-vfd", "modbus-rtu"), ("odrive-axis", "can")],
+    [
+        ("dc-motor", ["can"]),
+        ("dc-motor-modbus", ["modbus-tcp"]),
+        ("pump-vfd", ["modbus-rtu"]),
+        ("odrive-axis", ["can"]),
+        ("dc-motor-two-buses", ["can", "modbus-tcp"]),
+    ],
 )
-def test_the_plant_sends_as_the_machine_file_reads(name: str, transport: str) -> None:
-    assert transport_of(load_machine(EXAMPLES / f"{name}.toml", with_driver=False)) == transport
+def test_the_plant_sends_as_the_machine_file_reads(name: str, transport: list[str]) -> None:
+    assert transports_of(load_machine(EXAMPLES / f"{name}.toml", with_driver=False)) == transport
 
 
 def test_a_machine_without_a_bus_is_refused() -> None:
     path = EXAMPLES / "dc-motor-in-process.toml"
     with pytest.raises(ConfigurationError, match=r'dc-motor-in-process\.toml: .* \[driver\] has type = "plant"'):
-        transport_of(load_machine(path, with_driver=False))
+        transports_of(load_machine(path, with_driver=False))
 
 
 def test_a_gateway_for_serial_frames_is_refused(tmp_path: Path) -> None:
@@ -29,4 +35,4 @@ def test_a_gateway_for_serial_frames_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "gateway.toml"
     path.write_text(text.replace("port = 1502", 'framing = "rtu"\nport = 1502'), encoding="utf-8")
     with pytest.raises(ConfigurationError, match="the demo simulates a machine on a CAN bus or on Modbus"):
-        transport_of(load_machine(path, with_driver=False))
+        transports_of(load_machine(path, with_driver=False))

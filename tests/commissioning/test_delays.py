@@ -47,6 +47,20 @@ def deviation(signal: SignalDelay, truth: float) -> float:
     return abs(signal.value - truth) / signal.sd
 
 
+def test_the_delay_of_a_source_with_jitter_is_its_mean(tmp_path: Path) -> None:
+    """The speed comes over another bus: 20 ms late with a jitter of 5 ms; the jitter is noise of the speed."""
+    schedule, random = Schedule(omega=Timing(0.01)), np.random.default_rng(11)
+    recording = recorded(schedule, 100)
+    speed = recording.samples["omega"]
+    stated = np.sort(speed.times + 20.0 * MS + 5.0 * MS * random.standard_normal(len(speed.times)))
+    late_speed = replace(speed, stated=np.round(stated, 6))
+    problem, windows = cut(tmp_path, schedule, replace(recording, samples={**recording.samples, "omega": late_speed}))
+    signals = late(identify_delays_and_noise(problem, windows, {})[0])
+    assert set(signals) == {"omega"}
+    assert signals["omega"].value == pytest.approx(20.0 * MS, abs=1.0 * MS)
+    assert deviation(signals["omega"], 20.0 * MS) < 3.3
+
+
 @pytest.mark.parametrize("rate", ["10 ms", "50 ms"])
 @pytest.mark.parametrize("delay", [10 * MS, 35 * MS])
 @pytest.mark.parametrize("name", ["omega", "i", "V_a"])

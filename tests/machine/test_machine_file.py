@@ -149,3 +149,40 @@ def test_components_have_limits_by_site(own_machine: OwnMachine) -> None:
     plan = limits_of(own_machine, 'value = "6.5 ohm"', '[components]\nshaft = { watch = "1 mN*m", act = "4 mN*m" }\n')
     assert [limit.value for limit in plan.sites["shaft"].limits] == pytest.approx([0.001, 0.004])
     assert plan.sites["winding"].limits == ()
+
+
+def test_sources_without_a_delay_are_named(tmp_path: Path) -> None:
+    text = (EXAMPLES / "dc-motor-two-buses.toml").read_text(encoding="utf-8")
+    text = text.replace('dbc = "dc-motor.dbc"', f'dbc = "{EXAMPLES / "dc-motor.dbc"}"')
+    path = tmp_path / "machine.toml"
+    path.write_text(text, encoding="utf-8")
+    machine = load_machine(path)
+    assert "delay of omega: 25 ms" in describe(machine)
+    assert {plan.name: plan.source for plan in machine.plans(machine.driver.sampling)}["omega"] == "encoder"
+    path.write_text(text.replace(', delay = "25 ms"', ""), encoding="utf-8")
+    assert any(line.startswith("no signal has a delay") for line in describe(load_machine(path)))
+
+
+def test_what_was_learned_belongs_to_the_sources_of_the_signals(tmp_path: Path) -> None:
+    """A signal that comes from another source may have other values; the name of a host changes nothing."""
+    text = (EXAMPLES / "dc-motor-two-buses.toml").read_text(encoding="utf-8")
+    path = tmp_path / "machine.toml"
+
+    def fingerprint(old: str = "", new: str = "") -> str:
+        path.write_text(text.replace(old, new), encoding="utf-8")
+        return load_machine(path, with_driver=False).signal_fingerprint
+
+    assert fingerprint('host = "127.0.0.1"', 'host = "192.168.0.7"') == fingerprint()
+    assert fingerprint('source = "encoder"', 'source = "drive"') != fingerprint()
+    assert fingerprint("port = 1502", 'order = "CDAB"') != fingerprint()
+
+
+def test_one_driver_is_one_source_whether_signals_name_it_or_not(tmp_path: Path) -> None:
+    """Signals of different sources have clocks of their own."""
+    text = (
+        (EXAMPLES / "dc-motor-modbus.toml").read_text(encoding="utf-8").replace("[driver]", '[driver]\nname = "drive"')
+    )
+    path = tmp_path / "machine.toml"
+    path.write_text(text.replace("V_a = { ", 'V_a = { source = "drive", '), encoding="utf-8")
+    machine = load_machine(path)
+    assert {plan.source for plan in machine.plans(machine.driver.sampling)} == {""}

@@ -70,13 +70,16 @@ def align(samples: Series, span: GridSpan, grace: float) -> CyclicSeries:
     return align_to_grid(samples, span, grace)
 
 
-def align_delayed(samples: Series, delay: float, span: GridSpan, grace: float) -> CyclicSeries:
+def align_delayed(
+    samples: Series, delay: float, span: GridSpan, grace: float, arrivals: Array | None = None
+) -> CyclicSeries:
     """Return the samples of a cyclic signal at the times of their arrival, without lateness, minus ``delay`` (s).
 
     Slots of the grid would take away a part of the delay: that by which this signal arrives later than the others. The
-    lateness beyond the delay stays, so that the grid can follow the clock of the source.
+    lateness beyond the delay stays, so that the grid can follow the clock of the source. ``arrivals`` are the times of
+    all signals with the clock of this one, if there are others.
     """
-    phase = _arrival_phase(samples.times, span)
+    phase = _arrival_phase(samples.times if arrivals is None else arrivals, span)
     slots = round((delay - phase) / span.period)
     own = replace(span, start=span.start + phase + slots * span.period)
     aligned = align(samples, own, grace)

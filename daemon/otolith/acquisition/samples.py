@@ -47,6 +47,8 @@ class SignalPlan:
     """Standard deviation of the noise of a sample, in the unit of the signal."""
     checks: frozenset[Check] = frozenset(Check)
     """What its samples are checked for."""
+    source: str = ""
+    """Which of several sources of the machine it comes from: sources have clocks of their own."""
 
     @property
     def is_cyclic(self) -> bool:

@@ -6,13 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.alignment import PUNCTUAL_QUANTILE, CyclicSeries, align, align_delayed, align_to_grid
+from otolith.acquisition.alignment import (
+    PUNCTUAL_QUANTILE,
+    CyclicSeries,
+    align,
+    align_delayed,
+    align_to_grid,
+    has_period,
+)
 from otolith.acquisition.quality import QualityLimits, assess_quality
 from otolith.acquisition.records import EARLY, ON_GRID, lies_on_grid, make_records, phase_of_grid
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.samples import Series, SignalPlan, finite_samples, has_equal_times, merge_equal_times
 from otolith.acquisition.time_grid import GridSpan
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Array, Window
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 GRACE_PERIOD = 0.1  # s after its end that a window waits for late samples, at least,
@@ -43,6 +50,7 @@ class Windower:
         self.latency = 0.0  # s; by which samples arrive after their times because the source sends many at once
         self.counts = WindowerCounts()
         self._limits = limits or QualityLimits()
+        self._source_of_grid = next((plan.source for plan in plans if plan.is_cyclic), None)
         self._grace = GRACE_PERIOD
         self._intervals: dict[str, float] = {}
         self._start = math.inf
@@ -102,7 +110,7 @@ class Windower:
         """Return the next window; ``unix_offset`` is Unix time minus monotonic time, s."""
         series, aligned, repeated = self._align(rings)
         if self._index == 0:  # the grid was laid through a single sample, which may have been late
-            self._start += _grid_shift(aligned, first=True, period=self.sample_period)
+            self._start += self._grid_shift(aligned, first=True)
             series, aligned, repeated = self._align(rings)
         records = make_records(series, self.plans, self._span())
         window = Window(
@@ -119,8 +127,13 @@ class Windower:
         self.counts.stale += records.stale
         self._grace = self._next_grace(series)
         self._index += 1
-        self._start = self._start + self.length + _grid_shift(aligned, first=False, period=self.sample_period)
+        self._start = self._start + self.length + self._grid_shift(aligned, first=False)
         return window
+
+    def _grid_shift(self, aligned: dict[str, CyclicSeries], *, first: bool) -> float:
+        """Return by how much to move the grid, s: it follows one clock."""
+        followed = {name: item for name, item in aligned.items() if self._has_clock_of_grid(self.plans[name])}
+        return _grid_shift(followed, first=first, period=self.sample_period)
 
     def regrid(self, records: int, sample_period: float) -> None:
         """From the next window on, cut ``records`` records, ``sample_period`` s apart."""
@@ -138,22 +151,36 @@ class Windower:
     def _align(self, rings: Rings) -> tuple[dict[str, Series], dict[str, CyclicSeries], int]:
         """Return the samples of each signal, the lateness of those on the grid, and the number of repeated samples."""
         series = {name: self._samples(rings, plan) for name, plan in self.plans.items()}
-        true = [item for name, item in series.items() if not self.plans[name].is_cyclic]
-        repeated = sum(item.repeated for item in true)
-        self._adopt_phase(true)
+        repeated = sum(item.repeated for name, item in series.items() if not self.plans[name].is_cyclic)
+        true = [name for name, plan in self.plans.items() if not plan.is_cyclic and self._has_clock_of_grid(plan)]
+        self._adopt_phase([series[name] for name in true])
         aligned: dict[str, CyclicSeries] = {}
         for name, plan in self.plans.items():
-            if plan.is_cyclic:
-                span, delay = self._span(), plan.delay
-                aligned[name] = (
-                    align_delayed(series[name], delay, span, GRACE_PERIOD)
-                    if delay
-                    else align(series[name], span, GRACE_PERIOD)
-                )
+            if plan.is_cyclic and not self._has_clock_of_grid(plan):
+                arrivals = self._arrivals(plan, series)
+                aligned[name] = align_delayed(series[name], plan.delay, self._span(), GRACE_PERIOD, arrivals)
+            elif plan.is_cyclic and plan.delay:
+                aligned[name] = align_delayed(series[name], plan.delay, self._span(), GRACE_PERIOD)
+            elif plan.is_cyclic:
+                aligned[name] = align(series[name], self._span(), GRACE_PERIOD)
             elif self._is_on_grid(series[name]):
                 aligned[name] = align_to_grid(series[name], self._span(), GRACE_PERIOD)
             series[name] = aligned[name].series if name in aligned else series[name]
         return series, aligned, repeated
+
+    def _has_clock_of_grid(self, plan: SignalPlan) -> bool:
+        """Whether a signal comes from the source whose clock the grid follows: the first with cyclic signals."""
+        return self._source_of_grid in (None, plan.source)
+
+    def _arrivals(self, plan: SignalPlan, series: dict[str, Series]) -> Array | None:
+        """Return the times at which signals arrive that were sampled together with this one; None if it is alone."""
+        together = [
+            series[name].times
+            for name, other in self.plans.items()
+            if (other.is_cyclic, other.source, other.delay) == (True, plan.source, plan.delay)
+            and has_period(series[name].times, self.sample_period)
+        ]
+        return np.sort(np.concatenate(together)) if together else None
 
     def _samples(self, rings: Rings, plan: SignalPlan) -> Series:
         """Return the samples of a signal from one window before this one until after it, and the one before them.

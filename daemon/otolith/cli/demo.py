@@ -134,21 +134,23 @@ def compare_unbalance(fault: Unbalance, inertia: float, components: Sequence[Com
     return UnbalanceComparison(source, inner, fault.acceleration * inertia, min(periodic, key=distance, default=None))
 
 
-def transport_of(machine: LoadedMachine) -> str:
+def transports_of(machine: LoadedMachine) -> list[str]:
     """Return how the simulated machine must send what ``machine`` receives.
 
     Raises:
         ConfigurationError: the machine is read in a way that no simulated machine offers.
     """
-    driver = machine.file.driver
-    kind, is_tcp = driver.get("type"), driver.get("framing", "tcp") == "tcp"
-    if kind == "can":
-        return "can"
-    if kind == "modbus" and ("serial" in driver or is_tcp):
-        return "modbus-rtu" if "serial" in driver else "modbus-tcp"
-    raise ConfigurationError(
-        f'{machine.path}: the demo simulates a machine on a CAN bus or on Modbus, but [driver] has type = "{kind}"'
-    )
+    transports = []
+    for driver in machine.file.drivers:
+        kind, is_tcp = driver.get("type"), driver.get("framing", "tcp") == "tcp"
+        if kind == "can":
+            transports.append("can")
+        elif kind == "modbus" and ("serial" in driver or is_tcp):
+            transports.append("modbus-rtu" if "serial" in driver else "modbus-tcp")
+        else:
+            text = f'the demo simulates a machine on a CAN bus or on Modbus, but [driver] has type = "{kind}"'
+            raise ConfigurationError(f"{machine.path}: {text}")
+    return transports
 
 
 class Demo:
@@ -156,7 +158,7 @@ class Demo:
 
     def __init__(self, machine: Path, scenario: Path, duration: float, *, as_json: bool) -> None:
         self._machine, self._scenario = load_machine(machine), load_scenario(scenario)
-        self._transport = transport_of(self._machine)
+        self._transports = transports_of(self._machine)
         self._scenario_file, self._duration, self._as_json = scenario, duration, as_json
         stamp = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
         self._folder = writable(state_directory() / "demo" / f"{stamp}-{os.getpid()}")
@@ -185,7 +187,8 @@ class Demo:
         try:
             self._start("daemon", "run", machine, "--recording", str(self._recording))
             truth = str(self._folder / "truth.csv")
-            self._start("plant", "plant", scenario, "--as", self._transport, "--truth", truth)
+            buses = [argument for transport in self._transports for argument in ("--as", transport)]
+            self._start("plant", "plant", scenario, *buses, "--truth", truth)
             self._watch(endpoints, key, stopped)
         finally:
             self._end()

@@ -166,7 +166,8 @@ def replay(
     DATA is a table (CSV: a column 't' in seconds and one for each signal of the twin, in its unit or the one in
     brackets), a recording (.rrd) or a log of a CAN bus (of candump, SavvyCAN or python-can, .asc, .blf, .trc, .mf4).
     FILE needs [driver] and [signals] only for a log of a bus: they describe its frames.
-    Each of several files is a recording of its own: no window spans two.
+    Each of several files is a recording of its own: no window spans two. The logs of a machine with several sources are
+    one recording: drive=monday.log,encoder=monday.csv.
 
     \b
     Examples:
@@ -214,23 +215,26 @@ def watch(connect: tuple[str, ...], machine: str, as_json: bool, after: int | No
 
 @cli.command()
 @click.argument("scenario", type=FILE)
-@click.option("--as", "transport", type=click.Choice(TRANSPORTS), default="can",
-              help="A node on the CAN bus, or a Modbus drive on its own port or serial line.")  # fmt: skip
+@click.option("--as", "transports", type=click.Choice(TRANSPORTS), multiple=True, default=("can",),
+              help="A node on the CAN bus, or a Modbus drive on its port or serial line; may be repeated.")  # fmt: skip
 @click.option("--truth", type=FILE, help="Write the true parameters and states into this CSV file.")
 @click.option("--summary", type=FILE, help="At the end, write counts of frames and requests into this JSON file.")
 @click.option("--duration", type=click.FloatRange(0.1), default=math.inf, show_default=False, metavar="SECONDS",
               help="End after so many seconds.")  # fmt: skip
-def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | None, duration: float) -> int:
-    """Simulate the machine of SCENARIO in real time, on its bus.
+def plant(
+    scenario: Path, transports: tuple[str, ...], truth: Path | None, summary: Path | None, duration: float
+) -> int:
+    """Simulate the machine of SCENARIO in real time, on its bus or on several at once.
 
     \b
     Examples:
       otolith plant config/scenarios/demo.toml
       otolith plant config/scenarios/bus-dropouts.toml --as modbus-tcp
+      otolith plant config/scenarios/two-buses.toml --as can --as modbus-tcp
     """
     from contextlib import ExitStack, closing
 
-    from otolith_drivers.plant.realtime import TruthFile, open_node, write_summary
+    from otolith_drivers.plant.realtime import TruthFile, open_node, run_nodes, write_summary
     from otolith_drivers.plant.scenario import load_scenario
     from otolith_drivers.user_dirs import check_writable
 
@@ -240,12 +244,14 @@ def plant(scenario: Path, transport: str, truth: Path | None, summary: Path | No
     stop = StopSignal()
     with ExitStack() as stack:
         truth_file = stack.enter_context(closing(TruthFile(truth))) if truth is not None else None
-        node = stack.enter_context(closing(open_node(transport, loaded)))
-        click.echo(f"{node.title()}; Ctrl-C ends it", err=True)
-        counts = node.run(truth_file, stop.received, duration)
+        nodes = {name: stack.enter_context(closing(open_node(name, loaded))) for name in dict.fromkeys(transports)}
+        for node in nodes.values():
+            click.echo(f"{node.title()}; Ctrl-C ends it", err=True)
+        counts = run_nodes(nodes, loaded, truth_file, stop.received, duration)
     if summary is not None:
-        write_summary(summary, loaded, transport, counts)
-    click.echo(node.summary_line(counts), err=True)
+        write_summary(summary, loaded, counts)
+    for name, node in nodes.items():
+        click.echo(node.summary_line(counts[name]), err=True)
     return stop.code(clean=signal.SIGTERM)
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from pydantic import Field
+
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.discovery.adopted import Approval
 from otolith.discovery.decision import WindowDecision
@@ -257,6 +259,24 @@ class CostDocument(StrictModel):
     """Whether hypotheses were compared: components, moved parameters, faulty sensors."""
 
 
+class SourceDocument(StrictModel):
+    """State of one of several sources of a machine."""
+
+    signals: tuple[str, ...]
+    up: bool
+    reason: str = ""
+    """Why it is down."""
+    warnings: tuple[str, ...] = ()
+    """What is wrong although it is up, a line each."""
+    received: int = 0
+    """Samples."""
+    bad: int = 0
+    """Received frames, replies or values that could not be used."""
+    lost: int = 0
+    """Samples that were sent or requested and did not arrive."""
+    reconnects: int = 0
+
+
 class DriverDocument(StrictModel):
     """State of the connection to the machine."""
 
@@ -267,6 +287,8 @@ class DriverDocument(StrictModel):
     """What is wrong although the connection is up, a line each."""
     plan: str = ""
     """Polling plan and achieved rate of a polling driver."""
+    sources: dict[str, SourceDocument] = Field(default_factory=dict)
+    """By name, of a machine with several; the connection is up while any of them is."""
 
 
 class CountersDocument(StrictModel):

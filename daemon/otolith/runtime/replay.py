@@ -6,8 +6,9 @@ The clock is that of the data, so two runs over the same files give the same rep
 """
 
 import math
+import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -19,13 +20,15 @@ from otolith.acquisition.recording_statistics import RecordingStatistics
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
-from otolith.machine import LoadedMachine, RecordedMachine, driver_config
+from otolith.machine import LoadedMachine, RecordedMachine
+from otolith.machine_drivers import DriverConfig, driver_configs
 from otolith.runtime.worker import perform
 from otolith.storage.recording_files import MIN_FREE_BYTES, shortage_of
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError, counted
 from otolith_drivers.replay.joined import JoinedReader
+from otolith_drivers.replay.merged import MergedReader
 from otolith_drivers.replay.readers import Reader, Rows, format_of, holds_frames
 from otolith_drivers.user_dirs import writable
 
@@ -43,24 +46,61 @@ def open_recorded(machine: LoadedMachine, data: Path) -> Reader:
     """Open ``data`` as the signals of the twin of ``machine``.
 
     A log of a CAN bus is decoded as ``[driver]`` and ``[signals]`` say. A table or a recording needs only the names of
-    the signals, and uses the columns of ``[signals]`` if the machine file has ``type = "replay"``.
+    the signals, and uses the columns of ``[signals]`` if the machine file has ``type = "replay"``. The logs of several
+    sources are one recording, written as ``drive=monday.log,encoder=monday.csv``.
 
     Raises:
-        ConfigurationError: the file or a signal is missing, or the machine file does not describe the frames.
+        ConfigurationError: a file or a signal is missing, or the machine file does not describe the frames.
     """
-    kind = machine.file.driver.get("type")
-    has_frames = holds_frames(data)
+    names = [str(table.get("name")) for table in machine.file.drivers if "name" in table]
+    if files := _files_of_sources(names, data):
+        return _open_sources(machine, data, files)
+    has_frames, tables = holds_frames(data), machine.file.drivers
+    if has_frames and len(tables) > 1:
+        needed = ",".join(f"{name}=FILE" for name in names)
+        raise ConfigurationError(f"{data}: a log of one bus, but {machine.path} has {len(tables)} sources: {needed}")
+    kind = tables[0].get("type") if len(tables) == 1 else None
     if has_frames and kind not in ("can", "replay"):
         needed = '[driver] with type = "can" and [signals] must describe its frames'
         raise ConfigurationError(f"{data}: a log of a CAN bus, and in {machine.path} {needed}")
     if not has_frames and kind != "replay":
-        return _open_by_name(machine, data)
-    config = driver_config(machine.file, machine.twin, read(machine.path))
-    if kind == "can":
+        return _open_by_name(machine, data, machine.twin.signals)
+    (config,) = driver_configs(machine.file, machine.twin, read(machine.path))
+    return _open_as(machine, data, config)
+
+
+def _files_of_sources(names: Sequence[str], data: Path) -> dict[str, Path]:
+    """Return the file of each source that ``data`` names; empty if it is a file."""
+    if data.exists() or not names:
+        return {}
+    parts = re.split(rf"(?:^|,)({'|'.join(map(re.escape, names))})=", str(data))
+    return {} if parts[0] else dict(zip(parts[1::2], map(Path, parts[2::2]), strict=True))
+
+
+def _open_sources(machine: LoadedMachine, data: Path, files: Mapping[str, Path]) -> Reader:
+    """Open a file for each source of ``machine`` as one recording.
+
+    Raises:
+        ConfigurationError: a source has no file, or one of the files cannot be opened.
+    """
+    configs = {item.name: item for item in driver_configs(machine.file, machine.twin, read(machine.path))}
+    for name in configs:
+        if name not in files:
+            raise ConfigurationError(f"{data}: no file of source {name!r}: append ,{name}=FILE")
+    signals = {name: config.signals for name, config in configs.items()}
+    return MergedReader(data, signals, lambda name: _open_as(machine, files[name], configs[name]))
+
+
+def _open_as(machine: LoadedMachine, data: Path, config: DriverConfig) -> Reader:
+    """Open ``data`` as what the driver of ``config`` reads."""
+    has_frames, kind = holds_frames(data), config.kind
+    if kind == "can" and has_frames:
         with config.located_errors():
             return format_of(data).open_log(data, config.setup, config.options)
-    if not has_frames and format_of(data) is not format_of(config.options.file):
-        return _open_by_name(machine, data)
+    if has_frames and kind != "replay":
+        raise ConfigurationError(f"{data}: a log of a CAN bus, but source {config.name!r} has type = {kind!r}")
+    if kind != "replay" or (not has_frames and format_of(data) is not format_of(config.options.file)):
+        return _open_by_name(machine, data, config.signals)
     from otolith_drivers.replay.driver import opener  # noqa: PLC0415 - only for a machine file that names it
 
     with config.located_errors():
@@ -78,10 +118,10 @@ def open_recordings(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
     return JoinedReader(files, lambda path: open_recorded(machine, path))
 
 
-def _open_by_name(machine: LoadedMachine, data: Path) -> Reader:
-    """Open a table or recording whose columns have the names of the signals."""
+def _open_by_name(machine: LoadedMachine, data: Path, names: Sequence[str]) -> Reader:
+    """Open a table or recording whose columns have the ``names`` of signals."""
     data_format = format_of(data)
-    signals = tuple(Signal(name, machine.twin.unit_of(name), data_format.Source()) for name in machine.twin.signals)
+    signals = tuple(Signal(name, machine.twin.unit_of(name), data_format.Source()) for name in names)
     setup = Setup(signals, machine.path.parent, machine.file.window.sample_period)
     return data_format.open_log(data, setup, None)
 

@@ -22,9 +22,10 @@ from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
-from otolith.health.schema import CountersDocument, DriverDocument, Report, ReportDocument
+from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
+from otolith.publishing.connection import driver_document, with_missing_sources
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
@@ -216,7 +217,7 @@ class Service:
         latency = max(0.0, time.time() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         link = self._machine.driver.link()
-        driver = DriverDocument(up=link.up, reason=link.reason, warnings=link.warnings, plan=link.plan)
+        driver = driver_document(link)
         rings, driver_counters = self._rings.counters(), self._machine.driver.counters()
         counters = CountersDocument(
             received=rings.received,
@@ -231,10 +232,9 @@ class Service:
             recorder_restarts=self._recorder.restarts,
             history_dropped=0 if self._history is None else self._history.dropped,
         )
-        document = document.model_copy(
-            update={"cost": cost, "counters": counters, "driver": driver, "notes": self._notes}
-        )
-        document = self._numbers.number(document)
+        parameters = with_missing_sources(document.parameters, driver, report.traces)
+        update = {"cost": cost, "counters": counters, "driver": driver, "parameters": parameters, "notes": self._notes}
+        document = self._numbers.number(document.model_copy(update=update))
         if self._history is not None:
             self._history.add(document)
         if self._publisher is not None:

@@ -56,7 +56,8 @@ class CanNode(Node):
             f"{summary.frames} frames in {summary.seconds:.1f} s of simulated time, {summary.stalls} stalls{withheld}"
         )
 
-    def _publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
+    def publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
+        """See :meth:`otolith_drivers.plant.realtime.Node.publish`."""
         if scheduled.effect.withheld is None:
             for message in self._messages:
                 self._send(self._frame(message, scheduled))

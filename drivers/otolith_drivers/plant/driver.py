@@ -117,8 +117,8 @@ class PlantDriver:
 
     def _run(self, deliver: Deliver) -> None:
         try:
-            summary = NodeSummary.of(self._scenario.faults)
-            for scheduled in in_real_time(self._scenario, summary, self._stop.is_set):
+            summaries = {IN_PROCESS: NodeSummary.of(self._scenario.faults)}
+            for _, scheduled in in_real_time(self._scenario, summaries, self._stop.is_set):
                 self._take(scheduled, deliver)
         except Exception as error:
             self._link = Link(up=False, reason=f"{type(error).__name__}: {error}")

@@ -32,6 +32,7 @@ REGISTERS = 65536  # that a Modbus address can name
 CAN, MODBUS_TCP, MODBUS_RTU, IN_PROCESS = "can", "modbus-tcp", "modbus-rtu", "in-process"
 MODBUS = frozenset({MODBUS_TCP, MODBUS_RTU})
 ALL_TRANSPORTS = MODBUS | {CAN, IN_PROCESS}
+Transport = Literal["can", "modbus-tcp", "modbus-rtu", "in-process"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,8 +211,8 @@ def distorted(samples: Iterable[PlantSample], faults: list[tuple[SensorFault, Di
         yield replace(sample, measured=measured)
 
 
-# Faults of the bus. Each has ACTS_ON, the transports on which it can happen, and act(), which adds its effect on one
-# sample to that of the faults before it.
+# Faults of the bus. Each has ACTS_ON, the transports on which it can happen, on, the one on which it does, and act(),
+# which adds its effect on one sample to that of the faults before it.
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +239,12 @@ class BusEffect:
         return replace(self, withheld=number if self.withheld is None else self.withheld, gone=self.gone or gone)
 
 
-class Dropouts(Span):
+class _BusSpan(Span):
+    on: Transport | None = None
+    """Transport that is hit, if the machine is on several; without it all are."""
+
+
+class Dropouts(_BusSpan):
     """A share of the samples is not sent; over Modbus, requests during such a sample are not answered."""
 
     ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
@@ -250,7 +256,7 @@ class Dropouts(Span):
         return effect if random.random() >= self.share else effect.withhold(number)
 
 
-class Gone(Span):
+class Gone(_BusSpan):
     """The device sends and answers nothing; over Modbus TCP its port and connections are closed."""
 
     ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
@@ -261,7 +267,7 @@ class Gone(Span):
         return effect.withhold(number, gone=True)
 
 
-class Jitter(Span):
+class Jitter(_BusSpan):
     """Samples are sent late: normally distributed with this deviation about a mean of three deviations, never early."""
 
     ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
@@ -282,6 +288,8 @@ class ClockStep(StrictModel):
 
     ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["clock_step"]
+    on: Transport | None = None
+    """See :class:`_BusSpan`."""
     start: Seconds
     by: Annotated[float, BeforeValidator(Quantity("s", -60.0, 60.0))]
 
@@ -294,7 +302,7 @@ class ClockStep(StrictModel):
         return replace(effect, delay=effect.delay + self.by)
 
 
-class WordOrder(Span):
+class WordOrder(_BusSpan):
     """Registers have another order of bytes and words, as after a change of the drive's settings."""
 
     ACTS_ON: ClassVar[frozenset[str]] = MODBUS
@@ -306,7 +314,7 @@ class WordOrder(Span):
         return replace(effect, order=self.order)
 
 
-class Garbage(Span):
+class Garbage(_BusSpan):
     """With a share of the samples comes something else: a frame of another node, or bytes that are no frame."""
 
     ACTS_ON: ClassVar[frozenset[str]] = MODBUS | {CAN}
@@ -320,7 +328,7 @@ class Garbage(Span):
         return replace(effect, garbage=(*effect.garbage, random.bytes(int(random.integers(*GARBAGE_LENGTHS)))))
 
 
-class Refusal(Span):
+class Refusal(_BusSpan):
     """A read of any of the registers ``first`` to ``last`` gets an exception."""
 
     ACTS_ON: ClassVar[frozenset[str]] = MODBUS
@@ -352,12 +360,12 @@ Fault = Annotated[Drift | Step | Unbalance | SensorFault | BusFault, Field(discr
 class FaultInjector:
     """All faults of the bus of a scenario, each with random numbers of its own."""
 
-    def __init__(self, faults: Sequence[object], seed: int) -> None:
-        """``faults`` are all faults of the scenario; those of machine and sensors are ignored."""
+    def __init__(self, faults: Sequence[object], seed: int, transport: str | None = None) -> None:
+        """``faults`` are all faults of the scenario; those that do not act on ``transport`` are ignored."""
         self._faults = [
             (number, fault, fault_random(seed, number))
             for number, fault in enumerate(faults)
-            if isinstance(fault, BusFault)
+            if isinstance(fault, BusFault) and (transport is None or fault.on in (None, transport))
         ]
 
     def at(self, time: float) -> BusEffect:

@@ -28,7 +28,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from otolith_drivers.errors import DeviceError
 from otolith_drivers.plant.faults import BusEffect
 from otolith_drivers.plant.pseudo_terminal import LineTransport, SerialLine, default_link
-from otolith_drivers.plant.realtime import Node, NodeSummary, ScheduledSample, TruthFile
+from otolith_drivers.plant.realtime import Node, NodeSummary, ScheduledSample
 from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
 from otolith_drivers.plant.scenario import Scenario
 
@@ -206,15 +206,17 @@ class _ModbusNode(Node):
         what = f"{self._scenario.plant} on {self._place()}, device {options.device}, {options.type} {options.order}"
         return f"{what}: {', '.join(registers)}, {self._map.counter} tick counter"
 
-    def run(self, truth: TruthFile | None, stopped: Callable[[], bool], duration: float = math.inf) -> NodeSummary:
-        """See :meth:`otolith_drivers.plant.realtime.Node.run`."""
+    @contextlib.contextmanager
+    def online(self) -> Iterator[None]:
+        """See :meth:`otolith_drivers.plant.realtime.Node.online`."""
         with _short_switch_interval(), _LoopThread() as self._loop:
             try:
-                return super().run(truth, stopped, duration)
+                yield
             finally:
                 self._set_online(online=False)
 
-    def _publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
+    def publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
+        """See :meth:`otolith_drivers.plant.realtime.Node.publish`."""
         self._drive.update(scheduled, summary)
         self._set_online(online=not (scheduled.effect.gone and self.CLOSES_WHEN_GONE))
         if self._server is not None:

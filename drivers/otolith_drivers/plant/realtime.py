@@ -6,9 +6,12 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from heapq import merge
 from importlib import import_module
+from itertools import tee
 from pathlib import Path
 from typing import Any
 
@@ -110,13 +113,13 @@ class ScheduledSample:
 
 
 def refuse_unfit(scenario: Scenario, transport: str) -> None:
-    """Check that every fault of the bus can happen on ``transport``.
+    """Check that every fault of the bus that acts on ``transport`` can happen there.
 
     Raises:
         ConfigurationError: one cannot.
     """
     for number, fault in enumerate(scenario.faults):
-        if isinstance(fault, BusFault) and transport not in fault.ACTS_ON:
+        if isinstance(fault, BusFault) and fault.on in (None, transport) and transport not in fault.ACTS_ON:
             fit = ", ".join(sorted(fault.ACTS_ON))
             raise ConfigurationError(
                 f"faults[{number}]: a fault of kind {fault.kind!r} cannot happen on {transport}, only on {fit}"
@@ -124,24 +127,43 @@ def refuse_unfit(scenario: Scenario, transport: str) -> None:
 
 
 def in_real_time(
-    scenario: Scenario, summary: NodeSummary, stopped: Callable[[], bool], duration: float = math.inf
-) -> Iterator[ScheduledSample]:
-    """The samples of ``scenario`` in their order, until ``stopped`` or for ``duration`` s; counts them in ``summary``.
+    scenario: Scenario,
+    summaries: Mapping[str, NodeSummary],
+    stopped: Callable[[], bool],
+    duration: float = math.inf,
+) -> Iterator[tuple[str, ScheduledSample]]:
+    """The samples of ``scenario`` on each transport, when they are due, until ``stopped`` or for ``duration`` s.
 
-    A sample whose delay would put it before the previous one comes at once.
+    They are counted in the summary of the transport. A sample whose delay would put it before the previous one of its
+    transport comes at once.
     """
-    injector = FaultInjector(scenario.faults, scenario.seed)
-    start = latest = time.monotonic()
-    for index, sample in enumerate(simulate(scenario)):
-        effect = injector.at(sample.time)
-        latest = max(latest, start + sample.time + effect.delay)
-        if sample.time >= duration or not _wait_until(latest, stopped):
+    copies = tee(simulate(scenario), len(summaries))
+    schedules = [
+        _schedule(samples, FaultInjector(scenario.faults, scenario.seed, transport), transport, duration)
+        for transport, samples in zip(summaries, copies, strict=True)
+    ]
+    start = time.monotonic()
+    for transport, planned in merge(*schedules, key=lambda item: item[1].due):
+        if not _wait_until(start + planned.due, stopped):
             return
-        if (late := time.monotonic() - latest) > CATCH_UP_LIMIT:
-            summary.stalls += 1
-            start, latest = start + late, latest + late
-        summary.count(effect, scenario.sample_period)
-        yield ScheduledSample(index, sample, start + sample.time, latest, effect)
+        if (late := time.monotonic() - start - planned.due) > CATCH_UP_LIMIT:
+            summaries[transport].stalls += 1
+            start += late
+        summaries[transport].count(planned.effect, scenario.sample_period)
+        yield transport, replace(planned, taken=start + planned.taken, due=start + planned.due)
+
+
+def _schedule(
+    samples: Iterable[PlantSample], injector: FaultInjector, transport: str, duration: float
+) -> Iterator[tuple[str, ScheduledSample]]:
+    """The samples of the first ``duration`` s on a transport, with times since the start."""
+    latest = 0.0
+    for index, sample in enumerate(samples):
+        if sample.time >= duration:
+            return
+        effect = injector.at(sample.time)
+        latest = max(latest, sample.time + effect.delay)
+        yield transport, ScheduledSample(index, sample, sample.time, latest, effect)
 
 
 def _wait_until(moment: float, stopped: Callable[[], bool]) -> bool:
@@ -189,18 +211,10 @@ class Node(ABC):
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
 
-    def run(self, truth: TruthFile | None, stopped: Callable[[], bool], duration: float = math.inf) -> NodeSummary:
-        """Simulate the machine until ``stopped`` or for ``duration`` s.
-
-        Raises:
-            DeviceError: the bus failed.
-        """
-        summary = NodeSummary.of(self._scenario.faults)
-        for scheduled in in_real_time(self._scenario, summary, stopped, duration):
-            self._publish(scheduled, summary)
-            if truth is not None:
-                truth.write(scheduled)
-        return summary
+    @contextmanager
+    def online(self) -> Iterator[None]:
+        """Be on the bus for the time of a run."""
+        yield
 
     @abstractmethod
     def title(self) -> str:
@@ -215,8 +229,32 @@ class Node(ABC):
         """The summary in a line."""
 
     @abstractmethod
-    def _publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
+    def publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
         """Put a sample on the bus, and count it."""
+
+
+def run_nodes(
+    nodes: Mapping[str, Node],
+    scenario: Scenario,
+    truth: TruthFile | None,
+    stopped: Callable[[], bool],
+    duration: float = math.inf,
+) -> dict[str, NodeSummary]:
+    """Simulate one machine on all ``nodes``, by transport, until ``stopped`` or for ``duration`` s.
+
+    Raises:
+        DeviceError: a bus failed.
+    """
+    summaries = {transport: NodeSummary.of(scenario.faults) for transport in nodes}
+    first = next(iter(nodes))
+    with ExitStack() as stack:
+        for node in nodes.values():
+            stack.enter_context(node.online())
+        for transport, scheduled in in_real_time(scenario, summaries, stopped, duration):
+            nodes[transport].publish(scheduled, summaries[transport])
+            if truth is not None and transport == first:
+                truth.write(scheduled)
+    return summaries
 
 
 def open_node(transport: str, scenario: Scenario) -> Node:
@@ -232,13 +270,15 @@ def open_node(transport: str, scenario: Scenario) -> Node:
     return node
 
 
-def write_summary(path: Path, scenario: Scenario, transport: str, summary: NodeSummary) -> None:
-    """Write the summary as a JSON file.
+def write_summary(path: Path, scenario: Scenario, summaries: Mapping[str, NodeSummary]) -> None:
+    """Write the summary of each transport as a JSON file; of a single one without a level of its own.
 
     Raises:
         ServiceError: it cannot be written.
     """
-    document = {"plant": scenario.plant, "transport": transport, "seed": scenario.seed} | summary.document()
+    documents = [{"transport": transport} | summary.document() for transport, summary in summaries.items()]
+    nodes = documents[0] if len(documents) == 1 else {"nodes": documents}
+    document = {"plant": scenario.plant, "seed": scenario.seed} | nodes
     try:
         path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     except OSError as error:

@@ -11,7 +11,7 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -111,7 +111,7 @@ class ReplayDriver:
         options: ReplayOptions,
         gap: float,
         description: list[str],
-        sampling: Sampling = Sampling.TRUE,
+        sampling: Sampling | Mapping[str, Sampling] = Sampling.TRUE,
     ) -> None:
         """``gap`` is the time in seconds from the last row to the first one of the next repetition."""
         self.sampling = sampling

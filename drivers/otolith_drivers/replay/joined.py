@@ -24,12 +24,12 @@ class JoinedReader(Reader):
             self._readers = [opened.enter_context(open_file(path)) for path in paths]
             first = self._readers[0]
             for reader in self._readers[1:]:
-                if reader.sampling is not first.sampling:
-                    kinds = f"{reader.sampling} times, but {first.path} has {first.sampling} ones"
+                if reader.sampling != first.sampling:
+                    kinds = f"{_kind(reader)} times, but {first.path} has {_kind(first)} ones"
                     raise ConfigurationError(f"{reader.path}: {kinds}: replay them apart")
             self._opened = opened.pop_all()
         self.place, self.is_table = f"its file's {first.place}", first.is_table
-        self.sampling: Sampling = first.sampling
+        self.sampling = first.sampling
         self.ignored = tuple(dict.fromkeys(name for reader in self._readers for name in reader.ignored))
         self._finished = 0
 
@@ -81,3 +81,9 @@ class JoinedReader(Reader):
     def warnings(self) -> list[str]:
         """See :meth:`Reader.warnings`."""
         return [f"{reader.path}: {line}" for reader in self._readers for line in reader.warnings()]
+
+
+def _kind(reader: Reader) -> str:
+    """Return the meaning of the times of a file."""
+    kinds = reader.sampling
+    return kinds if isinstance(kinds, Sampling) else ", ".join(f"{name} {kind}" for name, kind in kinds.items())

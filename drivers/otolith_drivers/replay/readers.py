@@ -4,7 +4,7 @@ import gzip
 import io
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -87,8 +87,8 @@ class Reader(ABC):
     """What ``Rows.lines`` numbers: ``line``, ``frame`` or ``record``."""
     is_table = False
     """Whether the file is a text table, whose times may be in a unit that it does not name."""
-    sampling = Sampling.TRUE
-    """Meaning of the times of the file."""
+    sampling: Sampling | Mapping[str, Sampling] = Sampling.TRUE
+    """Meaning of the times of the file, the same for all signals or by signal."""
     ignored: tuple[str, ...] = ()
     """Names of the columns that no signal uses."""
 

@@ -38,7 +38,8 @@ READ_ALL = "import sys; from rerun.chunk import RrdReader; [None for _ in RrdRea
 class TimesRecord(StrictModel):
     """What the times and the packed records of a recording mean, as the recorder writes it."""
 
-    sampling: Sampling
+    sampling: Sampling | dict[str, Sampling]
+    """Of all signals, or by signal."""
     delays: dict[str, float]
     """By signal, s."""
     signals: dict[str, str]

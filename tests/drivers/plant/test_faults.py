@@ -33,7 +33,7 @@ from otolith_drivers.plant.faults import (
     Spikes,
     WordOrder,
 )
-from otolith_drivers.plant.realtime import NODES, refuse_unfit
+from otolith_drivers.plant.realtime import NODES, NodeSummary, ScheduledSample, in_real_time, refuse_unfit
 from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES
@@ -147,13 +147,28 @@ def test_fault_is_refused_on_a_transport_that_cannot_have_it() -> None:
     assert set(NODES) == {"can", "modbus-tcp", "modbus-rtu"}
 
 
+def test_a_fault_of_one_bus_leaves_the_other_alone() -> None:
+    scenario = load_scenario(EXAMPLES / "scenarios" / "two-buses.toml")
+    summaries = {transport: NodeSummary.of(scenario.faults) for transport in ("can", "modbus-tcp")}
+    sent: dict[str, list[ScheduledSample]] = {transport: [] for transport in summaries}
+    for transport, scheduled in in_real_time(scenario, summaries, lambda: False, 0.3):
+        sent[transport].append(scheduled)
+    assert [item.sample for item in sent["can"]] == [item.sample for item in sent["modbus-tcp"]]
+    assert len(sent["can"]) == summaries["can"].ticks == 30
+    assert {round(item.due - item.taken, 9) for item in sent["can"]} == {0.0}
+    late = [item.due - item.taken for item in sent["modbus-tcp"]]
+    assert np.mean(late) == pytest.approx(0.020, abs=0.004)
+    assert [fault.ticks for fault in summaries["can"].faults.values()] == [0, 0, 0, 0]
+    assert [fault.ticks for fault in summaries["modbus-tcp"].faults.values()] == [30, 30, 0, 0]
+
+
 def test_docs_have_every_fault_and_every_modbus_default() -> None:
     page = (Path(__file__).parents[3] / "docs" / "simulated-machines.md").read_text(encoding="utf-8")
     rows = {line.split("`")[1]: line for line in page.splitlines() if line.startswith("| `")}
     classes = {get_args(each.model_fields["kind"].annotation)[0]: each for each in get_args(get_args(Fault)[0])}
     assert rows.keys() == classes.keys()
     for kind, each in classes.items():
-        fields = set(each.model_fields) - {"kind", "start", "until"}
+        fields = set(each.model_fields) - {"kind", "start", "until", "on"}
         assert {name for name in fields if f"`{name}`" not in rows[kind]} == set()
     written = tomllib.loads(page.split("```toml")[1].split("```")[0])["modbus"]
     assert NodeModbusOptions.model_validate(written) == NodeModbusOptions()

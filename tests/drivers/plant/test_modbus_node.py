@@ -21,7 +21,7 @@ from pymodbus.pdu import ModbusPDU
 
 from otolith_drivers.errors import DeviceError
 from otolith_drivers.plant.pseudo_terminal import _create_link
-from otolith_drivers.plant.realtime import open_node
+from otolith_drivers.plant.realtime import open_node, run_nodes
 from otolith_drivers.plant.scenario import load_scenario
 from tests.conftest import EXAMPLES
 from tests.drivers.drives import COUNTER, REGISTERS, Client, Drive, floats, line_says, past, wait_for
@@ -208,7 +208,7 @@ def test_modbus_node_leaks_no_thread_or_descriptor(drive: Callable[..., Drive], 
     threads, descriptors = list[int](), list[int]()
     for _ in range(3):
         opened = open_node(transport, scenario)
-        done = opened.run(None, lambda: False, 0.6)
+        done = run_nodes({transport: opened}, scenario, None, lambda: False, 0.6)[transport]
         opened.close()
         assert done.ticks == 60
         assert [fault.ticks for fault in done.faults.values()] == [5] * 5

@@ -11,7 +11,7 @@ from otolith.cli.common import progress_line
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import prefix
 from otolith.runtime.preview import preview_lines, preview_recording
-from otolith_drivers.base import Sample
+from otolith_drivers.base import Link, Sample
 from otolith_drivers.user_dirs import check_writable
 
 # Engineering choices, guarded by tests/cli/test_check.py.
@@ -80,6 +80,7 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         *(f"  {name} = {text}" for name, text, _ in twin.definitions),
         *(f"  {left} = {right}" for left, right in twin.equations),
         *(machine.driver.describe() if machine.built_driver else sources),
+        *_delays(machine),
         f"windows of {file.window.length:g} s, {machine.records} records",
     ]
     for name, value in problem.known:
@@ -104,6 +105,14 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
     return lines
 
 
+def _delays(machine: LoadedMachine) -> list[str]:
+    """The declared delays; sources without any are unlikely to be equally late."""
+    declared = {name: table.delay for name, table in machine.signal_tables.items() if table.delay}
+    if not declared and len(machine.file.drivers) > 1:
+        return ["no signal has a delay: 'otolith noise' identifies by how much one source is later than another"]
+    return [f"delay of {name}: {1e3 * delay:g} ms" for name, delay in declared.items()]
+
+
 def _origin(name: str, in_file: Container[str]) -> str:
     return "" if name in in_file else " [not in the file: the twin's own value]"
 
@@ -121,23 +130,33 @@ def _listen(machine: LoadedMachine) -> tuple[Counter[str], list[str]]:
     begun = time.monotonic()
     driver.open(deliver)
     time.sleep(max(LISTEN, MIN_PERIODS * period))
-    while time.monotonic() < begun + PATIENCE and len(counts) < len(signals) and not driver.link().warnings:
+    while time.monotonic() < begun + PATIENCE and len(counts) < len(signals) and not _causes(driver.link()):
         time.sleep(PAUSE)
     link, seconds = driver.link(), time.monotonic() - begun
     driver.close()
+    neighbours = {signal: state.signals for state in link.sources for signal in state.signals}
     lines = []
     for signal in signals:
-        remark = _remark(counts[signal], seconds / period, any_came=bool(counts))
+        any_came = any(counts[other] for other in neighbours.get(signal, signals))
+        remark = _remark(counts[signal], seconds / period, any_came=any_came)
         value = f", now {latest[signal]:.4g} {machine.twin.unit_of(signal)}" if signal in latest else ""
         none_usable = ", none of them a number" if counts[signal] and not value else ""
         lines.append(f"received {signal}: {counts[signal]} samples in {seconds:.1f} s{remark}{value}{none_usable}")
     lines += [f"polling: {link.plan}"] if link.plan else []
     lines += link.warnings
     lines += [] if link.up else [f"no connection: {link.reason}"]
-    kind = machine.file.driver.get("type")
-    if kind in PROBED and len(latest) < len(signals):
-        lines.append(f"'otolith probe {kind}' shows what is on the bus")
+    for table in machine.file.drivers:
+        kind = table.get("type")
+        of_source = next((state.signals for state in link.sources if state.name == table.get("name")), signals)
+        if kind in PROBED and not set(of_source) <= set(latest):
+            lines.append(f"'otolith probe {kind}' shows what is on the bus")
     return counts, lines
+
+
+def _causes(link: Link) -> list[str]:
+    """The warnings of all sources, without those that are not connected yet."""
+    links = [state.link for state in link.sources] or [link]
+    return [warning for each in links for warning in each.warnings]
 
 
 def _remark(count: int, expected: float, *, any_came: bool) -> str:

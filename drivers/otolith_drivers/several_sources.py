@@ -1,0 +1,95 @@
+"""Several drivers as one: a machine whose signals come from several buses or files."""
+
+import threading
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from otolith_drivers.base import Counters, Deliver, Driver, Link, Sampling, SourceState, sampling_of
+from otolith_drivers.errors import DeviceError
+
+
+@dataclass(frozen=True, slots=True)
+class NamedSource:
+    """A driver of a machine with several, its name in the machine file, and the signals that it reads."""
+
+    name: str
+    driver: Driver
+    signals: tuple[str, ...]
+
+
+class SeveralSources:
+    """Implements :class:`otolith_drivers.base.Driver` over other drivers, each of which keeps its own threads.
+
+    All drivers stamp on this computer's monotonic clock, so their samples have one time base.
+    """
+
+    def __init__(self, sources: tuple[NamedSource, ...]) -> None:
+        self._sources = sources
+
+    @property
+    def sampling(self) -> Mapping[str, Sampling]:
+        """Meaning of the sample times of each signal."""
+        return {
+            signal: sampling_of(source.driver.sampling, signal) for source in self._sources for signal in source.signals
+        }
+
+    def open(self, deliver: Deliver) -> None:
+        """See :meth:`otolith_drivers.base.Driver.open`; if one driver cannot be opened, the others are closed."""
+        with ExitStack() as opened:
+            for source in self._sources:
+                opened.callback(source.driver.close)
+                try:
+                    source.driver.open(deliver)
+                except DeviceError as error:
+                    raise DeviceError(f"source {source.name!r}: {error}") from error
+            opened.pop_all()
+
+    def close(self) -> None:
+        """See :meth:`otolith_drivers.base.Driver.close`; all drivers close at the same time."""
+        threads = [threading.Thread(target=source.driver.close, name="close") for source in self._sources]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+    def counters(self) -> Counters:
+        """Return the sums over all drivers."""
+        counters = [source.driver.counters() for source in self._sources]
+        return Counters(
+            received=sum(item.received for item in counters),
+            bad=sum(item.bad for item in counters),
+            lost=sum(item.lost for item in counters),
+            reconnects=sum(item.reconnects for item in counters),
+        )
+
+    def link(self) -> Link:
+        """Return the state of each source, and that of the machine: it is up while any source is.
+
+        A source that is down is a warning. The period is that of the fastest source, if all of them are polled.
+        """
+        states = tuple(
+            SourceState(source.name, source.signals, source.driver.link(), source.driver.counters())
+            for source in self._sources
+        )
+        up, links = any(state.link.up for state in states), [state.link for state in states]
+        warnings = [f"{state.name}: {warning}" for state in states for warning in state.link.warnings]
+        down = [f"source {state.name!r} is down: {state.link.reason}" for state in states if not state.link.up]
+        periods = [link.period for link in links if link.period is not None]
+        return Link(
+            up=up,
+            reason="" if up else "; ".join(down),
+            warnings=tuple([*down, *warnings] if up else warnings),
+            plan="; ".join(f"{state.name}: {state.link.plan}" for state in states if state.link.plan),
+            period=min(periods) if len(periods) == len(links) else None,
+            latency=max((link.latency for link in links), default=0.0),
+            sources=states,
+        )
+
+    def describe(self) -> list[str]:
+        """Return the lines of each driver under its name."""
+        lines = [f"{len(self._sources)} sources: {', '.join(source.name for source in self._sources)}"]
+        for source in self._sources:
+            first, *rest = source.driver.describe()
+            lines += [f"source {source.name}: {first}", *rest]
+        return lines
