@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -26,6 +26,11 @@ from otolith.cli.common import (
     examples_directory,
     log_to_stderr,
 )
+from otolith.cli.operation.connection import endpoints, reader_options
+from otolith.cli.operation.keys import keys
+
+if TYPE_CHECKING:
+    from otolith.publishing.zenoh_config import Credentials
 
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.realtime.NODES, which is slow to import
 EXIT_CODES = """\b
@@ -36,13 +41,6 @@ Exit codes:
   2    a file, option, bus or port cannot be used; the message says which, why
        and what to do
   130  interrupted by Ctrl-C (128 + n by another signal n)"""
-
-
-def _endpoints(_: click.Context, __: click.Parameter, endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    for endpoint in endpoints:
-        if not re.fullmatch(r"[a-z-]+/\S+", endpoint):
-            raise click.BadParameter(f"{endpoint!r} is no endpoint: write it like tcp/127.0.0.1:7447")
-    return endpoints
 
 
 def _new_recording(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
@@ -99,7 +97,7 @@ def cli() -> None:
 
 @cli.command()
 @MACHINE_FILE
-@click.option("--listen", multiple=True, callback=_endpoints, metavar="ENDPOINT",
+@click.option("--listen", multiple=True, callback=endpoints, metavar="ENDPOINT",
               help="Publish here instead of where the file says; may be repeated.")  # fmt: skip
 @click.option("--recording", type=FILE, callback=_new_recording,
               help="Record into this file instead of a new one in the state directory.")  # fmt: skip
@@ -183,22 +181,24 @@ def replay(
 
 
 @cli.command()
-@click.option("--connect", multiple=True, default=["tcp/127.0.0.1:7447"], callback=_endpoints,
-              metavar="ENDPOINT", help="Where daemons publish; may be repeated.")  # fmt: skip
+@reader_options
 @click.option("--machine", default="*", callback=_machine_name, metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
-def watch(connect: tuple[str, ...], machine: str, as_json: bool) -> int:
+def watch(connect: tuple[str, ...], credentials: "Credentials", machine: str, as_json: bool) -> int:
     """Show the live table of running daemons, over Zenoh.
+
+    Each of the options to connect can also be set in the environment, such as OTOLITH_CA for --ca.
 
     \b
     Examples:
       otolith watch
+      otolith watch --connect tls/press-3.local:7447 --ca ca.crt
       otolith watch --json | jq .parameters.R_a
     """
     from otolith.cli.operation.watch import watch_reports
 
     stop = StopSignal()
-    watch_reports(connect, machine, as_json=as_json, stopped=stop.received)
+    watch_reports(connect, credentials, machine, as_json=as_json, stopped=stop.received)
     return stop.code()
 
 
@@ -280,5 +280,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, components, noise, probe, reset, twin):
+for command in (commission, components, keys, noise, probe, reset, twin):
     cli.add_command(command)

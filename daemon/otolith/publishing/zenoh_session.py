@@ -1,6 +1,8 @@
 """Zenoh: the session's configuration, the daemon's publisher, and a listener for the command line and tests."""
 
 import json
+import logging
+import os
 import re
 import threading
 from collections.abc import Callable, Iterable
@@ -12,10 +14,11 @@ import zenoh
 
 from otolith.health.schema import ReportDocument
 from otolith.health.text import announcements
+from otolith.publishing.zenoh_config import LEASE, SOCKET, SOCKET_UMASK, Access, Credentials, Settings, reader_settings
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ServiceError
 
-LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,31 +50,38 @@ def prefix(site: str, machine: str) -> str:
     return f"otolith/{site}/{machine}"
 
 
-def session(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> zenoh.Session:
+def session(listen: Iterable[str] = (), connect: Iterable[str] = (), settings: Settings | None = None) -> zenoh.Session:
     """Open a session in peer mode that uses only the given endpoints: no scouting, no shared memory.
 
     Raises:
         ServiceError: an endpoint to listen on is in use, or one is malformed.
     """
-    settings = {
+    listen, connect = tuple(listen), tuple(connect)
+    whole: Settings = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "listen/endpoints": list(listen),
-        "connect/endpoints": list(connect),
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
         "open/return_conditions/connect_scouted": False,
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE,
+        **(settings or {}),
     }
+    # The process has one umask. Zenoh's thread binds the sockets before open() returns, and nothing else runs yet.
+    umask = os.umask(SOCKET_UMASK) if any(endpoint.startswith(SOCKET) for endpoint in listen) else None
     try:
         config = zenoh.Config()
-        for key, value in settings.items():
+        for key, value in whole.items():
             config.insert_json5(key, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise ServiceError(f"Zenoh cannot open {', '.join([*listen, *connect])}: {_cause(str(error))}") from error
+    finally:
+        if umask is not None:
+            os.umask(umask)
 
 
 def _cause(message: str) -> str:
@@ -85,8 +95,13 @@ def _cause(message: str) -> str:
 class Publisher:
     """Publishes the reports of one machine and answers queries for the latest one."""
 
-    def __init__(self, site: str, machine: str, listen: Iterable[str], connect: Iterable[str]) -> None:
-        self._session = session(listen, connect)
+    def __init__(
+        self, site: str, machine: str, listen: Iterable[str], connect: Iterable[str], access: Access | None = None
+    ) -> None:
+        settings, warning = (access or Access()).settings(prefix(site, machine), listen)
+        if warning:
+            log.warning("%s", warning)
+        self._session = session(listen, connect, settings)
         self._site, self._machine = site, machine
         self._lock = threading.Lock()
         self._latest: str | None = None
@@ -128,8 +143,14 @@ class Publisher:
 class Listener:
     """Passes the reports under ``key`` to ``on_report``, beginning with the latest one of each machine if it exists."""
 
-    def __init__(self, connect: Iterable[str], key: str, on_report: Callable[[str], None]) -> None:
-        self._session = session(connect=tuple(connect))
+    def __init__(
+        self,
+        connect: Iterable[str],
+        key: str,
+        on_report: Callable[[str], None],
+        credentials: Credentials = Credentials(),  # noqa: B008 - immutable
+    ) -> None:
+        self._session = session(connect=connect, settings=reader_settings(credentials, connect))
         self._subscriber = self._session.declare_subscriber(key, lambda sample: on_report(sample.payload.to_string()))
         for reply in self._session.get(key, timeout=1.0):
             if reply.ok is not None:

@@ -25,6 +25,7 @@ from otolith.adaptation.state import AdaptationState, apply_decisions, initial_s
 from otolith.health.schema import CountersDocument, DriverDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
+from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS, ChildProcess
 from otolith.runtime.systemd import Notifier
@@ -109,7 +110,9 @@ class Service:
         self._supervisor.state = self._restored(self._supervisor.state)
         self._windower.records = self._supervisor.records
         identity, driver = self._machine.file.machine, self._machine.driver
-        self._publisher = Publisher(identity.site, identity.name, self._listen, self._machine.file.zenoh.connect)
+        zenoh, listen = self._machine.file.zenoh, listening(self._listen, f"{identity.site}.{identity.name}")
+        access = Access(zenoh, self._machine.path)
+        self._publisher = Publisher(identity.site, identity.name, listen, zenoh.connect, access)
         driver.open(self._rings.deliver)
         self._writer.start()
         self._supervisor.start()
@@ -117,7 +120,7 @@ class Service:
             self._start_recorder()
         self._started_at = self._progress_at = time.monotonic()
         self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
-        log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, ", ".join(self._listen))
+        log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, ", ".join(listen))
 
     def _stop(self) -> None:
         """Stop every part, even if stopping another one fails; the last callback runs first."""

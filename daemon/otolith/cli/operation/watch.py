@@ -17,8 +17,10 @@ from rich.console import Console
 from rich.live import Live
 
 from otolith.cli.common import drain
+from otolith.cli.operation.daemons import Daemons
 from otolith.cli.operation.live_table import LiveTable
-from otolith.publishing.zenoh_session import REPORT, Listener
+from otolith.publishing.zenoh_config import Credentials
+from otolith.publishing.zenoh_session import REPORT
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import cache_directory, state_directory
 
@@ -29,7 +31,9 @@ PATIENCE = 5.0  # s without a report until the stream prints what it waits for
 MAGIC = b"RRF2"  # first bytes of Rerun's files
 
 
-def watch_reports(connect: Sequence[str], machine: str, *, as_json: bool, stopped: Callable[[], bool]) -> None:
+def watch_reports(
+    connect: Sequence[str], credentials: Credentials, machine: str, *, as_json: bool, stopped: Callable[[], bool]
+) -> None:
     """Show reports until ``stopped``; wait for a daemon that is not there yet."""
     key = REPORT.under("*", machine)
     texts: queue.Queue[str] = queue.Queue(MAX_QUEUED)
@@ -39,33 +43,30 @@ def watch_reports(connect: Sequence[str], machine: str, *, as_json: bool, stoppe
             texts.get_nowait()
         texts.put_nowait(text)
 
-    with Listener(connect, key, receive) as listener:
-
-        def state() -> str:
-            missing = "no daemon reached yet; --connect sets where to look"
-            return f"{f'connected, waiting for {key}' if listener.connected else missing} ({', '.join(connect)})"
-
+    with Daemons(connect, key, receive, credentials) as daemons:
         if as_json:
-            _stream(texts, state, stopped)
+            _stream(texts, daemons, stopped)
             return
-        table = LiveTable(state)
+        table = LiveTable(daemons.state)
         with Live(table, console=Console(), refresh_per_second=5):
             while not stopped():
+                daemons.refresh()
                 for text in drain(texts, PAUSE):
                     table.add(text)
 
 
-def _stream(texts: "queue.Queue[str]", state: Callable[[], str], stopped: Callable[[], bool]) -> None:
+def _stream(texts: "queue.Queue[str]", daemons: Daemons, stopped: Callable[[], bool]) -> None:
     """Print reports as lines; print the state to standard error when it changes while no report comes."""
     latest, printed = time.monotonic(), ""
     while not stopped():
+        daemons.refresh()
         lines = drain(texts, PAUSE)
         sys.stdout.writelines(f"{line}\n" for line in lines)
         sys.stdout.flush()
         if lines:
             latest = time.monotonic()
-        elif time.monotonic() - latest > PATIENCE and state() != printed:
-            printed = state()
+        elif time.monotonic() - latest > PATIENCE and daemons.state() != printed:
+            printed = daemons.state()
             sys.stderr.write(f"{printed}\n")
 
 
