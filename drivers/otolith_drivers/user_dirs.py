@@ -1,5 +1,6 @@
 """Folders that belong to this user: systemd's folders in a service, the XDG folders otherwise."""
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -34,7 +35,11 @@ def runtime_folders() -> list[Path]:
     """Return the folders where daemons of this user and services have their sockets; some may be missing."""
     bases = (os.environ.get("XDG_RUNTIME_DIR"), os.environ.get("XDG_STATE_HOME"), f"{Path.home()}/.local/state")
     own = [Path(base) / "otolith" for base in bases if base and Path(base).is_absolute()]
-    return [*own, *(folder for parent in (*own, SERVICES) if os.access(parent, os.R_OK) for folder in parent.iterdir())]
+    folders = list(own)
+    for parent in (*own, SERVICES):
+        with contextlib.suppress(OSError):  # missing, closed to this user, or removed meanwhile
+            folders += parent.iterdir()
+    return folders
 
 
 def cache_directory(name: str) -> Path:

@@ -46,8 +46,8 @@ def tcp() -> str:
 class Reader:
     """A subscriber in this process: what it receives of reports, and which machines are alive."""
 
-    def __init__(self, endpoint: str, credentials: Credentials | None = None) -> None:
-        settings = reader_settings(credentials or Credentials(), [endpoint])
+    def __init__(self, endpoint: str, credentials: Credentials | None = None, mode: str = "peer") -> None:
+        settings = {**reader_settings(credentials or Credentials(), [endpoint]), "mode": mode}
         self.session = session(connect=[endpoint], settings=settings)
         self.texts: list[str] = []
         self.alive: list[str] = []
@@ -236,6 +236,19 @@ def test_only_users_with_their_password_read(stack: ExitStack, tmp_path: Path) -
         own.receives(daemon)
         assert received() == []
     assert own.receives(daemon) == EXPECTED
+
+
+def test_reports_pass_a_router(stack: ExitStack) -> None:
+    """It sends the daemon the subscriptions and queries of its own clients."""
+    endpoint = tcp()
+    stack.callback(session([endpoint], settings={"mode": "router"}).close)
+    daemon = Publisher("here", "motor", [], [endpoint])
+    stack.callback(daemon.close)
+    client = Reader(endpoint, mode="client")
+    stack.callback(client.session.close)
+    assert client.receives(daemon) == EXPECTED
+    assert client.queried() == EXPECTED[-1:]
+    assert client.alive == [ALIVE.under("here", "motor")]
 
 
 def test_half_open_connections_do_not_keep_readers_out(stack: ExitStack) -> None:

@@ -85,8 +85,6 @@ class Access:
         }, warning
 
     def _passwords(self) -> Settings:
-        from otolith.publishing.certificates import secret  # noqa: PLC0415 - slow to import
-
         access = self.zenoh.access
         if access.passwords is None:
             has_clients = self.zenoh.tls is not None and self.zenoh.tls.clients
@@ -94,6 +92,8 @@ class Access:
                 remedy = "set passwords, or [zenoh.tls] with clients = true"
                 raise ConfigurationError(f"nothing proves a reader's name: {remedy}", ("zenoh", "access", "readers"))
             return {}
+        from otolith.publishing.certificates import secret  # noqa: PLC0415 - slow to import
+
         key, path = ("zenoh", "access", "passwords"), self.path.parent.absolute() / access.passwords
         for number, line in enumerate(secret(path, key).decode(errors="replace").splitlines(), start=1):
             _login(line, f"{path}:{number}", key)

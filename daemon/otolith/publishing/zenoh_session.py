@@ -87,9 +87,9 @@ def session(listen: Iterable[str] = (), connect: Iterable[str] = (), settings: S
 def _cause(message: str) -> str:
     """Return the cause from Zenoh's nested message, and the remedy."""
     cause = re.sub(r"[\[\]]|\(os error \d+\)|at /\S+", "", message.rsplit(": [", maxsplit=1)[-1]).strip()
-    if "in use" in message:
+    if "in use" in message or "acquire lock" in message:
         return f"{cause}; another daemon publishes there: set zenoh.listen in the machine file, or --listen"
-    return f"{cause}; check the endpoint, which is written like tcp/127.0.0.1:7447"
+    return f"{cause}; check the endpoint, which is written like tcp/127.0.0.1:7447 or unixsock-stream//run/a.sock"
 
 
 class Publisher:
@@ -132,7 +132,10 @@ class Publisher:
 
     def close(self) -> None:
         """Close the session; subscribers see the liveliness token disappear."""
-        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+        try:
+            self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+        except zenoh.ZError as error:  # connections that never finish their handshake delay it beyond Zenoh's limit
+            log.warning("the Zenoh session was not closed in time: %s", _cause(str(error)))
 
     def _answer(self, query: zenoh.Query) -> None:
         with query, self._lock:

@@ -11,10 +11,11 @@ import click
 from otolith.cli.common import FILE
 
 
-def endpoints(_: click.Context, __: click.Parameter, written: tuple[str, ...]) -> tuple[str, ...]:
-    """Return what ``--connect`` gives; raise BadParameter for a text that is no endpoint."""
+def endpoints(_: click.Context, option: click.Parameter, written: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what ``--connect`` or ``--listen`` gives; raise BadParameter for a text that is no endpoint."""
     for endpoint in written:
-        if not re.fullmatch(r"[a-z-]+/\S+", endpoint):
+        is_local = option.name == "listen" and endpoint == "local"
+        if not (is_local or re.fullmatch(r"[a-z-]+/\S+", endpoint)):
             raise click.BadParameter(f"{endpoint!r} is no endpoint: write it like tcp/127.0.0.1:7447")
     return written
 
