@@ -115,10 +115,20 @@ def test_a_file_that_cannot_be_used_is_named(site: Path, name: str, line: int, c
 
 
 def test_a_certificate_for_other_hosts_is_named(site: Path) -> None:
-    for endpoint in (ENDPOINT, "tls/10.0.0.7:7447", "tls/0.0.0.0:7447", "tls/[::]:7447"):
-        assert not settings(site, endpoint)
-    with pytest.raises(ConfigurationError, match=r"not for 10\.0\.0\.8, but for 10\.0\.0\.7, press\.local"):
-        settings(site, "tls/10.0.0.8:7447")
+    # A name of the certificate may lead to any address.
+    for address in ("press.local", "Press.Local", "10.0.0.7", "10.0.0.8", "0.0.0.0", "[::]"):  # noqa: S104
+        assert not settings(site, f"tls/{address}:7447")
+    with pytest.raises(ConfigurationError, match=r"not for mill\.local, but for 10\.0\.0\.7, press\.local"):
+        settings(site, "tls/mill.local:7447")
+    for name, hosts, address in (
+        ("address", ["10.0.0.7"], "10.0.0.8"),
+        ("reader", [], "0.0.0.0"),  # noqa: S104
+    ):
+        make_certificate(site, name, hosts, utc_now())
+        for kind in ("crt", "key"):
+            (site / f"press.{kind}").write_bytes((site / f"{name}.{kind}").read_bytes())
+        with pytest.raises(ConfigurationError, match=rf"not for {address}, but for (10\.0\.0\.7|no host);"):
+            settings(site, f"tls/{address}:7447")
 
 
 def test_a_certificate_that_expires_soon_is_named(site: Path) -> None:
@@ -188,6 +198,13 @@ def test_a_reader_finds_sockets_as_they_appear() -> None:
         finally:
             publisher.close()
     assert local_sockets() == []
+
+
+def test_the_environment_may_have_the_options(monkeypatch: pytest.MonkeyPatch, site: Path) -> None:
+    monkeypatch.setenv("OTOLITH_CONNECT", f"{ENDPOINT} tls/other.local:7447")
+    monkeypatch.setenv("OTOLITH_CA", str(site / "nowhere.crt"))
+    with pytest.raises(ConfigurationError, match=r"nowhere\.crt: cannot be read"):
+        CliRunner().invoke(cli, ["watch", "--json"], catch_exceptions=False)
 
 
 def test_a_socket_with_a_long_path_is_refused() -> None:

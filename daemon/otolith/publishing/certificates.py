@@ -9,9 +9,10 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from otolith_drivers.config_files import content
@@ -59,8 +60,7 @@ def authorities(path: Path, key: Key) -> list[x509.Certificate]:
 def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str], now: datetime) -> str:
     """Check certificate and key; return a warning if the certificate expires soon, else an empty text.
 
-    ``keys`` name CA, certificate and private key for the error. ``hosts`` are the names or addresses by which clients
-    connect; those of all interfaces, such as ``0.0.0.0``, are not compared.
+    ``keys`` name CA, certificate and private key for the error. ``hosts`` are the names or addresses where it listens.
 
     Raises:
         ConfigurationError: a file cannot be used, or they do not belong together; the message has the cause.
@@ -69,14 +69,7 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
     trusted = authorities(identity.ca, keys[0])
     chain = authorities(identity.certificate, at_certificate)
     own, name = chain[0], identity.certificate
-    try:
-        private = serialization.load_pem_private_key(secret(identity.key, at_key), password=None)
-    except TypeError as error:
-        raise ConfigurationError(
-            f"{identity.key}: encrypted; Zenoh needs a key without a passphrase", at_key
-        ) from error
-    except ValueError as error:
-        raise ConfigurationError(f"{identity.key}: not a private key in PEM form", at_key) from error
+    private = _private_key(identity.key, at_key)
     if private.public_key() != own.public_key():
         raise ConfigurationError(f"{identity.key}: does not belong to the certificate {name}", at_key)
     if not own.subject.get_attributes_for_oid(NameOID.COMMON_NAME):
@@ -89,13 +82,25 @@ def check_identity(identity: Identity, keys: Sequence[Key], hosts: Iterable[str]
     if now > own.not_valid_after_utc:
         expired = f"expired on {own.not_valid_after_utc:%Y-%m-%d}"
         raise ConfigurationError(f"{name}: {expired}; 'otolith keys add' makes another", at_certificate)
-    if missing := sorted(set(hosts) - _names(own) - {"0.0.0.0", "::"}):  # noqa: S104 - compared, not listened on
-        valid = ", ".join(sorted(_names(own))) or "no host"
-        remedy = f"'otolith keys add DIR NAME --host {missing[0]}' makes one"
-        raise ConfigurationError(f"{name}: not for {missing[0]}, but for {valid}; {remedy}", at_certificate)
+    names = _names(own)
+    for host in hosts:
+        if not _is_for(names, host):
+            remedy = f"'otolith keys add DIR NAME --host {host}' makes one"
+            valid = ", ".join(sorted(names)) or "no host"
+            raise ConfigurationError(f"{name}: not for {host}, but for {valid}; {remedy}", at_certificate)
     if own.not_valid_after_utc - now < EXPIRY_WARNING:
         return f"{name}: expires on {own.not_valid_after_utc:%Y-%m-%d}; no connection is possible after it"
     return ""
+
+
+def _private_key(path: Path, key: Key) -> PrivateKeyTypes:
+    data = secret(path, key)
+    try:
+        return serialization.load_pem_private_key(data, password=None)
+    except TypeError as error:
+        raise ConfigurationError(f"{path}: encrypted; Zenoh needs a key without a passphrase", key) from error
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise ConfigurationError(f"{path}: not a private key in PEM form", key) from error
 
 
 def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
@@ -113,7 +118,26 @@ def _names(certificate: x509.Certificate) -> set[str]:
     except x509.ExtensionNotFound:
         return set()
     addresses = {str(address) for address in names.get_values_for_type(x509.IPAddress)}
-    return {*names.get_values_for_type(x509.DNSName), *addresses}
+    return {*(name.lower() for name in names.get_values_for_type(x509.DNSName)), *addresses}
+
+
+def _is_for(names: set[str], host: str) -> bool:
+    """Whether a certificate for ``names`` may serve an endpoint that listens at ``host``.
+
+    Clients may reach an address by any name, so an address is refused only if all names are other addresses.
+    """
+    address = _address(host)
+    if address is None:
+        host = host.lower()
+        return bool(names & {host, f"*.{host.partition('.')[2]}"})
+    return str(address) in names or any(address.is_unspecified or _address(name) is None for name in names)
+
+
+def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(text)
+    except ValueError:
+        return None
 
 
 def make_authority(folder: Path, now: datetime) -> datetime:
@@ -147,7 +171,7 @@ def make_certificate(folder: Path, name: str, hosts: Sequence[str], now: datetim
     if name == "ca":
         raise ConfigurationError(f"{folder / name}.crt: is the certificate of the authority: use another name")
     (authority,) = authorities(folder / "ca.crt", ())[:1]
-    signer = serialization.load_pem_private_key(secret(folder / "ca.key", ()), password=None)
+    signer = _private_key(folder / "ca.key", ())
     if not isinstance(signer, ec.EllipticCurvePrivateKey) or signer.public_key() != authority.public_key():
         raise ConfigurationError(f"{folder / 'ca.key'}: is not the key of {folder / 'ca.crt'}")
     private = ec.generate_private_key(ec.SECP256R1())
@@ -194,10 +218,8 @@ def _key_usage(*, authority: bool) -> x509.KeyUsage:
 
 
 def _host(text: str) -> x509.GeneralName:
-    try:
-        return x509.IPAddress(ipaddress.ip_address(text))
-    except ValueError:
-        return x509.DNSName(text)
+    address = _address(text)
+    return x509.DNSName(text) if address is None else x509.IPAddress(address)
 
 
 def _write(stem: Path, private: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
@@ -208,12 +230,12 @@ def _write(stem: Path, private: ec.EllipticCurvePrivateKey, certificate: x509.Ce
     for path in paths:
         if path.exists():
             raise ConfigurationError(f"{path}: exists and is not replaced; use another name or folder")
-    try:
-        for path, data, mode in ((paths[0], own, 0o600), (paths[1], certificate.public_bytes(pem), 0o644)):
+    for path, data, mode in ((paths[0], own, 0o600), (paths[1], certificate.public_bytes(pem), 0o644)):
+        try:
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
                 file.write(data)
-    except OSError as error:
-        raise ConfigurationError(f"{error.filename}: cannot be written: {error.strerror}") from error
+        except OSError as error:
+            raise ConfigurationError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def utc_now() -> datetime:
