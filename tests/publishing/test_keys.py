@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 from cryptography.hazmat.primitives import serialization
 
+from otolith.cli.demo import _refuse_busy
 from otolith.cli.main import cli
 from otolith.cli.operation.daemons import Daemons
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
@@ -195,6 +196,10 @@ def test_a_reader_finds_sockets_as_they_appear() -> None:
 
             wait_for(arrives)
             assert "connected" in daemons.state()
+            with pytest.raises(ServiceError, match=r"here\.motor\.sock is in use"):
+                _refuse_busy([endpoint])  # of the demo
+            with pytest.raises(ServiceError, match=r"another daemon publishes there"):
+                Publisher("here", "motor", [endpoint], [])
         finally:
             publisher.close()
     assert local_sockets() == []
