@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import resource
 import socket
 import subprocess
 import sys
@@ -251,16 +252,22 @@ def test_reports_pass_a_router(stack: ExitStack) -> None:
     assert client.alive == [ALIVE.under("here", "motor")]
 
 
-def test_half_open_connections_do_not_keep_readers_out(stack: ExitStack) -> None:
-    endpoint = tcp()
-    daemon = publisher(stack, endpoint)
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+def test_half_open_connections_do_not_keep_readers_out(stack: ExitStack, site: Path, protocol: str) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, limits)
+    usual = (1024 if protocol == "tls" else limits[0], limits[1])  # the clients of this test are in the same process
+    resource.setrlimit(resource.RLIMIT_NOFILE, usual)
+    endpoint = f"{protocol}/localhost:{free_port(socket.SOCK_STREAM)}"
+    tls = TlsTable(ca=Path("ca.crt"), certificate=Path("press.crt"), key=Path("press.key"))
+    daemon = publisher(stack, endpoint, Access(ZenohTable(tls=tls), site / "site" / "machine.toml"))
     port = int(endpoint.rpartition(":")[2])
     for _ in range(MAX_HALF_OPEN + 400):
         half_open = stack.enter_context(socket.socket())
         half_open.settimeout(1.0)
-        with suppress(OSError):
+        with suppress(TimeoutError, ConnectionError):
             half_open.connect(("127.0.0.1", port))
-    late = reader(stack, endpoint)
+    late = reader(stack, endpoint, client(site, "operator"))
     assert late.receives(daemon) == EXPECTED
 
 

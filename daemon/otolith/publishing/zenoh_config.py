@@ -1,6 +1,7 @@
 """Settings of Zenoh sessions: endpoints, who may connect, who may read, and limits against floods."""
 
 import os
+import resource
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
 MAX_SESSIONS = 200  # connections at a time
 MAX_HALF_OPEN = 512  # connections at a time that have not finished their handshake
 HANDSHAKE_TIMEOUT = 2000  # ms
+MAX_DESCRIPTORS = 16_384  # open files and connections of a daemon that listens with TLS
 MAX_MESSAGE_BYTES = 1 << 20  # of a message from a reader or a router: a query
 MAX_SOCKET_PATH = 107  # bytes, of a unix socket under Linux
 
@@ -128,6 +130,14 @@ _VERIFIED: Settings = {"verify_name_on_connect": True, "close_link_on_expiration
 
 def _rule(name: str, flow: str, messages: list[str], keys: list[str]) -> Settings:
     return {"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}
+
+
+def raise_descriptor_limit() -> None:
+    """Let connections in their TLS handshake, which Zenoh neither counts nor closes in time, exhaust no descriptors."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(MAX_DESCRIPTORS, hard)
+    if soft != resource.RLIM_INFINITY and soft < allowed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
 
 
 def _limits() -> Settings:

@@ -14,7 +14,17 @@ import zenoh
 
 from otolith.health.schema import ReportDocument
 from otolith.health.text import announcements
-from otolith.publishing.zenoh_config import LEASE, SOCKET, SOCKET_UMASK, Access, Credentials, Settings, reader_settings
+from otolith.publishing.zenoh_config import (
+    ENCRYPTED,
+    LEASE,
+    SOCKET,
+    SOCKET_UMASK,
+    Access,
+    Credentials,
+    Settings,
+    raise_descriptor_limit,
+    reader_settings,
+)
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ServiceError
 
@@ -70,6 +80,8 @@ def session(listen: Iterable[str] = (), connect: Iterable[str] = (), settings: S
         "transport/link/tx/lease": LEASE,
         **(settings or {}),
     }
+    if any(endpoint.startswith(ENCRYPTED) for endpoint in listen):
+        raise_descriptor_limit()
     # The process has one umask. Zenoh's thread binds the sockets before open() returns, and nothing else runs yet.
     umask = os.umask(SOCKET_UMASK) if any(endpoint.startswith(SOCKET) for endpoint in listen) else None
     try:
