@@ -14,6 +14,7 @@ import zenoh
 FORGED = "forged"
 KEY = "otolith/here/motor/report"
 GHOST = "otolith/here/ghost"
+ANSWERING = 2.0  # s
 OPENING = 1500  # ms: a session that is accepted opens in some 10 ms
 
 
@@ -53,6 +54,10 @@ def main() -> None:
         sys.stdout.write("attacked\n")
         sys.stdout.flush()
         sys.stdin.read()
+        # A subscription may arrive after the reports of the test; a query waits for its answer.
+        replies = session.get(KEY, target=zenoh.QueryTarget.ALL, timeout=ANSWERING)
+        answers = [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
+        received += [answer for answer in answers if answer != FORGED]  # its own queryable answers as well
         del ghost, queryable
     sys.stdout.write(json.dumps(received) + "\n")
 
