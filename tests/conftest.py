@@ -2,6 +2,7 @@
 
 import atexit
 import socket
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
@@ -61,11 +62,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: ranks.get(item.path, len(SLOWEST)))
 
 
+@pytest.fixture
+def runtime() -> Iterator[Path]:
+    """The folder of sockets; ``tmp_path`` is too long for the path of one."""
+    with tempfile.TemporaryDirectory(prefix="otolith-") as folder:
+        yield Path(folder)
+
+
 @pytest.fixture(autouse=True)
-def private_directories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Redirect the state directory of the user to ``tmp_path``. All tests share the compiled kernels."""
+def private_directories(tmp_path: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Redirect state directory and sockets of the user. All tests share the compiled kernels."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    for name in ("STATE_DIRECTORY", "CACHE_DIRECTORY", "NOTIFY_SOCKET", "WATCHDOG_USEC"):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    for name in ("RUNTIME_DIRECTORY", "STATE_DIRECTORY", "CACHE_DIRECTORY", "NOTIFY_SOCKET", "WATCHDOG_USEC"):
         monkeypatch.delenv(name, raising=False)
 
 

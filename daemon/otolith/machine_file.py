@@ -15,6 +15,8 @@ from otolith_drivers.config_files import Limits, StrictModel
 from otolith_drivers.units import Quantity
 
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
+LOCAL = "local"
+"""The socket of the machine on this computer, instead of an endpoint to listen on."""
 
 
 def check_name(text: str) -> str:
@@ -34,6 +36,10 @@ def _endpoint(text: str) -> str:
     return text
 
 
+def _listening(text: str) -> str:
+    return text if text == LOCAL else _endpoint(text)
+
+
 def _expand_value(written: object) -> object:
     """Expand ``"6.5 ohm"``, the short form of ``{ value = "6.5 ohm" }``."""
     return written if isinstance(written, dict) else {"value": written}
@@ -41,6 +47,7 @@ def _expand_value(written: object) -> object:
 
 Name = Annotated[str, AfterValidator(check_name)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
+Listening = Annotated[str, AfterValidator(_listening)]
 RawQuantity = str | float | None
 """A quantity as written in the file. It is converted once the twin gives its unit; a number without unit is refused."""
 WindowLength = Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))]
@@ -139,11 +146,33 @@ class SwarmTable(StrictModel):
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
 
 
-class ZenohTable(StrictModel):
-    """Endpoints of the Zenoh session; by default it listens on the loopback interface only."""
+class TlsTable(StrictModel):
+    """Certificates of ``tls/`` and ``quic/`` endpoints, in PEM form."""
 
-    listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
+    ca: Path
+    """The authority that clients and routers must be certified by."""
+    certificate: Path
+    key: Path
+    clients: bool = True
+    """Whether a client needs a certificate."""
+
+
+class AccessTable(StrictModel):
+    """Who may read the reports; nobody but the daemon may write under its keys."""
+
+    passwords: Path | None = None
+    """A file with a line ``name:password`` per user; with it, every connection needs one of them."""
+    readers: tuple[str, ...] | None = None
+    """Names of certificates and users that may read; without it all that may connect."""
+
+
+class ZenohTable(StrictModel):
+    """Endpoints of the Zenoh session; by default it listens on a socket that only its user and group may open."""
+
+    listen: tuple[Listening, ...] = (LOCAL,)
     connect: tuple[Endpoint, ...] = ()
+    tls: TlsTable | None = None
+    access: AccessTable = AccessTable()
 
 
 class RecordingTable(StrictModel):

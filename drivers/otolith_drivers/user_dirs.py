@@ -1,9 +1,13 @@
 """Folders that belong to this user: systemd's folders in a service, the XDG folders otherwise."""
 
+import contextlib
 import os
 from pathlib import Path
 
 from otolith_drivers.errors import ServiceError
+
+SERVICES = Path("/run/otolith")
+"""The folder of systemd's ``RuntimeDirectory=otolith/%i``: one folder for each service."""
 
 
 def state_directory() -> Path:
@@ -15,6 +19,29 @@ def state_directory() -> Path:
     return _user_directory("STATE_DIRECTORY", "XDG_STATE_HOME", ".local/state")
 
 
+def runtime_directory() -> Path:
+    """Return the folder for sockets, which no other user can replace.
+
+    Raises:
+        ServiceError: the folder cannot be created, belongs to another user, or is writable by others.
+    """
+    own = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
+    is_own = own.is_absolute() and own.is_dir() and own.stat().st_uid == os.geteuid()  # not so after su or sudo
+    folder = _user_directory("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR" if is_own else "XDG_STATE_HOME", ".local/state")
+    return _guarded(folder, "readers trust its sockets")
+
+
+def runtime_folders() -> list[Path]:
+    """Return the folders where daemons of this user and services have their sockets; some may be missing."""
+    bases = (os.environ.get("XDG_RUNTIME_DIR"), os.environ.get("XDG_STATE_HOME"), f"{Path.home()}/.local/state")
+    own = [Path(base) / "otolith" for base in bases if base and Path(base).is_absolute()]
+    folders = list(own)
+    for parent in (*own, SERVICES):
+        with contextlib.suppress(OSError):  # missing, closed to this user, or removed meanwhile
+            folders += parent.iterdir()
+    return folders
+
+
 def cache_directory(name: str) -> Path:
     """Return the folder for data that can be recreated: compiled kernels, parsed units.
 
@@ -22,9 +49,13 @@ def cache_directory(name: str) -> Path:
         ServiceError: the folder cannot be created, belongs to another user, or is writable by others.
     """
     folder = writable(_user_directory("CACHE_DIRECTORY", "XDG_CACHE_HOME", ".cache") / name)
+    return _guarded(folder, "its content is executed")
+
+
+def _guarded(folder: Path, reason: str) -> Path:
     status = folder.stat()
     if status.st_uid != os.geteuid() or status.st_mode & 0o022:
-        raise ServiceError(f"{folder}: must belong to this user and be writable by no other: its content is executed")
+        raise ServiceError(f"{folder}: must belong to this user and be writable by no other: {reason}")
     return folder
 
 

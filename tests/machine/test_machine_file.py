@@ -14,6 +14,7 @@ import pytest
 from otolith.cli.commissioning.check import describe
 from otolith.health.limits import Level, MonitoringPlan
 from otolith.machine import load_machine
+from otolith.publishing.zenoh_config import listening
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from tests.conftest import EXAMPLES, OwnMachine
 
@@ -42,10 +43,14 @@ def test_every_example_loads(path: Path) -> None:
 
 
 def test_all_examples_can_run_on_one_computer() -> None:
-    """Each listens on its own port, except that the two files of the same motor share one."""
-    others = [path for path in sorted(EXAMPLES.glob("*.toml")) if path.stem != "dc-motor-in-process"]
-    endpoints = [endpoint for path in others for endpoint in load_machine(path).file.zenoh.listen]
-    assert len(set(endpoints)) == len(others)
+    """Each listens on the socket of its own machine."""
+    files = [load_machine(path).file for path in sorted(EXAMPLES.glob("*.toml"))]
+    endpoints = [
+        address
+        for file in files
+        for address in listening(file.zenoh.listen, f"{file.machine.site}.{file.machine.name}")
+    ]
+    assert len(set(endpoints)) == len(files)
 
 
 def test_the_example_gives_its_estimation_problem() -> None:

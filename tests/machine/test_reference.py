@@ -29,6 +29,8 @@ TABLES: list[tuple[str, str, type[BaseModel]]] = [
     ("[discovery]", "key", machine_file.DiscoveryTable),
     ("[swarm]", "key", machine_file.SwarmTable),
     ("[zenoh]", "key", machine_file.ZenohTable),
+    ("[zenoh]", "key of `[zenoh.tls]`", machine_file.TlsTable),
+    ("[zenoh]", "key of `[zenoh.access]`", machine_file.AccessTable),
     ("[recording]", "key", machine_file.RecordingTable),
     ("[history]", "key", machine_file.HistoryTable),
     ('type = "can"', "key", can.Options),

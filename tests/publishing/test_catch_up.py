@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from otolith.publishing.catch_up import MAX_REPLIES, time_range
 from otolith.publishing.subscriber import MessageOrder, Subscriber
+from otolith.publishing.zenoh_config import Connection
 from otolith.publishing.zenoh_session import EVENT, REPORT, Publisher, Topic, session
 from otolith.storage.history import SUFFIX
 from otolith.storage.history_retention import Bounds
@@ -43,6 +44,8 @@ with zenoh.open(config):
 DAEMON = """
 import sys
 from pathlib import Path
+from otolith.machine_file import ZenohTable
+from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import Publisher
 from otolith.storage.history_retention import Bounds
 from otolith.storage.history_writer import HistoryWriter
@@ -51,7 +54,7 @@ writer = HistoryWriter(Path(sys.argv[1]), Bounds(50_000_000, 3650, 24))
 begin = float(sys.argv[3])
 numbers, _ = writer.open(begin)
 writer.start()
-publisher = Publisher(SITE, MACHINE, [], [sys.argv[2]], writer)
+publisher = Publisher(SITE, MACHINE, [], Access(ZenohTable(listen=(), connect=(sys.argv[2],))), writer)
 reports = documents(1_000_000, start=begin)
 print("open", flush=True)
 for line in sys.stdin:
@@ -119,7 +122,7 @@ def test_everything_comes_once_and_in_order_over_an_hour_without_router_and_a_ki
     def receive(text: str) -> None:
         (reports if "schema" in json.loads(text) else events).append(text)
 
-    with Subscriber([endpoint], receive, topics=(REPORT, EVENT)) as subscriber:
+    with Subscriber(Connection((endpoint,)), receive, topics=(REPORT, EVENT)) as subscriber:
         wait_for(lambda: bool(daemon.ask(1)) and bool(reports))  # connected
         assert subscriber.connected
         before = len(reports)
@@ -145,7 +148,9 @@ def test_everything_comes_once_and_in_order_over_an_hour_without_router_and_a_ki
 
     again: list[str] = []
     middle = sequences(reports)[700]
-    with Subscriber([endpoint], again.append, MACHINE, after=middle):  # another process went on with its own work
+    with Subscriber(
+        Connection((endpoint,)), again.append, MACHINE, after=middle
+    ):  # another process went on with its own work
         wait_for(lambda: bool(again) and sequences(again)[-1] == last)
     assert again == reports[701:]
 
@@ -164,7 +169,7 @@ def test_the_first_event_is_not_missed(
         if "schema" not in json.loads(text):
             events.append(text)
 
-    with Subscriber([endpoint], receive, topics=topics) as subscriber:
+    with Subscriber(Connection((endpoint,)), receive, topics=topics) as subscriber:
         wait_for(lambda: bool(subscriber.order.keys))
         router.kill()
         wait_for(lambda: not subscriber.connected)
@@ -179,7 +184,7 @@ def test_a_slow_subscriber_misses_nothing(tmp_path: Path, monkeypatch: pytest.Mo
     writer = HistoryWriter(tmp_path / f"{SITE}.{MACHINE}{SUFFIX}", BOUNDS)
     numbers, _ = writer.open(START)
     writer.start()
-    publisher = Publisher(SITE, MACHINE, [endpoint], [], writer)
+    publisher = Publisher(SITE, MACHINE, [endpoint], archive=writer)
     received, may_continue = list[str](), queue.Queue[None]()
 
     def receive(text: str) -> None:
@@ -187,7 +192,7 @@ def test_a_slow_subscriber_misses_nothing(tmp_path: Path, monkeypatch: pytest.Mo
             may_continue.get(timeout=PATIENCE)
         received.append(text)
 
-    with Subscriber([endpoint], receive, after=0) as subscriber:
+    with Subscriber(Connection((endpoint,)), receive, after=0) as subscriber:
         wait_for(lambda: subscriber.connected)
         for report in documents(200):
             numbered = numbers.number(report)
@@ -207,7 +212,7 @@ def test_queries_select_by_time_and_number(tmp_path: Path) -> None:
     now = time.time()
     numbers, _ = writer.open(now)
     writer.start()
-    publisher = Publisher(SITE, MACHINE, [endpoint], [], writer)
+    publisher = Publisher(SITE, MACHINE, [endpoint], archive=writer)
     for report in documents(MAX_REPLIES + 200, start=now - 2.0 * (MAX_REPLIES + 200)):
         writer.add(numbers.number(report))
         if report.window.index % 100 == 0:
@@ -301,7 +306,7 @@ def test_messages_without_numbers_are_passed_on() -> None:
 
 def test_a_payload_that_is_no_text_ends_no_subscriber() -> None:
     endpoint, passed = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", list[str]()
-    with session([endpoint]) as other, Subscriber([endpoint], passed.append) as subscriber:
+    with session([endpoint]) as other, Subscriber(Connection((endpoint,)), passed.append) as subscriber:
         wait_for(lambda: subscriber.connected)
 
         def received() -> bool:

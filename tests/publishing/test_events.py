@@ -29,7 +29,7 @@ def documents() -> list[ReportDocument]:
 
 def test_each_change_of_an_event_is_published_once() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    publisher = Publisher("here", "motor", [endpoint], [])
+    publisher = Publisher("here", "motor", [endpoint])
     received: list[tuple[str, str]] = []
 
     def published(document: ReportDocument, count: int) -> bool:

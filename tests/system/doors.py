@@ -18,7 +18,7 @@ from otolith_drivers.plant.scenario import load_scenario
 
 def measured(scenario: Path) -> Iterator[tuple[float, dict[str, float]]]:
     """The Unix time (s) and the measured values of each sample, when it is taken."""
-    for scheduled in in_real_time(load_scenario(scenario), NodeSummary.of(()), lambda: False):
+    for _, scheduled in in_real_time(load_scenario(scenario), {"can": NodeSummary.of(())}, lambda: False):
         yield time.time() - time.monotonic() + scheduled.taken, dict(scheduled.sample.measured)
 
 

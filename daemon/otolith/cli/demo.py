@@ -29,6 +29,7 @@ from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_styl
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
 from otolith.health.text import announcements, event_text, half_width_text, headline, summary
 from otolith.machine import LoadedMachine, load_machine
+from otolith.publishing.zenoh_config import SOCKET, listening
 from otolith.publishing.zenoh_session import REPORT, Listener
 from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
@@ -173,7 +174,8 @@ class Demo:
         Raises:
             OtolithError: the endpoint is in use, or plant or daemon ended.
         """
-        names, endpoints = self._machine.file.machine, self._machine.file.zenoh.listen
+        names = self._machine.file.machine
+        endpoints = listening(self._machine.file.zenoh.listen, f"{names.site}.{names.name}")
         if not endpoints:
             raise ConfigurationError(f"{self._machine.path}: zenoh.listen is empty, so there is nothing to watch")
         key = REPORT.under(names.site, names.name)
@@ -362,8 +364,14 @@ def _refuse_busy(endpoints: Sequence[str]) -> None:
         ServiceError: something listens there.
     """
     for endpoint in endpoints:
-        host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-        with contextlib.suppress(OSError, ValueError), socket.create_connection((host, int(port)), timeout=0.5):
+        is_file = endpoint.startswith(SOCKET)
+        host, _, port = endpoint.partition("/")[2].rpartition(":")
+        with (
+            contextlib.suppress(OSError, ValueError),
+            socket.socket(socket.AF_UNIX if is_file else socket.AF_INET) as s,
+        ):
+            s.settimeout(0.5)
+            s.connect(endpoint.removeprefix(SOCKET) if is_file else (host, int(port)))
             raise ServiceError(f"{endpoint} is in use: a daemon runs there; stop it, or set zenoh.listen")
 
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -26,8 +26,13 @@ from otolith.cli.common import (
     examples_directory,
     log_to_stderr,
 )
+from otolith.cli.operation.connection import endpoints, reader_options
 from otolith.cli.operation.history import history
+from otolith.cli.operation.keys import keys
 from otolith.cli.operation.view import view
+
+if TYPE_CHECKING:
+    from otolith.publishing.zenoh_config import Credentials
 
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.realtime.NODES, which is slow to import
 EXIT_CODES = """\b
@@ -38,13 +43,6 @@ Exit codes:
   2    a file, option, bus or port cannot be used; the message says which, why
        and what to do
   130  interrupted by Ctrl-C (128 + n by another signal n)"""
-
-
-def _endpoints(_: click.Context, __: click.Parameter, endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    for endpoint in endpoints:
-        if not re.fullmatch(r"[a-z-]+/\S+", endpoint):
-            raise click.BadParameter(f"{endpoint!r} is no endpoint: write it like tcp/127.0.0.1:7447")
-    return endpoints
 
 
 def _new_recording(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
@@ -101,7 +99,7 @@ def cli() -> None:
 
 @cli.command()
 @MACHINE_FILE
-@click.option("--listen", multiple=True, callback=_endpoints, metavar="ENDPOINT",
+@click.option("--listen", multiple=True, callback=endpoints, metavar="ENDPOINT",
               help="Publish here instead of where the file says; may be repeated.")  # fmt: skip
 @click.option("--recording", type=FILE, callback=_new_recording,
               help="Record into this file instead of a new one in the state directory.")  # fmt: skip
@@ -186,30 +184,32 @@ def replay(
 
 
 @cli.command()
-@click.option("--connect", multiple=True, default=["tcp/127.0.0.1:7447"], callback=_endpoints,
-              metavar="ENDPOINT", help="Where daemons publish; may be repeated.")  # fmt: skip
+@reader_options
 @click.option("--machine", default="*", callback=_machine_name, metavar="NAME", help="Only this machine.")
 @click.option("--json", "as_json", is_flag=True, help="Print each report as a line of JSON instead of a table.")
 @click.option("--after", type=click.IntRange(0), metavar="NUMBER",
               help="With --json: begin after the report with this sequence number.")  # fmt: skip
-def watch(connect: tuple[str, ...], machine: str, as_json: bool, after: int | None) -> int:
+def watch(connect: tuple[str, ...], credentials: "Credentials", machine: str, as_json: bool, after: int | None) -> int:
     """Show the live table of running daemons, over Zenoh.
 
     With --json each report is printed once and in order, also those that were
     published while the connection was down.
+    Each of the options to connect can also be set in the environment, such as OTOLITH_CA for --ca.
 
     \b
     Examples:
       otolith watch
+      otolith watch --connect tls/press-3.local:7447 --ca ca.crt
       otolith watch --json | jq .parameters.R_a
       otolith watch --json --machine press-3 --after 1790000000000
     """
     if after is not None and not as_json:
         raise click.UsageError("--after needs --json")
     from otolith.cli.operation.watch import watch_reports
+    from otolith.publishing.zenoh_config import Connection
 
     stop = StopSignal()
-    watch_reports(connect, machine, as_json=as_json, after=after, stopped=stop.received)
+    watch_reports(Connection(connect, credentials), machine, as_json=as_json, after=after, stopped=stop.received)
     return stop.code()
 
 
@@ -277,5 +277,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, components, history, noise, probe, reset, twin, view):
+for command in (commission, components, history, keys, noise, probe, reset, twin, view):
     cli.add_command(command)

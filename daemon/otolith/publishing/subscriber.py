@@ -10,6 +10,7 @@ from typing import Self
 import zenoh
 
 from otolith.publishing.catch_up import MAX_REPLIES
+from otolith.publishing.zenoh_config import Connection, local_sockets, reader_settings
 from otolith.publishing.zenoh_session import ALIVE, REPORT, Topic, session
 from otolith_drivers.errors import ServiceError
 
@@ -106,19 +107,27 @@ class Subscriber:
 
     def __init__(
         self,
-        connect: Iterable[str],
+        connection: Connection,
         on_message: Callable[[str], None],
         machine: str = "*",
         topics: tuple[Topic, ...] = (REPORT,),
         after: int | None = None,
     ) -> None:
-        """Begin after a sequence number, or without it with the latest report; ``machine`` may be ``*``."""
+        """Begin after a sequence number, or without it with the latest report; ``machine`` may be ``*``.
+
+        Without endpoints it reads all daemons on this computer that this user may read.
+
+        Raises:
+            ConfigurationError: a file of the credentials is missing or cannot be used.
+        """
         self._topics = topics
         self._waiting: queue.Queue[tuple[str, str | None]] = queue.Queue(MAX_BEHIND)
         self._stopping, self._is_behind = threading.Event(), threading.Event()
         self.order = MessageOrder(self._query, on_message, lambda: self._stopping.wait(QUERY_PAUSE), after, topics)
         self._machine, self._from_now = machine, after is None
-        self._endpoints, self._sessions = list(connect), list[zenoh.Session]()
+        self._endpoints = connection.endpoints
+        self._settings = reader_settings(connection.credentials, connection.endpoints)
+        self._sessions: dict[str, zenoh.Session] = {}
         self._declared: list[object] = []
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._connect, self._run)]
         for thread in self._threads:
@@ -127,7 +136,17 @@ class Subscriber:
     @property
     def connected(self) -> bool:
         """Whether a daemon or a router is connected."""
-        return any(each.info.peers_zid() or each.info.routers_zid() for each in self._sessions)
+        return any(each.info.peers_zid() or each.info.routers_zid() for each in tuple(self._sessions.values()))
+
+    def state(self) -> str:
+        """Return what it waits for, in words."""
+        addresses = ", ".join(self._endpoints or self._sessions)
+        if self.connected:
+            return f"connected, waiting for {REPORT.under('*', self._machine)} ({addresses})"
+        if self._endpoints:
+            return f"no daemon reached yet, or it refuses this reader; --connect sets where to look ({addresses})"
+        own = "no daemon of this user runs here, and no service that it may read"
+        return f"{own}: members of the group otolith may; --connect sets where to look"
 
     def __enter__(self) -> Self:
         return self
@@ -138,19 +157,20 @@ class Subscriber:
         self._stopping.set()
         for thread in self._threads:  # a session that is left open would keep the process alive
             thread.join(QUERY_TIMEOUT)
-        for each in self._sessions:
+        for each in self._sessions.values():
             each.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
 
     def _connect(self) -> None:
         """Open a session for each endpoint, as soon as something answers there; it reconnects by itself."""
-        while self._endpoints and not self._stopping.is_set():
-            for endpoint in tuple(self._endpoints):
+        while not self._stopping.is_set():
+            for endpoint in self._endpoints or local_sockets():
+                if endpoint in self._sessions:
+                    continue
                 try:
-                    opened = session(connect=[endpoint], mode="client")
+                    opened = session((), [endpoint], self._settings, "client")
                 except ServiceError:
                     continue
-                self._sessions.append(opened)
-                self._endpoints.remove(endpoint)
+                self._sessions[endpoint] = opened
                 self._declare(opened)
             self._stopping.wait(QUERY_PAUSE)
 
@@ -210,7 +230,7 @@ class Subscriber:
 
     def _get(self, selector: str) -> list[str]:
         none = zenoh.ConsolidationMode.NONE  # by default only the latest message of a key would be passed on
-        for each in tuple(self._sessions):
+        for each in tuple(self._sessions.values()):
             try:
                 replies = each.get(selector, timeout=QUERY_TIMEOUT, consolidation=none)
                 texts = [_text(reply.ok) for reply in replies if reply.ok is not None]

@@ -1,6 +1,8 @@
 """Zenoh: the session's configuration, the daemon's publisher, and a listener for the command line and tests."""
 
 import json
+import logging
+import os
 import re
 import threading
 from collections.abc import Callable, Iterable
@@ -13,10 +15,22 @@ import zenoh
 from otolith.health.schema import ReportDocument
 from otolith.health.text import announcements
 from otolith.publishing.catch_up import Archive, answer
+from otolith.publishing.zenoh_config import (
+    ENCRYPTED,
+    LEASE,
+    SOCKET,
+    SOCKET_UMASK,
+    Access,
+    Credentials,
+    Settings,
+    raise_descriptor_limit,
+    reader_settings,
+)
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ServiceError
 
-LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
+log = logging.getLogger(__name__)
+
 CLIENT_TIMEOUT = 1000  # ms for a client to connect
 
 
@@ -50,7 +64,10 @@ def prefix(site: str, machine: str) -> str:
 
 
 def session(
-    listen: Iterable[str] = (), connect: Iterable[str] = (), mode: Literal["peer", "client"] = "peer"
+    listen: Iterable[str] = (),
+    connect: Iterable[str] = (),
+    settings: Settings | None = None,
+    mode: Literal["peer", "client"] = "peer",
 ) -> zenoh.Session:
     """Open a session that uses only the given endpoints: no scouting, no shared memory.
 
@@ -59,46 +76,63 @@ def session(
     Raises:
         ServiceError: an endpoint to listen on is in use, one is malformed, or a client reaches none.
     """
-    settings = {
+    listen, connect = tuple(listen), tuple(connect)
+    whole: Settings = {
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "listen/endpoints": list(listen),
-        "connect/endpoints": list(connect),
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
         "open/return_conditions/connect_scouted": False,
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE,
+        **(settings or {}),
     }
     if mode == "client":
-        settings["connect/timeout_ms"] = CLIENT_TIMEOUT
+        whole["connect/timeout_ms"] = CLIENT_TIMEOUT
+    if any(endpoint.startswith(ENCRYPTED) for endpoint in listen):
+        raise_descriptor_limit()
+    # The process has one umask. Zenoh's thread binds the sockets before open() returns, and nothing else runs yet.
+    umask = os.umask(SOCKET_UMASK) if any(endpoint.startswith(SOCKET) for endpoint in listen) else None
     try:
         config = zenoh.Config()
-        for key, value in settings.items():
+        for key, value in whole.items():
             config.insert_json5(key, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise ServiceError(f"Zenoh cannot open {', '.join([*listen, *connect])}: {_cause(str(error))}") from error
+    finally:
+        if umask is not None:
+            os.umask(umask)
 
 
 def _cause(message: str) -> str:
     """Return the cause from Zenoh's nested message, and the remedy."""
     cause = re.sub(r"[\[\]]|\(os error \d+\)|at /\S+", "", message.rsplit(": [", maxsplit=1)[-1]).strip()
-    if "in use" in message:
+    if "in use" in message or "acquire lock" in message:
         return f"{cause}; another daemon publishes there: set zenoh.listen in the machine file, or --listen"
-    return f"{cause}; check the endpoint, which is written like tcp/127.0.0.1:7447"
+    return f"{cause}; check the endpoint, which is written like tcp/127.0.0.1:7447 or unixsock-stream//run/a.sock"
 
 
 class Publisher:
     """Publishes the reports of one machine and answers queries for the latest one, and for earlier ones."""
 
     def __init__(
-        self, site: str, machine: str, listen: Iterable[str], connect: Iterable[str], archive: Archive | None = None
+        self,
+        site: str,
+        machine: str,
+        listen: Iterable[str],
+        access: Access = Access(),  # noqa: B008 - immutable
+        archive: Archive | None = None,
     ) -> None:
         """Queries for earlier reports and events are answered from ``archive``."""
+        settings, warning = access.settings(prefix(site, machine), listen)
+        if warning:
+            log.warning("%s", warning)
         self._archive = archive
-        self._session = session(listen, connect)
+        self._session = session(listen, access.zenoh.connect, settings)
         self._site, self._machine = site, machine
         self._lock = threading.Lock()
         self._latest: str | None = None
@@ -132,7 +166,10 @@ class Publisher:
 
     def close(self) -> None:
         """Close the session; subscribers see the liveliness token disappear."""
-        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+        try:
+            self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+        except zenoh.ZError as error:  # connections that never finish their handshake delay it beyond Zenoh's limit
+            log.warning("the Zenoh session was not closed in time: %s", _cause(str(error)))
 
     def _answer(self, query: zenoh.Query) -> None:
         with self._lock:
@@ -148,8 +185,14 @@ class Publisher:
 class Listener:
     """Passes the reports under ``key`` to ``on_report``, beginning with the latest one of each machine if it exists."""
 
-    def __init__(self, connect: Iterable[str], key: str, on_report: Callable[[str], None]) -> None:
-        self._session = session(connect=tuple(connect))
+    def __init__(
+        self,
+        connect: Iterable[str],
+        key: str,
+        on_report: Callable[[str], None],
+        credentials: Credentials = Credentials(),  # noqa: B008 - immutable
+    ) -> None:
+        self._session = session(connect=connect, settings=reader_settings(credentials, connect))
         self._subscriber = self._session.declare_subscriber(key, lambda sample: on_report(sample.payload.to_string()))
         for reply in self._session.get(key, timeout=1.0):
             if reply.ok is not None:

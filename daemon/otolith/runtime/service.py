@@ -26,6 +26,7 @@ from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
 from otolith.publishing.connection import driver_document, with_missing_sources
+from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
@@ -116,8 +117,9 @@ class Service:
         self._start_history()
         self._windower.records = self._supervisor.records
         identity, driver = self._machine.file.machine, self._machine.driver
-        connect = self._machine.file.zenoh.connect
-        self._publisher = Publisher(identity.site, identity.name, self._listen, connect, self._history)
+        zenoh, listen = self._machine.file.zenoh, listening(self._listen, f"{identity.site}.{identity.name}")
+        access = Access(zenoh, self._machine.path)
+        self._publisher = Publisher(identity.site, identity.name, listen, access, self._history)
         driver.open(self._rings.deliver)
         self._writer.start()
         self._supervisor.start()
@@ -125,7 +127,7 @@ class Service:
             self._recorder.start(time.monotonic())
         self._started_at = self._progress_at = time.monotonic()
         self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
-        log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, ", ".join(self._listen))
+        log.info("machine %s, %s: reports on %s", identity.name, self._machine.twin.title, ", ".join(listen))
 
     def _stop(self) -> None:
         """Stop every part, even if stopping another one fails; the last callback runs first."""

@@ -107,7 +107,7 @@ class OpcuaSource(ScaledSource):
 
 
 @dataclass(frozen=True, slots=True)
-class Credentials:
+class OpcUaCredentials:
     """Certificate, key and password, read from their files."""
 
     certificate: x509.Certificate | None = None
@@ -166,7 +166,7 @@ class RefusedError(Exception):
 
 
 @asynccontextmanager
-async def connected(options: OpcuaOptions, credentials: Credentials) -> AsyncIterator[Client]:
+async def connected(options: OpcuaOptions, credentials: OpcUaCredentials) -> AsyncIterator[Client]:
     """Yield a client with a session, and end both.
 
     Raises:
@@ -200,7 +200,7 @@ async def _end(client: Client) -> None:
         await client.disconnect()
 
 
-async def _secure(client: Client, options: OpcuaOptions, credentials: Credentials) -> None:
+async def _secure(client: Client, options: OpcuaOptions, credentials: OpcUaCredentials) -> None:
     """Set the security policy with the certificate that the server presents.
 
     Raises:

@@ -18,7 +18,7 @@ from asyncua import Client, ua
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.opcua.connection import (
-    Credentials,
+    OpcUaCredentials,
     OpcuaOptions,
     OpcuaSource,
     RefusedError,
@@ -54,7 +54,7 @@ def build(options: OpcuaOptions, setup: Setup) -> "OpcuaSubscriber":
     Raises:
         ConfigurationError: a unit has the wrong dimension, or a certificate, key or password cannot be read.
     """
-    credentials = Credentials.load(options, setup.folder)
+    credentials = OpcUaCredentials.load(options, setup.folder)
     readings = Readings(setup.signals, setup.sample_period, use_server_stamps=options.stamps == "server")
     for node in readings.signals:
         if node.source.unit is not None:
@@ -70,7 +70,7 @@ class OpcuaSubscriber:
 
     sampling = Sampling.POLLED
 
-    def __init__(self, options: OpcuaOptions, credentials: Credentials, readings: Readings, period: float) -> None:
+    def __init__(self, options: OpcuaOptions, credentials: OpcUaCredentials, readings: Readings, period: float) -> None:
         self._options, self._credentials, self._readings, self._period = options, credentials, readings, period
         self._up, self._was_up, self._reason = False, False, "not opened yet"
         self._reconnects = 0

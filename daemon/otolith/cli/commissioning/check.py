@@ -9,6 +9,7 @@ from pathlib import Path
 
 from otolith.cli.common import progress_line
 from otolith.machine import LoadedMachine, load_machine
+from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import prefix
 from otolith.runtime.preview import preview_lines, preview_recording
 from otolith_drivers.base import Link, Sample
@@ -99,8 +100,12 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         lines += [f"noise of {driving.name}: {noise:g} {driving.unit}"] if noise else []
     for state, noise in zip(twin.states, problem.process_noise, strict=True):
         lines += [f"process noise of {state.name}: {noise:g} {state.unit} per square root of a second"] if noise else []
-    endpoints = ", ".join(file.zenoh.listen) or "no endpoint"
-    lines.append(f"reports on {endpoints}, keys {prefix(file.machine.site, file.machine.name)}/...")
+    endpoints = listening(file.zenoh.listen, f"{file.machine.site}.{file.machine.name}")
+    _, warning = Access(file.zenoh, machine.path).settings(prefix(file.machine.site, file.machine.name), endpoints)
+    lines += [f"! {warning}"] if warning else []
+    lines.append(
+        f"reports on {', '.join(endpoints) or 'no endpoint'}, keys {prefix(file.machine.site, file.machine.name)}/..."
+    )
     lines.append(f"recordings into {machine.recording_folder}" if file.recording.enabled else "no recordings")
     return lines
 

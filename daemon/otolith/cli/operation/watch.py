@@ -4,7 +4,7 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from rich.console import Console
 from rich.live import Live
@@ -12,7 +12,7 @@ from rich.live import Live
 from otolith.cli.common import drain
 from otolith.cli.operation.live_table import LiveTable
 from otolith.publishing.subscriber import Subscriber
-from otolith.publishing.zenoh_session import REPORT
+from otolith.publishing.zenoh_config import Connection
 
 # Engineering choices without a test of their own.
 MAX_QUEUED = 100  # reports that wait for a slow terminal; later ones come from the history
@@ -21,13 +21,17 @@ PATIENCE = 5.0  # s without a report until the stream prints what it waits for
 
 
 def watch_reports(
-    connect: Sequence[str], machine: str, *, as_json: bool, after: int | None, stopped: Callable[[], bool]
+    connection: Connection,
+    machine: str,
+    *,
+    as_json: bool,
+    after: int | None,
+    stopped: Callable[[], bool],
 ) -> None:
     """Show reports until ``stopped``; wait for a daemon that is not there yet.
 
     As JSON each report is printed once and in order, beginning after the sequence number ``after``.
     """
-    key = REPORT.under("*", machine)
     texts: queue.Queue[str] = queue.Queue(MAX_QUEUED)
     ended = threading.Event()
 
@@ -39,17 +43,12 @@ def watch_reports(
                 continue
             return
 
-    with Subscriber(connect, receive, machine, after=after) as subscriber:
-
-        def state() -> str:
-            missing = "no daemon reached yet; --connect sets where to look"
-            return f"{f'connected, waiting for {key}' if subscriber.connected else missing} ({', '.join(connect)})"
-
+    with Subscriber(connection, receive, machine, after=after) as subscriber:
         try:
             if as_json:
-                _stream(texts, state, stopped)
+                _stream(texts, subscriber.state, stopped)
                 return
-            table = LiveTable(state)
+            table = LiveTable(subscriber.state)
             with Live(table, console=Console(), refresh_per_second=5):
                 while not stopped():
                     for text in drain(texts, PAUSE):
