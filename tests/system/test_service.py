@@ -98,10 +98,16 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
         service._supervisor.missed += 1
         service._feed_watchdog(1000.0 + patience + 3.0)
         assert not fed()
-        service._supervisor.finished += 1
+        service._supervisor.progress += 1  # a kernel is compiled: time for the next one
         service._feed_watchdog(1000.0 + patience + 6.0)
         assert fed()
-        service._feed_watchdog(1000.0 + patience + 6.0 + STALL_TIMEOUT + 3 * 2.0 + 0.1)  # nothing is compiled any more
+        service._feed_watchdog(1000.0 + 2 * patience + 5.9)
+        assert fed()
+        service._supervisor.progress += 1  # a window is finished
+        service._supervisor.is_compiling = False
+        service._feed_watchdog(1000.0 + 2 * patience + 6.0)
+        assert fed()
+        service._feed_watchdog(1000.0 + 2 * patience + 6.0 + STALL_TIMEOUT + 3 * 2.0 + 0.1)
         assert not fed()
         service._notifier.close()
 

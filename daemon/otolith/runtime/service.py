@@ -78,7 +78,7 @@ class Service:
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
         self._stop_signal: int | None = None
-        self._windows = self._windows_bad = self._recordings_dropped = self._finished = 0
+        self._windows = self._windows_bad = self._recordings_dropped = self._progress = 0
         self._started_at = self._progress_at = self._fed_at = 0.0
         self._summarised_at = -math.inf
 
@@ -244,11 +244,10 @@ class Service:
             self._saved, self._saved_at = keys, now
 
     def _feed_watchdog(self, now: float) -> None:
-        """Feed systemd's watchdog as long as windows, good or bad, are being finished."""
-        if self._supervisor.finished != self._finished:
-            self._finished, self._progress_at = self._supervisor.finished, now
-        # Before the first window the worker may compile the kernels of the twin.
-        compiling = 0.0 if self._supervisor.finished else COMPILE_TIMEOUT
+        """Feed systemd's watchdog as long as windows, good or bad, are being finished, or kernels compiled."""
+        if self._supervisor.progress != self._progress:
+            self._progress, self._progress_at = self._supervisor.progress, now
+        compiling = COMPILE_TIMEOUT if self._supervisor.is_compiling else 0.0
         stalled = now - self._progress_at > STALL_TIMEOUT + 3 * self._windower.length + compiling
         if self._notifier.watchdog and not stalled and now - self._fed_at > self._notifier.watchdog / 4:
             self._fed_at = now

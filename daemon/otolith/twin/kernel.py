@@ -335,7 +335,7 @@ class Kernel:
         arguments = (np.ascontiguousarray(first), np.ascontiguousarray(second), *rest)
         if name in self._compiled:
             return function(*arguments)
-        with kernel_cache.compiling(self._module):
+        with kernel_cache.compiling(self._module, function, f"{self.definition.name}.{name}"):
             try:
                 result = function(*arguments)
             except Exception:  # noqa: BLE001 - a truncated cache file raises any type; a fault of the equations is raised again below
