@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -24,9 +25,10 @@ from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
 from otolith.health.schema import CountersDocument, DriverDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
-from otolith.machine import LoadedMachine
+from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS, ChildProcess
+from otolith.runtime.reload import reloaded
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.state_store import StateStore, WriterThread
@@ -78,12 +80,13 @@ class Service:
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
         self._stop_signal: int | None = None
+        self._is_reload_due = False
         self._windows = self._windows_bad = self._recordings_dropped = self._progress = 0
         self._started_at = self._progress_at = self._fed_at = 0.0
         self._summarised_at = -math.inf
 
     def run(self) -> int:
-        """Serve until SIGTERM, SIGHUP or SIGINT, and return the number of that signal.
+        """Serve until SIGTERM or SIGINT, or in a terminal SIGHUP, and return the number of that signal.
 
         Raises:
             DeviceError: the machine's bus cannot be opened.
@@ -96,12 +99,17 @@ class Service:
             self._start()
             while self._stop_signal is None:
                 self._step()
+                if self._is_reload_due:
+                    self._reload()
         finally:
             self._stop()
         return self._stop_signal or 0
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
-        self._stop_signal = number
+        if number == signal.SIGHUP and not os.isatty(0):  # in a terminal it means that the terminal is closed
+            self._is_reload_due = True
+        else:
+            self._stop_signal = number
 
     def _start(self) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL)
@@ -156,6 +164,23 @@ class Service:
                 remedy,
             )
         return state
+
+    def _reload(self) -> None:
+        """Take over limits and recording from the machine file; if it is invalid, go on as before."""
+        self._is_reload_due = False
+        try:
+            change = reloaded(self._machine, load_machine(self._machine.path))
+        except (OtolithError, OSError) as error:
+            log.warning("not reloaded, the daemon goes on as before: %s", error)
+            return
+        self._machine = change.machine
+        log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
+        if change.limits:
+            self._supervisor.revise(lambda state: replace(state, plan=change.machine.plan))
+        if change.recording:
+            self._recorder.stop(RECORDER_FLUSH)
+            if self._machine.file.recording.enabled:
+                self._try_to_record()
 
     def _step(self) -> None:
         """Cut due windows, hand them to the worker, publish finished reports, supervise the processes."""
@@ -258,11 +283,14 @@ class Service:
         if self._recorder.alive and self._recorder.age > RECORDER_HEALTHY_AGE:
             self._recorder.reset_backoff()
         if self._recorder.may_restart(now):
-            try:
-                self._start_recorder()
-            except OtolithError as error:  # monitoring continues without recording
-                log.warning("no recording: %s", error)
-                self._recorder.count_failed_start()
+            self._try_to_record()
+
+    def _try_to_record(self) -> None:
+        try:
+            self._start_recorder()
+        except OtolithError as error:  # monitoring continues without recording
+            log.warning("no recording: %s", error)
+            self._recorder.count_failed_start()
 
     def _start_recorder(self) -> None:
         machine = self._machine
