@@ -58,7 +58,7 @@ def _generator_hash() -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in GENERATOR)).hexdigest()
 
 
-class Step(NamedTuple):
+class CompileStep(NamedTuple):
     """The first call of a kernel in this process begins or ends."""
 
     kernel: str
@@ -67,11 +67,11 @@ class Step(NamedTuple):
     """At the end: whether it was compiled, and not loaded."""
 
 
-_observers: list[Callable[[Step], None]] = []
+_observers: list[Callable[[CompileStep], None]] = []
 
 
 @contextmanager
-def observed(observer: Callable[[Step], None]) -> Iterator[None]:
+def observed(observer: Callable[[CompileStep], None]) -> Iterator[None]:
     """Call ``observer`` with each step of this process, for its progress."""
     _observers.append(observer)
     try:
@@ -87,13 +87,13 @@ def compiling(module: ModuleType, function: Any, kernel: str) -> Iterator[None]:
     ``kernel`` names it for observers.
     """
     file = Path(module.__file__ or "")
-    _report(Step(kernel, is_end=False, compiled=False))
+    _report(CompileStep(kernel, is_end=False, compiled=False))
     with _locked(file.parent.parent / f"{file.parent.name}.lock"):
         yield
-    _report(Step(kernel, is_end=True, compiled=bool(function.stats.cache_misses)))
+    _report(CompileStep(kernel, is_end=True, compiled=bool(function.stats.cache_misses)))
 
 
-def _report(step: Step) -> None:
+def _report(step: CompileStep) -> None:
     for observer in _observers:
         observer(step)
 

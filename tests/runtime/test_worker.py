@@ -15,7 +15,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.state import initial_state
 from otolith.cli.main import cli
 from otolith.health.schema import Report
-from otolith.kernel_cache import Step
+from otolith.kernel_cache import CompileStep
 from otolith.machine import load_machine
 from otolith.runtime.worker import (
     COMPILE_TIMEOUT,
@@ -165,13 +165,16 @@ def test_a_worker_that_compiles_ten_times_slower_is_not_killed(batch: list[Windo
     """Twelve kernels at two minutes each, before the first window and for a component that is new later."""
     supervisor, worker = slow(batch)
     for number in range(1, 13):
-        worker.sent = [Step("kernel", is_end=True, compiled=True), Step("next", is_end=False, compiled=False)]
+        worker.sent = [
+            CompileStep("kernel", is_end=True, compiled=True),
+            CompileStep("next", is_end=False, compiled=False),
+        ]
         assert supervisor.poll(number * STEP) == []
         assert (worker.killed, supervisor.progress, supervisor.is_compiling) == (0, number, True)
     worker.sent = [Ready()]
     supervisor.poll(13 * STEP)
     assert not supervisor.is_compiling
-    worker.sent = [Step("rare", is_end=False, compiled=False)]
+    worker.sent = [CompileStep("rare", is_end=False, compiled=False)]
     supervisor.poll(13 * STEP + WINDOW_TIMEOUT)
     supervisor.poll(14 * STEP)
     assert worker.killed == 0
@@ -179,7 +182,7 @@ def test_a_worker_that_compiles_ten_times_slower_is_not_killed(batch: list[Windo
 
 def test_a_worker_that_hangs_while_it_compiles_is_killed(batch: list[Window]) -> None:
     supervisor, worker = slow(batch)
-    worker.sent = [Step("kernel", is_end=False, compiled=False)]
+    worker.sent = [CompileStep("kernel", is_end=False, compiled=False)]
     supervisor.poll(1.0)
     supervisor.poll(STEP + 2 * LENGTH + 0.9)
     assert worker.killed == 0
@@ -190,7 +193,11 @@ def test_a_worker_that_hangs_while_it_compiles_is_killed(batch: list[Window]) ->
 def test_kernels_that_are_loaded_are_no_progress(batch: list[Window]) -> None:
     """Otherwise a worker that dies at every start would feed the watchdog for ever."""
     supervisor, worker = slow(batch)
-    worker.sent = [Step("kernel", is_end=False, compiled=False), Step("kernel", is_end=True, compiled=False), Ready()]
+    worker.sent = [
+        CompileStep("kernel", is_end=False, compiled=False),
+        CompileStep("kernel", is_end=True, compiled=False),
+        Ready(),
+    ]
     supervisor.poll(1.0)
     assert supervisor.progress == 0
 

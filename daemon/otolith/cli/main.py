@@ -27,6 +27,7 @@ from otolith.cli.common import (
     log_to_stderr,
 )
 from otolith.cli.operation.compile import compile_command
+from otolith.cli.operation.install import install
 
 TRANSPORTS = ("can", "modbus-tcp", "modbus-rtu")  # the keys of plant.realtime.NODES, which is slow to import
 EXIT_CODES = """\b
@@ -289,5 +290,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, compile_command, components, noise, probe, reset, twin):
+for command in (commission, compile_command, components, install, noise, probe, reset, twin):
     cli.add_command(command)

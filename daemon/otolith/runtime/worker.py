@@ -59,7 +59,7 @@ def main(connection: Any, state: AdaptationState) -> None:
     Each step of a kernel is sent as well, and :class:`Ready` once.
     """
 
-    def report(step: kernel_cache.Step) -> None:
+    def report(step: kernel_cache.CompileStep) -> None:
         with contextlib.suppress(OSError):  # the daemon has died, which the next result notices
             connection.send(step)
 
@@ -167,7 +167,7 @@ class Supervisor:
         self._dispatch(now)
         return reports
 
-    def _note(self, step: kernel_cache.Step | Ready, now: float) -> None:
+    def _note(self, step: kernel_cache.CompileStep | Ready, now: float) -> None:
         """Allow time from this step on. Loading a kernel is no progress: a worker that always dies loads some, too."""
         if isinstance(step, Ready):
             self._is_ready = True

@@ -41,7 +41,7 @@ def compile_kernels(file: Path) -> None:
     folder, count = cache_directory("kernels"), 0
     with progress_line(f"compiling {machine.twin.name}") as show:
 
-        def observe(step: kernel_cache.Step) -> None:
+        def observe(step: kernel_cache.CompileStep) -> None:
             nonlocal count
             count += step.compiled
             show(f"compiling {step.kernel}, {counted(count, 'kernel')} done in {time.monotonic() - begun:.0f} s")
