@@ -47,6 +47,7 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
         if not file.exists():
             folder.mkdir(mode=0o700, exist_ok=True)
             _write(file, make_source())
+            _report(CompileStep("(source of a twin)", is_end=True, compiled=True))
             _remove_old(store, keep=folder)
         os.utime(folder)
         return _import(name, file)

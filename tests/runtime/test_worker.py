@@ -162,7 +162,7 @@ STEP = COMPILE_TIMEOUT + WINDOW_TIMEOUT  # s; less than a step may take
 
 
 def test_a_worker_that_compiles_ten_times_slower_is_not_killed(batch: list[Window]) -> None:
-    """Twelve kernels at two minutes each, before the first window and for a component that is new later."""
+    """Twelve kernels at ten minutes each, before the first window and for a component that is new later."""
     supervisor, worker = slow(batch)
     for number in range(1, 13):
         worker.sent = [

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 WARM_UP_RECORDS = 80  # of the random window that makes a new worker compile every kernel
 MAX_WAITING_WINDOWS = 2  # for a busy worker; older ones are missed
 WINDOW_TIMEOUT = 20.0  # s for a window, in addition to twice its length
-COMPILE_TIMEOUT = 120.0  # s in addition, from one kernel to the next: while the worker starts or compiles a kernel
+COMPILE_TIMEOUT = 600.0  # s in addition, from one kernel to the next: while the worker starts or compiles a kernel
 NOT_READY = (
     "the worker is starting; it compiles the kernels of a twin that is new on this computer, which takes minutes"
 )
