@@ -18,6 +18,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
+from typing import Any, NamedTuple
 
 from otolith_drivers.errors import ServiceError
 from otolith_drivers.user_dirs import cache_directory
@@ -46,6 +47,7 @@ def load(identity: str, make_source: Callable[[], str]) -> ModuleType:
         if not file.exists():
             folder.mkdir(mode=0o700, exist_ok=True)
             _write(file, make_source())
+            _report(CompileStep("(source of a twin)", is_end=True, compiled=True))
             _remove_old(store, keep=folder)
         os.utime(folder)
         return _import(name, file)
@@ -57,12 +59,44 @@ def _generator_hash() -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in GENERATOR)).hexdigest()
 
 
+class CompileStep(NamedTuple):
+    """The first call of a kernel in this process begins or ends."""
+
+    kernel: str
+    is_end: bool
+    compiled: bool
+    """At the end: whether it was compiled, and not loaded."""
+
+
+_observers: list[Callable[[CompileStep], None]] = []
+
+
 @contextmanager
-def compiling(module: ModuleType) -> Iterator[None]:
-    """Hold the lock of a kernel during its first call: other processes wait, then load the compiled code."""
+def observed(observer: Callable[[CompileStep], None]) -> Iterator[None]:
+    """Call ``observer`` with each step of this process, for its progress."""
+    _observers.append(observer)
+    try:
+        yield
+    finally:
+        _observers.remove(observer)
+
+
+@contextmanager
+def compiling(module: ModuleType, function: Any, kernel: str) -> Iterator[None]:
+    """Hold the lock of a kernel during its first call: other processes wait, then load the compiled code.
+
+    ``kernel`` names it for observers.
+    """
     file = Path(module.__file__ or "")
+    _report(CompileStep(kernel, is_end=False, compiled=False))
     with _locked(file.parent.parent / f"{file.parent.name}.lock"):
         yield
+    _report(CompileStep(kernel, is_end=True, compiled=bool(function.stats.cache_misses)))
+
+
+def _report(step: CompileStep) -> None:
+    for observer in _observers:
+        observer(step)
 
 
 def discard(module: ModuleType) -> None:

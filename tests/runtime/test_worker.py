@@ -5,12 +5,27 @@ import signal
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from otolith.acquisition.window import Window
+from otolith.adaptation.state import initial_state
+from otolith.cli.main import cli
 from otolith.health.schema import Report
-from otolith.runtime.worker import MAX_WAITING_WINDOWS, NOT_READY, WINDOW_TIMEOUT, Supervisor, perform
+from otolith.kernel_cache import CompileStep
+from otolith.machine import load_machine
+from otolith.runtime.worker import (
+    COMPILE_TIMEOUT,
+    MAX_WAITING_WINDOWS,
+    NOT_READY,
+    WINDOW_TIMEOUT,
+    Ready,
+    Supervisor,
+    perform,
+)
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.estimation.test_window_fit import Cut, state_for
 from tests.waiting import PATIENCE, wait_for
@@ -111,3 +126,119 @@ def test_windows_missed_during_compilation_are_logged_once(
     assert supervisor.missed == len(batch) - MAX_WAITING_WINDOWS
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
     assert warnings == [f"window 0 missed: {NOT_READY}"]
+
+
+class SlowWorker:
+    """A process that sends steps when the test does, and never a result."""
+
+    alive, starts = True, 1
+
+    def __init__(self) -> None:
+        self.sent: list[object] = []
+        self.killed = 0
+
+    def start(self, *_: object) -> None:
+        self.starts += 1
+
+    def replies(self) -> list[object]:
+        sent, self.sent = self.sent, []
+        return sent
+
+    def offer(self, _: object) -> bool:
+        return True
+
+    def kill(self) -> None:
+        self.killed += 1
+
+
+def slow(batch: list[Window]) -> tuple[Supervisor, SlowWorker]:
+    supervisor, worker = Supervisor(state_for("R_a"), window_length=LENGTH), SlowWorker()
+    supervisor.worker = worker  # type: ignore[assignment]
+    supervisor.submit(batch[0], 0.0)
+    return supervisor, worker
+
+
+STEP = COMPILE_TIMEOUT + WINDOW_TIMEOUT  # s; less than a step may take
+
+
+def test_a_worker_that_compiles_ten_times_slower_is_not_killed(batch: list[Window]) -> None:
+    """Twelve kernels at ten minutes each, before the first window and for a component that is new later."""
+    supervisor, worker = slow(batch)
+    for number in range(1, 13):
+        worker.sent = [
+            CompileStep("kernel", is_end=True, compiled=True),
+            CompileStep("next", is_end=False, compiled=False),
+        ]
+        assert supervisor.poll(number * STEP) == []
+        assert (worker.killed, supervisor.progress, supervisor.is_compiling) == (0, number, True)
+    worker.sent = [Ready()]
+    supervisor.poll(13 * STEP)
+    assert not supervisor.is_compiling
+    worker.sent = [CompileStep("rare", is_end=False, compiled=False)]
+    supervisor.poll(13 * STEP + WINDOW_TIMEOUT)
+    supervisor.poll(14 * STEP)
+    assert worker.killed == 0
+
+
+def test_a_worker_that_hangs_while_it_compiles_is_killed(batch: list[Window]) -> None:
+    supervisor, worker = slow(batch)
+    worker.sent = [CompileStep("kernel", is_end=False, compiled=False)]
+    supervisor.poll(1.0)
+    supervisor.poll(STEP + 2 * LENGTH + 0.9)
+    assert worker.killed == 0
+    supervisor.poll(STEP + 2 * LENGTH + 1.1)
+    assert worker.killed == 1
+
+
+def test_kernels_that_are_loaded_are_no_progress(batch: list[Window]) -> None:
+    """Otherwise a worker that dies at every start would feed the watchdog for ever."""
+    supervisor, worker = slow(batch)
+    worker.sent = [
+        CompileStep("kernel", is_end=False, compiled=False),
+        CompileStep("kernel", is_end=True, compiled=False),
+        Ready(),
+    ]
+    supervisor.poll(1.0)
+    assert supervisor.progress == 0
+
+
+TANK = """[twin]
+name = "tank"
+title = "tank with a pump and a leak"
+source = "mass balance"
+validity = "linear leak"
+[states]
+h = { unit = "m", meaning = "level", bounds = [0, 10] }
+[inputs]
+q = { unit = "m/s", hold = "zoh", range = [0, 1], meaning = "inflow per area" }
+[outputs]
+h = { unit = "m", noise = 0.01, meaning = "level" }
+[parameters]
+k = { unit = "1/s", nominal = 1, bounds = [0.1, 10], role = "estimated", meaning = "leak" }
+[equations]
+"der(h)" = "q - k*h"
+[sites]
+level = { into = "der(h)", mode = "additive", unit = "m/s", meaning = "inflow" }
+"""
+
+
+def test_a_first_start_with_an_empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Daemon and 'otolith compile' with a twin that is new on this computer, and small."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "tank.toml").write_text(TANK, encoding="utf-8")
+    file = tmp_path / "machine.toml"
+    file.write_text('[machine]\nname = "t"\nsite = "s"\n[twin]\nfile = "tank.toml"\n', encoding="utf-8")
+    machine = load_machine(file, with_driver=False)
+    state = initial_state("t", "s", machine.problem, machine.plan)
+    supervisor = Supervisor(state, LENGTH)
+    supervisor.start()
+    values = np.random.default_rng(1).uniform(0.4, 0.6, (200, 2))
+    supervisor.submit(Window.whole(0, 0.0, 0.01, machine.twin.signals, values), time.monotonic())
+    try:
+        wait_for(lambda: bool(supervisor.poll(time.monotonic())) or supervisor.missed > 0, 3 * PATIENCE)
+    finally:
+        supervisor.worker.kill()
+    assert (supervisor.restarts, supervisor.missed, supervisor.finished) == (0, 0, 1)
+    assert supervisor.progress > 5  # kernels, then the window
+    result = CliRunner().invoke(cli, ["compile", str(file)])
+    assert (result.exit_code, result.output) == (0, f"all kernels are there: {tmp_path}/cache/otolith/kernels\n")

@@ -98,10 +98,16 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
         service._supervisor.missed += 1
         service._feed_watchdog(1000.0 + patience + 3.0)
         assert not fed()
-        service._supervisor.finished += 1
+        service._supervisor.progress += 1  # a kernel is compiled: time for the next one
         service._feed_watchdog(1000.0 + patience + 6.0)
         assert fed()
-        service._feed_watchdog(1000.0 + patience + 6.0 + STALL_TIMEOUT + 3 * 2.0 + 0.1)  # nothing is compiled any more
+        service._feed_watchdog(1000.0 + 2 * patience + 5.9)
+        assert fed()
+        service._supervisor.progress += 1  # a window is finished
+        service._supervisor.is_compiling = False
+        service._feed_watchdog(1000.0 + 2 * patience + 8.0)
+        assert fed()
+        service._feed_watchdog(1000.0 + 2 * patience + 8.0 + STALL_TIMEOUT + 3 * 2.0 + 0.1)
         assert not fed()
         service._notifier.close()
 
@@ -167,3 +173,41 @@ def test_sighup_is_ignored_under_nohup(own_machine: OwnMachine) -> None:
     daemon.terminate()
     assert daemon.wait(timeout=PATIENCE) == 0
     daemon.stderr.close()
+
+
+def test_sighup_reloads_the_machine_file(own_machine: OwnMachine) -> None:
+    file = own_machine.machine
+    text = file.read_text(encoding="utf-8") + "\n[recording]\nenabled = false\n"
+    file.write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "otolith", "run", str(file)]
+    daemon = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    stderr = daemon.stderr
+    assert stderr is not None
+
+    def logged(part: str) -> str:
+        while part not in (line := stderr.readline()):
+            assert line
+        return line
+
+    logged("reports on")
+    file.write_text(text.replace("enabled = false", "enabled = 7"), encoding="utf-8")
+    daemon.send_signal(signal.SIGHUP)
+    assert "recording.enabled" in logged("not reloaded, the daemon goes on as before")
+    file.write_text(text.replace("enabled = false", "enabled = true"), encoding="utf-8")
+    daemon.send_signal(signal.SIGHUP)
+    logged("reloaded, recording changed")
+    logged("recording to")
+    daemon.terminate()
+    assert daemon.wait(timeout=PATIENCE) == 0
+    stderr.close()
+
+
+def test_a_wrong_machine_file_has_an_exit_code_of_its_own(own_machine: OwnMachine) -> None:
+    """So that systemd does not start it for ever, as it does where a bus is missing."""
+    own_machine.machine.write_text("[machine]\n", encoding="utf-8")
+    command = [sys.executable, "-m", "otolith", "run", str(own_machine.machine)]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == os.EX_CONFIG
+    unit = (Path(__file__).parents[2] / "systemd" / "otolith@.service").read_text(encoding="utf-8")
+    assert f"\nRestartPreventExitStatus={os.EX_CONFIG:d}\n" in unit

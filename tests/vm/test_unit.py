@@ -22,16 +22,15 @@ def shown(name: str) -> str:
 @pytest.fixture
 def installed(machine: Machine) -> Iterator[Machine]:
     """As README.md says; /opt/otolith is there already. Kernels that are compiled are taken over."""
-    run("install", "-m", "644", str(SYSTEMD / "otolith@.service"), "/etc/systemd/system/")
-    run("install", "-m", "644", str(SYSTEMD / "otolith.sysusers.conf"), "/usr/lib/sysusers.d/otolith.conf")
-    run("systemd-sysusers")
-    run("install", "-D", "-m", "644", str(machine.file), "/etc/otolith/bench.toml")
-    run("install", "-m", "644", str(machine.dbc), "/etc/otolith/")
+    file = machine.file.with_name("bench.toml")
+    if file != machine.file:
+        shutil.copy(machine.file, file)
+    run("systemd-sysusers", str(SYSTEMD / "otolith.sysusers.conf"))
     cache = Path("/var/cache/otolith/bench")
     cache.parent.mkdir(exist_ok=True)
     shutil.copytree(Path.home() / ".cache" / "otolith", cache)
     run("chown", "--recursive", "otolith:otolith", str(cache))
-    run("systemctl", "daemon-reload")
+    run("/opt/otolith/bin/otolith", "install", str(file), seconds=600.0)
     yield machine
     run("systemctl", "disable", "--now", UNIT)
 

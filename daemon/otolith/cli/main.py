@@ -26,8 +26,10 @@ from otolith.cli.common import (
     examples_directory,
     log_to_stderr,
 )
+from otolith.cli.operation.compile import compile_command
 from otolith.cli.operation.connection import endpoints, reader_options
 from otolith.cli.operation.history import history
+from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
 from otolith.cli.operation.view import view
 
@@ -42,6 +44,7 @@ Exit codes:
        check: a signal was missing, or no window of DATA can be used
   2    a file, option, bus or port cannot be used; the message says which, why
        and what to do
+  78   the same of 'run' for a machine file that is wrong: no restart helps
   130  interrupted by Ctrl-C (128 + n by another signal n)"""
 
 
@@ -107,7 +110,8 @@ def cli() -> None:
 def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bool) -> int:
     """Run the daemon for the machine in FILE.
 
-    It runs until SIGTERM or Ctrl-C.
+    It runs until SIGTERM or Ctrl-C. SIGHUP takes over changed limits and
+    [recording] from FILE.
 
     \b
     Examples:
@@ -116,9 +120,15 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
     """
     from otolith.machine import load_machine
     from otolith.runtime.service import Service
+    from otolith_drivers.errors import ConfigurationError
 
     log_to_stderr(verbose=verbose)
-    ended_by = Service(load_machine(file), listen or None, recording).run()
+    try:
+        machine = load_machine(file)
+    except ConfigurationError as error:
+        error.exit_code = os.EX_CONFIG  # so that systemd distinguishes it from a bus that may come up later
+        raise
+    ended_by = Service(machine, listen or None, recording).run()
     return INTERRUPTED if ended_by == signal.SIGINT else 0
 
 
@@ -277,5 +287,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, components, history, keys, noise, probe, reset, twin, view):
+for command in (commission, compile_command, components, history, install, keys, noise, probe, reset, twin, view):
     cli.add_command(command)

@@ -36,6 +36,7 @@ class RecorderSupervisor:
         self._machine, self._path = machine, path
         self._process = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
         self._unanswered = self._unwritten = 0
+        self._planned_starts = 1
         self._progress_at = 0.0
         self._problem = ""
         self.dropped = 0
@@ -44,7 +45,7 @@ class RecorderSupervisor:
     @property
     def restarts(self) -> int:
         """How often the recorder was started again."""
-        return max(0, self._process.starts - 1)
+        return max(0, self._process.starts - self._planned_starts)
 
     def start(self, now: float) -> None:
         """Start the recorder with a new file, if the disk has room.
@@ -65,6 +66,15 @@ class RecorderSupervisor:
         self._process.start(path, self._machine.recorded(self._machine.driver.sampling), folder)
         self._progress_at, self._problem = now, ""
         log.info("recording to %s", path)
+
+    def reload(self, machine: LoadedMachine, now: float, seconds: float) -> None:
+        """Go on with a new file as the changed machine file says; the old one is finished in up to ``seconds``."""
+        self._process.stop(seconds)
+        self._unanswered = self._unwritten = 0
+        self._machine = machine
+        if machine.file.recording.enabled:
+            self._planned_starts += self._process.starts >= self._planned_starts
+            self._try_to_start(now)
 
     def _folder(self) -> RecordingFolder:
         identity, table = self._machine.file.machine, self._machine.file.recording
@@ -101,10 +111,13 @@ class RecorderSupervisor:
         self.dropped += self._unanswered + self._unwritten
         self._unanswered = self._unwritten = 0
         if self._process.may_restart(now):
-            try:
-                self.start(now)
-            except OtolithError as error:  # monitoring continues without recording
-                self._pause(f"no recording: {error}")
+            self._try_to_start(now)
+
+    def _try_to_start(self, now: float) -> None:
+        try:
+            self.start(now)
+        except OtolithError as error:  # monitoring continues without recording
+            self._pause(f"no recording: {error}")
 
     def stop(self, seconds: float) -> None:
         """Let the recorder write what it has for up to ``seconds``."""

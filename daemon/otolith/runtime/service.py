@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -24,12 +25,13 @@ from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
 from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
-from otolith.machine import LoadedMachine
+from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.connection import driver_document, with_missing_sources
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.process import SIGNALS
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
+from otolith.runtime.reload import reloaded
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.history import history_path
@@ -85,12 +87,13 @@ class Service:
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
         self._stop_signal: int | None = None
-        self._windows = self._windows_bad = self._finished = 0
+        self._is_reload_due = False
+        self._windows = self._windows_bad = self._progress = 0
         self._started_at = self._progress_at = self._fed_at = 0.0
         self._summarised_at = -math.inf
 
     def run(self) -> int:
-        """Serve until SIGTERM, SIGHUP or SIGINT, and return the number of that signal.
+        """Serve until SIGTERM or SIGINT, or in a terminal SIGHUP, and return the number of that signal.
 
         Raises:
             DeviceError: the machine's bus cannot be opened.
@@ -103,12 +106,17 @@ class Service:
             self._start()
             while self._stop_signal is None:
                 self._step()
+                if self._is_reload_due:
+                    self._reload()
         finally:
             self._stop()
         return self._stop_signal or 0
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
-        self._stop_signal = number
+        if number == signal.SIGHUP and not os.isatty(0):  # in a terminal it means that the terminal is closed
+            self._is_reload_due = True
+        else:
+            self._stop_signal = number
 
     def _start(self) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL)
@@ -174,6 +182,21 @@ class Service:
             self._numbers, note = self._history.open(time.time())
             self._notes += (note,) if note else ()
             self._history.start()
+
+    def _reload(self) -> None:
+        """Take over limits and recording from the machine file; if it is invalid, go on as before."""
+        self._is_reload_due = False
+        try:
+            change = reloaded(self._machine, load_machine(self._machine.path))
+        except (OtolithError, OSError) as error:
+            log.warning("not reloaded, the daemon goes on as before: %s", error)
+            return
+        self._machine = change.machine
+        log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
+        if change.limits:
+            self._supervisor.revise(lambda state: replace(state, plan=change.machine.plan))
+        if change.recording:
+            self._recorder.reload(self._machine, time.monotonic(), RECORDER_FLUSH)
 
     def _step(self) -> None:
         """Cut due windows, hand them to the worker, publish finished reports, supervise the processes."""
@@ -267,11 +290,10 @@ class Service:
             self._saved, self._saved_at = keys, now
 
     def _feed_watchdog(self, now: float) -> None:
-        """Feed systemd's watchdog as long as windows, good or bad, are being finished."""
-        if self._supervisor.finished != self._finished:
-            self._finished, self._progress_at = self._supervisor.finished, now
-        # Before the first window the worker may compile the kernels of the twin.
-        compiling = 0.0 if self._supervisor.finished else COMPILE_TIMEOUT
+        """Feed systemd's watchdog as long as windows, good or bad, are being finished, or kernels compiled."""
+        if self._supervisor.progress != self._progress:
+            self._progress, self._progress_at = self._supervisor.progress, now
+        compiling = COMPILE_TIMEOUT if self._supervisor.is_compiling else 0.0
         stalled = now - self._progress_at > STALL_TIMEOUT + 3 * self._windower.length + compiling
         if self._notifier.watchdog and not stalled and now - self._fed_at > self._notifier.watchdog / 4:
             self._fed_at = now

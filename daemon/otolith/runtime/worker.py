@@ -8,15 +8,17 @@ The daemon imports this module too, so the adaptation core with its compiler and
 functions that run in the worker.
 """
 
+import contextlib
 import logging
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from otolith import kernel_cache
 from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState, with_problem
 from otolith.health.schema import Report
@@ -28,8 +30,10 @@ log = logging.getLogger(__name__)
 WARM_UP_RECORDS = 80  # of the random window that makes a new worker compile every kernel
 MAX_WAITING_WINDOWS = 2  # for a busy worker; older ones are missed
 WINDOW_TIMEOUT = 20.0  # s for a window, in addition to twice its length
-COMPILE_TIMEOUT = 120.0  # s for the first window, in addition: the kernels of a new twin are compiled before it
-NOT_READY = "the worker is starting; it compiles the kernels of a twin that is new on this computer for 1 to 2 minutes"
+COMPILE_TIMEOUT = 600.0  # s in addition, from one kernel to the next: while the worker starts or compiles a kernel
+NOT_READY = (
+    "the worker is starting; it compiles the kernels of a twin that is new on this computer, which takes minutes"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +49,25 @@ class WorkerResult:
     """The exception, or an empty string."""
 
 
+class Ready(NamedTuple):
+    """The worker has started: sent once, before the first result."""
+
+
 def main(connection: Any, state: AdaptationState) -> None:
-    """Serve in the worker process: receive (state, window) and send a result, until None comes."""
-    warm_up(state)
-    while (task := connection.recv()) is not None:
-        connection.send(perform(*task))
+    """Serve in the worker process: receive (state, window) and send a result, until None comes.
+
+    Each step of a kernel is sent as well, and :class:`Ready` once.
+    """
+
+    def report(step: kernel_cache.CompileStep) -> None:
+        with contextlib.suppress(OSError):  # the daemon has died, which the next result notices
+            connection.send(step)
+
+    with kernel_cache.observed(report):
+        warm_up(state)
+        connection.send(Ready())
+        while (task := connection.recv()) is not None:
+            connection.send(perform(*task))
 
 
 def perform(state: AdaptationState, window: Window) -> WorkerResult:
@@ -66,13 +84,16 @@ def perform(state: AdaptationState, window: Window) -> WorkerResult:
     return WorkerResult(window.index, state, report, time.perf_counter() - begun, failure)
 
 
-def warm_up(state: AdaptationState) -> None:
-    """Import and compile what the first window needs: no twin explains random values, so discovery runs as well."""
+def warm_up(state: AdaptationState) -> str:
+    """Import and compile what the first window needs: no twin explains random values, so discovery runs as well.
+
+    Returns the reason of a failure, or an empty string.
+    """
     signals = state.problem.twin.signals
     values = np.random.default_rng(state.problem.seed).standard_normal((WARM_UP_RECORDS, len(signals)))
     window = Window.whole(0, 0.0, 0.01, signals, values)
     short = replace(state.problem, swarm=replace(state.problem.swarm, generations=2))
-    perform(with_problem(state, short), window)
+    return perform(with_problem(state, short), window).failure
 
 
 class Supervisor:
@@ -84,6 +105,11 @@ class Supervisor:
         """State after the last finished window."""
         self.missed = 0
         self.finished = 0
+        self.progress = 0
+        """Finished windows and compiled kernels."""
+        self.is_compiling = True
+        """Whether the worker starts, or compiles or loads a kernel."""
+        self._is_ready = False
         self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
         self._timeout = WINDOW_TIMEOUT + 2 * window_length
         self.worker = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
@@ -105,7 +131,7 @@ class Supervisor:
 
     @property
     def _allowed_seconds(self) -> float:
-        return self._timeout + (0.0 if self.finished else COMPILE_TIMEOUT)
+        return self._timeout + (COMPILE_TIMEOUT if self.is_compiling else 0.0)
 
     def revise(self, change: Callable[[AdaptationState], AdaptationState]) -> None:
         """Apply ``change`` to the state before the next window is dispatched."""
@@ -113,18 +139,24 @@ class Supervisor:
 
     def start(self) -> None:
         """Start the worker."""
+        self.is_compiling, self._is_ready = True, False
         self.worker.start(self.state)
 
     def submit(self, window: Window, now: float) -> None:
         """Queue a window, and dispatch it if the worker is free."""
         self._waiting.append(window)
         while len(self._waiting) > MAX_WAITING_WINDOWS:
-            self._miss(self._waiting.popleft(), "the worker is behind" if self.finished else NOT_READY)
+            self._miss(self._waiting.popleft(), "the worker is behind" if self._is_ready else NOT_READY)
         self._dispatch(now)
 
     def poll(self, now: float) -> list[tuple[Report, float]]:
         """Return finished reports with their computing times in s; restart a worker that died or hangs."""
-        reports = [report for result in self.worker.replies() if (report := self._take(result)) is not None]
+        reports = []
+        for reply in self.worker.replies():
+            if not isinstance(reply, WorkerResult):
+                self._note(reply, now)
+            elif (report := self._take(reply)) is not None:
+                reports.append(report)
         if not self.worker.alive:
             self._requeue("died")
             if self.worker.may_restart(now):
@@ -135,17 +167,28 @@ class Supervisor:
         self._dispatch(now)
         return reports
 
+    def _note(self, step: kernel_cache.CompileStep | Ready, now: float) -> None:
+        """Allow time from this step on. Loading a kernel is no progress: a worker that always dies loads some, too."""
+        if isinstance(step, Ready):
+            self._is_ready = True
+        elif step.compiled:
+            self.progress += 1
+            log.info("compiled kernel %s", step.kernel)
+        self.is_compiling = not self._is_ready or not (isinstance(step, Ready) or step.is_end)
+        self._deadline = now + self._allowed_seconds
+
     def _take(self, result: WorkerResult) -> tuple[Report, float] | None:
         window = self._current
         if window is None or window.index != result.window_index:  # the window was requeued meanwhile
             return None
-        self._current = None
+        self._current, self.is_compiling = None, False  # a kernel that raised an exception has no end
         self.worker.reset_backoff()
         if result.report is None:
             self._miss(window, result.failure)
             return None
         self.state = result.state
         self.finished += 1
+        self.progress += 1
         return result.report, result.seconds
 
     def _requeue(self, reason: str) -> None:

@@ -5,6 +5,8 @@ setting; ``h_`` an expression of parameters alone; ``t_`` a shared subexpression
 ``k1_`` to ``k4_`` the rates at the Runge-Kutta stages. docs/explanation/kernels.md reads one kernel line by line.
 """
 
+import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from string import Template
@@ -17,7 +19,9 @@ from otolith.twin.augmentation import augmentation_inputs
 from otolith.twin.definition import Definition
 from otolith.twin.symbolic import COMPONENT_SLOPES, component, system_of
 
-DECORATOR = '@njit(error_model="numpy", fastmath={"contract"})'
+# Of functions that kernels alone call: code that lets Python and C call them takes a fifth of their compile time.
+INNER = "no_cpython_wrapper=True, no_cfunc_wrapper=True"
+DECORATOR = f'@njit(error_model="numpy", fastmath={{"contract"}}, {INNER})'
 
 
 # Step of a central difference by a state, in its unit. Its truncation error grows with the square of the step, its
@@ -176,26 +180,38 @@ class KernelCode:
         self.f, self.g = (SparseJacobian(rows, entering) for rows in (system.rates, system.outputs))
         self.sites = len(entering)
         self.rates = [hoist(expression) for expression in system.rates]
-        self._outputs = [hoist(expression) for expression in system.outputs]
-        self._rate_slopes = [hoist(value) for jacobian in (self.a, self.b) for value in jacobian.elements.values()]
-        self._output_slopes = [hoist(value) for jacobian in (self.c, self.d) for value in jacobian.elements.values()]
-        of_sites = [[hoist(value) for value in part.elements.values()] for part in (self.a, self.f, self.c, self.g)]
-        self._site_slopes = [*self.rates, *of_sites[0], *of_sites[1]], [*self._outputs, *of_sites[2], *of_sites[3]]
-        self.hoisted = hoist.assignments
-        self.constants = [*self.p, *self.settings, *hoist.names]
+        outputs = [hoist(expression) for expression in system.outputs]
+        of_rates = [hoist(value) for jacobian in (self.a, self.b) for value in jacobian.elements.values()]
+        of_outputs = [hoist(value) for jacobian in (self.c, self.d) for value in jacobian.elements.values()]
+        self._functions = {
+            "rates_": self.rates,
+            "outputs_": outputs,
+            "linearise_": [*self.rates, *of_rates],
+            "linearise_outputs_": [*outputs, *of_outputs],
+        }
+        if self.sites:
+            of_sites = [[hoist(value) for value in part.elements.values()] for part in (self.a, self.f, self.c, self.g)]
+            self._functions["linearise_sites_"] = [*self.rates, *of_sites[0], *of_sites[1]]
+            self._functions["linearise_site_outputs_"] = [*outputs, *of_sites[2], *of_sites[3]]
+        self._hoisted = hoist.assignments
+        self._constants = [*self.p, *self.settings, *hoist.names]
         self.blocks = self._shared_blocks()
 
     def functions(self) -> list[str]:
         """The right sides, alone and with their Jacobians, as functions of scalars that the compiler inlines."""
-        of_rates, of_outputs = self._site_slopes
-        return [
-            *self._function("rates_", self.rates),
-            *self._function("outputs_", self._outputs),
-            *self._function("linearise_", [*self.rates, *self._rate_slopes]),
-            *self._function("linearise_outputs_", [*self._outputs, *self._output_slopes]),
-            *(self._function("linearise_sites_", of_rates) if self.sites else []),
-            *(self._function("linearise_site_outputs_", of_outputs) if self.sites else []),
-        ]
+        return [line for name, expressions in self._functions.items() for line in self._function(name, expressions)]
+
+    def kernel(self, template: str, blocks: Blocks) -> list[str]:
+        """The lines of a kernel, without the constants that it does not use: each costs compile time."""
+        lines = fill(template, self.blocks | blocks)
+        uses = Counter(re.findall(r"\w+", "\n".join(lines)))
+        unused = set()
+        for line in reversed(self._read_constants("")):  # a constant may use those before it
+            name, *used = re.findall(r"\w+", line)
+            if uses[name] == 1:
+                unused.add(name)
+                uses.subtract(used)
+        return [line for line in lines if line.split(" = ", 1)[0].strip() not in unused]
 
     def _function(self, name: str, expressions: list[sympy.Expr]) -> list[str]:
         """A function of states, inputs and constants; common subexpressions are computed once."""
@@ -203,16 +219,23 @@ class KernelCode:
         shared, results = sympy.cse(expressions, symbols=sympy.numbered_symbols("t_", real=True), order="none")
         lines += [f"{symbol.name} = {PRINTER.doprint(value)}" for symbol, value in shared]
         returned = ", ".join(PRINTER.doprint(result) for result in results)
-        head = f"def {name}({self.arguments(self.x, self.u)}):"
+        head = f"def {name}({self.arguments(name, self.x, self.u)}):"
         return [DECORATOR, head, *indent([*lines, f"return ({returned},)"]), "", ""]
 
-    def arguments(self, states: Sequence[str], inputs: Sequence[str]) -> str:
-        """Arguments of such a function."""
-        return ", ".join([*states, *inputs, *self.constants])
+    def arguments(self, function: str, states: Sequence[str], inputs: Sequence[str]) -> str:
+        """Arguments of such a function: states, inputs and the constants that it uses."""
+        return ", ".join([*states, *inputs, *self.constants_of(function)])
+
+    def constants_of(self, function: str) -> list[str]:
+        """The constants that such a function uses."""
+        occurring = set().union(*(expression.free_symbols for expression in self._functions[function]))
+        names = {symbol.name for symbol in occurring}
+        return [name for name in self._constants if name in names]
 
     def _shared_blocks(self) -> Blocks:
         return {
-            "arguments": self.arguments(self.x, self.u),
+            "decorator": DECORATOR,
+            **{f"of_{name}": self.arguments(name, self.x, self.u) for name in self._functions},
             "n_states": str(len(self.x)),
             "n_outputs": str(len(self.y)),
             "y": unpacked(self.y),
@@ -249,11 +272,11 @@ class KernelCode:
 
     def read_parameters(self, row: str) -> list[str]:
         """Parameters, hoisted expressions and the initial state; ``row`` selects the particle of a swarm."""
-        return [
-            *(f"{name} = parameters[{row}{index}]" for index, name in enumerate([*self.p, *self.settings])),
-            *self.hoisted,
-            *(f"{name} = initial[{row}{index}]" for index, name in enumerate(self.x)),
-        ]
+        return [*self._read_constants(row), *(f"{x} = initial[{row}{index}]" for index, x in enumerate(self.x))]
+
+    def _read_constants(self, row: str) -> list[str]:
+        parameters = (f"{name} = parameters[{row}{index}]" for index, name in enumerate([*self.p, *self.settings]))
+        return [*parameters, *self._hoisted]
 
     def input_increments(self, following: str) -> list[str]:
         """Change of each ``foh`` input per substep; ``following`` is its value at the next record."""
@@ -270,7 +293,9 @@ class KernelCode:
             results = numbered(f"k{stage.number}", len(self.x))
             results += [name for prefix, jacobian in jacobians for name in jacobian.names(f"{prefix}{stage.number}")]
             inputs = [stage.input_prefix + name if name in self.ramps else name for name in self.u]
-            lines.append(f"{unpacked(results)} = {function}({self.arguments(stage.advanced(self.x, 'k'), inputs)})")
+            lines.append(
+                f"{unpacked(results)} = {function}({self.arguments(function, stage.advanced(self.x, 'k'), inputs)})"
+            )
         return lines
 
     def slopes_of_state(self, forced: SparseJacobian) -> Blocks:
@@ -301,7 +326,7 @@ class KernelCode:
     def advanced(self, names: list[str], changed: Mapping[str, str]) -> str:
         """An assignment of the states at the next record to ``names``, with some arguments of ``advance_`` replaced."""
         given = [changed.get(name, name) for name in (*self.x, *self.u, *numbered("w", len(self.u)))]
-        return f"{unpacked(names)} = advance_({', '.join(['step', 'substeps', *given, *self.constants])})"
+        return f"{unpacked(names)} = advance_({', '.join(['step', 'substeps', *given, *self.constants_of('rates_')])})"
 
     def transition(self, element: str) -> list[str]:
         """The next state by this one, by central differences, into ``element`` of row and column."""

@@ -7,7 +7,7 @@ a whole spectrum of curves at the cost of a few.
 
 import sympy
 
-from otolith.twin.codegen import PRINTER, STAGES, Blocks, KernelCode, fill, unpacked
+from otolith.twin.codegen import INNER, PRINTER, STAGES, Blocks, KernelCode, unpacked
 from otolith.twin.component_families import COMPONENT_FAMILIES, family_code
 from otolith.twin.symbolic import absolute, sign
 
@@ -20,12 +20,12 @@ def linearise(parameters, initial, inputs, steps, counts, measured, gain):
     input_now, input_next = np.zeros((2, records, $n_states, $n_sites))
     output, feedthrough = np.zeros((records, $n_outputs, $n_states)), np.zeros((records, $n_outputs, $n_sites))
     dx, forcing = np.zeros(($n_states, $n_columns)), np.zeros((4, $n_states, $n_columns))
-    correct = np.any(gain != 0.0)
+    correct = len(gain) > 0
     $read_parameters
     for record in range(records):
         $read_inputs
         $store_trajectory
-        $linearised_y = linearise_site_outputs_($arguments)
+        $linearised_y = linearise_site_outputs_($of_linearise_site_outputs_)
         $store_output_matrix
         $store_feedthrough
         if correct:
@@ -37,7 +37,9 @@ def linearise(parameters, initial, inputs, steps, counts, measured, gain):
         step = steps[record] / substeps
         half, sixth = step / 2.0, step / 6.0
         $input_increments
-        dx[:] = 0.0
+        for row in range($n_states):
+            for column in range($n_columns):
+                dx[row, column] = 0.0
         $initial_dx
         for substep in range(substeps):
             $inputs_at_stages
@@ -49,8 +51,10 @@ def linearise(parameters, initial, inputs, steps, counts, measured, gain):
                 $stage_dx
                 $advance_dx
             $advance_inputs
-        transition[record] = dx[:, :$n_states]
-        $store_input_matrices
+        for row in range($n_states):
+            for column in range($n_states):
+                transition[record, row, column] = dx[row, column]
+            $store_input_matrices
     return trajectory, transition, input_now, input_next, output, feedthrough
 """
 
@@ -74,12 +78,12 @@ def linearise(code: KernelCode) -> list[str]:
         "linearised_stages": code.stages("linearise_sites_", [("a", code.a), ("f", code.f)]),
         "forcing_of_sites": _forcing(code, column_of),
         "store_input_matrices": [
-            f"{matrix}[record, :, {site}] = dx[:, {column + shift}]"
+            f"{matrix}[record, row, {site}] = dx[row, {column + shift}]"
             for matrix, shift in (("input_now", 0), ("input_next", len(reaching)))
             for site, column in column_of.items()
         ],
     }
-    return fill(LINEARISE, code.blocks | code.slopes_of_state(code.f) | blocks)
+    return code.kernel(LINEARISE, code.slopes_of_state(code.f) | blocks)
 
 
 def _forcing(code: KernelCode, column_of: dict[int, int]) -> list[str]:
@@ -162,7 +166,9 @@ def adjoint(transition, input_now, input_next, output, feedthrough, gain, whiten
     costate, before = np.zeros((states, count)), np.zeros((states, count))
     weighted = np.zeros((outputs, count))
     for record in range(records - 1, -1, -1):
-        before[:] = 0.0
+        for row in range(states):
+            for signal in range(count):
+                before[row, signal] = 0.0
         if record + 1 < records:
             for row in range(states):
                 for site in range(sites):
@@ -175,7 +181,8 @@ def adjoint(transition, input_now, input_next, output, feedthrough, gain, whiten
                     for signal in range(count):
                         before[column, signal] += factor * costate[row, signal]
         for row in range(outputs):
-            weighted[row] = 0.0
+            for signal in range(count):
+                weighted[row, signal] = 0.0
             if present[record, row]:
                 for column in range(row, outputs):
                     factor = whitening[record, column, row]
@@ -194,7 +201,9 @@ def adjoint(transition, input_now, input_next, output, feedthrough, gain, whiten
                 factor = output[record, row, column]
                 for signal in range(count):
                     before[column, signal] += factor * weighted[row, signal]
-        costate[:] = before
+        for row in range(states):
+            for signal in range(count):
+                costate[row, signal] = before[row, signal]
     return result
 '''
 
@@ -245,7 +254,7 @@ def component_functions() -> list[str]:
 def _by_family(name: str, rows: dict[float, list[sympy.Expr]]) -> list[str]:
     """A function that evaluates the row of the family whose code it is given; of an empty slot, code 0, zeros."""
     zeros = [sympy.Integer(0)] * len(next(iter(rows.values())))
-    lines = ['@njit(error_model="numpy")', f"def {name}(family, x, a, b, c):"]
+    lines = [f'@njit(error_model="numpy", {INNER})', f"def {name}(family, x, a, b, c):"]
     for code, row in ({0.0: zeros} | rows).items():  # most slots are empty: they come first
         shared, results = sympy.cse(row, symbols=sympy.numbered_symbols("t_", real=True), order="none")
         lines.append(f"    if family == {code!r}:")

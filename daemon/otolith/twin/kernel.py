@@ -204,9 +204,8 @@ class Kernel:
             columns = range(of_parameters * (1 + drifts) + len(self.definition.states))
         wanted = np.array(columns, dtype=np.int64)
         times = np.ascontiguousarray(excitation.grid.before_last)
-        return Sensitivities(
-            *self._call("sensitivities", parameters, initial, *self._arguments(excitation), times, wanted)
-        )
+        drive = self._arguments(excitation)
+        return Sensitivities(*self._call("sensitivities", parameters, initial, *drive, times, wanted))
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
@@ -242,7 +241,8 @@ class Kernel:
 
     def curves(self, families: Array, x: Array, sources: Indices, inner: Array, phases: Array) -> Array:
         """(records, curves) of components of unit amplitude; ``x`` is (sources, records), all else (curves,)."""
-        shapes: Array = self._call("curves", families, x, sources, inner, phases)
+        rest = (np.ascontiguousarray(part) for part in (sources, inner, phases))
+        shapes: Array = self._call("curves", families, x, *rest)
         return shapes
 
     def respond(
@@ -322,7 +322,8 @@ class Kernel:
         measured, gain = self._unmeasured, self._open_loop
         if excitation.measured is not None and excitation.gain is not None:
             measured = np.ascontiguousarray(excitation.measured, dtype=np.float64)
-            gain = np.ascontiguousarray(excitation.gain, dtype=np.float64)
+            if excitation.gain.any():
+                gain = np.ascontiguousarray(excitation.gain, dtype=np.float64)
         return inputs, np.ascontiguousarray(grid.steps), excitation.counts, measured, gain
 
     @cached_property
@@ -334,7 +335,7 @@ class Kernel:
         arguments = (np.ascontiguousarray(first), np.ascontiguousarray(second), *rest)
         if name in self._compiled:
             return function(*arguments)
-        with kernel_cache.compiling(self._module):
+        with kernel_cache.compiling(self._module, function, f"{self.definition.name}.{name}"):
             try:
                 result = function(*arguments)
             except Exception:  # noqa: BLE001 - a truncated cache file raises any type; a fault of the equations is raised again below

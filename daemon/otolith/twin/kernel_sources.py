@@ -5,7 +5,7 @@ it, which :mod:`otolith.twin.expressions` has checked. The theory is in docs/exp
 predictor line by line, ``sensitivities.md`` derives the sensitivities, ``innovation-form.md`` the filter.
 """
 
-from otolith.twin.codegen import PRINTER, STAGES, Blocks, KernelCode, fill, numbered, total, unpacked
+from otolith.twin.codegen import INNER, PRINTER, STAGES, Blocks, KernelCode, fill, numbered, total, unpacked
 from otolith.twin.component_kernels import ADJOINT, RESPOND, SPREAD, component_functions, linearise
 from otolith.twin.definition import Definition
 
@@ -20,7 +20,7 @@ from numba import njit
 '''
 
 ADVANCE = """
-@njit(error_model="numpy", fastmath={"contract"})
+$decorator
 def advance_(step, substeps, $from_record_to_next):
     half, sixth = step / 2.0, step / 6.0
     $increments
@@ -37,12 +37,12 @@ SIMULATE = """
 def simulate(parameters, initial, inputs, steps, counts, measured, gain):
     particles, records = parameters.shape[0], inputs.shape[0]
     predicted = np.empty((particles, records, $n_outputs))
-    correct = np.any(gain != 0.0)
+    correct = len(gain) > 0
     for particle in range(particles):
         $read_parameters
         for record in range(records):
             $read_inputs
-            $y = outputs_($arguments)
+            $y = outputs_($of_outputs_)
             $store
             if correct:
                 $innovations
@@ -71,7 +71,7 @@ def euler(parameters, initial, inputs, sample_period, substeps):
         $read_parameters
         for record in range(records):
             $read_inputs
-            $y = outputs_($arguments)
+            $y = outputs_($of_outputs_)
             $store
             if record + 1 == records:
                 break
@@ -87,23 +87,23 @@ def advance(code: KernelCode) -> list[str]:
     """``advance_``: the states at the next record, a function of scalars; ``w_`` are the inputs at the next record."""
     following = numbered("w", len(code.u))
     blocks: Blocks = {
-        "from_record_to_next": ", ".join([*code.x, *code.u, *following, *code.constants]),
+        "from_record_to_next": ", ".join([*code.x, *code.u, *following, *code.constants_of("rates_")]),
         "increments": code.input_increments("w_{index}"),
         "x": unpacked(code.x),
     }
-    return fill(ADVANCE, code.blocks | blocks)
+    return code.kernel(ADVANCE, blocks)
 
 
 def simulate(code: KernelCode) -> list[str]:
     """``simulate``: the predictions of a swarm of particles, each with its own parameters and initial state."""
-    return fill(SIMULATE, code.blocks | _swarm(code))
+    return code.kernel(SIMULATE, _swarm(code))
 
 
 def euler(code: KernelCode) -> list[str]:
     """``euler``: explicit Euler, each state with the new values of those before it, as the paper's Eq. 11-12."""
     rates = [f"{x} = {x} + step * ({PRINTER.doprint(rate)})" for x, rate in zip(code.x, code.rates, strict=True)]
     blocks: Blocks = {"euler_step": rates, "euler_inputs": [f"{u} += increment_{u}" for u in code.ramps]}
-    return fill(EULER, code.blocks | _swarm(code) | blocks)
+    return code.kernel(EULER, _swarm(code) | blocks)
 
 
 def _swarm(code: KernelCode) -> Blocks:
@@ -113,32 +113,33 @@ def _swarm(code: KernelCode) -> Blocks:
     }
 
 
-# dx is S, the derivative of the state, and dy is Y, that of the outputs; forcing[j - 1] is B at stage j. They hold the
-# columns that are asked for; the others share one more column, which nothing reads.
+# dx is S, the derivative of the state, and dy is Y, that of the outputs; forcing[j - 1] is F at stage j. They hold the
+# columns that are asked for; the others share one more column, which nothing reads. d and b hold D, and B per
+# stage, by all parameters: loops copy them to the columns, as a line for each element takes compile time.
 SENSITIVITIES = """
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, before_last, columns):
     records, count = inputs.shape[0], len(columns)
-    position = np.full($n_columns, count)
+    predicted = np.empty((records, $n_outputs))
+    position, drifting = np.full($n_columns, count), False
     for column in range(count):
         position[columns[column]] = column
-    drifting = np.any(columns >= $n_constant)
-    predicted = np.empty((records, $n_outputs))
+        drifting = drifting or columns[column] >= $n_constant
     dy = np.zeros((records, $n_outputs, count + 1))
-    dx = np.zeros(($n_states, count + 1))
-    forcing = np.zeros((4, $n_states, count + 1))
-    $initial_dx
-    correct = np.any(gain != 0.0)
+    dx, forcing = np.zeros(($n_states, count + 1)), np.zeros((4, $n_states, count + 1))
+    d, b = np.zeros(($n_outputs, $n_parameters)), np.zeros((4, $n_states, $n_parameters))
+    for row in range($n_states):
+        dx[row, position[$n_parameters + row]] = 1.0
+    correct = len(gain) > 0
     $read_parameters
     for record in range(records):
         $read_inputs
-        $linearised_y = linearise_outputs_($arguments)
+        $linearised_y = linearise_outputs_($of_linearise_outputs_)
         $store
         time = before_last[record]
         for column in range(count):
             $dy_through_state
         $dy_through_parameters
-        $dy_through_drifts
         if correct:
             $innovations
             $correct_state
@@ -154,9 +155,19 @@ def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, be
             $inputs_at_stages
             $linearised_stages
             $advance_state
-            $forcing_of_parameters
+            $store_b
+            for stage in range(4):
+                for row in range($n_states):
+                    for parameter in range($n_parameters):
+                        forcing[stage, row, position[parameter]] = b[stage, row, parameter]
             if drifting:
-                $forcing_of_drifts
+                start = time + substep * step
+                moments = (start + 0.0 * step, start + 0.5 * step, start + 0.5 * step, start + 1.0 * step)
+                for stage in range(4):
+                    for row in range($n_states):
+                        for parameter in range($n_parameters):
+                            column = position[$n_constant + parameter]
+                            forcing[stage, row, column] = moments[stage] * b[stage, row, parameter]
             for column in range(count):
                 $read_dx
                 $stage_dx
@@ -174,18 +185,15 @@ def sensitivities(code: KernelCode) -> list[str]:
     Columns: each parameter, each initial state, and the drift of each parameter.
     """
     parameters, states = len(code.p), len(code.x)
-    initial = [f"dx[{row}, position[{parameters + row}]] = 1.0" for row in range(states)]  # dx_0 by x_0: the identity
     blocks: Blocks = {
         "n_columns": str(2 * parameters + states),
+        "n_parameters": str(parameters),
         "n_constant": str(parameters + states),
-        "initial_dx": initial,
         "store": [f"predicted[record, {index}] = {y}" for index, y in enumerate(code.y)],
         "linearised_stages": code.stages("linearise_", [("a", code.a), ("b", code.b)]),
         "store_final": [f"final[{row}] = {x}" for row, x in enumerate(code.x)],
     }
-    return fill(
-        SENSITIVITIES, code.blocks | blocks | _output_slopes(code) | _forcing(code) | code.slopes_of_state(code.b)
-    )
+    return code.kernel(SENSITIVITIES, blocks | _output_slopes(code) | _forcing(code) | code.slopes_of_state(code.b))
 
 
 def _output_slopes(code: KernelCode) -> Blocks:
@@ -193,43 +201,46 @@ def _output_slopes(code: KernelCode) -> Blocks:
 
     The drift of a parameter moves it by the time since the last record, so its column has D times that time.
     """
-    base = len(code.p) + len(code.x)
     through_state = {
         row: [f"{c} * dx[{column}, column]" for r, column, c in code.c.named("c") if r == row]
         for row in range(len(code.y))
     }
-    d = code.d.named("d")
     corrections = {
         row: total([f"gain[record, {row}, {i}] * m_{i} * dy[record, {i}, column]" for i in range(len(code.y))])
         for row in range(len(code.x))
     }
+    through_parameters = [f"d[{row}, {column}] = {value}" for row, column, value in code.d.named("d")]
+    if through_parameters:
+        through_parameters += [
+            f"for row in range({len(code.y)}):",
+            f"    for parameter in range({len(code.p)}):",
+            "        dy[record, row, position[parameter]] += d[row, parameter]",
+            f"        dy[record, row, position[{len(code.p) + len(code.x)} + parameter]] += time * d[row, parameter]",
+        ]
     return {
         "dy_through_state": [f"dy[record, {row}, column] = {total(terms)}" for row, terms in through_state.items()],
-        "dy_through_parameters": [f"dy[record, {row}, position[{at}]] += {value}" for row, at, value in d],
-        "dy_through_drifts": [f"dy[record, {row}, position[{base + at}]] += time * {value}" for row, at, value in d],
+        "dy_through_parameters": through_parameters,
         "correct_dx": [f"dx[{row}, column] -= ({correction})" for row, correction in corrections.items()],
     }
 
 
 def _forcing(code: KernelCode) -> Blocks:
-    """F_j of a substep: B_j in the columns of the parameters, B_j times the time of the stage in those of the drifts.
+    """B_j of a substep: F_j is B_j in the columns of parameters, and the stage's time times B_j in those of drifts.
 
     The columns of the initial state keep their zeros.
     """
-    base = len(code.p) + len(code.x)
-    of_parameters, of_drifts = [], ["start = time + substep * step"]
-    for stage in STAGES:
-        for row, column, b in code.b.named(f"b{stage.number}"):
-            element = f"forcing[{stage.number - 1}, {row}, position[{{}}]] = {{}}"
-            of_parameters.append(element.format(column, b))
-            time = f"(start + {stage.time} * step)"
-            of_drifts.append(element.format(base + column, f"{time} * {b}"))
-    return {"forcing_of_parameters": of_parameters, "forcing_of_drifts": of_drifts}
+    return {
+        "store_b": [
+            f"b[{stage.number - 1}, {row}, {column}] = {b}"
+            for stage in STAGES
+            for row, column, b in code.b.named(f"b{stage.number}")
+        ]
+    }
 
 
 # The measurement update by the Cholesky factor of the innovation covariance and its inverse, both lower triangular.
 COVARIANCE_STEPS = '''
-@njit(error_model="numpy")
+@njit(error_model="numpy", $inner)
 def update_(covariance, output, innovation, present, gain, whitening):
     """Fill gain and whitening, correct covariance; return the log determinant of the innovation covariance."""
     outputs, states = output.shape
@@ -244,10 +255,11 @@ def update_(covariance, output, innovation, present, gain, whitening):
                 innovation[row, column] += output[row, inner] * cross[inner, column]
     for row in range(outputs):
         if not present[row]:
-            innovation[row, :] = 0.0
-            innovation[:, row] = 0.0
+            for column in range(outputs):
+                innovation[row, column] = innovation[column, row] = 0.0
             innovation[row, row] = 1.0
-            cross[:, row] = 0.0
+            for state in range(states):
+                cross[state, row] = 0.0
     log_determinant = 0.0
     for row in range(outputs):
         for column in range(row + 1):
@@ -278,7 +290,7 @@ def update_(covariance, output, innovation, present, gain, whitening):
     return log_determinant
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", $inner)
 def propagate_(covariance, transition):
     """Set covariance to transition @ covariance @ transition.T, exactly symmetric."""
     states = len(covariance)
@@ -306,9 +318,10 @@ def kalman(parameters, initial, inputs, steps, counts, parts, measured, sensor, 
     $read_parameters
     for record in range(records):
         $read_inputs
-        $linearised_y = linearise_outputs_($arguments)
+        $linearised_y = linearise_outputs_($of_linearise_outputs_)
         $store_output_matrix
-        innovation = np.diag(sensor)
+        innovation = np.zeros(($n_outputs, $n_outputs))
+        $sensor_noise
         $input_noise_in_outputs
         $innovations
         $mark_present
@@ -338,6 +351,7 @@ def kalman(code: KernelCode) -> list[str]:
     states = range(len(code.x))
     blocks: Blocks = {
         "store_output_matrix": [f"output[{row}, {column}] = {c}" for row, column, c in code.c.named("c")],
+        "sensor_noise": [f"innovation[{index}, {index}] = sensor[{index}]" for index in range(len(code.y))],
         "input_noise_in_outputs": _input_noise_in_outputs(code),
         "mark_present": [f"present[{index}] = m_{index} > 0.0" for index in range(len(code.y))],
         "read_inputs_of_part": _inputs_of_part(code),
@@ -345,7 +359,7 @@ def kalman(code: KernelCode) -> list[str]:
         "process_noise": [f"covariance[{row}, {row}] += process[{row}] * length" for row in states],
         **_input_noise_in_states(code),
     }
-    return fill(KALMAN, code.blocks | blocks)
+    return code.kernel(KALMAN, blocks)
 
 
 def _inputs_of_part(code: KernelCode) -> list[str]:
@@ -369,7 +383,7 @@ def _input_noise_in_outputs(code: KernelCode) -> list[str]:
         shifted = [f"{u} + noise[record, {index}]" if u == name else u for u in code.u]
         lines += [
             f"if noise[record, {index}] > 0.0:",
-            f"    {unpacked(numbered('z', len(code.y)))} = outputs_({code.arguments(code.x, shifted)})",
+            f"    {unpacked(numbered('z', len(code.y)))} = outputs_({code.arguments('outputs_', code.x, shifted)})",
             *(f"    innovation[{r}, {c}] += (z_{r} - y_{r}) * (z_{c} - y_{c})" for r in outputs for c in outputs),
         ]
     return lines
@@ -393,7 +407,7 @@ def _input_noise_in_states(code: KernelCode) -> Blocks:
 def kernel_source(definition: Definition) -> str:
     """The text of the kernel module: all kernels, and for an augmented twin those of the search for components."""
     code, blank = KernelCode(definition), ["", ""]
-    lines = [*COVARIANCE_STEPS.strip().splitlines(), *blank]
+    lines = [*fill(COVARIANCE_STEPS, {"inner": INNER}), *blank]
     if definition.base is not None:
         lines += component_functions()
     lines += [*code.functions(), *advance(code), *blank, *simulate(code), *blank]

@@ -63,9 +63,9 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
 async def _browse(options: "OpcuaOptions", most: int) -> "list[Variable]":
     """Return the variables of the server; raise DeviceError if it cannot be read."""
     from otolith_drivers.errors import DeviceError
-    from otolith_drivers.opcua.connection import Credentials, browse, connected, reason
+    from otolith_drivers.opcua.connection import OpcUaCredentials, browse, connected, reason
 
-    credentials = Credentials.load(options, Path())
+    credentials = OpcUaCredentials.load(options, Path())
     try:
         async with connected(options, credentials) as client:
             return await browse(client, most)

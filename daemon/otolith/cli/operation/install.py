@@ -1,0 +1,215 @@
+"""``otolith install``: the service of one machine. Each step is idempotent, and shown by ``--dry-run``."""
+
+import ipaddress
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import click
+
+from otolith.cli.common import MACHINE_FILE
+from otolith_drivers.errors import ConfigurationError, ServiceError
+
+UNIT, SYSUSERS = "otolith@.service", "otolith.sysusers.conf"
+PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
+USER = "otolith"
+# Drivers whose addresses are in the keys 'host', 'endpoint' and 'channel'.
+KNOWN_DRIVERS = {"can", "modbus", "mqtt", "opcua", "plant", "replay"}
+
+
+@dataclass(frozen=True, slots=True)
+class InstalledFile:
+    """A file of the service."""
+
+    path: Path
+    content: bytes
+    is_private: bool = False
+    """Readable by root and the service only."""
+
+
+@click.command()
+@MACHINE_FILE
+@click.option("--dry-run", is_flag=True, help="Only print the steps.")
+@click.option("--root", type=click.Path(path_type=Path, file_okay=False), default=Path("/"),
+              help="Put the files under this folder, and run no command.")  # fmt: skip
+def install(file: Path, dry_run: bool, root: Path) -> None:
+    """Install the service of the machine in FILE, as root.
+
+    It copies the unit, what the unit may access, and FILE with the files that it names, makes the user 'otolith', and
+    compiles the twin. It starts nothing. Repeat it after an upgrade or a change of FILE.
+
+    \b
+    Examples:
+      otolith install --dry-run press-3.toml
+      sudo /opt/otolith/bin/otolith install press-3.toml
+    """
+    is_here = root == Path("/")
+    if is_here and not dry_run and os.geteuid() != 0:
+        raise ServiceError("install needs root: use sudo, or --root DIR to look at the files, or --dry-run")
+    files = list(_files(file))
+    for item in files:
+        _put(item, root, dry_run=dry_run)
+    private = [f"/{item.path}" for item in files if item.is_private]
+    for command, user in _commands(file.stem, private):
+        click.echo(f"{'run' if is_here and not dry_run else 'to run'}: {shlex.join(command)}")
+        if is_here and not dry_run:
+            _run(command, user, file.stem)
+    if not PROGRAM.exists():
+        click.echo(f"missing: {PROGRAM}, which the unit starts: make the environment /opt/otolith first", err=True)
+    click.echo(f"start it: systemctl enable --now otolith@{file.stem}")
+
+
+def _files(file: Path) -> Iterator[InstalledFile]:
+    """Yield the files of the service of one machine.
+
+    Raises:
+        ConfigurationError: the machine file is wrong, or it cannot be installed under its name.
+    """
+    from otolith.machine import load_machine
+
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", file.stem) or file.suffix != ".toml":
+        raise ConfigurationError(f"{file}: its name becomes that of the service: use letters, digits, '_', '-', .toml")
+    machine = load_machine(file)
+    shipped, etc = shipped_directory(), Path("etc")
+    yield InstalledFile(etc / "systemd/system" / UNIT, (shipped / UNIT).read_bytes())
+    yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
+    zenoh = machine.file.zenoh
+    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect)
+    yield InstalledFile(etc / f"systemd/system/otolith@{file.stem}.service.d/machine.conf", text.encode())
+    yield InstalledFile(etc / "otolith" / file.name, file.read_bytes())
+    for name in named_files(file):
+        source = file.parent / name
+        is_private = not source.stat().st_mode & 0o004
+        yield InstalledFile(etc / "otolith" / name, source.read_bytes(), is_private)
+
+
+def shipped_directory() -> Path:
+    """Return the folder of the unit: in an installed package, or beside the sources of a checkout."""
+    installed = Path(__file__).parents[2] / "systemd"
+    return installed if installed.is_dir() else Path(__file__).parents[4] / "systemd"
+
+
+def named_files(file: Path) -> list[Path]:
+    """Return the files that a machine file names, relative to it.
+
+    Raises:
+        ConfigurationError: one of them is not in its folder, so that it cannot be copied along.
+    """
+    names = []
+    for text in _strings(tomllib.loads(file.read_text(encoding="utf-8"))):
+        name = Path(text)
+        if text and len(text) < 255 and (file.parent / name).is_file() and not text.startswith("/dev/"):
+            folder = file.parent.resolve()
+            if name.is_absolute() or folder not in (folder / name).resolve().parents:
+                remedy = "the service reads /etc/otolith alone: copy it beside and name it so"
+                raise ConfigurationError(f"{file}: {text!r} is not in the folder of the machine file: {remedy}")
+            names.append(name)
+    return list(dict.fromkeys(names))
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping | list | tuple):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _strings(item)
+
+
+def drop_in(name: str, drivers: Sequence[Mapping[str, Any]], listen: Sequence[str], connect: Sequence[str]) -> str:
+    """Return the drop-in of the unit: the devices and addresses that the machine file names, and no others."""
+    lines = [f"# Made by 'otolith install' from /etc/otolith/{name}.toml.", "[Service]"]
+    devices = [text.partition("@")[0] for text in _strings(drivers) if text.startswith("/dev/")]
+    if devices:
+        lines += ["PrivateDevices=no", "DevicePolicy=closed"]
+        lines += [f"DeviceAllow={device} rw" for device in dict.fromkeys(devices)]
+        lines += ["SupplementaryGroups=dialout"]
+    hosts = [host for endpoint in connect if (host := _host(endpoint))]
+    hosts += [host for driver in drivers for host in _hosts_of(driver)]
+    unknown = [host for host in hosts if not _address(host) and host != "localhost"]
+    unknown += [host for endpoint in listen if (host := _host(endpoint)) and not _is_loopback(host)]
+    unknown += [f"driver {driver.get('type')!r}" for driver in drivers if driver.get("type") not in KNOWN_DRIVERS]
+    if unknown:
+        comment = (
+            f"# No IPAddressDeny: the addresses that {', '.join(dict.fromkeys(unknown))} stands for are not known."
+        )
+        return "\n".join([*lines, comment, ""])
+    multicast = ["multicast"] if any(driver.get("type") == "can" for driver in drivers) else []
+    allowed = dict.fromkeys(["localhost", *multicast, *(host for host in hosts if _address(host))])
+    return "\n".join([*lines, "IPAddressDeny=any", *(f"IPAddressAllow={host}" for host in allowed), ""])
+
+
+def _hosts_of(driver: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the computers that a table ``[driver]`` names."""
+    if isinstance(host := driver.get("host"), str):
+        yield host
+    if isinstance(endpoint := driver.get("endpoint"), str):
+        yield urlsplit(endpoint).hostname or endpoint
+
+
+def _host(endpoint: str) -> str:
+    """Return the host of a Zenoh endpoint like ``tcp/[::1]:7447``; empty for a socket of this computer."""
+    protocol, _, rest = endpoint.partition("/")
+    place = re.split(r"[?#]", rest)[0]
+    return "" if protocol.startswith("unix") else place.rpartition(":")[0].strip("[]")
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def _is_loopback(host: str) -> bool:
+    address = _address(host)
+    return host == "localhost" or (address is not None and address.is_loopback)
+
+
+def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> None:
+    """Write a file as a whole, unless it is there; what it replaces is kept with a ``~``."""
+    path = root / item.path
+    before = path.read_bytes() if path.is_file() else None
+    if before == item.content:
+        click.echo(f"unchanged: {path}")
+        return
+    click.echo(f"{'to ' if dry_run else ''}{'write' if before is None else 'replace'}: {path}")
+    if dry_run:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if before is not None:
+        shutil.copy2(path, path.with_name(f"{path.name}~"))
+    handle, temporary = tempfile.mkstemp(dir=path.parent)
+    with os.fdopen(handle, "wb") as stream:
+        stream.write(item.content)
+        os.fchmod(stream.fileno(), 0o640 if item.is_private else 0o644)
+    Path(temporary).replace(path)
+
+
+def _commands(name: str, private: list[str]) -> list[tuple[list[str], str | None]]:
+    """Return the commands of an installation, each with the user who runs it, root if None."""
+    cache, program = f"/var/cache/otolith/{name}", str(PROGRAM if PROGRAM.exists() else Path(sys.argv[0]).absolute())
+    return [
+        (["systemd-sysusers"], None),
+        *([(["chgrp", USER, *private], None)] if private else []),
+        (["systemctl", "daemon-reload"], None),
+        (["install", "-d", "-m", "0700", "-o", USER, "-g", USER, cache], None),
+        ([program, "compile", f"/etc/otolith/{name}.toml"], USER),
+    ]
+
+
+def _run(command: list[str], user: str | None, name: str) -> None:
+    environment = {"PATH": os.environ.get("PATH", ""), "CACHE_DIRECTORY": f"/var/cache/otolith/{name}"}
+    rights = {"user": user, "group": user, "extra_groups": []} if user else {}
+    done = subprocess.run(command, env=environment, check=False, **rights)  # type: ignore[call-overload]  # noqa: S603
+    if done.returncode:
+        raise ServiceError(f"{shlex.join(command)}: ended with exit code {done.returncode}; repeat the installation")

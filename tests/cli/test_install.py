@@ -1,0 +1,119 @@
+"""``otolith install`` into a folder: the files of the service, again, and what the drop-in allows."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from otolith.cli.main import cli
+from otolith.cli.operation.install import UNIT, drop_in, named_files, shipped_directory
+from otolith_drivers.errors import ConfigurationError
+from tests.conftest import EXAMPLES
+
+LOOPBACK = ("tcp/127.0.0.1:7447",)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    for name in ("dc-motor.toml", "dc-motor.dbc"):
+        shutil.copy(EXAMPLES / name, tmp_path)
+    return (tmp_path / "dc-motor.toml").rename(tmp_path / "press-3.toml")
+
+
+def installed(file: Path, root: Path, *options: str) -> str:
+    result = CliRunner().invoke(cli, ["install", str(file), "--root", str(root), *options], catch_exceptions=False)
+    assert result.exit_code == 0
+    return result.output
+
+
+def test_every_step_is_shown_and_idempotent(file: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    shown = installed(file, root, "--dry-run")
+    assert not root.exists()
+    names = (
+        "etc/otolith/press-3.toml",
+        "etc/otolith/dc-motor.dbc",
+        f"etc/systemd/system/{UNIT}",
+        "etc/systemd/system/otolith@press-3.service.d/machine.conf",
+        "usr/lib/sysusers.d/otolith.conf",
+    )
+    assert all(f"to write: {root / name}" in shown for name in names)
+    assert "to run: systemd-sysusers" in shown
+    assert "compile /etc/otolith/press-3.toml" in shown
+    installed(file, root)
+    assert {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()} == set(names)
+    assert (root / names[2]).read_bytes() == (shipped_directory() / UNIT).read_bytes()
+    assert (root / names[0]).stat().st_mode & 0o777 == 0o644
+    again = installed(file, root)
+    assert again.count("unchanged: ") == len(names)
+    file.write_text(file.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
+    assert f"replace: {root / names[0]}" in installed(file, root)
+    assert "# changed" not in (root / f"{names[0]}~").read_text(encoding="utf-8")
+
+
+def test_the_shipped_unit_is_hardened(file: Path, tmp_path: Path) -> None:
+    """Exposure by systemd's own measure, with the drop-in of the machine."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze here")
+    installed(file, tmp_path)
+    command = ["systemd-analyze", "security", "--offline=yes", f"--root={tmp_path}", "otolith@press-3.service"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    exposure = re.search(r"exposure level for \S+: ([\d.]+)", done.stdout)
+    assert exposure is not None, done.stderr
+    assert float(exposure[1]) <= 1.6
+
+
+def test_a_wrong_machine_file_installs_nothing(file: Path, tmp_path: Path) -> None:
+    file.write_text("[machine]\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError):
+        installed(file, tmp_path / "root")
+    assert not (tmp_path / "root").exists()
+    odd = file.rename(tmp_path / "a b.toml")
+    with pytest.raises(ConfigurationError, match="becomes that of the service"):
+        installed(odd, tmp_path / "root")
+
+
+def test_a_file_elsewhere_is_not_copied(file: Path, tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    deep = tmp_path / "deep" / "press-3.toml"
+    text = file.read_text(encoding="utf-8").replace('"dc-motor.dbc"', '"../dc-motor.dbc"')
+    deep.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="not in the folder of the machine file"):
+        named_files(deep)
+    (tmp_path / "deep" / "link.dbc").symlink_to(tmp_path / "dc-motor.dbc")
+    deep.write_text(text.replace("../dc-motor.dbc", "link.dbc"), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="not in the folder of the machine file"):
+        named_files(deep)
+
+
+def test_the_drop_in_allows_what_the_file_names() -> None:
+    serial = drop_in("pump", [{"type": "modbus", "serial": "/dev/ttyUSB0"}], LOOPBACK, ())
+    assert {"PrivateDevices=no", "DevicePolicy=closed", "DeviceAllow=/dev/ttyUSB0 rw", "SupplementaryGroups=dialout",
+            "IPAddressDeny=any", "IPAddressAllow=localhost"} <= set(serial.splitlines())  # fmt: skip
+    drive = drop_in("drive", [{"type": "modbus", "host": "192.168.0.10"}], LOOPBACK, ("tcp/[fd00::1]:7447",))
+    assert "PrivateDevices" not in drive
+    assert [line for line in drive.splitlines() if "IPAddressAllow" in line] == [
+        "IPAddressAllow=localhost", "IPAddressAllow=fd00::1", "IPAddressAllow=192.168.0.10"]  # fmt: skip
+    assert "IPAddressAllow=multicast" in drop_in("press", [{"type": "can"}], LOOPBACK, ())
+    adapter = drop_in("press", [{"type": "can", "interface": "slcan", "channel": "/dev/ttyACM0@115200"}], LOOPBACK, ())
+    assert "DeviceAllow=/dev/ttyACM0 rw" in adapter
+
+
+@pytest.mark.parametrize(
+    ("driver", "listen", "connect"),
+    [
+        ({"type": "modbus", "host": "drive.plant.local"}, LOOPBACK, ()),
+        ({"type": "can"}, ("tcp/0.0.0.0:7447",), ()),
+        ({"type": "can"}, LOOPBACK, ("tcp/router:7447",)),
+        ({"type": "of-our-own", "host": "10.0.0.1"}, LOOPBACK, ()),
+    ],
+)
+def test_unknown_addresses_are_not_denied(
+    driver: dict[str, str], listen: tuple[str, ...], connect: tuple[str, ...]
+) -> None:
+    text = drop_in("press", [driver], listen, connect)
+    assert "\nIPAddressDeny" not in text
+    assert "# No IPAddressDeny" in text

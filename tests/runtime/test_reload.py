@@ -1,0 +1,53 @@
+"""A changed machine file: what a running daemon takes over, and what it names."""
+
+from pathlib import Path
+
+import pytest
+
+from otolith.machine import load_machine
+from otolith.runtime.reload import Reload, reloaded
+
+TEXT = """[machine]
+name = "motor"
+[twin]
+name = "dc_motor"
+[parameters]
+R_a = { value = "6.5 ohm", estimate = true, act = "+40 %" }
+[recording]
+enabled = false
+"""
+
+
+def change(folder: Path, before: str, after: str) -> Reload:
+    (folder / "machine.toml").write_text(TEXT, encoding="utf-8")
+    running = load_machine(folder / "machine.toml", with_driver=False)
+    assert before in TEXT
+    (folder / "machine.toml").write_text(TEXT.replace(before, after), encoding="utf-8")
+    return reloaded(running, load_machine(folder / "machine.toml", with_driver=False))
+
+
+def test_limits_and_recording_change(tmp_path: Path) -> None:
+    result = change(tmp_path, '"+40 %"', '"+60 %"')
+    assert (result.limits, result.recording, result.needs_restart) == (True, False, ())
+    assert any(limit.value == pytest.approx(6.5 * 1.6) for limit in result.machine.plan.parameters["R_a"].limits)
+    result = change(tmp_path, "enabled = false", "enabled = true")
+    assert (result.limits, result.recording, result.needs_restart) == (False, True, ())
+    assert result.machine.file.recording.enabled
+    assert result.text.endswith("reloaded, recording changed")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "keys"),
+    [
+        ('name = "motor"', 'name = "other"', ("machine.name",)),
+        ('"6.5 ohm"', '"7 ohm"', ("parameters.R_a.value",)),
+        ('"6.5 ohm", estimate = true, act = "+40 %"', '"7 ohm", estimate = true, act = "+60 %"',
+         ("parameters.R_a.value", "parameters.R_a.act")),
+        ("[recording]", '[window]\nlength = "4 s"\n[recording]', ("window.length",)),
+    ],
+)  # fmt: skip
+def test_all_else_needs_a_restart(tmp_path: Path, before: str, after: str, keys: tuple[str, ...]) -> None:
+    result = change(tmp_path, before, after)
+    assert (result.limits, result.recording, result.needs_restart) == (False, False, keys)
+    assert result.machine.file.parameters["R_a"].value == "6.5 ohm"
+    assert f"only a restart takes over {', '.join(keys)}" in result.text
