@@ -163,7 +163,8 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
     for index, parameter in enumerate(state.problem.free):
         if parameter.name == name:
             previous = {**state.previous, parameter.label: PreviousStatus()}
-            return replace(state, posterior=state.posterior.reset_parameter(index), previous=previous, test=None)
+            health, posterior = state.health.without_history(name), state.posterior.reset_parameter(index)
+            return replace(state, posterior=posterior, previous=previous, test=None, health=health)
     for component in state.problem.components:
         if component.key == name:
             return without_component(state, component)

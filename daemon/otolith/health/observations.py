@@ -9,7 +9,7 @@ from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingFeatures, FindingKind, severity
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan, probability_beyond
 from otolith.health.schema import ComponentDocument, ComponentStatus, ParameterDocument, ReportDocument, Status
-from otolith.health.text import interval_text, value_text
+from otolith.health.text import forecast_text, interval_text, value_text
 
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
@@ -75,7 +75,8 @@ def _of_parameter(
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, _manner(parameter, step))
     change = f" ({value / parameter.nominal - 1.0:+.1%})" if parameter.nominal else ""
     beyond = f"{limit.side} its limit {limit.value:.4g} {unit}"
-    text = f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {beyond}"
+    expected = forecast_text(parameter, report.window.end)
+    text = f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {beyond}{expected and f', {expected}'}"
     condition, numbers = f"{quantity.meaning} is {limit.side} its limit", _numbers(value, sd, unit, limit)
     return Observation(key, quantity.part, level, features, text, condition, numbers=numbers)
 

@@ -198,6 +198,32 @@ class WindowDocument(StrictModel):
     quality: QualityDocument
 
 
+class CrossingDocument(StrictModel):
+    """When a parameter will pass a limit, Unix seconds."""
+
+    limit: float
+    """In the unit of the parameter."""
+    at: float
+    """Median."""
+    low: float
+    """Lower end of the 80 % interval."""
+    high: float | None = None
+    """None if it lies beyond ten times the length of the history."""
+
+
+class ForecastDocument(StrictModel):
+    """Whether and when a parameter will pass its limits, from its history."""
+
+    computed: float
+    """Unix seconds."""
+    family: Literal["", "linear", "exponential"] = ""
+    """Of the trend; empty without one."""
+    watch: CrossingDocument | None = None
+    act: CrossingDocument | None = None
+    reason: str = ""
+    """Why there is no forecast."""
+
+
 class ParameterDocument(StrictModel):
     """One parameter: value, unit, uncertainty, status, reason."""
 
@@ -219,6 +245,8 @@ class ParameterDocument(StrictModel):
     """How far the interval has come from the bounds to what is required, 0 to 1."""
     identifiability: Identifiability | None = None
     reason: str = ""
+    forecast: ForecastDocument | None = None
+    """None without limits."""
     advice: str | None = None
     """The experiment that would determine the parameter, if this window did not."""
 
