@@ -40,6 +40,7 @@ from otolith_drivers.user_dirs import state_directory
 LIBRARY = Path(__file__).parent / "twin" / "library"
 RULES = Path(__file__).parent / "health" / "rules.toml"
 FINGERPRINT_KEYS = ("dbc", "eds", "order", "first_address", "device")  # driver options that signal values depend on
+TWIN_LIMITS, OWN_LIMITS = "the limits of the twin do not fit this value", "write watch and act here"
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MIN_OUTPUT_NOISE = 1e-12  # in the unit of the output: the residual is divided by the noise
@@ -382,8 +383,11 @@ def _monitored(parameter: Parameter, table: LimitsTable, where: tuple[str, ...],
     is_written = table.watch is not None or table.act is not None
     defaults = (parameter.watch, parameter.act) if nominal != 0.0 and not is_written else ((), ())
     for level, written, default in zip((Level.WATCH, Level.ACT), (table.watch, table.act), defaults, strict=True):
-        with context.at(*where, level.lower()):
+        try:
             values = limit_values(default if written is None else written, unit, nominal)
+        except ValueError as error:
+            fault = str(error) if is_written else f"{TWIN_LIMITS}: {level.lower()}: {error}: {OWN_LIMITS}"
+            context.fail((*where, level.lower()) if is_written else where, fault)
         limits += [Limit(level, value, value < nominal) for value in values]
         for value in values:
             if is_written and not parameter.low < value < parameter.high:
@@ -393,8 +397,10 @@ def _monitored(parameter: Parameter, table: LimitsTable, where: tuple[str, ...],
     acts = [limit for limit in limits if limit.level is Level.ACT]
     for watch in (limit for limit in limits if limit.level is Level.WATCH):
         if any(act.is_lower is watch.is_lower and act.excess(watch.value) >= 0.0 for act in acts):
-            remedy = f"write a limit nearer to the nominal value {nominal:g} {unit}"
-            context.fail((*where, "watch"), f"{watch.value:g} {unit} is not passed before act: {remedy}")
+            fault = f"{watch.value:g} {unit} is not passed before act"
+            if not is_written:
+                context.fail(where, f"{TWIN_LIMITS}: watch {fault}: {OWN_LIMITS}")
+            context.fail((*where, "watch"), f"{fault}: write a limit nearer to the nominal value {nominal:g} {unit}")
     return MonitoredQuantity(parameter.part or MACHINE, parameter.meaning, unit, nominal, tuple(limits))
 
 
