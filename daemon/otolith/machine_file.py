@@ -33,6 +33,12 @@ def _endpoint(text: str) -> str:
     return text
 
 
+def _command(command: tuple[str, ...]) -> tuple[str, ...]:
+    if command and not command[0].startswith("/"):
+        raise ValueError(f'{command[0]!r} is not an absolute path: write it like ["/usr/bin/logger", "-t", "otolith"]')
+    return command
+
+
 def _expand_value(written: object) -> object:
     """Expand ``"6.5 ohm"``, the short form of ``{ value = "6.5 ohm" }``."""
     return written if isinstance(written, dict) else {"value": written}
@@ -50,6 +56,8 @@ class MachineTable(StrictModel):
 
     name: Name
     site: Name = "site"
+    on_event: Annotated[tuple[str, ...], AfterValidator(_command)] = ()
+    """Command and arguments that the daemon runs for each event."""
 
 
 class TwinTable(StrictModel):

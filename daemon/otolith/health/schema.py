@@ -312,6 +312,8 @@ class CountersDocument(StrictModel):
     worker_restarts: int = 0
     recordings_dropped: int = 0
     """Windows that the recorder did not accept in time."""
+    commands_failed: int = 0
+    """Events for which ``on_event`` failed."""
 
 
 class ReportDocument(StrictModel):

@@ -2,8 +2,8 @@
 
     driver thread -> rings -> [main thread] window -> worker process -> [main thread] report -> Zenoh, recorder process
 
-The main thread never waits for a machine, a worker, a disk or a subscriber. It waits only for a process that it has
-killed and, at the end, for the writer thread and the recorder, each up to its flush time.
+The main thread never waits for a machine, a worker, a disk, a command or a subscriber. It waits only for a process that
+it has killed and, at the end, for writer thread, recorder and commands, each up to its flush time.
 """
 
 import contextlib
@@ -26,6 +26,7 @@ from otolith.health.schema import CountersDocument, DriverDocument, Report, Repo
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine
 from otolith.publishing.zenoh_session import Publisher
+from otolith.runtime.event_command import EventCommand
 from otolith.runtime.process import SIGNALS, ChildProcess
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
@@ -42,7 +43,7 @@ MAX_WAIT = 0.1  # s; bounds the reaction time to a stop signal, a dead process a
 MIN_WAIT = 0.005  # s; bounds the CPU load while a window is overdue
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
 RECORDER_ROOM = 32  # windows that wait for the recorder
-RECORDER_FLUSH, WRITER_FLUSH = 1.5, 0.5  # s to finish writing at the end
+RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writing, or running, at the end
 STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths; the watchdog is not fed afterwards
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
@@ -75,6 +76,7 @@ class Service:
         self._supervisor = Supervisor(state, longest * period)
         self._recorder = ChildProcess("otolith-recorder", "otolith.publishing.recorder:main", RECORDER_ROOM)
         self._recording = recording
+        self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
         self._stop_signal: int | None = None
@@ -126,6 +128,7 @@ class Service:
             steps.callback(self._notifier.close)
             if self._publisher is not None:
                 steps.callback(self._publisher.close)
+            steps.callback(self._command.stop, COMMAND_FLUSH)
             steps.callback(self._writer.stop, WRITER_FLUSH)
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
             steps.callback(self._supervisor.worker.kill)
@@ -211,6 +214,7 @@ class Service:
             windows_missed=self._supervisor.missed,
             worker_restarts=self._supervisor.restarts,
             recordings_dropped=self._recordings_dropped,
+            commands_failed=self._command.failed,
         )
         document = document.model_copy(
             update={"cost": cost, "counters": counters, "driver": driver, "notes": self._notes}
@@ -223,9 +227,13 @@ class Service:
         self._log(document, time.monotonic())
 
     def _log(self, document: ReportDocument, now: float) -> None:
-        """Log the events that the window changed, and once per hour the window; in a terminal each window."""
+        """Log the events that the window changed, and run the command for each; log the window once per hour.
+
+        In a terminal each window is logged.
+        """
         for event in announcements(document):
             log.log(logging.ERROR if event.is_urgent else logging.WARNING, "%s", event_text(event))
+            self._command.run(event)
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
         self._summarised_at = now if is_due else self._summarised_at
         self._notifier.send(f"STATUS={line}")
