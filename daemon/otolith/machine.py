@@ -29,7 +29,7 @@ from otolith.machine_file import (
 from otolith.twin.augmentation import sources
 from otolith.twin.component_families import FAMILY_NAMES
 from otolith.twin.definition import Definition, Parameter, Role
-from otolith.twin.language import read_twin
+from otolith.twin.language import MAX_COEFFICIENT, read_twin
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal
 from otolith_drivers.config_files import Context, SourceFile, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
@@ -39,6 +39,7 @@ from otolith_drivers.user_dirs import state_directory
 
 LIBRARY = Path(__file__).parent / "twin" / "library"
 RULES = Path(__file__).parent / "health" / "rules.toml"
+TEMPERATURE_UNIT = "K"
 FINGERPRINT_KEYS = ("dbc", "eds", "order", "first_address", "device")  # driver options that signal values depend on
 TWIN_LIMITS, OWN_LIMITS = "the limits of the twin do not fit this value", "write watch and act here"
 
@@ -95,6 +96,11 @@ class LoadedMachine:
         return f"{self.file.machine.name} at {self.file.machine.site}"
 
     @property
+    def observed(self) -> tuple[str, ...]:
+        """The temperatures, which are signals beside those of the twin; each in K."""
+        return _observed(self.file)
+
+    @property
     def records(self) -> int:
         """Records of the first window."""
         return self.problem.window.records
@@ -136,7 +142,7 @@ class LoadedMachine:
         if not self.file.signals:
             return ""
         options = {key: self.file.driver.get(key) for key in FINGERPRINT_KEYS}
-        read = {name: _own(table) for name, table in self.file.signals.items()}
+        read = {name: _own(table) for name, table in self.file.signals.items() if name in self.twin.signals}
         text = json.dumps([read, options], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -251,13 +257,14 @@ def driver_config(file: MachineFile, twin: Definition, source: SourceFile) -> Dr
     if not file.driver:
         remedy = "write [driver] with type = \"can\" or another driver, and [signals]; only 'otolith replay' needs none"
         context.fail(("driver",), f"missing: {remedy}")
-    needed = list(twin.signals)
+    units = {name: twin.unit_of(name) for name in twin.signals} | dict.fromkeys(_observed(file), TEMPERATURE_UNIT)
     for name in file.signals:
-        if name not in needed:
-            context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, needed)}")
-    for name in needed:
+        if name not in units:
+            context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, list(units))}")
+    for name, unit in units.items():
         if name not in file.signals:
-            context.fail(("signals",), f"{name} ({twin.unit_of(name)}) is missing: the twin needs {', '.join(needed)}")
+            needed = f"the twin needs {', '.join(twin.signals)}" if name in twin.signals else "[parameters] names it"
+            context.fail(("signals",), f"{name} ({unit}) is missing: {needed}")
     with context.at("driver", "type"):
         kind = file.driver.get("type")
         if not isinstance(kind, str):
@@ -266,12 +273,16 @@ def driver_config(file: MachineFile, twin: Definition, source: SourceFile) -> Dr
     written = {key: value for key, value in file.driver.items() if key != "type"}
     options = validate(written, module.Options, source, under=("driver",))
     signals = tuple(
-        Signal(
-            name, twin.unit_of(name), validate(_own(file.signals[name]), module.Source, source, under=("signals", name))
-        )
-        for name in needed
+        Signal(name, unit, validate(_own(file.signals[name]), module.Source, source, under=("signals", name)))
+        for name, unit in units.items()
     )
     return DriverConfig(module, options, Setup(signals, source.path.parent, file.window.sample_period), source)
+
+
+def _observed(file: MachineFile) -> tuple[str, ...]:
+    """Return the signals of the temperatures that parameters depend on."""
+    names = (table.temperature for table in file.parameters.values())
+    return tuple(dict.fromkeys(name for name in names if name))
 
 
 def _own(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -351,9 +362,10 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
     """Return the limits of the file, or those of the twin where it has none, and the rules of the diagnosis."""
     free, sites = {parameter.name: parameter for parameter in problem.free}, {site.name: site for site in twin.sites}
     for name, table in file.parameters.items():
-        for key, written in (("watch", table.watch), ("act", table.act)):
+        for key, written in (("watch", table.watch), ("act", table.act), ("temperature", table.temperature)):
             if written and name not in free:
-                context.fail(("parameters", name, key), f"{name} is not estimated: write estimate = true, or no limit")
+                what = "temperature" if key == "temperature" else "limit"
+                context.fail(("parameters", name, key), f"{name} is not estimated: write estimate = true, or no {what}")
     for name in file.components:
         if name not in sites:
             context.fail(("components", name), f"twin {twin.name!r} has no such site: {nearest(name, list(sites))}")
@@ -361,6 +373,9 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         name: _monitored(row, file.parameters.get(name, LimitsTable()), ("parameters", name), context)
         for name, row in free.items()
     }
+    for name, quantity in parameters.items():
+        table = file.parameters.get(name, ParameterTable())
+        parameters[name] = _with_temperature(quantity, free[name], table, twin, context)
     amplitudes = {
         name: Parameter(name, row.unit, 0.0, 0.0, math.inf, row.meaning, part=row.part) for name, row in sites.items()
     }
@@ -369,6 +384,25 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         for name, row in amplitudes.items()
     }
     return MonitoringPlan(parameters, components, load_rules())
+
+
+def _with_temperature(
+    quantity: MonitoredQuantity, parameter: Parameter, table: ParameterTable, twin: Definition, context: Context
+) -> MonitoredQuantity:
+    """Return a parameter with what the file states of its temperature."""
+    where, coefficient = ("parameters", parameter.name), parameter.temperature_coefficient
+    if table.temperature_coefficient is not None:
+        with context.at(*where, "temperature_coefficient"):
+            coefficient = Quantity("1/K", *MAX_COEFFICIENT)(table.temperature_coefficient)
+    if table.temperature is not None:
+        if table.temperature in twin.signals or not table.temperature:
+            fault = f"{table.temperature!r} must be a signal of [signals] beside those of the twin"
+            context.fail((*where, "temperature"), fault)
+        if coefficient == 0.0:
+            fault = f'{parameter.name} has no temperature_coefficient: write one, like "0.393 %/K" of copper'
+            context.fail((*where, "temperature"), fault)
+    temperature, reference = table.temperature or "", table.reference_temperature
+    return replace(quantity, temperature_coefficient=coefficient, temperature=temperature, reference=reference)
 
 
 def load_rules() -> tuple[Rule, ...]:

@@ -83,6 +83,12 @@ class ParameterTable(LimitsTable):
     """Without it, a parameter with a value is known, and one without has the role that the twin gives it."""
     low: RawQuantity = None
     high: RawQuantity = None
+    temperature: str | None = None
+    """Signal that measures the temperature on which the parameter depends."""
+    temperature_coefficient: RawQuantity = None
+    """Relative change per kelvin; without it that of the twin."""
+    reference_temperature: Annotated[float, BeforeValidator(Quantity("K", 0.0, 5000.0))] = 293.15
+    """K, for which value and limits are stated."""
 
 
 class SignalTable(StrictModel):

@@ -79,7 +79,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     """Return the state after ``report``, and the report with states and events."""
     state = _with_forecasts(plan, _with_steps(state, report), report)
     parameters = {
-        name: item.model_copy(update={"forecast": state.forecasts.get(name)})
+        name: item.model_copy(update={"forecast": state.forecasts.get(name), "referred": _referred(plan, report, name)})
         for name, item in report.parameters.items()
     }
     report = report.model_copy(update={"parameters": parameters})
@@ -124,6 +124,15 @@ def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
     return replace(state, values=values, steps={**state.steps, **changes})
 
 
+def _referred(plan: MonitoringPlan, report: ReportDocument, name: str) -> float | None:
+    """Return the value of a parameter at the reference temperature, if a temperature is measured."""
+    quantity, item = plan.parameters.get(name), report.parameters[name]
+    if quantity is None or not quantity.temperature or item.value is None:
+        return None
+    referred = quantity.referred(item.value, 0.0, report.window.observed or {})
+    return referred[0] if referred else None
+
+
 def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
     """Return the state with the values of this window in the histories, and with the forecasts that are due."""
     histories, forecasts = dict(state.histories), dict(state.forecasts)
@@ -132,7 +141,9 @@ def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocu
         is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
         if quantity is None or not quantity.limits or not is_new or item.value is None or not item.sd:
             continue
-        histories[name] = with_point(histories.get(name, ()), report.window.end, item.value, item.sd**2)
+        if (referred := quantity.referred(item.value, item.sd, report.window.observed or {})) is None:
+            continue
+        histories[name] = with_point(histories.get(name, ()), report.window.end, referred[0], referred[1] ** 2)
         if is_due(forecasts.get(name), histories[name]):
             forecasts[name] = forecast(quantity, histories[name])
     return replace(state, histories=histories, forecasts=forecasts)
@@ -189,7 +200,7 @@ def _states(
 ) -> HealthDocument:
     """Return the states of parts and machine; ``events`` begin with the most severe."""
     worst = {event.part: event for event in reversed(events)}
-    silent = next((event for event in events if event.state is Level.NO_DATA), None)
+    silent = next((event for event in events if event.state is Level.NO_DATA and event.part == BUS), None)
     parts: dict[str, PartDocument] = {}
     for part in dict.fromkeys((*plan.parts, SENSORS, BUS, *worst)):
         event, missing = worst.get(part, silent), _undetermined(plan, part, report)

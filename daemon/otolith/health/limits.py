@@ -14,6 +14,7 @@ from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import Rule
 
 RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
+MIN_TEMPERATURE_FACTOR = 0.1  # relative value at a temperature, below which the temperature cannot be true
 MACHINE = "machine"  # the part to which belongs what no part of the twin explains
 
 
@@ -60,6 +61,25 @@ class MonitoredQuantity:
     unit: str = ""
     nominal: float = 0.0
     limits: tuple[Limit, ...] = ()
+    temperature_coefficient: float = 0.0
+    """Relative change per kelvin."""
+    temperature: str = ""
+    """Signal of the temperature, K; empty if it is not measured."""
+    reference: float = 293.15
+    """Temperature for which nominal value and limits are stated, K."""
+
+    def referred(self, value: float, sd: float, observed: Mapping[str, float]) -> tuple[float, float] | None:
+        """Return an estimate as it would be at the reference temperature, from the ``observed`` signals of a window.
+
+        Without a temperature it is the estimate itself; None if the temperature is measured, but not at present.
+        (IEC 60034-1: resistance is linear in temperature.)
+        """
+        if not self.temperature:
+            return value, sd
+        if (temperature := observed.get(self.temperature)) is None:
+            return None
+        factor = 1.0 + self.temperature_coefficient * (temperature - self.reference)
+        return (value / factor, sd / factor) if factor > MIN_TEMPERATURE_FACTOR else None
 
     @property
     def limits_text(self) -> str:

@@ -196,6 +196,8 @@ class WindowDocument(StrictModel):
     end: float
     records: int
     quality: QualityDocument
+    observed: dict[str, float] | None = None
+    """Mean of each observed signal, as a temperature in K."""
 
 
 class CrossingDocument(StrictModel):
@@ -234,6 +236,8 @@ class ParameterDocument(StrictModel):
     """Lower end of the 95 % interval."""
     high: float | None = None
     nominal: float
+    referred: float | None = None
+    """Value at the reference temperature, by which the limits are judged; None if no temperature is measured."""
     raw: float | None = None
     """Estimate of this window alone."""
     raw_sd: float | None = None
@@ -394,6 +398,7 @@ def window_document(window: Window) -> WindowDocument:
         start=window.start,
         end=window.end,
         records=window.records,
+        observed=dict(window.observed) or None,
         quality=QualityDocument(
             verdict=quality.verdict,
             missing=quality.missing,

@@ -5,9 +5,10 @@
 The clock is that of the data, so two runs over the same files give the same reports, byte for byte.
 """
 
+import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -19,7 +20,7 @@ from otolith.acquisition.recording_statistics import RecordingStatistics
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
-from otolith.machine import LoadedMachine, RecordedMachine, driver_config
+from otolith.machine import TEMPERATURE_UNIT, LoadedMachine, RecordedMachine, driver_config
 from otolith.runtime.worker import perform
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
@@ -78,11 +79,19 @@ def open_recordings(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
 
 
 def _open_by_name(machine: LoadedMachine, data: Path) -> Reader:
-    """Open a table or recording whose columns have the names of the signals."""
+    """Open a table or recording whose columns have the names of the signals; observed ones may be missing."""
     data_format = format_of(data)
-    signals = tuple(Signal(name, machine.twin.unit_of(name), data_format.Source()) for name in machine.twin.signals)
-    setup = Setup(signals, machine.path.parent, machine.file.window.sample_period)
-    return data_format.open_log(data, setup, None)
+    units = {name: machine.twin.unit_of(name) for name in machine.twin.signals}
+    temperatures = dict.fromkeys(machine.observed, TEMPERATURE_UNIT)
+
+    def opened(wanted: Mapping[str, str]) -> Reader:
+        signals = tuple(Signal(name, unit, data_format.Source()) for name, unit in wanted.items())
+        return data_format.open_log(data, Setup(signals, machine.path.parent, machine.file.window.sample_period), None)
+
+    if temperatures:
+        with contextlib.suppress(ConfigurationError):
+            return opened(units | temperatures)
+    return opened(units)
 
 
 class RealTimePacer:
@@ -133,7 +142,7 @@ class Replay:
         self._timing = timing
         self._length = window.length
         plans = machine.plans(data.sampling)
-        self._playback = Playback(plans, machine.records, window.sample_period, machine.limits)
+        self._playback = Playback(plans, machine.records, window.sample_period, machine.limits, machine.observed)
         self._windows = self._windows_bad = self._missed = 0
 
     def reports(self) -> Iterator[Report]:

@@ -63,7 +63,8 @@ class Service:
         self._listen = file.zenoh.listen if listen is None else listen
         plans = machine.plans(machine.driver.sampling)
         delay = max(plan.delay for plan in plans)
-        self._rings = Rings(machine.twin.signals, RING_RATE * (RING_WINDOWS * longest + math.ceil(delay / period)))
+        capacity = RING_RATE * (RING_WINDOWS * longest + math.ceil(delay / period))
+        self._rings = Rings(machine.twin.signals, capacity, machine.observed)
         self._windower = Windower(plans, machine.records, period, machine.limits)
         self._store = StateStore(
             file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
