@@ -422,7 +422,11 @@ def _monitored(parameter: Parameter, table: LimitsTable, where: tuple[str, ...],
         except ValueError as error:
             fault = str(error) if is_written else f"{TWIN_LIMITS}: {level.lower()}: {error}: {OWN_LIMITS}"
             context.fail((*where, level.lower()) if is_written else where, fault)
-        limits += [Limit(level, value, value < nominal) for value in values]
+        relative = [str(text).strip().endswith("%") for text in (default if written is None else written)]
+        limits += [
+            Limit(level, value, value < nominal, is_relative)
+            for value, is_relative in zip(values, relative, strict=True)
+        ]
         for value in values:
             if is_written and not parameter.low < value < parameter.high:
                 bounds = f"the bounds {parameter.low:g} to {parameter.high:g} {unit}"

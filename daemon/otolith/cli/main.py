@@ -13,6 +13,7 @@ from typing import Any
 import click
 
 from otolith import __version__
+from otolith.cli.commissioning.baseline import baseline
 from otolith.cli.commissioning.components import commission, components, reset
 from otolith.cli.commissioning.noise import noise
 from otolith.cli.commissioning.probe import probe
@@ -280,5 +281,5 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, components, noise, probe, reset, twin):
+for command in (baseline, commission, components, noise, probe, reset, twin):
     cli.add_command(command)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingKind, diagnose
-from otolith.health.limits import MACHINE, Level, MonitoringPlan
+from otolith.health.limits import MACHINE, Level, MonitoredQuantity, MonitoringPlan
 from otolith.health.observations import BUS, SENSORS, Observation, observe
 from otolith.health.prognosis import History, forecast, is_due, with_point
 from otolith.health.schema import (
@@ -79,7 +79,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     """Return the state after ``report``, and the report with states and events."""
     state = _with_forecasts(plan, _with_steps(state, report), report)
     parameters = {
-        name: item.model_copy(update={"forecast": state.forecasts.get(name), "referred": _referred(plan, report, name)})
+        name: item.model_copy(update={"forecast": state.forecasts.get(name), **_judged(plan, report, name)})
         for name, item in report.parameters.items()
     }
     report = report.model_copy(update={"parameters": parameters})
@@ -124,13 +124,14 @@ def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
     return replace(state, values=values, steps={**state.steps, **changes})
 
 
-def _referred(plan: MonitoringPlan, report: ReportDocument, name: str) -> float | None:
-    """Return the value of a parameter at the reference temperature, if a temperature is measured."""
-    quantity, item = plan.parameters.get(name), report.parameters[name]
-    if quantity is None or not quantity.temperature or item.value is None:
-        return None
-    referred = quantity.referred(item.value, 0.0, report.window.observed or {})
-    return referred[0] if referred else None
+def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, float]:
+    """Return the baseline of a parameter, and its value at the reference temperature if a temperature is measured."""
+    quantity, item = plan.parameters.get(name, MonitoredQuantity()), report.parameters[name]
+    judged = {"baseline": quantity.nominal} if quantity.has_baseline else {}
+    if quantity.temperature and item.value is not None:
+        referred = quantity.referred(item.value, 0.0, report.window.observed or {})
+        judged |= {"referred": referred[0]} if referred else {}
+    return judged
 
 
 def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:

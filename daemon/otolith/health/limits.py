@@ -41,6 +41,8 @@ class Limit:
     value: float
     is_lower: bool
     """Whether values below it are beyond it."""
+    is_relative: bool = False
+    """Whether it is stated in percent of the nominal value."""
 
     @property
     def side(self) -> str:
@@ -67,6 +69,8 @@ class MonitoredQuantity:
     """Signal of the temperature, K; empty if it is not measured."""
     reference: float = 293.15
     """Temperature for which nominal value and limits are stated, K."""
+    has_baseline: bool = False
+    """Whether ``nominal`` is a value from commissioning instead of that of the machine file."""
 
     def referred(self, value: float, sd: float, observed: Mapping[str, float]) -> tuple[float, float] | None:
         """Return an estimate as it would be at the reference temperature, from the ``observed`` signals of a window.
@@ -115,6 +119,8 @@ class MonitoringPlan:
     sites: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Limits are those of the amplitude of a component at the site."""
     rules: Sequence[Rule] = ()
+    stated: Mapping[str, MonitoredQuantity] | None = None
+    """The parameters as the machine file states them, if there is a baseline."""
 
     @property
     def parts(self) -> tuple[str, ...]:

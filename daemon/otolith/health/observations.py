@@ -72,13 +72,15 @@ def _of_parameter(
         return Observation(key, quantity.part, None)
     if (referred := quantity.referred(value, sd, report.window.observed or {})) is None:
         return Observation(key, quantity.part, None)
-    deviation = referred[0] - parameter.nominal
+    deviation = referred[0] - quantity.nominal
     level, limit = quantity.level(*referred, before.get(key, Level.OK))
     if limit is None:
         return Observation(key, quantity.part, level)
     manner = _manner(parameter, deviation, step)
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
-    change = f" ({deviation / parameter.nominal:+.1%}{_at_temperature(quantity)})" if parameter.nominal else ""
+    against = " of the baseline" if quantity.has_baseline else ""
+    share = f"{deviation / quantity.nominal:+.1%}" if quantity.nominal else ""
+    change = f" ({share}{against}{_at_temperature(quantity)})" if share else ""
     beyond = f"{limit.side} its limit {limit.value:.4g} {unit}"
     expected = forecast_text(parameter, report.window.end)
     text = f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {beyond}{expected and f', {expected}'}"

@@ -236,6 +236,8 @@ class ParameterDocument(StrictModel):
     """Lower end of the 95 % interval."""
     high: float | None = None
     nominal: float
+    baseline: float | None = None
+    """Value of the healthy machine, to which limits in percent refer; None if they refer to ``nominal``."""
     referred: float | None = None
     """Value at the reference temperature, by which the limits are judged; None if no temperature is measured."""
     raw: float | None = None
