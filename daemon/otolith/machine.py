@@ -16,7 +16,7 @@ from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
 from otolith.health.diagnosis import Rule, RulesFile
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan
-from otolith.machine_drivers import build_driver, driver_configs, own_keys
+from otolith.machine_drivers import build_driver, driver_configs, observed_signals, own_keys
 from otolith.machine_file import (
     DiscoveryTable,
     LimitsTable,
@@ -29,7 +29,7 @@ from otolith.machine_file import (
 from otolith.twin.augmentation import sources
 from otolith.twin.component_families import FAMILY_NAMES
 from otolith.twin.definition import Definition, Parameter, Role
-from otolith.twin.language import read_twin
+from otolith.twin.language import MAX_COEFFICIENT, read_twin
 from otolith_drivers.base import Driver, Sampling, sampling_of
 from otolith_drivers.config_files import Context, expect, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
@@ -39,6 +39,7 @@ from otolith_drivers.user_dirs import state_directory
 LIBRARY = Path(__file__).parent / "twin" / "library"
 RULES = Path(__file__).parent / "health" / "rules.toml"
 FINGERPRINT_KEYS = ("dbc", "eds", "order", "first_address", "device")  # driver options that signal values depend on
+TWIN_LIMITS, OWN_LIMITS = "the limits of the twin do not fit this value", "write watch and act here"
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MIN_OUTPUT_NOISE = 1e-12  # in the unit of the output: the residual is divided by the noise
@@ -97,6 +98,11 @@ class LoadedMachine:
         return f"{self.file.machine.name} at {self.file.machine.site}"
 
     @property
+    def observed(self) -> tuple[str, ...]:
+        """The temperatures, which are signals beside those of the twin; each in K."""
+        return observed_signals(self.file)
+
+    @property
     def records(self) -> int:
         """Records of the first window."""
         return self.problem.window.records
@@ -141,11 +147,12 @@ class LoadedMachine:
         if not self.file.signals:
             return ""
         tables = self.file.drivers or ({},)
+        used = {name: table for name, table in self.file.signals.items() if name in self.twin.signals}
         options: list[Any] = [{key: table.get(key) for key in FINGERPRINT_KEYS} for table in tables]
-        read: dict[str, Any] = {name: own_keys(table) for name, table in self.file.signals.items()}
+        read: dict[str, Any] = {name: own_keys(table) for name, table in used.items()}
         if len(tables) > 1:
             options = [[table["name"], options[number]] for number, table in enumerate(tables)]
-            read = {name: [table.get("source"), read[name]] for name, table in self.file.signals.items()}
+            read = {name: [table.get("source"), read[name]] for name, table in used.items()}
         text = json.dumps([read, *options], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -299,9 +306,10 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
     """Return the limits of the file, or those of the twin where it has none, and the rules of the diagnosis."""
     free, sites = {parameter.name: parameter for parameter in problem.free}, {site.name: site for site in twin.sites}
     for name, table in file.parameters.items():
-        for key, written in (("watch", table.watch), ("act", table.act)):
+        for key, written in (("watch", table.watch), ("act", table.act), ("temperature", table.temperature)):
             if written and name not in free:
-                context.fail(("parameters", name, key), f"{name} is not estimated: write estimate = true, or no limit")
+                what = "temperature" if key == "temperature" else "limit"
+                context.fail(("parameters", name, key), f"{name} is not estimated: write estimate = true, or no {what}")
     for name in file.components:
         if name not in sites:
             context.fail(("components", name), f"twin {twin.name!r} has no such site: {nearest(name, list(sites))}")
@@ -309,6 +317,9 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         name: _monitored(row, file.parameters.get(name, LimitsTable()), ("parameters", name), context)
         for name, row in free.items()
     }
+    for name, quantity in parameters.items():
+        table = file.parameters.get(name, ParameterTable())
+        parameters[name] = _with_temperature(quantity, free[name], table, twin, context)
     amplitudes = {
         name: Parameter(name, row.unit, 0.0, 0.0, math.inf, row.meaning, part=row.part) for name, row in sites.items()
     }
@@ -317,6 +328,25 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         for name, row in amplitudes.items()
     }
     return MonitoringPlan(parameters, components, load_rules())
+
+
+def _with_temperature(
+    quantity: MonitoredQuantity, parameter: Parameter, table: ParameterTable, twin: Definition, context: Context
+) -> MonitoredQuantity:
+    """Return a parameter with what the file states of its temperature."""
+    where, coefficient = ("parameters", parameter.name), parameter.temperature_coefficient
+    if table.temperature_coefficient is not None:
+        with context.at(*where, "temperature_coefficient"):
+            coefficient = Quantity("1/K", *MAX_COEFFICIENT)(table.temperature_coefficient)
+    if table.temperature is not None:
+        if table.temperature in twin.signals or not table.temperature:
+            fault = f"{table.temperature!r} must be a signal of [signals] beside those of the twin"
+            context.fail((*where, "temperature"), fault)
+        if coefficient == 0.0:
+            fault = f'{parameter.name} has no temperature_coefficient: write one, like "0.393 %/K" of copper'
+            context.fail((*where, "temperature"), fault)
+    temperature, reference = table.temperature or "", table.reference_temperature
+    return replace(quantity, temperature_coefficient=coefficient, temperature=temperature, reference=reference)
 
 
 def load_rules() -> tuple[Rule, ...]:
@@ -331,9 +361,16 @@ def _monitored(parameter: Parameter, table: LimitsTable, where: tuple[str, ...],
     is_written = table.watch is not None or table.act is not None
     defaults = (parameter.watch, parameter.act) if nominal != 0.0 and not is_written else ((), ())
     for level, written, default in zip((Level.WATCH, Level.ACT), (table.watch, table.act), defaults, strict=True):
-        with context.at(*where, level.lower()):
+        try:
             values = limit_values(default if written is None else written, unit, nominal)
-        limits += [Limit(level, value, value < nominal) for value in values]
+        except ValueError as error:
+            fault = str(error) if is_written else f"{TWIN_LIMITS}: {level.lower()}: {error}: {OWN_LIMITS}"
+            context.fail((*where, level.lower()) if is_written else where, fault)
+        relative = [str(text).strip().endswith("%") for text in (default if written is None else written)]
+        limits += [
+            Limit(level, value, value < nominal, is_relative)
+            for value, is_relative in zip(values, relative, strict=True)
+        ]
         for value in values:
             if is_written and not parameter.low < value < parameter.high:
                 bounds = f"the bounds {parameter.low:g} to {parameter.high:g} {unit}"
@@ -342,8 +379,10 @@ def _monitored(parameter: Parameter, table: LimitsTable, where: tuple[str, ...],
     acts = [limit for limit in limits if limit.level is Level.ACT]
     for watch in (limit for limit in limits if limit.level is Level.WATCH):
         if any(act.is_lower is watch.is_lower and act.excess(watch.value) >= 0.0 for act in acts):
-            remedy = f"write a limit nearer to the nominal value {nominal:g} {unit}"
-            context.fail((*where, "watch"), f"{watch.value:g} {unit} is not passed before act: {remedy}")
+            fault = f"{watch.value:g} {unit} is not passed before act"
+            if not is_written:
+                context.fail(where, f"{TWIN_LIMITS}: watch {fault}: {OWN_LIMITS}")
+            context.fail((*where, "watch"), f"{fault}: write a limit nearer to the nominal value {nominal:g} {unit}")
     return MonitoredQuantity(parameter.part or MACHINE, parameter.meaning, unit, nominal, tuple(limits))
 
 

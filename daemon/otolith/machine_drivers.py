@@ -16,6 +16,8 @@ from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.registry import find
 from otolith_drivers.several_sources import NamedSource, SeveralSources
 
+TEMPERATURE_UNIT = "K"
+
 
 @dataclass(frozen=True, slots=True)
 class DriverConfig:
@@ -65,13 +67,15 @@ def driver_configs(file: MachineFile, twin: Definition, source: SourceFile) -> t
     if not file.drivers:
         remedy = "write [driver] with type = \"can\" or another driver, and [signals]; only 'otolith replay' needs none"
         context.fail(("driver",), f"missing: {remedy}")
-    needed = list(twin.signals)
+    units = signal_units(file, twin)
+    needed = list(units)
     for name in file.signals:
         if name not in needed:
             context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, needed)}")
-    for name in needed:
+    for name, unit in units.items():
         if name not in file.signals:
-            context.fail(("signals",), f"{name} ({twin.unit_of(name)}) is missing: the twin needs {', '.join(needed)}")
+            reason = f"the twin needs {', '.join(twin.signals)}" if name in twin.signals else "[parameters] names it"
+            context.fail(("signals",), f"{name} ({unit}) is missing: {reason}")
     names = source_names(file, context)
     readers = {name: _source_of(name, file, names, context) for name in needed}
     for number, name in enumerate(names):
@@ -82,6 +86,17 @@ def driver_configs(file: MachineFile, twin: Definition, source: SourceFile) -> t
         _driver_config(number, [signal for signal in needed if readers[signal] == name], file, twin, source)
         for number, name in enumerate(names)
     )
+
+
+def signal_units(file: MachineFile, twin: Definition) -> dict[str, str]:
+    """Return the signals that the drivers read, with their units: those of the twin, and the observed ones."""
+    return {name: twin.unit_of(name) for name in twin.signals} | dict.fromkeys(observed_signals(file), TEMPERATURE_UNIT)
+
+
+def observed_signals(file: MachineFile) -> tuple[str, ...]:
+    """Return the signals of the temperatures that parameters depend on."""
+    names = (table.temperature for table in file.parameters.values())
+    return tuple(dict.fromkeys(name for name in names if name))
 
 
 def source_names(file: MachineFile, context: Context) -> list[str]:
@@ -134,10 +149,11 @@ def _driver_config(
         module = find(kind)
     written = {key: value for key, value in table.items() if key not in ("type", "name")}
     options = validate(written, module.Options, source, under=place)
+    units = signal_units(file, twin)
     own = tuple(
         Signal(
             signal,
-            twin.unit_of(signal),
+            units[signal],
             validate(own_keys(file.signals[signal]), module.Source, source, under=("signals", signal)),
         )
         for signal in signals

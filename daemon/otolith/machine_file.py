@@ -40,6 +40,12 @@ def _listening(text: str) -> str:
     return text if text == LOCAL else _endpoint(text)
 
 
+def _command(command: tuple[str, ...]) -> tuple[str, ...]:
+    if command and not command[0].startswith("/"):
+        raise ValueError(f'{command[0]!r} is not an absolute path: write it like ["/usr/bin/logger", "-t", "otolith"]')
+    return command
+
+
 def _expand_value(written: object) -> object:
     """Expand ``"6.5 ohm"``, the short form of ``{ value = "6.5 ohm" }``."""
     return written if isinstance(written, dict) else {"value": written}
@@ -58,6 +64,8 @@ class MachineTable(StrictModel):
 
     name: Name
     site: Name = "site"
+    on_event: Annotated[tuple[str, ...], AfterValidator(_command)] = ()
+    """Command and arguments that the daemon runs for each event."""
 
 
 class TwinTable(StrictModel):
@@ -83,6 +91,12 @@ class ParameterTable(LimitsTable):
     """Without it, a parameter with a value is known, and one without has the role that the twin gives it."""
     low: RawQuantity = None
     high: RawQuantity = None
+    temperature: str | None = None
+    """Signal that measures the temperature on which the parameter depends."""
+    temperature_coefficient: RawQuantity = None
+    """Relative change per kelvin; without it that of the twin."""
+    reference_temperature: Annotated[float, BeforeValidator(Quantity("K", 0.0, 5000.0))] = 293.15
+    """K, for which value and limits are stated."""
 
 
 class SignalTable(StrictModel):

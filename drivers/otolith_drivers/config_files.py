@@ -39,10 +39,15 @@ KINDS = {
 
 
 def _one_or_two(written: object) -> object:
-    """Return a value that may be written alone or in a list of two as a list; raise ValueError for a longer one."""
-    if isinstance(written, list | tuple) and len(written) > 2:
-        raise ValueError(f"{written!r} are {len(written)} limits: write one, or two in a list")
-    return written if isinstance(written, list | tuple) else (written,)
+    """Return limits, one alone or two in a list, as a list; raise ValueError for more, and for what is no limit."""
+    limits = written if isinstance(written, list | tuple) else (written,)
+    if len(limits) > 2:
+        raise ValueError(f"{written!r} are {len(limits)} limits: write one, or two in a list")
+    for limit in limits:
+        if isinstance(limit, bool) or not isinstance(limit, str | int | float):  # pydantic would turn true into 1.0
+            text = str(limit).lower() if isinstance(limit, bool) else repr(limit)
+            raise ValueError(f'{text} is not a limit: write a percentage like "-3 %", or a quantity with its unit')  # noqa: TRY004 - a fault of a file
+    return limits
 
 
 Limits = Annotated[tuple[str | float, ...], BeforeValidator(_one_or_two)]

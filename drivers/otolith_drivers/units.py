@@ -169,7 +169,7 @@ class Quantity:
         match = NUMBER_AND_UNIT.fullmatch(text) if len(text) <= MAX_LENGTH else None
         if match is None:
             raise ValueError(f"{written!r} is not a number with a unit: {example}")
-        if not match[2] and not self._is_plain_number:
+        if not match[2] and not self.is_plain_number:
             raise ValueError(f"{written!r} has no unit: {example}")
         if match[2].startswith(","):
             raise ValueError(f"{written!r} is not a number with a unit: the decimal sign is a point")
@@ -180,7 +180,8 @@ class Quantity:
         return value
 
     @property
-    def _is_plain_number(self) -> bool:
+    def is_plain_number(self) -> bool:
+        """Whether its values may be written without a unit."""
         return unit(self.unit).dimensionless and unit(self.unit) not in (unit("rad"), unit("degree"))
 
     def _bounds(self) -> str:
@@ -210,7 +211,14 @@ def _limit_value(written: Any, unit_text: str, nominal: float) -> float:
         raise ValueError(f'{written!r} has no sign: write "-{match[2]} %" or "+{match[2]} %", or both in a list')
     if match and nominal == 0.0:
         raise ValueError(f'{written!r} of a nominal value of 0 is 0: write it with its unit, like "1 {unit_text}"')
-    value = nominal * (1.0 + float(match[1] + match[2]) / 100.0) if match else Quantity(unit_text)(written)
+    quantity = Quantity(unit_text)
+    bare = NUMBER_AND_UNIT.fullmatch(str(written).strip()[:MAX_LENGTH])
+    if bare and not bare[2] and not quantity.is_plain_number:
+        number = bare[1] if bare[1][0] in "+-" else f"+{bare[1]}"
+        raise ValueError(
+            f'{written!r} has no unit: write "{number} %" of the nominal value, or "{bare[1]} {unit_text}"'
+        )
+    value = nominal * (1.0 + float(match[1] + match[2]) / 100.0) if match else quantity(written)
     if value == nominal:
         raise ValueError(f"{written!r} is the nominal value {nominal:g} {unit_text} itself: write a limit beside it")
     return value

@@ -39,6 +39,16 @@ def test_every_rule_names_what_exists(rule: Rule) -> None:
         assert text
 
 
+@pytest.mark.parametrize("name", TWINS)
+@pytest.mark.parametrize("side", ["below", "above"])
+@pytest.mark.parametrize("manner", ["", "step", "trend"])
+def test_a_rule_of_another_machine_is_no_alternative_to_one_of_this_twin(name: str, side: str, manner: str) -> None:
+    """The damping of a hydraulic circuit is no friction of bearings."""
+    for parameter in TWINS[name].parameters:
+        rows = matching(RULES, FindingFeatures(FindingKind.LIMIT, name, parameter.name, side, manner))
+        assert len({bool(rule.twin) for rule in rows}) <= 1, [rule.condition for rule in rows]
+
+
 def test_every_kind_of_event_has_a_rule() -> None:
     for kind in set(FindingKind) - {FindingKind.OPEN, FindingKind.COMPONENT}:
         assert matching(RULES, FindingFeatures(kind))

@@ -13,7 +13,7 @@ import pytest
 
 from otolith.cli.commissioning.check import describe
 from otolith.health.limits import Level, MonitoringPlan
-from otolith.machine import load_machine
+from otolith.machine import LIBRARY, load_machine
 from otolith.publishing.zenoh_config import listening
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from tests.conftest import EXAMPLES, OwnMachine
@@ -191,3 +191,32 @@ def test_one_driver_is_one_source_whether_signals_name_it_or_not(tmp_path: Path)
     path.write_text(text.replace("V_a = { ", 'V_a = { source = "drive", '), encoding="utf-8")
     machine = load_machine(path)
     assert {plan.source for plan in machine.plans(machine.driver.sampling)} == {""}
+
+
+@pytest.mark.parametrize(
+    ("limit", "message"),
+    [
+        ("true", "true is not a limit"),
+        ('[true, "-5 %"]', "true is not a limit"),
+        ('{ low = "5 ohm" }', "is not a limit"),
+        ('"-5"', """'-5' has no unit: write "-5 %" of the nominal value, or "-5 ohm\""""),
+        ("4.5", """4.5 has no unit: write "+4.5 %" of the nominal value, or "4.5 ohm\""""),
+        ('"5 %"', "has no sign"),
+    ],
+)
+def test_what_is_no_limit_is_refused_with_a_remedy(own_machine: OwnMachine, limit: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=re.escape(message)) as error:
+        limits_of(own_machine, f"watch = {limit}")
+    assert "parameters.R_a.watch" in str(error.value)
+
+
+def test_limits_of_the_twin_that_do_not_fit_are_not_blamed_on_the_machine_file(own_machine: OwnMachine) -> None:
+    twin = (LIBRARY / "dc_motor.toml").read_text(encoding="utf-8")
+    own = own_machine.machine.with_name("own-twin.toml")
+    own.write_text(twin.replace('watch = ["-5 %", "+25 %"]', 'watch = "6.2 ohm"'), encoding="utf-8")
+    text = own_machine.machine.read_text(encoding="utf-8")
+    own_machine.machine.write_text(text.replace('name = "dc_motor"', 'file = "own-twin.toml"'), encoding="utf-8")
+    with pytest.raises(
+        ConfigurationError, match=r"limits of the twin do not fit this value: watch: .*write watch and act"
+    ):
+        limits_of(own_machine, 'value = "6.2 ohm"')

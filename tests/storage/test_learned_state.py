@@ -15,7 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from otolith.adaptation.state import EVERYTHING, AdaptationState, OperatorDecisions, apply_decisions, component_records
-from otolith.health.schema import EventChange, ReportDocument, Status
+from otolith.health.events import HealthState
+from otolith.health.schema import EventChange, ForecastDocument, ReportDocument, Status
 from otolith.storage.state_store import MAX_KEPT, MAX_STATE_BYTES, StateStore
 from otolith_drivers.errors import OtolithError
 from tests.runtime.motors import NAMES, PROBLEM, START, UNBALANCE, fresh, healthy, noisy, run, unbalanced, windows
@@ -119,6 +120,16 @@ def test_an_open_event_goes_on_after_a_restart(tmp_path: Path) -> None:
     for report in reports:
         assert {event.id for event in report.events} == open_before
         assert not any(event.change is EventChange.RAISED for event in report.events)
+
+
+def test_histories_survive_a_restart_and_forecasts_are_computed_again(tmp_path: Path) -> None:
+    history = tuple((START + 2.0 * index, R_A + 0.01 * index, 1e-4) for index in range(40))
+    forecasts = {"R_a": ForecastDocument(computed=START + 78.0, reason="no trend")}
+    state = replace(healthy(), health=HealthState(histories={"R_a": history}, forecasts=forecasts))
+    assert restarted(state, tmp_path).health == HealthState(histories={"R_a": history})
+    wrong = replace(state, health=HealthState(histories={"R_a": history[::-1]}))
+    with pytest.raises(OtolithError, match="a history is not plausible"):
+        store_in(tmp_path).save(wrong)
 
 
 def test_only_the_newest_refused_files_are_kept(tmp_path: Path) -> None:

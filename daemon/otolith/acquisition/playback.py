@@ -66,12 +66,18 @@ class Playback:
     """Cuts windows from rows; times are seconds of the data. ``windower.records`` may be set between two windows."""
 
     def __init__(
-        self, plans: Sequence[SignalPlan], records: int, sample_period: float, limits: QualityLimits | None = None
+        self,
+        plans: Sequence[SignalPlan],
+        records: int,
+        sample_period: float,
+        limits: QualityLimits | None = None,
+        observed: Sequence[str] = (),
     ) -> None:
+        """``observed`` are the signals of :attr:`Window.observed`."""
         self.windower = Windower(plans, records, sample_period, limits)
         self.counts = PlaybackCounts()
-        self._plans, self._limits = tuple(plans), limits
-        self._rings = Rings(self.windower.signals, 1)
+        self._plans, self._limits, self._observed = tuple(plans), limits, tuple(observed)
+        self._rings = Rings(self.windower.signals, 1, observed)
         self._segments = SegmentFinder(self.windower.length)
         self._windows = 0
         self._clock = -math.inf  # latest time of a delivered row
@@ -135,7 +141,7 @@ class Playback:
             self._step = median_step(rows.times)
         step = min(old.sample_period, self._step)
         held = RING_WINDOWS * old.length + max(plan.delay for plan in self._plans)
-        self._rings = Rings(old.signals, int(min(held / step, MAX_RING_SAMPLES)))
+        self._rings = Rings(old.signals, int(min(held / step, MAX_RING_SAMPLES)), self._observed)
         self._clock = self._begun = self._checked = float(rows.times[at])
 
     def _skip_gap(self, following: float) -> None:

@@ -10,6 +10,9 @@ import numpy as np
 from otolith.acquisition.window import Array
 from otolith_drivers.base import Sample
 
+# Threshold: docs/reference/thresholds-acquisition.md has its origin.
+MAX_OBSERVED_AGE = 600.0  # s after which the last value of an observed signal is no longer used
+
 
 @dataclass(frozen=True, slots=True)
 class RingCounters:
@@ -102,9 +105,11 @@ class Ring:
 class Rings:
     """The rings of all signals of a machine, guarded by one lock."""
 
-    def __init__(self, signals: Sequence[str], capacity: int) -> None:
+    def __init__(self, signals: Sequence[str], capacity: int, observed: Sequence[str] = ()) -> None:
+        """No window waits for the signals in ``observed``: it has their means."""
         self._lock = threading.Lock()
-        self._rings = {signal: Ring(capacity) for signal in signals}
+        self._signals, self._observed = tuple(signals), tuple(observed)
+        self._rings = {signal: Ring(capacity) for signal in (*signals, *observed)}
         self._received = 0
         self._unknown = 0
 
@@ -135,18 +140,32 @@ class Rings:
         with self._lock:
             return self._rings[signal].around(start, end, read_until)
 
+    def observed_means(self, start: float, end: float) -> dict[str, float]:
+        """Return the mean from ``start`` to ``end`` (s) of each observed signal, otherwise its last value before.
+
+        A signal without a sample for ``MAX_OBSERVED_AGE`` has none.
+        """
+        means = {}
+        for signal in self._observed:
+            times, values = self.around(signal, start, end, end)
+            times, values = times[np.isfinite(values)], values[np.isfinite(values)]
+            inside = values[times >= start] if len(times) and times[-1] >= start else values[-1:]
+            if len(inside) and end - times[-1] <= MAX_OBSERVED_AGE:
+                means[signal] = float(inside.mean())
+        return means
+
     def first_times(self) -> dict[str, float]:
         """Return the result of :meth:`Ring.first_time` for every signal."""
         with self._lock:
-            return {signal: ring.first_time() for signal, ring in self._rings.items()}
+            return {signal: self._rings[signal].first_time() for signal in self._signals}
 
     def last_times(self) -> dict[str, float]:
         """Return the result of :meth:`Ring.last_time` for every signal."""
         with self._lock:
-            return {signal: ring.last_time() for signal, ring in self._rings.items()}
+            return {signal: self._rings[signal].last_time() for signal in self._signals}
 
     def counters(self) -> RingCounters:
         """Return the counts since the start."""
         with self._lock:
-            overwritten = sum(ring.overwritten for ring in self._rings.values())
+            overwritten = sum(self._rings[signal].overwritten for signal in self._signals)
             return RingCounters(self._received, overwritten, self._unknown)

@@ -1,6 +1,7 @@
 """A window: the samples of a machine in a stretch of time, each at its own time, and the quality of their sampling."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Self
 
@@ -78,6 +79,8 @@ class Window:
     quality: Quality
     bridge_error: BridgeError | None = None
     """None if every record has a sample of every input."""
+    observed: Mapping[str, float] = field(default_factory=dict)
+    """Mean over the window of each signal that only the judgement of the estimates needs, as a temperature."""
 
     @classmethod
     def whole(cls, index: int, start: float, sample_period: float, signals: tuple[str, ...], values: Array) -> Self:

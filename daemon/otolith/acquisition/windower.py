@@ -122,6 +122,7 @@ class Windower:
             missing=records.missing,
             quality=assess_quality(records, self.plans, aligned, self._limits, self._span(unix_offset)),
             bridge_error=records.bridge_error,
+            observed=rings.observed_means(self._start, self.next_end),
         )
         self.counts.repeated += repeated
         self.counts.stale += records.stale

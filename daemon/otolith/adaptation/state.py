@@ -10,6 +10,7 @@ from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.augmented import augment, indices, slot_of, without
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
+from otolith.health.baseline import Baseline, with_baselines
 from otolith.health.events import HealthState
 from otolith.health.limits import MonitoringPlan
 from otolith.health.schema import Status
@@ -135,6 +136,8 @@ class OperatorDecisions:
     resets: Mapping[str, float] = field(default_factory=dict)
     """Unix seconds at which the operator reset a parameter, a component or everything, by name. Each is applied once.
     """
+    baselines: Mapping[str, Baseline] = field(default_factory=dict)
+    """Of the parameters; relative limits refer to them."""
 
 
 def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> AdaptationState:
@@ -153,6 +156,9 @@ def apply_decisions(state: AdaptationState, decisions: OperatorDecisions) -> Ada
     excluded = state.restricted | decisions.rejected
     if excluded != state.problem.excluded:  # an open test was searched with other exclusions
         state = replace(with_problem(state, replace(state.problem, excluded=excluded)), test=None)
+    plan = with_baselines(state.plan, decisions.baselines)
+    if plan.parameters != state.plan.parameters:  # the forecasts are about other limits
+        state = replace(state, plan=plan, health=replace(state.health, forecasts={}))
     return replace(state, adopted=adopted, approved=decisions.approved, resets=dict(decisions.resets))
 
 
@@ -163,7 +169,8 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
     for index, parameter in enumerate(state.problem.free):
         if parameter.name == name:
             previous = {**state.previous, parameter.label: PreviousStatus()}
-            return replace(state, posterior=state.posterior.reset_parameter(index), previous=previous, test=None)
+            health, posterior = state.health.without_history(name), state.posterior.reset_parameter(index)
+            return replace(state, posterior=posterior, previous=previous, test=None, health=health)
     for component in state.problem.components:
         if component.key == name:
             return without_component(state, component)

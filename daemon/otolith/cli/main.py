@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from otolith import __version__
+from otolith.cli.commissioning.baseline import baseline
 from otolith.cli.commissioning.components import commission, components, reset
 from otolith.cli.commissioning.noise import noise
 from otolith.cli.commissioning.probe import probe
@@ -287,5 +288,8 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (commission, compile_command, components, history, install, keys, noise, probe, reset, twin, view):
+for command in (
+    *(baseline, commission, compile_command, components, history, install, keys),
+    *(noise, probe, reset, twin, view),
+):
     cli.add_command(command)

@@ -31,6 +31,8 @@ class FindingKind(StrEnum):
     """Hypotheses are being compared."""
     UNEXPLAINED = "unexplained"
     NO_DATA = "no data"
+    NO_TEMPERATURE = "no temperature"
+    """The temperature on which a parameter depends is not measured at present."""
 
 
 @dataclass(frozen=True, slots=True)

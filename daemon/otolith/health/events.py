@@ -9,13 +9,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingKind, diagnose
-from otolith.health.limits import MACHINE, Level, MonitoringPlan
+from otolith.health.limits import MACHINE, Level, MonitoredQuantity, MonitoringPlan
 from otolith.health.observations import BUS, SENSORS, Observation, observe
+from otolith.health.prognosis import History, forecast, is_due, with_point
 from otolith.health.schema import (
     EventChange,
     EventDocument,
     EvidenceDocument,
+    ForecastDocument,
     HealthDocument,
     PartDocument,
     ReportDocument,
@@ -52,6 +55,9 @@ class HealthState:
     """Of the parameters, after the last window that updated them."""
     steps: Mapping[str, float] = field(default_factory=dict)
     """Last sudden change of each parameter."""
+    histories: Mapping[str, History] = field(default_factory=dict)
+    """Of the parameters with limits, since their last sudden change."""
+    forecasts: Mapping[str, ForecastDocument] = field(default_factory=dict)
     inside: frozenset[str] = frozenset()
     """Keys of conditions that were at OK in some window."""
     document: HealthDocument | None = None
@@ -62,10 +68,21 @@ class HealthState:
         """The events that are not cleared."""
         return tuple(record.event for record in self.records.values() if record.event is not None)
 
+    def without_history(self, name: str) -> "HealthState":
+        """Return the state without history and forecast of a parameter."""
+        histories = {key: history for key, history in self.histories.items() if key != name}
+        forecasts = {key: item for key, item in self.forecasts.items() if key != name}
+        return replace(self, histories=histories, forecasts=forecasts)
+
 
 def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
     """Return the state after ``report``, and the report with states and events."""
-    state = _with_steps(state, report)
+    state = _with_forecasts(plan, _with_steps(state, report), report)
+    parameters = {
+        name: item.model_copy(update={"forecast": state.forecasts.get(name), **_judged(plan, report, name)})
+        for name, item in report.parameters.items()
+    }
+    report = report.model_copy(update={"parameters": parameters})
     levels = {key: record.level for key, record in state.records.items()}
     is_informative = any(item.status is Status.ESTIMATED for item in report.parameters.values())  # not at rest
     absent = Level.OK if report.decision in ACCEPTED and is_informative else None
@@ -91,14 +108,46 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
 
 
 def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
-    """Return the state with the values of a window that updated them, and with their sudden changes."""
+    """Return the state with the values of a window that updated them, and with their sudden changes.
+
+    The history of a parameter begins again at a sudden change.
+    """
     if report.decision not in ACCEPTED:
         return state
     values = {name: item.value for name, item in report.parameters.items() if item.value is not None}
-    steps = dict(state.steps)
-    if report.decision is WindowDecision.STEPPED:
-        steps |= {name: value - state.values[name] for name, value in values.items() if name in state.values}
-    return replace(state, values=values, steps=steps)
+    if report.decision is not WindowDecision.STEPPED:
+        return replace(state, values=values)
+    changes = {name: value - state.values[name] for name, value in values.items() if name in state.values}
+    moved = {name for name, change in changes.items() if abs(change) > QUANTILE * (report.parameters[name].sd or 0.0)}
+    for name in moved:
+        state = state.without_history(name)
+    return replace(state, values=values, steps={**state.steps, **changes})
+
+
+def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, float]:
+    """Return the baseline of a parameter, and its value at the reference temperature if a temperature is measured."""
+    quantity, item = plan.parameters.get(name, MonitoredQuantity()), report.parameters[name]
+    judged = {"baseline": quantity.nominal} if quantity.has_baseline else {}
+    if quantity.temperature and item.value is not None:
+        referred = quantity.referred(item.value, 0.0, report.window.observed or {})
+        judged |= {"referred": referred[0]} if referred else {}
+    return judged
+
+
+def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> HealthState:
+    """Return the state with the values of this window in the histories, and with the forecasts that are due."""
+    histories, forecasts = dict(state.histories), dict(state.forecasts)
+    for name, item in report.parameters.items():
+        quantity = plan.parameters.get(name)
+        is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
+        if quantity is None or not quantity.limits or not is_new or item.value is None or not item.sd:
+            continue
+        if (referred := quantity.referred(item.value, item.sd, report.window.observed or {})) is None:
+            continue
+        histories[name] = with_point(histories.get(name, ()), report.window.end, referred[0], referred[1] ** 2)
+        if is_due(forecasts.get(name), histories[name]):
+            forecasts[name] = forecast(quantity, histories[name])
+    return replace(state, histories=histories, forecasts=forecasts)
 
 
 def _advance(
@@ -152,7 +201,7 @@ def _states(
 ) -> HealthDocument:
     """Return the states of parts and machine; ``events`` begin with the most severe."""
     worst = {event.part: event for event in reversed(events)}
-    silent = next((event for event in events if event.state is Level.NO_DATA), None)
+    silent = next((event for event in events if event.state is Level.NO_DATA and event.part == BUS), None)
     parts: dict[str, PartDocument] = {}
     for part in dict.fromkeys((*plan.parts, SENSORS, BUS, *worst)):
         event, missing = worst.get(part, silent), _undetermined(plan, part, report)

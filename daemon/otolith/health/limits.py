@@ -14,6 +14,7 @@ from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import Rule
 
 RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
+MIN_TEMPERATURE_FACTOR = 0.1  # relative value at a temperature, below which the temperature cannot be true
 MACHINE = "machine"  # the part to which belongs what no part of the twin explains
 
 
@@ -40,6 +41,8 @@ class Limit:
     value: float
     is_lower: bool
     """Whether values below it are beyond it."""
+    is_relative: bool = False
+    """Whether it is stated in percent of the nominal value."""
 
     @property
     def side(self) -> str:
@@ -60,6 +63,27 @@ class MonitoredQuantity:
     unit: str = ""
     nominal: float = 0.0
     limits: tuple[Limit, ...] = ()
+    temperature_coefficient: float = 0.0
+    """Relative change per kelvin."""
+    temperature: str = ""
+    """Signal of the temperature, K; empty if it is not measured."""
+    reference: float = 293.15
+    """Temperature for which nominal value and limits are stated, K."""
+    has_baseline: bool = False
+    """Whether ``nominal`` is a value from commissioning instead of that of the machine file."""
+
+    def referred(self, value: float, sd: float, observed: Mapping[str, float]) -> tuple[float, float] | None:
+        """Return an estimate as it would be at the reference temperature, from the ``observed`` signals of a window.
+
+        Without a temperature it is the estimate itself; None if the temperature is measured, but not at present.
+        (IEC 60034-1: resistance is linear in temperature.)
+        """
+        if not self.temperature:
+            return value, sd
+        if (temperature := observed.get(self.temperature)) is None:
+            return None
+        factor = 1.0 + self.temperature_coefficient * (temperature - self.reference)
+        return (value / factor, sd / factor) if factor > MIN_TEMPERATURE_FACTOR else None
 
     @property
     def limits_text(self) -> str:
@@ -95,6 +119,8 @@ class MonitoringPlan:
     sites: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Limits are those of the amplitude of a component at the site."""
     rules: Sequence[Rule] = ()
+    stated: Mapping[str, MonitoredQuantity] | None = None
+    """The parameters as the machine file states them, if there is a baseline."""
 
     @property
     def parts(self) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingFeatures, FindingKind, severity
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan, probability_beyond
 from otolith.health.schema import ComponentDocument, ComponentStatus, ParameterDocument, ReportDocument, Status
-from otolith.health.text import interval_text, value_text
+from otolith.health.text import forecast_text, interval_text, value_text
 
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
@@ -50,6 +50,7 @@ def observe(
         features, text = FindingFeatures(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
         observations.append(Observation("unexplained", MACHINE, Level.WATCH, features, text, "an unknown change"))
     observations += [_of_parameter(plan, report, name, before, steps.get(name, 0.0)) for name in report.parameters]
+    observations += _without_temperature(plan, report)
     components = (_of_component(plan, report.twin, component, before) for component in report.components)
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
     for finding in report.findings:
@@ -69,14 +70,22 @@ def _of_parameter(
     value, sd, unit = parameter.value, parameter.sd, parameter.unit
     if value is None or sd is None or parameter.status not in DETERMINED:
         return Observation(key, quantity.part, None)
-    level, limit = quantity.level(value, sd, before.get(key, Level.OK))
+    if (referred := quantity.referred(value, sd, report.window.observed or {})) is None:
+        return Observation(key, quantity.part, None)
+    deviation = referred[0] - quantity.nominal
+    level, limit = quantity.level(*referred, before.get(key, Level.OK))
     if limit is None:
         return Observation(key, quantity.part, level)
-    features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, _manner(parameter, step))
-    change = f" ({value / parameter.nominal - 1.0:+.1%})" if parameter.nominal else ""
+    manner = _manner(parameter, deviation, step)
+    features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
+    against = " of the baseline" if quantity.has_baseline else ""
+    share = f"{deviation / quantity.nominal:+.1%}" if quantity.nominal else ""
+    change = f" ({share}{against}{_at_temperature(quantity)})" if share else ""
     beyond = f"{limit.side} its limit {limit.value:.4g} {unit}"
-    text = f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {beyond}"
-    condition, numbers = f"{quantity.meaning} is {limit.side} its limit", _numbers(value, sd, unit, limit)
+    expected = forecast_text(parameter, report.window.end)
+    text = f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {beyond}{expected and f', {expected}'}"
+    text += _warming(quantity, deviation)
+    condition, numbers = f"{quantity.meaning} is {limit.side} its limit", _numbers(*referred, unit, limit)
     return Observation(key, quantity.part, level, features, text, condition, numbers=numbers)
 
 
@@ -87,9 +96,35 @@ def _numbers(value: float, sd: float, unit: str, limit: Limit | None) -> dict[st
     return numbers | {"limit": limit.value, "probability": probability_beyond(limit, value, sd)}
 
 
-def _manner(parameter: ParameterDocument, step: float) -> str:
-    """Return how a parameter came to its deviation from the nominal value, if that is significant."""
-    deviation = (parameter.value or 0.0) - parameter.nominal
+def _at_temperature(quantity: MonitoredQuantity) -> str:
+    return f" at {quantity.reference - 273.15:.3g} °C" if quantity.temperature else ""
+
+
+def _warming(quantity: MonitoredQuantity, deviation: float) -> str:
+    """Return by how much warmer a parameter without a measured temperature would have to be for its deviation."""
+    if quantity.temperature or not quantity.temperature_coefficient or not quantity.nominal:
+        return ""
+    kelvin = deviation / quantity.nominal / quantity.temperature_coefficient
+    if kelvin <= 0.0:
+        return ""
+    return f"; being {kelvin:.3g} K warmer than at the nominal value would explain it: no temperature is measured"
+
+
+def _without_temperature(plan: MonitoringPlan, report: ReportDocument) -> list[Observation]:
+    """Return for each temperature whether it is measured: without it, limits that depend on it are not judged."""
+    observations = []
+    for name, quantity in plan.parameters.items():
+        if quantity.temperature:
+            is_known = quantity.referred(1.0, 0.0, report.window.observed or {}) is not None
+            text = f"no usable value of {quantity.temperature}: the limits of {name} are not judged"
+            level, features = Level.OK if is_known else Level.NO_DATA, FindingFeatures(FindingKind.NO_TEMPERATURE)
+            key, condition = f"temperature/{name}", "no temperature"
+            observations.append(Observation(key, quantity.part, level, features, text, condition))
+    return observations
+
+
+def _manner(parameter: ParameterDocument, deviation: float, step: float) -> str:
+    """Return how a parameter came to its ``deviation`` from the nominal value, if that is significant."""
     trend, sd = parameter.trend_per_hour or 0.0, parameter.trend_sd_per_hour or 0.0
     if step * deviation > 0.0 and abs(step) >= MAIN_SHARE * abs(deviation):
         return "step"

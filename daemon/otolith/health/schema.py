@@ -202,6 +202,34 @@ class WindowDocument(StrictModel):
     end: float
     records: int
     quality: QualityDocument
+    observed: dict[str, float] | None = None
+    """Mean of each observed signal, as a temperature in K."""
+
+
+class CrossingDocument(StrictModel):
+    """When a parameter will pass a limit, Unix seconds."""
+
+    limit: float
+    """In the unit of the parameter."""
+    at: float
+    """Median."""
+    low: float
+    """Lower end of the 80 % interval."""
+    high: float | None = None
+    """None if it lies beyond ten times the length of the history."""
+
+
+class ForecastDocument(StrictModel):
+    """Whether and when a parameter will pass its limits, from its history."""
+
+    computed: float
+    """Unix seconds."""
+    family: Literal["", "linear", "exponential"] = ""
+    """Of the trend; empty without one."""
+    watch: CrossingDocument | None = None
+    act: CrossingDocument | None = None
+    reason: str = ""
+    """Why there is no forecast."""
 
 
 class ParameterDocument(StrictModel):
@@ -214,6 +242,10 @@ class ParameterDocument(StrictModel):
     """Lower end of the 95 % interval."""
     high: float | None = None
     nominal: float
+    baseline: float | None = None
+    """Value of the healthy machine, to which limits in percent refer; None if they refer to ``nominal``."""
+    referred: float | None = None
+    """Value at the reference temperature, by which the limits are judged; None if no temperature is measured."""
     raw: float | None = None
     """Estimate of this window alone."""
     raw_sd: float | None = None
@@ -225,6 +257,8 @@ class ParameterDocument(StrictModel):
     """How far the interval has come from the bounds to what is required, 0 to 1."""
     identifiability: Identifiability | None = None
     reason: str = ""
+    forecast: ForecastDocument | None = None
+    """None without limits."""
     advice: str | None = None
     """The experiment that would determine the parameter, if this window did not."""
 
@@ -313,6 +347,8 @@ class CountersDocument(StrictModel):
     recorder_restarts: int = 0
     history_dropped: int = 0
     """Windows that the history did not take: its disk was full or too slow."""
+    commands_failed: int = 0
+    """Events for which ``on_event`` failed."""
 
 
 class ReportDocument(StrictModel):
@@ -397,6 +433,7 @@ def window_document(window: Window) -> WindowDocument:
         start=window.start,
         end=window.end,
         records=window.records,
+        observed=dict(window.observed) or None,
         quality=QualityDocument(
             verdict=quality.verdict,
             missing=quality.missing,

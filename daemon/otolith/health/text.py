@@ -6,6 +6,7 @@ from otolith.acquisition.quality import time_text
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import (
     ComponentDocument,
+    CrossingDocument,
     EventDocument,
     FindingDocument,
     HealthDocument,
@@ -15,6 +16,8 @@ from otolith.health.schema import (
 )
 
 UNKNOWN = "unknown"
+UNITS_OF_TIME = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
+"""Length in s and name, the longest first; a duration is given in the longest of which it has at least two."""
 
 
 def half_width_text(sd: float) -> str:
@@ -77,6 +80,32 @@ def probability_text(event: EventDocument) -> str:
     return f"with {'over 99.9' if probability > 0.999 else f'{100.0 * probability:.3g}'} % probability"
 
 
+def duration_text(seconds: float) -> str:
+    """A duration with two digits: ``3.4 h``."""
+    length, unit = next(((length, unit) for length, unit in UNITS_OF_TIME if seconds >= 2.0 * length), (1.0, "s"))
+    number = max(seconds, 0.0) / length
+    return f"{number:.0f} {unit}" if number >= 10.0 else f"{number:.2g} {unit}"
+
+
+def crossing_text(crossing: CrossingDocument, level: str, now: float) -> str:
+    """When a limit is passed, from ``now`` in Unix s: ``reaches ACT in 3.1 h to 5 h``."""
+    low = duration_text(crossing.low - now)
+    if crossing.high is None:
+        return f"reaches {level} in more than {low}"
+    high = duration_text(crossing.high - now)
+    return f"reaches {level} in {low} to {high}" if low != high else f"reaches {level} in {low}"
+
+
+def forecast_text(parameter: ParameterDocument, now: float) -> str:
+    """When a parameter passes its limits, from ``now`` in Unix s; empty without a forecast of the time after it."""
+    if (forecast := parameter.forecast) is None:
+        return ""
+    levels = (("WATCH", forecast.watch), ("ACT", forecast.act))
+    return ", ".join(
+        crossing_text(crossing, level, now) for level, crossing in levels if crossing is not None and crossing.at > now
+    )
+
+
 def announcements(document: ReportDocument) -> list[EventDocument]:
     """The events that the window raised, changed or cleared."""
     return [event for event in document.events if event.change is not None]
@@ -93,11 +122,12 @@ def summary(document: ReportDocument) -> str:
     """A report in one line: state, window, parameters, findings, and the first warning of the driver."""
     parts: list[str] = [] if document.health is None else [document.health.state]
     parts += [f"window {document.window.index} {document.window.quality.verdict}"]
-    parts += [parameter_text(name, parameter) for name, parameter in document.parameters.items()]
+    for name, parameter in document.parameters.items():
+        parts += [parameter_text(name, parameter), forecast_text(parameter, document.window.end)]
     parts += [finding_text(finding) for finding in document.findings]
     if (driver := document.driver) is not None:
         parts += [] if driver.up else [f"no connection: {driver.reason}"]
         parts += driver.warnings[:1]
         more = len(driver.warnings) - 1
         parts += [f"and {more} more warnings"] if more > 0 else []
-    return ", ".join(parts)
+    return ", ".join(filter(None, parts))

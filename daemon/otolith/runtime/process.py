@@ -1,8 +1,8 @@
 """A child process that may die at any moment without harm to the daemon.
 
-This is the only module that starts processes. A child process is spawned, not forked, because a fork copies only part
-of the threads of Zenoh and Rerun. It communicates over one pipe, on which the daemon never waits, and ends by itself
-when the daemon has died.
+This is the only module that starts processes of Otolith. A child process is spawned, not forked, because a fork copies
+only part of the threads of Zenoh and Rerun. It communicates over one pipe, on which the daemon never waits, and ends by
+itself when the daemon has died.
 """
 
 import contextlib

@@ -5,6 +5,7 @@
 The clock is that of the data, so two runs over the same files give the same reports, byte for byte.
 """
 
+import contextlib
 import math
 import re
 import time
@@ -21,7 +22,7 @@ from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
 from otolith.machine import LoadedMachine, RecordedMachine
-from otolith.machine_drivers import DriverConfig, driver_configs
+from otolith.machine_drivers import DriverConfig, driver_configs, signal_units
 from otolith.runtime.worker import perform
 from otolith.storage.recording_files import MIN_FREE_BYTES, shortage_of
 from otolith_drivers.base import Setup, Signal
@@ -64,7 +65,7 @@ def open_recorded(machine: LoadedMachine, data: Path) -> Reader:
         needed = '[driver] with type = "can" and [signals] must describe its frames'
         raise ConfigurationError(f"{data}: a log of a CAN bus, and in {machine.path} {needed}")
     if not has_frames and kind != "replay":
-        return _open_by_name(machine, data, machine.twin.signals)
+        return _open_by_name(machine, data, (*machine.twin.signals, *machine.observed))
     (config,) = driver_configs(machine.file, machine.twin, read(machine.path))
     return _open_as(machine, data, config)
 
@@ -119,11 +120,18 @@ def open_recordings(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
 
 
 def _open_by_name(machine: LoadedMachine, data: Path, names: Sequence[str]) -> Reader:
-    """Open a table or recording whose columns have the ``names`` of signals."""
-    data_format = format_of(data)
-    signals = tuple(Signal(name, machine.twin.unit_of(name), data_format.Source()) for name in names)
-    setup = Setup(signals, machine.path.parent, machine.file.window.sample_period)
-    return data_format.open_log(data, setup, None)
+    """Open a table or recording whose columns have the ``names`` of signals; observed ones may be missing."""
+    data_format, units = format_of(data), signal_units(machine.file, machine.twin)
+
+    def opened(wanted: Sequence[str]) -> Reader:
+        signals = tuple(Signal(name, units[name], data_format.Source()) for name in wanted)
+        return data_format.open_log(data, Setup(signals, machine.path.parent, machine.file.window.sample_period), None)
+
+    needed = [name for name in names if name not in machine.observed]
+    if len(needed) < len(names):
+        with contextlib.suppress(ConfigurationError):
+            return opened(names)
+    return opened(needed)
 
 
 class RealTimePacer:
@@ -174,7 +182,7 @@ class Replay:
         self._timing = timing
         self._length = window.length
         plans = machine.plans(data.sampling)
-        self._playback = Playback(plans, machine.records, window.sample_period, machine.limits)
+        self._playback = Playback(plans, machine.records, window.sample_period, machine.limits, machine.observed)
         self._windows = self._windows_bad = self._missed = 0
 
     def reports(self) -> Iterator[Report]:

@@ -2,8 +2,8 @@
 
     driver thread -> rings -> [main thread] window -> worker process -> [main thread] report -> Zenoh, recorder process
 
-The main thread never waits for a machine, a worker, a disk or a subscriber. It waits only for a process that it has
-killed and, at the end, for the writer thread and the recorder, each up to its flush time.
+The main thread never waits for a machine, a worker, a disk, a command or a subscriber. It waits only for a process that
+it has killed and, at the end, for writer thread, recorder and commands, each up to its flush time.
 """
 
 import contextlib
@@ -29,6 +29,7 @@ from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.connection import driver_document, with_missing_sources
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
+from otolith.runtime.event_command import EventCommand
 from otolith.runtime.process import SIGNALS
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.reload import reloaded
@@ -48,7 +49,7 @@ RING_RATE = 4  # times the grid's rate at which a source may send for that to ho
 MAX_WAIT = 0.1  # s; bounds the reaction time to a stop signal, a dead process and an outage
 MIN_WAIT = 0.005  # s; bounds the CPU load while a window is overdue
 SWITCH_INTERVAL = 5e-4  # s; Python's thread switch interval, which delays the time stamps of arriving samples
-RECORDER_FLUSH, WRITER_FLUSH = 1.5, 0.5  # s to finish writing at the end
+RECORDER_FLUSH, WRITER_FLUSH, COMMAND_FLUSH = 1.5, 0.5, 0.5  # s to finish writing, or running, at the end
 STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths; the watchdog is not fed afterwards
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
@@ -67,7 +68,8 @@ class Service:
         self._listen = file.zenoh.listen if listen is None else listen
         plans = machine.plans(machine.driver.sampling)
         delay = max(plan.delay for plan in plans)
-        self._rings = Rings(machine.twin.signals, RING_RATE * (RING_WINDOWS * longest + math.ceil(delay / period)))
+        capacity = RING_RATE * (RING_WINDOWS * longest + math.ceil(delay / period))
+        self._rings = Rings(machine.twin.signals, capacity, machine.observed)
         self._windower = Windower(plans, machine.records, period, machine.limits)
         self._store = StateStore(
             file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
@@ -84,6 +86,7 @@ class Service:
         state = initial_state(file.machine.name, file.machine.site, machine.problem, machine.plan)
         self._supervisor = Supervisor(state, longest * period)
         self._recorder = RecorderSupervisor(machine, recording)
+        self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
         self._publisher: Publisher | None = None
         self._notifier = Notifier()
         self._stop_signal: int | None = None
@@ -146,6 +149,7 @@ class Service:
                 steps.callback(self._publisher.close)
             if self._history is not None:
                 steps.callback(self._history.stop, WRITER_FLUSH)
+            steps.callback(self._command.stop, COMMAND_FLUSH)
             steps.callback(self._writer.stop, WRITER_FLUSH)
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
             steps.callback(self._supervisor.worker.kill)
@@ -256,6 +260,7 @@ class Service:
             recordings_dropped=self._recorder.dropped,
             recorder_restarts=self._recorder.restarts,
             history_dropped=0 if self._history is None else self._history.dropped,
+            commands_failed=self._command.failed,
         )
         parameters = with_missing_sources(document.parameters, driver, report.traces)
         update = {"cost": cost, "counters": counters, "driver": driver, "parameters": parameters, "notes": self._notes}
@@ -269,9 +274,13 @@ class Service:
         self._log(document, time.monotonic())
 
     def _log(self, document: ReportDocument, now: float) -> None:
-        """Log the events that the window changed, and once per hour the window; in a terminal each window."""
+        """Log the events that the window changed, and run the command for each; log the window once per hour.
+
+        In a terminal each window is logged.
+        """
         for event in announcements(document):
             log.log(logging.ERROR if event.is_urgent else logging.WARNING, "%s", event_text(event))
+            self._command.run(event)
         line, is_due = summary(document), now - self._summarised_at >= SUMMARY_INTERVAL
         self._summarised_at = now if is_due else self._summarised_at
         self._notifier.send(f"STATUS={line}")

@@ -21,6 +21,7 @@ from otolith.estimation.imm_filter import HIGHEST_LEVEL, MAX_VARIANCE_RATIO, Imm
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import UNLIMITED, Problem
 from otolith.health.events import HealthState
+from otolith.health.prognosis import is_plausible
 from otolith.health.status import PreviousStatus
 from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
 from otolith.twin.component_families import FAMILY_NAMES
@@ -168,6 +169,8 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         ValueError: the document is not plausible.
     """
     _require(max(map(abs, _numbers(document.model_dump())), default=0.0) <= MAX_MAGNITUDE, "a number is too large")
+    _require(all(map(is_plausible, document.health.histories.values())), "health: a history is not plausible")
+    health = replace(document.health, forecasts={})  # their limits may have changed
     record, problem = document.filter, state.problem
     check_components(document.components, problem.base_model)
     adopted = tuple(component.adopted for component in document.components)
@@ -180,7 +183,7 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         _require_near(np.array(component.values), low[at], high[at], "components")
     if record is None:
         known = restore_components(state, document.components)
-        return replace(known, resets=document.resets, health=document.health)
+        return replace(known, resets=document.resets, health=health)
     problem = _with_steps(_with_noise(problem, record.noise), record.steps)
     posterior, window = _posterior(record, problem), problem.window
     if record.end > now:
@@ -195,7 +198,7 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         previous=dict(zip(record.labels, record.previous, strict=True)),
         adopted=adopted,
         resets=document.resets,
-        health=document.health,
+        health=health,
     )
 
 

@@ -18,6 +18,8 @@ from typing import Annotated, TypeVar
 from pydantic import Field, ValidationError
 
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
+from otolith.health.baseline import Baseline
+from otolith.health.prognosis import History
 from otolith.storage.learned_state import (
     VERSION,
     LearnedState,
@@ -56,6 +58,7 @@ class _DecisionsFile(StrictModel):
     rejected: tuple[str, ...] = ()
     forgotten: Annotated[dict[str, float], Field(default_factory=dict)]
     resets: Annotated[dict[str, float], Field(default_factory=dict)]
+    baselines: Annotated[dict[str, Baseline], Field(default_factory=dict)]
 
 
 class StateStore:
@@ -133,6 +136,17 @@ class StateStore:
         except ValueError as error:
             raise ConfigurationError(f"{self.components_path}: {error}: {REMEDY}") from error
         return learned.components
+
+    def histories(self) -> dict[str, History]:
+        """Return the saved histories of parameters of this machine; none if they are of another twin or other signals.
+
+        Raises:
+            ConfigurationError: the file is unreadable or damaged.
+        """
+        learned = _read(self.components_path, LearnedState, VERSION)
+        if learned is None or self._other_origin(learned):
+            return {}
+        return dict(learned.health.histories)
 
     def _other_origin(self, learned: LearnedState) -> str:
         """Return why ``learned`` is about something else; empty if it is not."""
@@ -230,7 +244,9 @@ class StateStore:
         file = _read(self.decisions_path, _DecisionsFile, DECISIONS_VERSION)
         if file is None:
             return OperatorDecisions()
-        return OperatorDecisions(frozenset(file.approved), frozenset(file.rejected), file.forgotten, file.resets)
+        return OperatorDecisions(
+            frozenset(file.approved), frozenset(file.rejected), file.forgotten, file.resets, file.baselines
+        )
 
     def save_decisions(self, decisions: OperatorDecisions) -> None:
         """Write the operator's decisions; a running daemon applies them with its next window.
@@ -244,6 +260,7 @@ class StateStore:
             rejected=rejected,
             forgotten=dict(decisions.forgotten),
             resets=dict(decisions.resets),
+            baselines=dict(decisions.baselines),
         )
         _write(self.decisions_path, file, f"{self.decisions_path.name}.{os.getpid()}.new")
 

@@ -33,6 +33,8 @@ class Parameter:
     """Limits beyond which the part is watched, as written: absolute or relative to the nominal value."""
     act: tuple[str | float, ...] = ()
     """Limits beyond which somebody has to act."""
+    temperature_coefficient: float = 0.0
+    """Relative change per kelvin."""
 
     @property
     def label(self) -> str:

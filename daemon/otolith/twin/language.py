@@ -8,6 +8,7 @@ import ast
 import math
 import re
 from collections.abc import Callable, Mapping, Sized
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -21,6 +22,7 @@ from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import Quantity, limit_values, to_base
 
 # Limits keep the compile time of a kernel in minutes; docs/reference/thresholds-twin.md.
+MAX_COEFFICIENT = -0.1, 0.1  # 1/K: lowest and highest temperature coefficient
 MAX_ROWS = {"states": 12, "parameters": 40, "inputs": 40, "outputs": 40, "definitions": 60}
 MAX_EXPANDED_TERMS, MAX_EXPANDED_LEVELS = 3000, 100  # of an equation with its definitions substituted
 
@@ -84,6 +86,7 @@ class _ParameterTable(_QuantityTable):
     part: str = ""
     watch: Limits = ()
     act: Limits = ()
+    temperature_coefficient: Annotated[float, BeforeValidator(Quantity("1/K", *MAX_COEFFICIENT))] = 0.0
 
 
 class _ConstantTable(_QuantityTable):
@@ -237,9 +240,9 @@ class _Reader:
                 limit_values(limits, table.unit, nominal)
             except ValueError as error:
                 self._fault(("parameters", name, key), str(error))
-        return Parameter(
-            name, table.unit, nominal, *bounds, table.meaning, table.role, table.part, table.watch, table.act
-        )
+        parameter = Parameter(name, table.unit, nominal, *bounds, table.meaning, table.role, table.part)
+        coefficient = table.temperature_coefficient
+        return replace(parameter, watch=table.watch, act=table.act, temperature_coefficient=coefficient)
 
     def _constant(self, name: str, table: _ConstantTable) -> Constant:
         value = self._number(("constants", name, "value"), table.unit, table.value)

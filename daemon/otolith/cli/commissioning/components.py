@@ -217,7 +217,9 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
 
 def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windows: int, *, approve_all: bool) -> None:
+    from otolith.cli.commissioning.baseline import keep_baseline
     from otolith.cli.commissioning.noise import identified_noise, noise_lines
+    from otolith_drivers.errors import OtolithError
 
     state = _replayed(machine, data)
     _, identified = identified_noise(machine, data, windows)
@@ -229,6 +231,10 @@ def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windo
     else:
         click.echo("# put these tables into the machine file in place of its own", err=True)
     _review(machine, store, state, approve_all=approve_all)
+    try:
+        keep_baseline(machine, store, state.health.histories)
+    except OtolithError as error:  # nothing that has limits, or a record that is too short
+        click.echo(str(error), err=True)
 
 
 def _replayed(machine: "LoadedMachine", data: Path) -> "AdaptationState":

@@ -14,7 +14,7 @@ from otolith.cli.common import local_time
 from otolith.health.diagnosis import FindingKind
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
-from otolith.health.text import event_text, headline, interval_text, value_cells
+from otolith.health.text import event_text, forecast_text, headline, interval_text, value_cells
 
 HISTORY = 200  # windows that the curve of a parameter can show
 OTHER_COLUMNS = 72  # characters that the table needs beside the curve
@@ -161,6 +161,8 @@ def _messages(document: ReportDocument) -> list[Text]:
     bad = document.window.quality.reasons
     lines = [Text(f"bad window: {reason}", style="red") for reason in bad]
     for name, parameter in document.parameters.items():
+        if expected := forecast_text(parameter, document.window.end):
+            lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
         if parameter.reason and not bad:
             lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
         if parameter.advice:

@@ -1,0 +1,297 @@
+"""When a parameter passes its limits, from the history of its estimates.
+
+Meta-models of the paper (Table 1) are compared: a constant, a line, and an exponential that accelerates or levels off.
+Line and exponential begin at an unknown onset:
+
+    value(t) = c + d·φ(t),   φ = s or (exp(x·s) - 1)/(exp(x) - 1),   s = (t - onset)/(now - onset), 0 before the onset
+
+Errors of consecutive estimates are correlated, because the filter carries information from window to window. They are
+an Ornstein-Uhlenbeck process of unknown time constant, whose variance is that of the estimates times an unknown factor.
+For given onset, ``x`` and time constant this is a linear regression with a conjugate prior (C. M. Bishop, Pattern
+Recognition and Machine Learning, section 3.5). These three are summed over a grid, which is refined where the evidence
+is, so that a forecast is the average over all models by their evidence.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from otolith.acquisition.window import Array
+from otolith.health.limits import MonitoredQuantity
+from otolith.health.schema import CrossingDocument, ForecastDocument
+
+# Thresholds: docs/reference/thresholds-health.md has the origin of each.
+MAX_POINTS = 200  # of a history
+REFIT = 0.02  # of the span of a history: how much longer it must be for another fit
+MIN_POINTS = 20  # of a history, for a forecast
+MIN_POINTS_AFTER = 10  # of a history after an onset
+MIN_TREND_PROBABILITY = 0.99  # of a trend, for a forecast
+MIN_CHANGE = 0.1  # of the distance to a limit that a trend must have covered, for a forecast
+HORIZON = 10.0  # spans of the history after now: no forecast beyond
+COVERAGE = 0.8  # probability of the interval of a forecast
+GROWTH = (-6.0, 8.0)  # lowest and highest exponent of an exponential between its onset and now
+GRID = 13, 15, 7  # points of onset, exponent and time constant
+REFINEMENTS = 3  # of the grid
+MIN_WEIGHT = 1e-3  # weight of a grid point, over that of the best one, that a refined grid encloses
+FACTOR_SHAPE = 1.5  # of the inverse gamma prior of the factor on the variances, and its scale: its mode is 0.6
+UNKNOWN_CONSTANT = 100.0  # standard deviation of the constant, over that of the change
+BISECTIONS = 40  # of the time of a crossing: more than a number has digits
+
+History = tuple[tuple[float, float, float], ...]
+"""Time (Unix s), value and variance of a parameter; the times rise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """Seconds from now until a limit is passed: median and interval of probability :data:`COVERAGE`."""
+
+    median: float
+    low: float
+    high: float
+    """Infinite beyond the horizon."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """Grid points with their posterior; one row each."""
+
+    log_weight: Array
+    onset: Array
+    exponent: Array
+    """0 for a line."""
+    mean: Array
+    """(cells, 2) constant and change until now."""
+    covariance: Array
+    """(cells, 2, 2)."""
+
+    @property
+    def heavy(self) -> Array:
+        """Which of them have more than :data:`MIN_WEIGHT`."""
+        return np.asarray(self.log_weight > self.log_weight.max() + math.log(MIN_WEIGHT))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trend:
+    """The posterior of the models of a history."""
+
+    family: str
+    """``linear`` or ``exponential``: the one with more evidence."""
+    now: float
+    """Time of the last point, Unix s."""
+    span: float
+    """See :func:`span`."""
+    cells: _Cells
+
+    def crossing(self, limit: float, *, is_lower: bool) -> Crossing | None:
+        """Return when ``limit`` is passed, downwards if ``is_lower``.
+
+        None if the trend has not yet covered a tenth of the way, or probably does not pass it within the horizon.
+        """
+        weight = np.exp(self.cells.log_weight)
+        constant, change = weight @ self.cells.mean
+        way = limit - constant
+        if change / way < MIN_CHANGE if way else True:
+            return None
+        before = self._beyond(weight, limit, 0.0, is_lower=is_lower)
+        tail = 0.5 * (1.0 - COVERAGE)
+        times = [
+            self._quantile(weight, limit, before + share * (1.0 - before), is_lower=is_lower)
+            for share in (0.5, tail, 1.0 - tail)
+        ]
+        return Crossing(*times) if before < 0.5 and math.isfinite(times[0]) else None
+
+    def _quantile(self, weight: Array, limit: float, probability: float, *, is_lower: bool) -> float:
+        """Return after how many seconds the value is beyond ``limit`` with ``probability``; infinity if not."""
+        low, high = 0.0, HORIZON * self.span
+        if self._beyond(weight, limit, high, is_lower=is_lower) < probability:
+            return math.inf
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            is_beyond = self._beyond(weight, limit, middle, is_lower=is_lower) >= probability
+            low, high = (low, middle) if is_beyond else (middle, high)
+        return high
+
+    def _beyond(self, weight: Array, limit: float, seconds: float, *, is_lower: bool) -> float:
+        """Return the probability that the value is beyond ``limit`` after ``seconds``."""
+        cells = self.cells
+        shape = _shape(np.array([self.now + seconds]), cells.onset, self.now, cells.exponent)[:, 0]
+        mean = cells.mean[:, 0] + cells.mean[:, 1] * shape
+        covariance = cells.covariance
+        variance = covariance[:, 0, 0] + 2.0 * shape * covariance[:, 0, 1] + shape**2 * covariance[:, 1, 1]
+        excess = (limit - mean if is_lower else mean - limit) / np.sqrt(variance)
+        return float(sum(w * 0.5 * math.erfc(-z / math.sqrt(2.0)) for w, z in zip(weight, excess, strict=True)))
+
+
+def with_point(history: History, time: float, value: float, variance: float) -> History:
+    """Return the history with another point and at most :data:`MAX_POINTS`, whose density falls with the root of age.
+
+    Points that are not before ``time`` are dropped: the clock was set back.
+    """
+    kept = [*(point for point in history if point[0] < time), (time, value, variance)]
+    if len(kept) > MAX_POINTS:
+        times = np.array([point[0] for point in kept])
+        gaps = (times[2:] - times[:-2]) / np.sqrt(time - times[1:-1])
+        del kept[1 + int(np.argmin(gaps))]
+    return tuple(kept)
+
+
+def is_plausible(history: History) -> bool:
+    """Whether a history may have been made by :func:`with_point`."""
+    times = [time for time, _, _ in history]
+    rising = all(before < after for before, after in itertools.pairwise(times))
+    return len(history) <= MAX_POINTS and rising and all(0.0 < variance < math.inf for _, _, variance in history)
+
+
+def span(history: History) -> float:
+    """Return twice the age of the middle point, s: the length of the history unless its clock was once set forward."""
+    return 2.0 * (history[-1][0] - history[len(history) // 2][0])
+
+
+def find_trend(history: History, change: float) -> Trend | str:
+    """Return the trend of a history, or why there is none; ``change`` is one that would not be surprising."""
+    if len(history) < MIN_POINTS:
+        return f"too short: {len(history)} of {MIN_POINTS} estimates"
+    data = _Data.of(history, change)
+    constant = _cells(data, np.zeros(1), np.zeros(1), is_constant=True)
+    families = {"linear": _refined(data, (0.0, 0.0)), "exponential": _refined(data, GROWTH)}
+    evidence = {name: _log_sum(cells.log_weight) for name, cells in families.items()}
+    total = _log_sum(np.array([_log_sum(constant.log_weight), *evidence.values()]))
+    if 1.0 - math.exp(_log_sum(constant.log_weight) - total) < MIN_TREND_PROBABILITY:
+        return "no trend"
+    family = max(evidence, key=lambda name: evidence[name])
+    return Trend(family, history[-1][0], span(history), _together(*families.values()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Data:
+    """A history relative to its last value, with the errors of each possible time constant made white."""
+
+    times: Array
+    origin: float
+    """Of the values."""
+    values: Array
+    deviations: Array
+    change: float
+    correlation: Array
+    """(time constants, points - 1) of consecutive errors."""
+    innovation: Array
+    """Share of the variance of an error that the one before does not predict."""
+
+    @classmethod
+    def of(cls, history: History, change: float) -> "_Data":
+        times, values, variances = np.array(history).T
+        gaps = np.diff(times)
+        ages = gaps / np.geomspace(0.3 * gaps.min(), 0.5 * span(history), GRID[2])[:, None]
+        deviations, origin = np.sqrt(variances), float(values[-1])
+        return cls(times, origin, values - origin, deviations, change, np.exp(-ages), -np.expm1(-2.0 * ages))
+
+    def whitened(self, rows: Array) -> Array:
+        """Return (rows, points) for each time constant: (time constants, rows, points) with independent errors."""
+        scaled = rows / self.deviations
+        rho = self.correlation[:, None, :]
+        later = (scaled[None, :, 1:] - rho * scaled[None, :, :-1]) / np.sqrt(self.innovation[:, None, :])
+        first = np.broadcast_to(scaled[None, :, :1], (*later.shape[:2], 1))
+        return np.concatenate([first, later], axis=2)
+
+
+def _together(*families: _Cells) -> _Cells:
+    """Return the grid points of all families that have weight; the sum of their weights is 1."""
+    onset, exponent, mean, covariance = (
+        np.concatenate([getattr(cells, name) for cells in families])
+        for name in ("onset", "exponent", "mean", "covariance")
+    )
+    log_weight = np.concatenate([cells.log_weight for cells in families])
+    kept = _Cells(log_weight - _log_sum(log_weight), onset, exponent, mean, covariance).heavy
+    log_weight = log_weight[kept] - _log_sum(log_weight[kept])
+    return _Cells(log_weight, onset[kept], exponent[kept], mean[kept], covariance[kept])
+
+
+def _shape(times: Array, onset: Array, now: float, exponent: Array) -> Array:
+    """Return φ of the module's docstring, (cells, times)."""
+    s = np.maximum(times[None, :] - onset[:, None], 0.0) / (now - onset[:, None])
+    x = np.where(np.abs(exponent) < 1e-6, 1e-6, exponent)[:, None]  # the limit is the line
+    return np.asarray(np.expm1(np.minimum(x * s, 500.0)) / np.expm1(x))
+
+
+def _cells(data: _Data, onset: Array, exponent: Array, *, is_constant: bool = False) -> _Cells:
+    """Return the posterior at each pair of onset and exponent and each time constant, with its evidence.
+
+    The evidence lacks factors that are the same for all models of a history.
+    """
+    shapes = _shape(data.times, onset, data.times[-1], exponent)
+    count, points = len(onset), len(data.times)
+    rows = data.whitened(np.concatenate([np.ones((1, points)), data.values[None, :], shapes]))
+    ones, values, shapes = rows[:, :1], rows[:, 1:2], rows[:, 2:]
+    prior = np.diag([(UNKNOWN_CONSTANT * data.change) ** -2.0, data.change**-2.0])
+    if is_constant:
+        shapes = np.zeros_like(shapes)
+    precision = np.empty((len(rows), count, 2, 2))
+    precision[..., 0, 0] = (ones * ones).sum(2)
+    precision[..., 0, 1] = precision[..., 1, 0] = (ones * shapes).sum(2)
+    precision[..., 1, 1] = (shapes * shapes).sum(2)
+    precision += prior
+    moment = np.stack([np.broadcast_to((ones * values).sum(2), (len(rows), count)), (shapes * values).sum(2)], axis=2)
+    covariance = np.linalg.inv(precision)
+    mean = np.einsum("tcij,tcj->tci", covariance, moment)
+    misfit = (values * values).sum(2) - (mean * moment).sum(2)
+    scale, shape = FACTOR_SHAPE + 0.5 * np.maximum(misfit, 0.0), FACTOR_SHAPE + 0.5 * points
+    log_weight = 0.5 * (np.log(np.linalg.det(prior)) - np.log(np.linalg.det(precision))) - shape * np.log(scale)
+    log_weight -= 0.5 * np.log(data.innovation).sum(1)[:, None] + math.log(log_weight.size)
+    covariance = covariance * (scale / (shape - 1.0))[..., None, None]
+    mean[..., 0] += data.origin
+    onset, exponent = (np.tile(each, len(rows)) for each in (onset, exponent))
+    return _Cells(log_weight.ravel(), onset, exponent, mean.reshape(-1, 2), covariance.reshape(-1, 2, 2))
+
+
+def _refined(data: _Data, growth: tuple[float, float]) -> _Cells:
+    """Return the grid points of a family, on a grid around those with weight."""
+    points = len(data.times)
+    box = np.array([[0.0, points - MIN_POINTS_AFTER - 1.0], growth])
+    whole, share = box[:, 1] - box[:, 0], 1.0
+    numbers = GRID[0], GRID[1] if whole[1] > 0.0 else 1
+    for step in range(REFINEMENTS + 1):
+        axes = [np.linspace(low, high, number) for (low, high), number in zip(box, numbers, strict=True)]
+        index, exponent = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
+        onset = np.interp(index, np.arange(points), data.times)
+        cells = _cells(data, onset, exponent)
+        cells.log_weight[:] += math.log(share)
+        if step == REFINEMENTS:
+            break
+        heavy = cells.heavy.reshape(-1, len(index)).any(0)
+        for axis, values in enumerate((index, exponent)):
+            spacing = (box[axis, 1] - box[axis, 0]) / max(numbers[axis] - 1, 1)
+            low, high = values[heavy].min() - spacing, values[heavy].max() + spacing
+            box[axis] = max(low, box[axis, 0]), min(high, box[axis, 1])
+        share = float(np.prod([(b - a) / w for (a, b), w in zip(box, whole, strict=True) if w > 0.0]))
+    return cells
+
+
+def _log_sum(values: Array) -> float:
+    """Return the logarithm of the sum of the exponentials of ``values``."""
+    highest = float(values.max())
+    return highest + math.log(float(np.exp(values - highest).sum()))
+
+
+def forecast(quantity: MonitoredQuantity, history: History) -> ForecastDocument:
+    """Return when the parameter of a history passes its limits, or why that cannot be forecast."""
+    now = history[-1][0]
+    change = max(abs(limit.value - quantity.nominal) for limit in quantity.limits)
+    trend = find_trend(history, change)
+    if isinstance(trend, str):
+        return ForecastDocument(computed=now, reason=trend)
+    crossings: dict[str, CrossingDocument] = {}
+    for limit in quantity.limits:
+        crossing, key = trend.crossing(limit.value, is_lower=limit.is_lower), limit.level.lower()
+        if crossing is not None and (key not in crossings or now + crossing.median < crossings[key].at):
+            high = now + crossing.high if math.isfinite(crossing.high) else None
+            at, low = now + crossing.median, now + crossing.low
+            crossings[key] = CrossingDocument(limit=limit.value, at=at, low=low, high=high)
+    reason = "" if crossings else "the trend leads to no further limit"
+    return ForecastDocument(computed=now, family=trend.family, reason=reason, **crossings)
+
+
+def is_due(before: ForecastDocument | None, history: History) -> bool:
+    """Whether a history has grown so much since the forecast ``before`` that it is fitted again."""
+    return before is None or not 0.0 <= history[-1][0] - before.computed < REFIT * span(history)

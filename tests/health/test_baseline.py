@@ -1,0 +1,88 @@
+"""Relative limits refer to the healthy machine; report and events say so."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
+from otolith.cli.main import cli
+from otolith.health.baseline import Baseline, baselines, with_baseline, with_baselines
+from otolith.health.events import HealthState, assess
+from otolith.health.limits import Level, Limit, MonitoredQuantity
+from otolith.health.prognosis import MIN_POINTS, History
+from otolith.health.schema import ForecastDocument
+from otolith.machine import load_machine
+from otolith.storage.state_store import StateStore
+from otolith_drivers.errors import OtolithError
+from tests.conftest import OwnMachine
+from tests.health.test_events import PLAN, report
+
+LIMITS = (Limit(Level.WATCH, 6.175, True, True), Limit(Level.ACT, 5.9, True), Limit(Level.ACT, 9.0, False))
+QUANTITY = MonitoredQuantity("winding", "armature resistance", "ohm", 6.5, LIMITS)
+HEALTHY = Baseline(7.0, 0.01, 200, 400.0)
+
+
+def history(value: float, count: int) -> History:
+    return tuple((2.0 * index, value + 0.01 * (-1) ** index, 1e-4) for index in range(count))
+
+
+def test_a_baseline_is_the_mean_of_enough_estimates() -> None:
+    known = baselines({"R_a": history(7.0, 200), "D": history(1.0, MIN_POINTS - 1)})
+    assert set(known) == {"R_a"}
+    assert known["R_a"].value == pytest.approx(7.0)
+    assert known["R_a"].sd == pytest.approx(0.01 * 2**0.5)  # not divided by the number: the errors are correlated
+    assert (known["R_a"].windows, known["R_a"].end) == (200, 398.0)
+
+
+def test_limits_in_percent_refer_to_the_baseline_and_others_stay() -> None:
+    quantity = with_baseline(QUANTITY, HEALTHY)
+    assert [limit.value for limit in quantity.limits] == pytest.approx([6.65, 5.9, 9.0])
+    assert quantity.nominal == 7.0
+    assert with_baseline(QUANTITY, None) == QUANTITY
+    assert with_baseline(QUANTITY, replace(HEALTHY, value=-1.0)) == QUANTITY
+
+
+def test_report_and_event_name_the_baseline() -> None:
+    plan = with_baselines(replace(PLAN, parameters={"R_a": QUANTITY}), {"R_a": HEALTHY})
+    state = HealthState()
+    for index in range(5):
+        state, document = assess(plan, state, report(index, 6.5))
+    assert document.parameters["R_a"].baseline == 7.0
+    (event,) = document.events
+    assert event.state is Level.WATCH
+    assert "(-7.1% of the baseline), below its limit 6.65 ohm" in event.text
+    without = assess(with_baselines(plan, {}), HealthState(), report(0, 6.5))[1]
+    assert without.parameters["R_a"].baseline is None
+
+
+def test_a_decision_replaces_the_plan_and_its_forecasts(own_machine: OwnMachine) -> None:
+    machine = load_machine(own_machine.machine, with_driver=False)
+    forecasts = {"R_a": ForecastDocument(computed=1.0, reason="no trend")}
+    state = initial_state("m", "s", machine.problem, machine.plan)
+    state = replace(state, health=HealthState(forecasts=forecasts))
+    assert apply_decisions(state, OperatorDecisions()).health.forecasts == forecasts
+    changed = apply_decisions(state, OperatorDecisions(baselines={"R_a": HEALTHY, "unknown": HEALTHY}))
+    assert changed.plan.parameters["R_a"].nominal == 7.0
+    assert changed.health.forecasts == {}
+    assert apply_decisions(changed, OperatorDecisions()).plan.parameters == machine.plan.parameters
+
+
+def test_the_command_takes_the_saved_estimates(
+    own_machine: OwnMachine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    machine = load_machine(own_machine.machine, with_driver=False)
+    names = machine.file.machine
+    store = StateStore(names.site, names.name, machine.twin)
+    arguments = ["baseline", str(own_machine.machine)]
+    with pytest.raises(OtolithError, match="needs 20 estimates"):
+        CliRunner().invoke(cli, arguments, catch_exceptions=False, standalone_mode=False)
+    state = initial_state(names.name, names.site, machine.problem, machine.plan)
+    store.save(replace(state, health=HealthState(histories={"R_a": history(7.0, 50)})))
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert "baseline R_a = 7 ohm ± 0.028, mean of 50 estimates" in result.output
+    assert store.decisions().baselines["R_a"].value == pytest.approx(7.0)
+    CliRunner().invoke(cli, [*arguments, "--clear"], catch_exceptions=False)
+    assert store.decisions().baselines == {}

@@ -1,0 +1,160 @@
+"""Forecasts from histories: right and covered on degradations, none without a trend; histories stay small."""
+
+import numpy as np
+import pytest
+from benchmarks.prognosis import QUANTITY, coverage, median_error, run
+
+from otolith.discovery.decision import WindowDecision
+from otolith.health.events import HealthState, assess
+from otolith.health.prognosis import (
+    MAX_POINTS,
+    MIN_CHANGE,
+    MIN_POINTS,
+    REFIT,
+    History,
+    Trend,
+    find_trend,
+    forecast,
+    is_plausible,
+    span,
+    with_point,
+)
+from otolith.health.schema import CrossingDocument
+from otolith.health.text import crossing_text, duration_text, event_text
+from tests.health.test_events import PLAN, changes, report
+
+SD = 0.01  # ohm
+NOMINAL = QUANTITY.nominal
+
+
+def history_of(values: list[float], period: float = 2.0, sd: float = SD) -> History:
+    history: History = ()
+    for index, value in enumerate(values):
+        history = with_point(history, period * (index + 1), value, sd**2)
+    return history
+
+
+def test_a_degradation_as_in_the_paper_is_forecast_from_half_way() -> None:
+    """Twelve of the runs of ``benchmarks/prognosis.py``, five forecasts each."""
+    outcomes = [outcome for seed in range(12) for outcome in run(seed)]
+    assert median_error(outcomes) < 0.1
+    assert 0.65 <= coverage(outcomes) <= 0.95
+
+
+@pytest.mark.full
+def test_eighty_percent_intervals_hold_eighty_percent() -> None:
+    outcomes = [outcome for seed in range(1, 101) for outcome in run(seed)]
+    assert median_error(outcomes) < 0.1
+    assert 0.75 <= coverage(outcomes) <= 0.85
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8, 0.98, 1.0])
+def test_correlated_errors_are_no_trend(rho: float) -> None:
+    """A healthy machine, and one whose estimate is a random walk, observed at ten moments."""
+    for seed in range(3):
+        random = np.random.default_rng(seed)
+        errors = random.standard_normal(1000)
+        for index in range(1, len(errors)):
+            step = np.sqrt(1.0 - rho**2) if rho < 1.0 else 0.1
+            errors[index] = rho * errors[index - 1] + step * errors[index]
+        values = (NOMINAL + SD * errors).tolist()
+        for count in range(100, 1001, 100):
+            result = forecast(QUANTITY, history_of(values[:count]))
+            assert result.act is None
+            assert result.reason
+
+
+def test_few_estimates_give_no_forecast() -> None:
+    result = forecast(QUANTITY, history_of([NOMINAL - 0.02 * index for index in range(MIN_POINTS - 1)]))
+    assert result.reason == f"too short: {MIN_POINTS - 1} of {MIN_POINTS} estimates"
+
+
+def test_what_levels_off_or_leads_away_reaches_no_limit() -> None:
+    random = np.random.default_rng(2)
+    times = np.arange(300)
+    warm = NOMINAL + 0.3 * (1.0 - np.exp(-times / 60.0)) + SD * random.standard_normal(300)
+    assert isinstance(find_trend(history_of(warm.tolist()), 0.65), Trend)
+    assert forecast(QUANTITY, history_of(warm.tolist())).reason == "the trend leads to no further limit"
+    levelling = NOMINAL - 0.3 * (1.0 - np.exp(-times / 60.0)) + SD * random.standard_normal(300)
+    assert forecast(QUANTITY, history_of(levelling.tolist())).act is None
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.7 * MIN_CHANGE, False), (1.5 * MIN_CHANGE, True)])
+def test_a_small_part_of_the_way_gives_no_forecast(share: float, expected: bool) -> None:
+    random = np.random.default_rng(4)
+    values = NOMINAL - share * 0.65 * np.linspace(0.0, 1.0, 200) + 0.1 * SD * random.standard_normal(200)
+    assert (forecast(QUANTITY, history_of(values.tolist(), sd=0.1 * SD)).act is not None) == expected
+
+
+def test_a_linear_trend_is_called_so() -> None:
+    random = np.random.default_rng(5)
+    values = NOMINAL - 0.001 * np.arange(200) + SD * random.standard_normal(200)
+    result = forecast(QUANTITY, history_of(values.tolist()))
+    assert result.family == "linear"
+    assert result.act is not None
+    assert result.act.low < result.act.at == pytest.approx(2.0 * 650.0, rel=0.1)
+
+
+def test_a_history_stays_small_and_dense_where_it_is_recent() -> None:
+    history: History = ()
+    for index in range(5000):
+        history = with_point(history, 2.0 * index, NOMINAL, SD**2)
+    assert len(history) == MAX_POINTS
+    assert is_plausible(history)
+    gaps = np.diff([time for time, _, _ in history])
+    assert gaps[-1] == 2.0
+    assert gaps[:20].mean() > 3.0 * gaps[-20:].mean()
+    assert history[0][0] == 0.0
+
+
+def test_a_clock_that_is_set_keeps_a_history_usable() -> None:
+    """A computer without a clock of its own starts in 1970, and is set later; or is set back."""
+    values = [NOMINAL - 0.001 * index for index in range(300)]
+    jumped = history_of(values[:30])
+    for index, value in enumerate(values[30:]):
+        jumped = with_point(jumped, 1.8e9 + 2.0 * index, value, SD**2)
+    assert span(jumped) < 1000.0
+    assert forecast(QUANTITY, jumped).computed == jumped[-1][0]
+    back = with_point(jumped, 30.0, NOMINAL, SD**2)
+    assert back[-1] == (30.0, NOMINAL, SD**2)
+    assert is_plausible(back)
+    assert not is_plausible(((2.0, 1.0, 1.0), (1.0, 1.0, 1.0)))
+    assert not is_plausible(((2.0, 1.0, 0.0),))
+
+
+def test_the_event_and_the_report_have_the_forecast() -> None:
+    random = np.random.default_rng(6)
+    state, documents = HealthState(), []
+    for index in range(150):
+        value = NOMINAL - 0.002 * index + 0.001 * random.standard_normal()
+        state, document = assess(PLAN, state, report(index, value, 0.001))
+        documents.append(document)
+    result = documents[-1].parameters["R_a"].forecast
+    assert result is not None
+    assert result.act is not None
+    assert result.act.at == pytest.approx(2.0 * 251.0, rel=0.02)
+    assert result.act.limit == 6.0
+    (event,) = documents[-1].events
+    assert "reaches ACT in " in event_text(event)
+    assert "reaches WATCH" not in event_text(event)
+    computed = {document.parameters["R_a"].forecast.computed for document in documents}  # type: ignore[union-attr]
+    assert len(computed) < 20 + 5.0 / REFIT  # fitted when the history has grown, not with each window
+    assert len(changes(documents)) == 1
+
+
+def test_a_sudden_change_begins_a_new_history() -> None:
+    state = HealthState()
+    for index in range(40):
+        decision = WindowDecision.STEPPED if index == 30 else WindowDecision.LEARNED
+        state, document = assess(PLAN, state, report(index, 6.5 if index < 30 else 6.4, decision=decision))
+    assert len(state.histories["R_a"]) == 10
+    assert document.parameters["R_a"].forecast is not None
+    assert document.parameters["R_a"].forecast.reason.startswith("too short")
+
+
+def test_a_forecast_is_said_in_words() -> None:
+    crossing = CrossingDocument(limit=6.0, at=4.0 * 3600.0, low=3.0 * 3600.0, high=5.0 * 3600.0)
+    assert crossing_text(crossing, "ACT", 0.0) == "reaches ACT in 3 h to 5 h"
+    assert crossing_text(crossing.model_copy(update={"high": None}), "ACT", 0.0) == "reaches ACT in more than 3 h"
+    durations = {-1.0: "0 s", 1.3: "1.3 s", 119.0: "119 s", 200.0: "3.3 min", 86400.0: "24 h", 2.6e6: "30 d"}
+    assert {seconds: duration_text(seconds) for seconds in durations} == durations

@@ -1,0 +1,168 @@
+"""Warming up is not wear: limits are judged at the reference temperature, or the finding names the temperature."""
+
+from dataclasses import replace
+from itertools import islice, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from otolith.acquisition.ring import MAX_OBSERVED_AGE, Rings
+from otolith.acquisition.window import Window
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import initial_state
+from otolith.health.limits import Level
+from otolith.health.schema import EventDocument, ReportDocument
+from otolith.health.text import announcements
+from otolith.machine import LoadedMachine, load_machine
+from otolith.runtime.replay import Replay, open_recorded
+from otolith_drivers.base import Sample
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.plant.faults import Drift
+from otolith_drivers.plant.scenario import load_scenario, simulate
+from tests.conftest import EXAMPLES, SIGNALS, OwnMachine
+
+COPPER, RISE, WINDOWS = 0.00393, 40.0, 60  # 1/K, K
+PERIOD, RECORDS = 0.01, 200
+ROW = 'R_a = { value = "6.5 ohm", estimate = true, watch = ["-2 %", "+5 %"], act = ["-5 %", "+10 %"]'
+MEASURED = ', temperature = "winding_temperature"'
+
+
+def machine_with(own_machine: OwnMachine, extra: str, signals: str = "") -> LoadedMachine:
+    text = own_machine.machine.read_text(encoding="utf-8")
+    lines = [f"{ROW}{extra} }}" if line.startswith("R_a = ") else line for line in text.splitlines()]
+    text = "\n".join(lines).replace("[signals]", f"[signals]\n{signals}")
+    own_machine.machine.write_text(text + "\n", encoding="utf-8")
+    return load_machine(own_machine.machine, with_driver=False)
+
+
+def warming(until: float = RISE) -> tuple[list[Window], list[float]]:
+    """Windows of the demo's motor whose winding warms up from 20 °C, with the rise at the end of each, K."""
+    rate = 1.0 / 30.0
+    final = 6.5 * COPPER * until
+    drift = {"kind": "drift", "parameter": "R_a", "start": "0 s", "amount": f"{-final} ohm", "rate": f"{-rate} 1/s"}
+    scenario = load_scenario(EXAMPLES / "scenarios" / "demo.toml")
+    assert isinstance(scenario, MotorScenario)
+    scenario = scenario.model_copy(update={"faults": (Drift.model_validate(drift),)})
+    ticks, windows = simulate(scenario), []
+    for index in range(WINDOWS):
+        rows = [[tick.measured[name] for name in SIGNALS.values()] for tick in islice(ticks, RECORDS)]
+        windows.append(Window.whole(index, index * PERIOD * RECORDS, PERIOD, tuple(SIGNALS), np.array(rows)))
+    times = np.arange(WINDOWS) * PERIOD * RECORDS + 1.0
+    return windows, (-until * np.expm1(-rate * times)).tolist()
+
+
+def reports(machine: LoadedMachine, windows: list[Window]) -> list[ReportDocument]:
+    state, documents = initial_state("m", "s", machine.problem, machine.plan), []
+    for window in windows:
+        state, report = adapt(state, window)
+        documents.append(report.document)
+    return documents
+
+
+def events(documents: list[ReportDocument]) -> list[EventDocument]:
+    return [event for document in documents for event in announcements(document)]
+
+
+def test_a_motor_that_warms_up_by_40_kelvin_is_no_finding(own_machine: OwnMachine) -> None:
+    windows, rises = warming()
+    measured = [
+        replace(window, observed={"winding_temperature": 293.15 + rise})
+        for window, rise in zip(windows, rises, strict=True)
+    ]
+    documents = reports(machine_with(own_machine, MEASURED), measured)
+    assert events(documents) == []
+    last = documents[-1].parameters["R_a"]
+    assert last.value == pytest.approx(6.5 * (1.0 + COPPER * rises[-1]), rel=0.01)
+    assert last.referred == pytest.approx(6.5, rel=0.01)
+    assert last.forecast is not None
+    assert last.forecast.act is None
+    assert documents[-1].window.observed == measured[-1].observed
+
+
+def test_without_a_temperature_the_finding_names_it(own_machine: OwnMachine) -> None:
+    windows, rises = warming()
+    (*_, event) = events(reports(machine_with(own_machine, ""), windows))
+    assert (event.part, event.state) == ("winding", Level.ACT)
+    assert "hotter than at its nominal value or a contact" in event.condition
+    kelvin = float(event.text.rpartition("; being ")[2].split()[0])
+    assert 0.1 / COPPER < kelvin < max(rises)
+    assert "no temperature is measured" in event.text
+
+
+def test_wear_of_a_warm_winding_is_a_finding(own_machine: OwnMachine) -> None:
+    """Turns short out of a winding at 60 °C: the resistance alone is inside its limits."""
+    windows, _ = warming(0.0)
+    warm = [replace(window, observed={"winding_temperature": 333.15}) for window in windows[:10]]
+    (event,) = events(reports(machine_with(own_machine, MEASURED), warm))
+    assert (event.part, event.state) == ("winding", Level.ACT)
+    assert "(-13.6% at 20 °C)" in event.text
+
+
+def test_a_temperature_that_fails_is_named_and_no_limit_is_judged_without_it(own_machine: OwnMachine) -> None:
+    windows, _ = warming()
+    documents = reports(machine_with(own_machine, MEASURED), windows)
+    (event,) = events(documents)
+    assert (event.part, event.state, event.condition) == ("winding", Level.NO_DATA, "no temperature")
+    health = documents[-1].health
+    assert health is not None
+    assert (health.parts["winding"].state, health.parts["shaft"].state) == (Level.NO_DATA, Level.OK)
+
+
+def test_a_table_has_the_temperature_as_one_more_column(own_machine: OwnMachine, tmp_path: Path) -> None:
+    windows, rises = warming()
+    names = (*SIGNALS, "winding_temperature [degC]")
+    lines = ["t," + ",".join(names)]
+    for window, (before, after) in zip(windows, pairwise([0.0, *rises]), strict=True):
+        for record, row in enumerate(window.values):
+            slow = f"{20.0 + 0.5 * (before + after):.3f}" if record % 50 == 0 else ""  # slower than the others
+            lines.append(f"{window.start + record * PERIOD:.2f}," + ",".join(map(repr, row.tolist())) + f",{slow}")
+    data = tmp_path / "warm.csv"
+    data.write_text("\n".join(lines), encoding="utf-8")
+    machine = machine_with(own_machine, MEASURED)
+    with open_recorded(machine, data) as table:
+        documents = [report.document for report in Replay(machine, table).reports()]
+    assert len(documents) >= WINDOWS - 1
+    assert all(document.window.observed for document in documents)
+    assert events(documents) == []
+    data.write_text("\n".join(line.rpartition(",")[0] for line in lines), encoding="utf-8")
+    with open_recorded(machine, data) as table:
+        without = [report.document for report in Replay(machine, table).reports()]
+    assert {event.condition for event in events(without)} == {"no temperature"}
+
+
+def test_an_observed_signal_has_the_mean_of_the_window_or_the_last_value() -> None:
+    rings = Rings(("a",), 100, ("b", "c"))
+    rings.deliver([Sample("b", time, value) for time, value in ((1.0, 5.0), (2.5, 1.0), (3.0, 3.0), (4.0, 9.0))])
+    assert rings.observed_means(2.0, 4.0) == {"b": 2.0}
+    assert rings.observed_means(10.0, 12.0) == {"b": 9.0}
+    assert rings.observed_means(10.0, 4.1 + MAX_OBSERVED_AGE) == {}
+    assert set(rings.first_times()) == set(rings.last_times()) == {"a"}  # no window waits for them
+
+
+def test_the_driver_reads_the_temperature(own_machine: OwnMachine) -> None:
+    machine_with(own_machine, MEASURED, 'winding_temperature = { signal = "RotorSpeed", unit = "degC" }')
+    lines = load_machine(own_machine.machine).driver.describe()
+    assert any(line.startswith("winding_temperature [K] from ") for line in lines), lines
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (', temperature = "omega"', "'omega' must be a signal of [signals] beside those of the twin"),
+        (f'{MEASURED}, temperature_coefficient = "0 1/K"', "R_a has no temperature_coefficient"),
+        (', temperature_coefficient = "3 1/K"', "out of bounds"),
+        (', reference_temperature = "20 ohm"', "does not measure"),
+    ],
+)
+def test_a_wrong_temperature_is_refused(own_machine: OwnMachine, extra: str, message: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        machine_with(own_machine, extra)
+    assert message in str(error.value)
+
+
+def test_a_temperature_without_a_signal_is_refused(own_machine: OwnMachine) -> None:
+    machine_with(own_machine, MEASURED)
+    with pytest.raises(ConfigurationError, match=r"winding_temperature \(K\) is missing: \[parameters\] names it"):
+        load_machine(own_machine.machine)
