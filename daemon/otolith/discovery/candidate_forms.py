@@ -83,15 +83,17 @@ def rate_terms(base: Definition, columns: Mapping[str, Array], site: int = 0, en
     ``site``.
     """
     ordered, scales = _equations(base)
-    entered = base.sites[site]
+    entered = base.sites[site] if entering else None
     values = {name: [np.asarray(column) * scales[name]] for name, column in columns.items()}
     values |= {fixed.name: [np.array([fixed.value * scales[fixed.name]])] for fixed in base.constants}
     with np.errstate(all="ignore"):
         for name, tree in ordered:
             values[name] = terms(tree, values)
-            if entering and entered.into == name and entered.mode == "multiplicative":
+            if entered is None or entered.into != name:
+                continue
+            if entered.mode == "multiplicative":
                 values[name] = [(1.0 + entering) * term for term in values[name]]
-            elif entering and entered.into == name:
+            else:
                 through = evaluate(parse(entered.through), values)
                 values[name] = [*values[name], through * entering * to_base(entered.unit)[0]]
     return [_rows(values[f"der({state.name})"], scales[state.name]) for state in base.states]
