@@ -61,6 +61,14 @@ def test_a_narrow_terminal_cuts_no_number(written: HistoryWriter) -> None:
     assert "…" not in run(MACHINE, width=60).stdout
 
 
+@pytest.mark.parametrize("width", [80, 100, 120, 200])
+def test_values_and_curve_are_on_one_line(written: HistoryWriter, width: int) -> None:
+    del written
+    rows = [line.split("│")[1:-1] for line in run(MACHINE, width=width).stdout.splitlines() if "│" in line]
+    assert rows
+    assert all(cell.strip() for row in rows for cell in (row[1], row[-1]))
+
+
 def test_csv_json_and_parquet_have_the_same_values(written: HistoryWriter, tmp_path: Path) -> None:
     del written
     rows = list(csv.DictReader(run(MACHINE, "--csv", "--every", "hour").stdout.splitlines()))

@@ -25,7 +25,9 @@ INTERVALS = ("window", "minute", "hour", "day")
 LONGEST = {"window": 7200.0, "minute": 2 * 86_400.0, "hour": 60 * 86_400.0}  # s that are shown at a resolution
 MAX_EVENTS = 20  # in the table
 MIN_CURVE = 8  # characters of a curve
-OTHER_COLUMNS = 84  # characters that the table needs beside it
+OTHER_COLUMNS = 46  # characters that the table needs beside it, names and units
+RANGE_COLUMNS = 24  # characters of its columns min and max
+WIDTH_WITH_RANGE = 100  # characters of a terminal that shows them
 
 
 def _since(_: click.Context, __: click.Parameter, text: str) -> float:
@@ -238,8 +240,10 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
     """A row for each parameter: last value and interval, change and range of the means, and their curve."""
     from otolith.cli.operation.live_table import parameter_table, sparkline
 
-    length = max(width - OTHER_COLUMNS, MIN_CURVE)
-    table = parameter_table("min", "max", "history")
+    has_range = width >= WIDTH_WITH_RANGE
+    words = max(len(sample.name) for sample in samples) + max(len(sample.unit) for sample in samples)
+    length = max(width - OTHER_COLUMNS - RANGE_COLUMNS * has_range - words, MIN_CURVE)
+    table = parameter_table(*(("min", "max") if has_range else ()), "history")
     first, last = samples[0].time, samples[-1].time
     series: dict[tuple[str, str], list[HistorySample]] = {}
     for sample in samples:
@@ -253,5 +257,6 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
         half = "" if end.low is None or end.high is None else f"{0.5 * (end.high - end.low):.2g}"
         change = f"{row[-1].mean / begin - 1.0:+.2%}" if begin else ""
         low, high = min(sample.min for sample in row), max(sample.max for sample in row)
-        table.add_row(name, f"{end.last:.5g}", half, unit, change, f"{low:.5g}", f"{high:.5g}", curve)
+        limits = (f"{low:.5g}", f"{high:.5g}") if has_range else ()
+        table.add_row(name, f"{end.last:.5g}", half, unit, change, *limits, curve)
     return table
