@@ -48,8 +48,9 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     if posterior is not state.posterior:
         state = with_posterior(state, posterior)
     posterior = state.posterior.with_steps(window)
-    if posterior is not state.posterior:  # the hypotheses of an open test were compared with other noise
-        state = replace(state, posterior=posterior, test=None)
+    if posterior is not state.posterior:
+        test = None if state.test is None else state.test.with_steps(posterior.problem.steps)
+        state = replace(state, posterior=posterior, test=test)
     predicted = posterior.predict(window)
     checked = check_window(window, predicted)
     act = _estimate if checked.is_usable else _reject

@@ -121,6 +121,14 @@ class SequentialTest:
         """Whether windows after the one that opened the test speak decisively against the filter."""
         return self.against_filter > DECISIVE
 
+    def with_steps(self, steps: tuple[float, ...]) -> "SequentialTest":
+        """Return the test with the steps of converters that windows have shown since."""
+        hypotheses = tuple(
+            replace(item, posterior=replace(item.posterior, problem=replace(item.problem, steps=steps)))
+            for item in self.hypotheses
+        )
+        return replace(self, problem=replace(self.problem, steps=steps), hypotheses=hypotheses)
+
     def with_filter(self, filtered: Fit) -> "SequentialTest":
         """Return the test after its last window, of which the filter leaves ``filtered``.
 

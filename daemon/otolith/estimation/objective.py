@@ -266,11 +266,17 @@ def rounding_variance(values: Array, known_step: float) -> float:
 
 
 def converter_steps(problem: Problem, window: Window) -> tuple[float, ...]:
-    """Return the steps of converters that ``window`` or those before show, per output; empty if there are none."""
+    """Return the steps of converters that ``window`` or those before show, per output; empty if there are none.
+
+    A step replaces the one before if it is smaller by more than rounding.
+    """
     outputs = [output.name for output in problem.base_model.outputs]
     shown = [adc_step(window.column(name)[~window.missing_in(name)]) for name in outputs]
     before = problem.steps or (0.0,) * len(outputs)
-    steps = tuple(min(pair) if all(pair) else max(pair) for pair in zip(before, shown, strict=True))
+    steps = tuple(
+        new if new and (not old or new < old * (1.0 - ADC_TOLERANCE)) else old
+        for old, new in zip(before, shown, strict=True)
+    )
     return steps if any(steps) else ()
 
 
