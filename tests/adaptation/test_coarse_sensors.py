@@ -10,7 +10,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.discovery.decision import WindowDecision
-from otolith.estimation.objective import adc_step, rounding_variance
+from otolith.estimation.objective import WHITE_ROUNDING, adc_step, rounding_variance
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument
 from otolith.machine import find_twin
@@ -88,6 +88,17 @@ def test_the_step_of_a_converter(values: list[float], step: float) -> None:
 
 
 def test_equal_readings_have_one_error() -> None:
-    assert rounding_variance(np.array([0.0, 1.0, 2.0, 3.0]), 0.0) == pytest.approx(1.0 / 12.0)
-    assert rounding_variance(np.repeat([0.0, 1.0, 2.0, 3.0], 10), 0.0) == pytest.approx(10.0 / 12.0)
-    assert rounding_variance(np.repeat([2.0], 10), 0.5) == pytest.approx(10.0 * 0.25 / 12.0)
+    assert rounding_variance(np.array([0.0, 1.0, 2.0, 3.0]), 0.1, 0.0) == pytest.approx(1.0 / 12.0)
+    assert rounding_variance(np.repeat([0.0, 1.0, 2.0, 3.0], 10), 0.1, 0.0) == pytest.approx(10.0 / 12.0)
+    assert rounding_variance(np.repeat([2.0], 10), 0.1, 0.5) == pytest.approx(10.0 * 0.25 / 12.0)
+    assert rounding_variance(np.array([]), 0.1, 0.5) == 0.0
+
+
+def test_rounding_beside_noise_is_white() -> None:
+    """Normal noise of half a step leaves no mean error, wherever the value lies between two levels."""
+    noise = np.random.default_rng(1).normal(0.0, 1.0 / WHITE_ROUNDING, 1_000_000)
+    for value in np.linspace(0.0, 0.5, 6):
+        assert abs(float(np.mean(np.rint(value + noise) - value))) < 0.005
+    values = np.repeat([0.0, 1.0, 2.0, 3.0], 10)
+    assert rounding_variance(values, 0.5, 0.0) == pytest.approx(1.0 / 12.0)
+    assert rounding_variance(values, 0.49, 0.0) == pytest.approx(10.0 / 12.0)

@@ -239,7 +239,7 @@ def _frozen_run(predicted: Posterior, window: Window, name: str, runs: list[Indi
     values, noise = window.column(name)[present], problem.noise[index]
     step = _step(values)
     known = problem.steps[index] if problem.steps else 0.0
-    lacking = step**2 / 12.0 - rounding_variance(values, known)
+    lacking = step**2 / 12.0 - rounding_variance(values, noise, known)
     if lacking > 0.0:  # the objective leaves so few levels out
         with_rounding = float(np.sqrt(noise**2 + lacking))
         problem = replace(problem, noise=(*problem.noise[:index], with_rounding, *problem.noise[index + 1 :]))

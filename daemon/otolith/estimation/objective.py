@@ -25,6 +25,7 @@ TRUNCATION = 1e-3  # share of the noise: largest truncation error of the integra
 PENALTY = 1e30  # cost of a guess whose prediction is not finite
 MAX_SUBSTEPS_WITH_COMPONENTS = 8  # no number of sub-steps makes the step of dry friction smooth
 ADC_TOLERANCE = 0.01  # share of a step: how far level differences may be from whole multiples of it
+WHITE_ROUNDING = 2.0  # standard deviations of the noise: rounding to steps up to this size is white noise
 MIN_ADC_LEVELS = 4  # levels in a window that show the step of a converter
 
 
@@ -223,7 +224,8 @@ class Objective:
         measured = zip(self.measured.T, self.present.T, strict=True)
         known = problem.steps or (0.0,) * len(twin.outputs)
         rounding = [
-            rounding_variance(values[present], step) for (values, present), step in zip(measured, known, strict=True)
+            rounding_variance(values[present], noise, step)
+            for (values, present), noise, step in zip(measured, problem.noise, known, strict=True)
         ]
         outputs = np.sqrt(np.array(problem.noise) ** 2 + np.array(rounding))
         states = np.array(problem.process_noise or [0.0] * len(twin.states))
@@ -252,17 +254,19 @@ def input_matrix(twin: Definition, window: Window) -> Array:
     return np.hstack(columns)
 
 
-def rounding_variance(values: Array, known_step: float) -> float:
+def rounding_variance(values: Array, noise: float, known_step: float) -> float:
     """Return the variance that rounding to the steps of a converter adds to ``values`` (n,), in their unit squared.
 
-    Each error has a twelfth of the squared step (B. Widrow, I. Kollar, Quantization Noise, section 4.4). The errors of
-    a run of equal values are one error, so that the variance of a mean is larger by the mean length of the runs.
-    Values on too few levels to show a step have the ``known_step`` of the windows before, or 0.
+    Beside normal ``noise`` of at least half a step the errors are white, with a twelfth of the squared step (B. Widrow,
+    I. Kollar, Quantization Noise, section 4.4). With less noise the errors of a run of equal values are one error, so
+    that the variance of a mean is larger by the mean length of the runs. Values on too few levels to show a step have
+    the ``known_step`` of the windows before, or 0.
     """
     if len(values) == 0:
         return 0.0
     step = adc_step(values) or (known_step if len(np.unique(values)) < MIN_ADC_LEVELS else 0.0)
-    return step**2 / 12.0 * len(values) / _runs(values)
+    alike = 1.0 if step <= WHITE_ROUNDING * noise else len(values) / _runs(values)
+    return step**2 / 12.0 * alike
 
 
 def converter_steps(problem: Problem, window: Window) -> tuple[float, ...]:
