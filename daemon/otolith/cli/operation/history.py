@@ -243,7 +243,7 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
     has_range = width >= WIDTH_WITH_RANGE
     words = max(len(sample.name) for sample in samples) + max(len(sample.unit) for sample in samples)
     length = max(width - OTHER_COLUMNS - RANGE_COLUMNS * has_range - words, MIN_CURVE)
-    table = parameter_table(*(("min", "max") if has_range else ()), "history")
+    table = parameter_table(*(("min", "max") if has_range else ()), "history", width=width)
     first, last = samples[0].time, samples[-1].time
     series: dict[tuple[str, str], list[HistorySample]] = {}
     for sample in samples:
