@@ -235,7 +235,7 @@ def watch(connect: tuple[str, ...], credentials: "Credentials", machine: str, as
 def plant(
     scenario: Path, transports: tuple[str, ...], truth: Path | None, summary: Path | None, duration: float
 ) -> int:
-    """Simulate the machine of SCENARIO in real time, on its bus or on several at once.
+    """Simulate the machine of SCENARIO in real time, on its buses.
 
     \b
     Examples:
@@ -288,8 +288,19 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (
-    *(baseline, commission, compile_command, components, history, install, keys),
-    *(noise, probe, reset, twin, view),
-):
+COMMANDS: tuple[click.Command, ...] = (
+    baseline,
+    commission,
+    compile_command,
+    components,
+    history,
+    install,
+    keys,
+    noise,
+    probe,
+    reset,
+    twin,
+    view,
+)
+for command in COMMANDS:
     cli.add_command(command)
