@@ -48,7 +48,8 @@ def view(recording: str | None, since: str | None, only_list: bool, web: bool) -
     known = Recordings.search(recording or "")
     files = [file for file in known.files if seconds is None or file.end >= time.time() - seconds]
     if only_list:
-        click.echo("".join(f"{_row(file)}\n" for file in files), nl=False)
+        width = max((len(file.key) for file in files), default=0)
+        click.echo("".join(f"{_row(file, width)}\n" for file in files), nl=False)
         for line in known.unreadable if files else [known.none_text(since)]:
             click.echo(line, err=True)
         return 0
@@ -131,12 +132,12 @@ def unreadable_text(path: Path) -> str:
     return f"{path}: not readable for this user: join group {group}: {join}"
 
 
-def _row(file: RecordingFile) -> str:
-    """Return the line of a list: begin, length, size, machine, mark, path."""
-    minutes = max(0.0, file.end - file.begin) / 60.0
+def _row(file: RecordingFile, width: int) -> str:
+    """Return the line of a list: end, length, size, machine, mark, path; the name has begin and machine, or neither."""
+    minutes = f"{max(0.0, file.end - file.begin) / 60.0:.0f}" if file.key else "-"
     mark = "event" if file.is_marked else ""
     size = f"{file.size / MEGABYTE:8.1f} MB"
-    return f"{local_time(file.begin)}  {minutes:5.0f} min  {size}  {file.key or '-':<24}  {mark:<5}  {file.path}"
+    return f"{local_time(file.end)}  {minutes:>5} min  {size}  {file.key or '-':<{width}}  {mark:<5}  {file.path}"
 
 
 def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:
