@@ -153,7 +153,6 @@ def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
     from otolith.cli.commissioning.check import check_data, check_machine
 
     if data is not None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # so that Ctrl-C removes the line of progress
         return 0 if check_data(file, data, click.echo, as_json=as_json) else 1
     if as_json:
         raise click.UsageError("--json needs DATA: it prints what recorded data offer")
