@@ -21,6 +21,13 @@ DATA_FILES = click.argument("data", type=FILE, nargs=-1, required=True)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 
 
+def new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+    """Return the file of an option; raise BadParameter if it exists."""
+    if path is not None and path.exists():
+        raise click.BadParameter(f"{str(path)!r} exists and would be overwritten")
+    return path
+
+
 class StopSignal:
     """Remembers the signal that asks this command to end."""
 

@@ -26,6 +26,7 @@ from otolith.cli.common import (
     StopSignal,
     examples_directory,
     log_to_stderr,
+    new_file,
 )
 from otolith.cli.operation.compile import compile_command
 from otolith.cli.operation.connection import endpoints, reader_options
@@ -49,12 +50,10 @@ Exit codes:
   130  interrupted by Ctrl-C (128 + n by another signal n)"""
 
 
-def _new_recording(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+def _new_recording(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
     if path is not None and path.suffix != ".rrd":
         raise click.BadParameter(f"{str(path)!r}: the name of a recording ends in .rrd")
-    if path is not None and path.exists():
-        raise click.BadParameter(f"{str(path)!r} exists and would be overwritten")
-    return path
+    return new_file(context, option, path)
 
 
 def _machine_name(_: click.Context, __: click.Parameter, name: str) -> str:
