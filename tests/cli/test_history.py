@@ -93,6 +93,14 @@ def test_csv_json_and_parquet_have_the_same_values(written: HistoryWriter, tmp_p
     assert document["counters"][-1]["windows"] == COUNT - 1
 
 
+def test_a_parquet_file_that_cannot_be_written_is_named(written: HistoryWriter, tmp_path: Path) -> None:
+    del written
+    path = tmp_path / "missing" / "values.parquet"
+    error = run(MACHINE, "--parquet", str(path)).exception
+    assert isinstance(error, OSError)
+    assert error.filename == str(path)
+
+
 def test_events_alone(written: HistoryWriter) -> None:
     del written
     rows = list(csv.DictReader(run(MACHINE, "--events", "--csv").stdout.splitlines()))

@@ -176,7 +176,11 @@ def _write_parquet(samples: "Sequence[HistorySample]", path: Path) -> None:
     for row in rows:
         row["parameter"] = row.pop("name")
         row["time"] = datetime.fromtimestamp(row["time"], UTC)
-    pq.write_table(pa.Table.from_pylist(rows, schema=schema), path)
+    try:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), path)
+    except OSError as error:
+        error.filename = str(path)  # pyarrow gives none
+        raise
 
 
 def _print_json(
