@@ -83,7 +83,7 @@ class LimitsTable(StrictModel):
 
 
 class ParameterTable(LimitsTable):
-    """What the file says of one parameter; the twin gives the rest."""
+    """What the file states of one parameter; the rest is that of the twin."""
 
     value: RawQuantity = None
     """Value of a known parameter, or start of the search for an estimated one."""

@@ -41,6 +41,12 @@ def test_help_fits_80_columns_and_has_an_example(path: tuple[str, ...]) -> None:
     assert re.search(rf"(Examples?|Start here):\n\s+{' '.join(('otolith', *path))}\b", text)
 
 
+def test_a_list_of_commands_cuts_no_sentence() -> None:
+    groups = [path for path in PATHS if isinstance(command_at(path), click.Group)]
+    texts = [CliRunner().invoke(cli, [*path, "--help"], env={"COLUMNS": str(WIDTH)}).output for path in groups]
+    assert not [line for text in texts for line in text.splitlines()[1:] if line.endswith("...")]
+
+
 @pytest.mark.parametrize("path", PATHS, ids=" ".join)
 def test_the_reference_has_every_command_and_option(path: tuple[str, ...]) -> None:
     text = REFERENCE.read_text(encoding="utf-8")

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sqlite3
 import time
 from collections.abc import Iterator
@@ -56,9 +57,12 @@ def test_the_table_has_values_events_and_findings(written: HistoryWriter, is_run
     assert f"in {COUNT // 2} windows" in text
 
 
-def test_a_narrow_terminal_cuts_no_number(written: HistoryWriter) -> None:
+@pytest.mark.parametrize("width", [40, 60])
+def test_a_narrow_terminal_cuts_no_number(written: HistoryWriter, width: int) -> None:
     del written
-    assert "…" not in run(MACHINE, width=60).stdout
+    text = run(MACHINE, width=width).stdout
+    assert "…" not in text
+    assert re.search(r"R_a\W+6\.5004\W+0\.02\W+ohm\W+0\.01%.*█", text)  # on one line
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 200])
@@ -87,6 +91,14 @@ def test_csv_json_and_parquet_have_the_same_values(written: HistoryWriter, tmp_p
     assert [event["change"] for event in document["events"]] == ["raised"] * 4
     assert document["findings"][0]["count"] == COUNT // 2
     assert document["counters"][-1]["windows"] == COUNT - 1
+
+
+def test_a_parquet_file_that_cannot_be_written_is_named(written: HistoryWriter, tmp_path: Path) -> None:
+    del written
+    path = tmp_path / "missing" / "values.parquet"
+    error = run(MACHINE, "--parquet", str(path)).exception
+    assert isinstance(error, OSError)
+    assert error.filename == str(path)
 
 
 def test_events_alone(written: HistoryWriter) -> None:

@@ -6,7 +6,7 @@ import socket
 import pytest
 from rich.console import Console
 
-from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_style
+from otolith.cli.operation.live_table import BARS, LEVEL_STYLES, LiveTable, event_style
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import value_cells
@@ -71,9 +71,10 @@ def test_the_recording_has_an_event_on_its_changes_only() -> None:
     assert lines == [("WATCH", "WARN"), ("ACT", "ERROR"), ("cleared", "WARN")]
 
 
-def drawn(document: ReportDocument, width: int = 200) -> str:
+def drawn(*shown: ReportDocument, width: int = 200) -> str:
     table, console = LiveTable(lambda: "waiting"), Console(width=width)
-    table.add(document.to_json())
+    for document in shown:
+        table.add(document.to_json())
     with console.capture() as capture:
         console.print(table)
     return capture.get()
@@ -96,11 +97,22 @@ def test_a_cleared_event_has_the_style_of_what_is_well() -> None:
     assert all(event_style(event) == LEVEL_STYLES[levels[event.change]] for event in events)
 
 
-def test_a_narrow_terminal_cuts_no_number() -> None:
+def test_each_machine_has_its_own_table_and_curves() -> None:
+    first, second = documents()[0], documents()[0].model_copy(update={"machine": "press-9"})
+    text = drawn(second, first, second)
+    blocks = [block for block in text.split("\n\n") if "R_a" in block]
+    assert [block.split()[0] for block in blocks] == [first.machine, "press-9"]
+    assert [block.count(BARS[3]) for block in blocks] == [1, 2]  # a point per report of that machine
+    assert "--machine NAME" in text
+    assert "--machine NAME" not in drawn(first)
+
+
+@pytest.mark.parametrize("width", [40, 60])
+def test_a_narrow_terminal_cuts_no_number(width: int) -> None:
     document = documents()[0]
     wide = ParameterDocument(
         value=1.23456e9, sd=1.25e7, unit="Pa*s^2/m^6", nominal=6e8, status=Status.UNESTIMATED
     )  # the longest cells
-    text = drawn(document.model_copy(update={"parameters": {"h_2": wide}}), width=60)
+    text = drawn(document.model_copy(update={"parameters": {"h_2": wide}}), width=width)
     assert "…" not in text
-    assert all(cell in text for cell in value_cells(wide) if cell != wide.unit)
+    assert all(cell in text for cell in ("h_2", *value_cells(wide)) if cell != wide.unit)

@@ -21,6 +21,13 @@ DATA_FILES = click.argument("data", type=FILE, nargs=-1, required=True)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 
 
+def new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+    """Return the file of an option; raise BadParameter if it exists."""
+    if path is not None and path.exists():
+        raise click.BadParameter(f"{str(path)!r} exists and would be overwritten")
+    return path
+
+
 class StopSignal:
     """Remembers the signal that asks this command to end."""
 
@@ -69,8 +76,17 @@ def progress_line(first: str, *, enabled: bool = True) -> Iterator[Callable[[str
 
     console = Console(stderr=True)
     console.quiet = not (enabled and console.is_terminal)
+    if not console.quiet and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, _end_with_cursor)
     with console.status(first) as status:
         yield status.update
+
+
+def _end_with_cursor(number: int, _: FrameType | None) -> None:
+    """Remove the line of progress, show the cursor, and end by the signal; the compiler would drop an exception."""
+    os.write(sys.stderr.fileno(), b"\r\x1b[2K\x1b[?25h")
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
 
 
 def drain(texts: "queue.Queue[str]", timeout: float) -> list[str]:

@@ -205,7 +205,7 @@ class Demo:
         compiler = ChildProcess("otolith-compiler", "otolith.runtime.worker:main", room=1)
         compiler.start(initial_state(names.name, names.site, self._machine.problem))
         compiler.offer(None)  # ask it to end as soon as it is ready
-        self._print("compiling the twin, which takes a minute or two the first time ...")
+        self._print("compiling the twin, which takes longer the first time ...")
         with self._console.status("compiling"):
             while compiler.alive and not stopped():
                 time.sleep(PAUSE)

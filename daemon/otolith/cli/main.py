@@ -26,6 +26,7 @@ from otolith.cli.common import (
     StopSignal,
     examples_directory,
     log_to_stderr,
+    new_file,
 )
 from otolith.cli.operation.compile import compile_command
 from otolith.cli.operation.connection import endpoints, reader_options
@@ -49,12 +50,10 @@ Exit codes:
   130  interrupted by Ctrl-C (128 + n by another signal n)"""
 
 
-def _new_recording(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+def _new_recording(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
     if path is not None and path.suffix != ".rrd":
         raise click.BadParameter(f"{str(path)!r}: the name of a recording ends in .rrd")
-    if path is not None and path.exists():
-        raise click.BadParameter(f"{str(path)!r} exists and would be overwritten")
-    return path
+    return new_file(context, option, path)
 
 
 def _machine_name(_: click.Context, __: click.Parameter, name: str) -> str:
@@ -153,7 +152,6 @@ def check(file: Path, data: Path | None, no_device: bool, as_json: bool) -> int:
     from otolith.cli.commissioning.check import check_data, check_machine
 
     if data is not None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # so that Ctrl-C removes the line of progress
         return 0 if check_data(file, data, click.echo, as_json=as_json) else 1
     if as_json:
         raise click.UsageError("--json needs DATA: it prints what recorded data offer")
@@ -235,7 +233,7 @@ def watch(connect: tuple[str, ...], credentials: "Credentials", machine: str, as
 def plant(
     scenario: Path, transports: tuple[str, ...], truth: Path | None, summary: Path | None, duration: float
 ) -> int:
-    """Simulate the machine of SCENARIO in real time, on its bus or on several at once.
+    """Simulate the machine of SCENARIO in real time, on its buses.
 
     \b
     Examples:
@@ -288,8 +286,19 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     return stop.code() or code
 
 
-for command in (
-    *(baseline, commission, compile_command, components, history, install, keys),
-    *(noise, probe, reset, twin, view),
-):
+COMMANDS: tuple[click.Command, ...] = (
+    baseline,
+    commission,
+    compile_command,
+    components,
+    history,
+    install,
+    keys,
+    noise,
+    probe,
+    reset,
+    twin,
+    view,
+)
+for command in COMMANDS:
     cli.add_command(command)

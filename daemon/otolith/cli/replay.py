@@ -57,7 +57,7 @@ class ReplaySummary:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Parameters, components and findings of the last report, and the counts."""
-        del console, options
+        del console
         if self._first is None or self._last is None:
             yield Text("no window")
             return
@@ -65,7 +65,7 @@ class ReplaySummary:
         if last.health is not None:
             yield Text(headline(last.health), style=LEVEL_STYLES[last.health.state])
         yield title(last, f", from {time_text(self._first.window.start)} to {time_text(last.window.end)}")
-        yield self._parameters(last)
+        yield self._parameters(last, options.max_width)
         for name, parameter in last.parameters.items():
             if parameter.reason:
                 yield Text(f"{name} in the last window: {parameter.reason}", style="yellow")
@@ -78,9 +78,9 @@ class ReplaySummary:
                 yield Text(finding_text(finding), style="magenta")
         yield from self._counts()
 
-    def _parameters(self, last: ReportDocument) -> Table:
+    def _parameters(self, last: ReportDocument, width: int) -> Table:
         seen = [kind for kind in Status if any(self._statuses[name, kind] for name in last.parameters)]
-        table = parameter_table("last window", *seen)
+        table = parameter_table("last window", *seen, width=width)
         for name, parameter in last.parameters.items():
             status = Text(parameter.status, style=STYLES[parameter.status])
             counts = (str(self._statuses[name, kind]) for kind in seen)

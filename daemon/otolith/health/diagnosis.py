@@ -109,6 +109,6 @@ def diagnose(rules: Sequence[Rule], features: FindingFeatures) -> dict[str, str]
 
 
 def severity(rules: Sequence[Rule], features: FindingFeatures) -> Literal["WATCH", "ACT"]:
-    """Return the level of a finding without limits: ACT if each row that matches says so."""
+    """Return the level of a finding without limits: ACT if each row that matches has it."""
     rows = matching(rules, features)
     return "ACT" if rows and all(rule.severity == "ACT" for rule in rows) else "WATCH"

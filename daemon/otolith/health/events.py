@@ -91,10 +91,8 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
     records, events = {}, []
     for key, observed in observations.items():
-        if key not in state.inside and observed.features.finding is FindingKind.LIMIT:
-            features = replace(observed.features, finding=FindingKind.LIMIT_FROM_START)
-            observed = replace(observed, features=features)  # noqa: PLW2901
-        record = _advance(plan, state.records.get(key, ConditionRecord()), observed, report)
+        own = observed if key in state.inside else _from_start(observed)
+        record = _advance(plan, state.records.get(key, ConditionRecord()), own, report)
         if record.event is not None:
             events.append(record.event)
             record = replace(record, event=record.event if record.event.end is None else None)
@@ -105,6 +103,13 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     changed = {"health": document, "events": tuple(events)}
     state = replace(state, records=records, document=document, inside=state.inside | was_ok)
     return state, report.model_copy(update=changed)
+
+
+def _from_start(observed: Observation) -> Observation:
+    """Return the observation of a condition that was never at OK: a parameter that is beyond its limit is no wear."""
+    if observed.features.finding is not FindingKind.LIMIT:
+        return observed
+    return replace(observed, features=replace(observed.features, finding=FindingKind.LIMIT_FROM_START))
 
 
 def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:

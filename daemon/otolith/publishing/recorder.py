@@ -255,7 +255,7 @@ class Recording:
             self._add_row(entity, end, amplitude.low, amplitude.high, amplitude.value)
 
     def _add_state(self, document: ReportDocument, end: Times) -> None:
-        """Append what the operator sees, where it has changed."""
+        """Append events and states of the operator's tab, where they have changed."""
         for event in announcements(document):
             self._rows[EVENTS].append((end, (event_text(event), "ERROR" if event.is_urgent else "WARN")))
         health = document.health

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 @MACHINE_FILE
 @click.option("--clear", is_flag=True, help="Return to the nominal values of FILE.")
 def baseline(file: Path, clear: bool) -> None:
-    """Take the present values of the healthy machine in FILE as baseline.
+    """Take the present values of the machine in FILE as baseline.
 
-    They are the means of the saved estimates. Limits in percent refer to them
+    It must be healthy. The values are the means of the saved estimates. Limits in percent refer to them
     from then on, also those of a running daemon, with its next window.
 
     \b

@@ -2,7 +2,6 @@
 
 import json
 import math
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -210,7 +209,6 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
       otolith commission my-machine.toml monday.csv
       otolith commission my-machine.toml monday.csv --yes
     """
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     machine, store = _store(file)
     with store.locked():
         _commission(machine, store, data, windows, approve_all=yes)

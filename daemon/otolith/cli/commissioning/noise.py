@@ -1,7 +1,6 @@
 """``otolith noise``: noise levels and delays from recorded data of a healthy machine, as lines of its machine file."""
 
 import json
-import signal
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -37,7 +36,6 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
     """
     from otolith.machine import load_machine
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # so that Ctrl-C removes the line of progress
     machine = load_machine(file, with_driver=False)
     delays, identified = identified_noise(machine, data, windows)
     if as_json:

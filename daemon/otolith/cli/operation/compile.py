@@ -11,7 +11,7 @@ from otolith.cli.common import MACHINE_FILE, progress_line
 @click.command("compile")
 @MACHINE_FILE
 def compile_command(file: Path) -> None:
-    """Compile the twin of the machine in FILE, so that the daemon starts at once.
+    """Compile the twin of the machine in FILE before it is needed.
 
     The kernels go into the cache of this user. 'otolith run' compiles what is missing there, during which it reports
     nothing; so does 'otolith install' for the service.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from otolith.cli.common import AS_JSON, FILE, local_time
+from otolith.cli.common import AS_JSON, FILE, local_time, new_file
 
 if TYPE_CHECKING:
     from otolith.health.schema import EventDocument
@@ -40,12 +40,6 @@ def _since(_: click.Context, __: click.Parameter, text: str) -> float:
         raise click.BadParameter(f"{text!r}: write an age like 12h, 30d or 8w, or a date like 2026-01-31") from error
 
 
-def _new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
-    if path is not None and path.exists():
-        raise click.BadParameter(f"{str(path)!r} exists and would be overwritten")
-    return path
-
-
 @click.command()
 @click.argument("machine", metavar="FILE|MACHINE")
 @click.option("--since", default="1d", callback=_since, metavar="AGE|DATE", help="Begin here, like 12h, 30d, 8w.")
@@ -55,7 +49,7 @@ def _new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path 
 @click.option("--events", "only_events", is_flag=True, help="Only events and findings.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print the values, or the events, as CSV.")
 @AS_JSON
-@click.option("--parquet", type=FILE, callback=_new_file, help="Write the values into this Parquet file.")
+@click.option("--parquet", type=FILE, callback=new_file, help="Write the values into this Parquet file.")
 def history(
     machine: str,
     since: float,
@@ -70,7 +64,7 @@ def history(
 
     FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
     Windows are kept for a day, minutes for 14 days, hours for a year, days and
-    events for ten years, unless the machine file says otherwise.
+    events for ten years, unless the machine file has other limits.
 
     \b
     Examples:
@@ -182,7 +176,11 @@ def _write_parquet(samples: "Sequence[HistorySample]", path: Path) -> None:
     for row in rows:
         row["parameter"] = row.pop("name")
         row["time"] = datetime.fromtimestamp(row["time"], UTC)
-    pq.write_table(pa.Table.from_pylist(rows, schema=schema), path)
+    try:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), path)
+    except OSError as error:
+        error.filename = str(path)  # pyarrow gives none
+        raise
 
 
 def _print_json(
@@ -243,7 +241,7 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
     has_range = width >= WIDTH_WITH_RANGE
     words = max(len(sample.name) for sample in samples) + max(len(sample.unit) for sample in samples)
     length = max(width - OTHER_COLUMNS - RANGE_COLUMNS * has_range - words, MIN_CURVE)
-    table = parameter_table(*(("min", "max") if has_range else ()), "history")
+    table = parameter_table(*(("min", "max") if has_range else ()), "history", width=width)
     first, last = samples[0].time, samples[-1].time
     series: dict[tuple[str, str], list[HistorySample]] = {}
     for sample in samples:

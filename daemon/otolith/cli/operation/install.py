@@ -209,7 +209,9 @@ def _commands(name: str, private: list[str]) -> list[tuple[list[str], str | None
 
 def _run(command: list[str], user: str | None, name: str) -> None:
     environment = {"PATH": os.environ.get("PATH", ""), "CACHE_DIRECTORY": f"/var/cache/otolith/{name}"}
-    rights = {"user": user, "group": user, "extra_groups": []} if user else {}
-    done = subprocess.run(command, env=environment, check=False, **rights)  # type: ignore[call-overload]  # noqa: S603
+    extra_groups = None if user is None else ()
+    done = subprocess.run(  # noqa: S603 - the commands above, without a shell
+        command, env=environment, user=user, group=user, extra_groups=extra_groups, check=False
+    )
     if done.returncode:
         raise ServiceError(f"{shlex.join(command)}: ended with exit code {done.returncode}; repeat the installation")

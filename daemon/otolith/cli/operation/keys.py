@@ -9,9 +9,12 @@ FOLDER = click.argument("folder", metavar="DIR", type=click.Path(path_type=Path,
 
 
 def _name(_: click.Context, __: click.Parameter, name: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}", name):
-        raise click.BadParameter(f"{name!r}: use 1 to 64 letters, digits, '-' and '_', and begin with one of the first")
-    return name
+    from otolith.machine_file import check_name
+
+    try:
+        return check_name(name)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error
 
 
 def _hosts(_: click.Context, __: click.Parameter, hosts: tuple[str, ...]) -> tuple[str, ...]:

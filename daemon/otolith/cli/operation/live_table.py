@@ -1,10 +1,12 @@
-"""The live table of a machine in a terminal, drawn from its published reports."""
+"""The live table of machines in a terminal, drawn from their published reports."""
 
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
+from rich import box
 from rich.console import Console, ConsoleOptions, Group, OverflowMethod, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
@@ -18,6 +20,7 @@ from otolith.health.text import event_text, forecast_text, headline, interval_te
 
 HISTORY = 200  # windows that the curve of a parameter can show
 OTHER_COLUMNS = 72  # characters that the table needs beside the curve
+WIDTH_WITH_LINES = 60  # characters of a terminal whose tables have lines; a narrower one has no room for them
 SILENT_WINDOWS = 3  # lengths of a window without a report until a warning; engineering choice, no test
 BARS = "▁▂▃▄▅▆▇█"
 STYLES = {
@@ -32,15 +35,36 @@ VALUE_COLUMNS = ("parameter", "value", "± 95 %", "unit", "change")
 RIGHT = {"value", "± 95 %", "change"}
 
 
+@dataclass(slots=True)
+class _Machine:
+    """What is shown of one machine."""
+
+    document: ReportDocument
+    received: float
+    """Monotonic s."""
+    histories: dict[str, deque[float]] = field(default_factory=dict)
+
+    def draw(self, state: str, width: int, *, in_short: bool) -> list[RenderableType]:
+        """Return its lines and tables; ``in_short`` without components, messages and counters."""
+        document, silence = self.document, time.monotonic() - self.received
+        parts: list[RenderableType] = []
+        if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
+            parts.append(Text(f"no report for {silence:.0f} s: {state}", style="bold red"))
+        table = _parameters(document.parameters, self.histories, width)
+        if in_short:
+            return [title(document), *parts, *state_lines(document), table, Text()]
+        parts += [*state_lines(document), *_title_lines(document), table]
+        parts += [_components(document, width)] if document.components else []
+        return [*parts, *_messages(document), *_counters(document)]
+
+
 class LiveTable:
     """Takes reports from any thread, and draws itself; ``state`` returns what is waited for, in words."""
 
     def __init__(self, state: Callable[[], str]) -> None:
         self._state = state
         self._lock = threading.Lock()
-        self._latest: ReportDocument | None = None
-        self._latest_at = 0.0
-        self._histories: dict[str, deque[float]] = {}
+        self._machines: dict[tuple[str, str], _Machine] = {}
         self._unreadable = 0
 
     def add(self, text: str) -> ReportDocument | None:
@@ -52,10 +76,12 @@ class LiveTable:
                 self._unreadable += 1
             return None
         with self._lock:
-            self._latest, self._latest_at = document, time.monotonic()
+            now = time.monotonic()
+            machine = self._machines.setdefault((document.site, document.machine), _Machine(document, now))
+            machine.document, machine.received = document, now
             for name, parameter in document.parameters.items():
                 if parameter.value is not None:
-                    self._histories.setdefault(name, deque(maxlen=HISTORY)).append(parameter.value)
+                    machine.histories.setdefault(name, deque(maxlen=HISTORY)).append(parameter.value)
         return document
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -64,24 +90,17 @@ class LiveTable:
         yield self._draw(options.max_width)
 
     def _draw(self, width: int) -> RenderableType:
+        state = self._state()
         with self._lock:
-            document, unreadable = self._latest, self._unreadable
-            silence = time.monotonic() - self._latest_at
-            histories = {name: tuple(values) for name, values in self._histories.items()}
-        if document is None:
-            return Text(self._state(), style="dim")
-        parts: list[RenderableType] = [
-            *state_lines(document),
-            *_title_lines(document),
-            _parameters(document.parameters, histories, width),
-        ]
-        parts += [_components(document)] if document.components else []
-        parts += [*_messages(document), *_counters(document)]
-        if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
-            parts.insert(0, Text(f"no report for {silence:.0f} s: {self._state()}", style="bold red"))
+            in_short = len(self._machines) > 1
+            shown = [self._machines[key] for key in sorted(self._machines)]
+            parts = [part for machine in shown for part in machine.draw(state, width, in_short=in_short)]
+            unreadable = self._unreadable
+        if in_short:
+            parts.append(Text("'--machine NAME' shows more of one machine", style="dim"))
         if unreadable:
             parts.append(Text(f"{unreadable} reports cannot be read: another version publishes here", style="red"))
-        return Group(*parts)
+        return Group(*parts) if parts else Text(state, style="dim")
 
 
 def title(document: ReportDocument, rest: str = "") -> Text:
@@ -108,17 +127,22 @@ def state_lines(document: ReportDocument) -> list[Text]:
     return [Text(headline(health, local_time), style=LEVEL_STYLES[health.state]), parts, *events]
 
 
-def parameter_table(*columns: str) -> Table:
+def parameter_table(*columns: str, width: int) -> Table:
     """A table of parameters: the columns of :func:`value_cells`, then ``columns``; status counts are numbers.
 
     In a narrow terminal words are folded first, as a truncated number would be a wrong one.
     """
-    table = Table(expand=False)
+    table = _table(width)
     for column in (*VALUE_COLUMNS, *columns):
-        right = column in RIGHT or column in set(Status)
-        overflow: OverflowMethod = "ellipsis" if column in RIGHT else "fold"
-        table.add_column(column, justify="right" if right else "left", no_wrap=column in RIGHT, overflow=overflow)
+        right, whole = column in RIGHT or column in set(Status), column in (*RIGHT, "history")
+        overflow: OverflowMethod = "ellipsis" if whole else "fold"
+        table.add_column(column, justify="right" if right else "left", no_wrap=whole, overflow=overflow)
     return table
+
+
+def _table(width: int) -> Table:
+    has_lines = width >= WIDTH_WITH_LINES
+    return Table(box=box.HEAVY_HEAD if has_lines else None, pad_edge=has_lines, collapse_padding=not has_lines)
 
 
 def _title_lines(document: ReportDocument) -> list[Text]:
@@ -132,20 +156,20 @@ def _title_lines(document: ReportDocument) -> list[Text]:
 
 
 def _parameters(
-    parameters: Mapping[str, ParameterDocument], histories: Mapping[str, tuple[float, ...]], width: int
+    parameters: Mapping[str, ParameterDocument], histories: Mapping[str, deque[float]], width: int
 ) -> Table:
     length = width - OTHER_COLUMNS
     curve = ("history",) if length > len("history") else ()  # below, numbers need the room
-    table = parameter_table("status", *curve)
+    table = parameter_table("status", *curve, width=width)
     for name, parameter in parameters.items():
         status = Text(parameter.status, style=STYLES[parameter.status])
-        cells = [sparkline(histories.get(name, ())[-length:]) for _ in curve]
+        cells = [sparkline(tuple(histories.get(name, ()))[-length:]) for _ in curve]
         table.add_row(name, *value_cells(parameter), status, *cells)
     return table
 
 
-def _components(document: ReportDocument) -> Table:
-    table = Table(expand=False)
+def _components(document: ReportDocument, width: int) -> Table:
+    table = _table(width)
     for column in ("component", "equation", "amplitude ± 95 %", "since", "status"):
         table.add_column(column, overflow="fold")  # a truncated equation would be a wrong one
     for component in document.components:

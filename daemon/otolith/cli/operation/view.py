@@ -28,9 +28,9 @@ LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all 
 @click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
 @click.option("--web", is_flag=True, help="For a browser on this computer, instead of a window.")
 def view(recording: str | None, since: str | None, only_list: bool, web: bool) -> int:
-    """Open the newest recording, of MACHINE if given, or FILE, in the Rerun viewer.
+    """Open the newest recording, or FILE, in the Rerun viewer.
 
-    MACHINE is the name of a machine, with or without its site, or of an instance of the service.
+    MACHINE is the name of the machine that it is of, with or without its site, or an instance of the service.
 
     \b
     Examples:
@@ -48,7 +48,8 @@ def view(recording: str | None, since: str | None, only_list: bool, web: bool) -
     known = Recordings.search(recording or "")
     files = [file for file in known.files if seconds is None or file.end >= time.time() - seconds]
     if only_list:
-        click.echo("".join(f"{_row(file)}\n" for file in files), nl=False)
+        width = max((len(file.key) for file in files), default=0)
+        click.echo("".join(f"{_row(file, width)}\n" for file in files), nl=False)
         for line in known.unreadable if files else [known.none_text(since)]:
             click.echo(line, err=True)
         return 0
@@ -131,12 +132,12 @@ def unreadable_text(path: Path) -> str:
     return f"{path}: not readable for this user: join group {group}: {join}"
 
 
-def _row(file: RecordingFile) -> str:
-    """Return the line of a list: begin, length, size, machine, mark, path."""
-    minutes = max(0.0, file.end - file.begin) / 60.0
+def _row(file: RecordingFile, width: int) -> str:
+    """Return the line of a list: end, length, size, machine, mark, path; the name has begin and machine, or neither."""
+    minutes = f"{max(0.0, file.end - file.begin) / 60.0:.0f}" if file.key else "-"
     mark = "event" if file.is_marked else ""
     size = f"{file.size / MEGABYTE:8.1f} MB"
-    return f"{local_time(file.begin)}  {minutes:5.0f} min  {size}  {file.key or '-':<24}  {mark:<5}  {file.path}"
+    return f"{local_time(file.end)}  {minutes:>5} min  {size}  {file.key or '-':<{width}}  {mark:<5}  {file.path}"
 
 
 def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:
@@ -156,13 +157,13 @@ def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:
         raise ServiceError(f"{program}: the Rerun viewer is not installed; copy {paths[0]} to a computer that has it")
     # Only 'rerun analytics disable' switches its analytics off, by a file; a folder of ours keeps the user's settings.
     environment = {**os.environ, "XDG_CONFIG_HOME": str(cache_directory("viewer"))}
-    subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)  # noqa: S603
+    subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)  # noqa: S603 - our viewer
     with tempfile.TemporaryDirectory(prefix="otolith-view-") as folder:
         whole = list(_whole(program, paths, Path(folder)))
         target = ("--serve-web", "--web-viewer-port", "0") if web else ()
         command = [str(program), *LOOPBACK, *target, *map(str, whole)]
         try:
-            return subprocess.run(command, env=environment, check=False).returncode  # noqa: S603
+            return subprocess.run(command, env=environment, check=False).returncode  # noqa: S603 - our viewer
         except KeyboardInterrupt:
             return 0
 
@@ -180,7 +181,7 @@ def _check(path: Path) -> None:
 
 def _whole(program: Path, paths: Sequence[Path], folder: Path) -> Iterator[Path]:
     """Yield each path, or of a file that was not finished what is whole of it: the viewer refuses a torn one."""
-    done = subprocess.run(  # noqa: S603
+    done = subprocess.run(  # noqa: S603 - our viewer
         [program, "rrd", "verify", *paths], capture_output=True, text=True, check=False
     )
     for number, path in enumerate(paths):
@@ -189,5 +190,5 @@ def _whole(program: Path, paths: Sequence[Path], folder: Path) -> Iterator[Path]
             continue
         copy = folder / f"{number}-{path.name}"
         command = [str(program), "rrd", "optimize", "--continue-on-error", str(path), "-o", str(copy)]
-        subprocess.run(command, capture_output=True, check=False)  # noqa: S603
+        subprocess.run(command, capture_output=True, check=False)  # noqa: S603 - our viewer
         yield copy if copy.exists() else path
