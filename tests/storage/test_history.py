@@ -109,9 +109,18 @@ def test_beyond_the_size_reports_go_before_values_of_minutes(opened: Callable[..
     assert START + HOUR < first < end - HOUR
 
 
+def test_a_report_writes_little_more_than_it_contains(opened: Callable[..., Simulated], path: Path) -> None:
+    history, noise = opened(), np.random.default_rng(1)
+    assert history.writer._connection is not None
+    history.writer._connection.execute("PRAGMA wal_autocheckpoint = 0").fetchall()  # the log has all that was written
+    for report in documents(300):
+        history.write(report.model_copy(update={"notes": (noise.bytes(1200).hex(),)}))  # 1.5 kB when compressed
+    assert path.with_name(f"{path.name}-wal").stat().st_size / 300 < 16_000
+
+
 def test_a_lower_limit_makes_the_file_smaller(opened: Callable[..., Simulated], path: Path) -> None:
     history, noise = opened(Bounds(40 * MEGABYTE, 3650, 8760)), np.random.default_rng(1)
-    reports = [report.model_copy(update={"notes": (noise.bytes(5000).hex(),)}) for report in documents(2600)]
+    reports = [report.model_copy(update={"notes": (noise.bytes(5000).hex(),)}) for report in documents(3200)]
     for index in range(0, len(reports), 200):
         history.write(*reports[index : index + 200])
     history.writer._close()

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from otolith.health.schema import EventDocument, ReportDocument
-from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_PAGES, HistoryReader, Tables, check, create
+from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_BYTES, HistoryReader, Tables, check, create
 from otolith.storage.history_retention import Bounds, Retention
 from otolith.storage.state_store import WRITE_RETRY, give_to, opened_folder
 from otolith_drivers.errors import OtolithError, ServiceError
@@ -262,7 +262,8 @@ class HistoryWriter:
             create(connection, self.reader.site, self.reader.machine)
         check(connection, self.reader.site, self.reader.machine)
         connection.execute("PRAGMA synchronous = NORMAL")
-        connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_PAGES}").fetchall()
+        (page_size,) = connection.execute("PRAGMA page_size").fetchone()
+        connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_BYTES // page_size}").fetchall()
         connection.execute("PRAGMA journal_size_limit = 0").fetchall()
         self._tables, self._retention = Tables(connection, int(time.time())), Retention(connection, self._bounds)
 
