@@ -38,7 +38,8 @@ from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.history import history_path
 from otolith.storage.history_retention import Bounds
 from otolith.storage.history_writer import HistoryWriter, Numbers
-from otolith.storage.state_store import StateStore, WriterThread
+from otolith.storage.state_store import StateStore
+from otolith.storage.state_writer import StateWriter
 from otolith_drivers.errors import OtolithError
 
 log = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ class Service:
         self._store = StateStore(
             file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
         )
-        self._writer = WriterThread(self._store, self._store.decisions_time())
+        self._writer = StateWriter(self._store, self._store.decisions_time())
         self._history: HistoryWriter | None = None
         if (bounds := file.history).enabled:
             kept = Bounds(bounds.max_megabytes * 1_000_000, bounds.days, bounds.resend_hours)
