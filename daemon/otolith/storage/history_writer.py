@@ -15,7 +15,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from otolith.health.schema import EventDocument, ReportDocument
-from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_BYTES, HistoryReader, Tables, check, create
+from otolith.machine_file import MachineFile
+from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_BYTES, HistoryReader, Tables, check, create, history_path
 from otolith.storage.history_retention import Bounds, Retention
 from otolith.storage.state_store import give_to, opened_folder
 from otolith.storage.writer_thread import WriterThread
@@ -265,6 +266,15 @@ class HistoryWriter(WriterThread):
             with contextlib.suppress(sqlite3.Error):
                 self._connection.close()
             self._connection = None
+
+
+def history_of(file: MachineFile) -> HistoryWriter | None:
+    """Return the history of a machine; None if its file disables it. Raises as :func:`history_path`."""
+    table, names = file.history, file.machine
+    if not table.enabled:
+        return None
+    bounds = Bounds(table.max_megabytes * 1_000_000, table.days, table.resend_hours)
+    return HistoryWriter(history_path(names.site, names.name), bounds)
 
 
 def _code(error: sqlite3.Error) -> int:

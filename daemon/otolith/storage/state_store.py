@@ -17,6 +17,7 @@ from pydantic import Field, ValidationError
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
 from otolith.health.baseline import Baseline
 from otolith.health.prognosis import History
+from otolith.machine import LoadedMachine
 from otolith.storage.learned_state import (
     VERSION,
     LearnedState,
@@ -264,6 +265,12 @@ class StateStore:
         with contextlib.suppress(OSError):
             return self.decisions_path.stat().st_mtime
         return 0.0
+
+
+def store_of(machine: LoadedMachine) -> StateStore:
+    """Return the store of a machine."""
+    names = machine.file.machine
+    return StateStore(names.site, names.name, machine.twin, signal_fingerprint=machine.signal_fingerprint)
 
 
 def _read(path: Path, model: type[StateModel], newest: int) -> StateModel | None:
