@@ -112,10 +112,12 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def _write(file: Path, text: str) -> None:
-    """Write all or nothing: a process that dies here leaves no truncated module."""
+    """Write all or nothing, also if the computer loses power: a truncated module would fail at every start."""
     handle, temporary = tempfile.mkstemp(dir=file.parent, suffix=".new")
     with os.fdopen(handle, "w", encoding="utf-8") as stream:
         stream.write(text)
+        stream.flush()
+        os.fsync(handle)
     Path(temporary).replace(file)
 
 
