@@ -1,4 +1,4 @@
-"""The history: what is kept, bounded by age and size whatever the clock says, and a database that cannot be used."""
+"""The history: what is kept, bounded by age and size with any clock, and a database that cannot be used."""
 
 import shutil
 import signal
@@ -250,7 +250,7 @@ def test_a_database_that_cannot_be_used_is_kept(
 def test_a_database_that_is_damaged_while_it_is_used_is_kept(opened: Callable[..., Simulated], path: Path) -> None:
     history = opened()
     history.write(*documents(500))
-    history.writer._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # type: ignore[union-attr]
+    history.writer._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # type: ignore[union-attr]  # it is open
     history.writer._close()
     history = opened()
     with path.open("r+b") as file:
@@ -321,7 +321,7 @@ def test_a_full_disk_is_logged_once_and_what_waits_is_written_later(
             writer.add(numbers.number(report))
         for count in (1, 2, 3):
             writer._wakeup.set()
-            wait_for(lambda least=count: len(tries) >= least)  # type: ignore[misc]
+            wait_for(lambda least=count: len(tries) >= least)  # type: ignore[misc]  # mypy infers no type of a default
         assert writer.dropped == 10
         assert writer.messages("report", 10) == []  # without waiting for the disk
     writer.stop(PATIENCE)
@@ -396,7 +396,7 @@ def test_a_clock_that_leaps_ahead_deletes_nothing_for_a_day(opened: Callable[...
     assert len(numbers_of(history.writer.reader)) == 200
     for hour in range(24):
         history.prune(wrong + hour * HOUR, HOUR)
-    assert len(history.writer.reader.samples(WINDOW, 0.0)) == 100  # a day after the leap, it is believed
+    assert len(history.writer.reader.samples(WINDOW, 0.0)) == 100  # a day after the leap, the clock is used
 
 
 WRITES_FOR_EVER = """

@@ -51,7 +51,7 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """What the machine file says of the session of its daemon; ``path`` is that of the file."""
+    """The tables of the machine file for the session of its daemon; ``path`` is that of the file."""
 
     zenoh: ZenohTable = field(default_factory=ZenohTable)
     path: Path = Path()

@@ -46,7 +46,7 @@ class Topic:
 REPORT = Topic("report")
 """JSON document ``otolith.report/1``, once per window; a query returns the latest one, or those that it selects."""
 PARAMETER = Topic("parameter/*")
-"""JSON object, once per window: what the report says of one parameter."""
+"""JSON object, once per window: the part of the report about one parameter."""
 EVENT = Topic("event")
 """JSON object, once when a window raises, changes or clears an event; a query returns those that it selects."""
 ALIVE = Topic("alive")

@@ -10,7 +10,7 @@ from otolith.storage.history import DAY, HOUR, MINUTE, WINDOW
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 AGES = {WINDOW: 1.0 * DAY, MINUTE: 14.0 * DAY, HOUR: 366.0 * DAY}  # s; of days, events and findings the machine file
 MAX_LEAP = 1.0 * DAY  # s by which the clock may pass the time that the daemon ran
-LEAP_PATIENCE = 1.0 * DAY  # s of operation after which a clock that leapt is believed
+LEAP_PATIENCE = 1.0 * DAY  # s of operation after which a clock that leapt is used
 MAX_AHEAD = 1.0 * DAY  # s after the present from which a time is that of a wrong clock
 HARD_SHARE, PRUNED_SHARE = 0.9, 0.8  # of the size limit: never exceeded, and kept by deleting
 MIN_REPORTS = 1800  # that are kept before coarser values go
@@ -77,7 +77,7 @@ class Retention:
         return pages
 
     def _clock(self, now: float, elapsed: float) -> float:
-        """Return ``now``, or after a leap of the clock the time until it is believed; a wrong clock deletes nothing."""
+        """Return ``now``, or the time without a leap of the clock until it is used: a wrong clock deletes nothing."""
         row = self._connection.execute("SELECT retention, waited FROM clock").fetchone()
         clock, waited = row or (now, 0.0)
         if now - clock <= MAX_LEAP + elapsed or waited + elapsed >= LEAP_PATIENCE:
