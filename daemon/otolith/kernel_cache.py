@@ -11,7 +11,6 @@ import importlib.util
 import os
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -112,11 +111,13 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def _write(file: Path, text: str) -> None:
-    """Write all or nothing: a process that dies here leaves no truncated module."""
-    handle, temporary = tempfile.mkstemp(dir=file.parent, suffix=".new")
-    with os.fdopen(handle, "w", encoding="utf-8") as stream:
+    """Write all or nothing, also if the computer loses power: a truncated module would fail at every start."""
+    temporary = file.with_suffix(".new")  # one name, as the folder is locked: failures leave no more than one file
+    with temporary.open("w", encoding="utf-8") as stream:
         stream.write(text)
-    Path(temporary).replace(file)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(file)
 
 
 def _import(name: str, file: Path) -> ModuleType:

@@ -1,4 +1,4 @@
-"""A subscriber gets every report and event once and in order, whoever was away meanwhile."""
+"""A subscriber gets every report and event once and in order, also those published while it was away."""
 
 import json
 import queue

@@ -117,13 +117,13 @@ def test_a_file_that_cannot_be_used_is_named(site: Path, name: str, line: int, c
 
 def test_a_certificate_for_other_hosts_is_named(site: Path) -> None:
     # A name of the certificate may lead to any address.
-    for address in ("press.local", "Press.Local", "10.0.0.7", "10.0.0.8", "0.0.0.0", "[::]"):  # noqa: S104
+    for address in ("press.local", "Press.Local", "10.0.0.7", "10.0.0.8", "0.0.0.0", "[::]"):  # noqa: S104 - nothing listens
         assert not settings(site, f"tls/{address}:7447")
     with pytest.raises(ConfigurationError, match=r"not for mill\.local, but for 10\.0\.0\.7, press\.local"):
         settings(site, "tls/mill.local:7447")
     for name, hosts, address in (
         ("address", ["10.0.0.7"], "10.0.0.8"),
-        ("reader", [], "0.0.0.0"),  # noqa: S104
+        ("reader", [], "0.0.0.0"),  # noqa: S104 - nothing listens
     ):
         make_certificate(site, name, hosts, utc_now())
         for kind in ("crt", "key"):

@@ -193,7 +193,7 @@ def test_only_readers_with_a_certificate_read_over_the_network(stack: ExitStack,
     own.receives(daemon)
     no_certificate = reader_settings(Credentials(site / "site" / "ca.crt"), [endpoint])
     rogue = {**reader_settings(client(site, "operator", own="other", ca="other"), [endpoint])}
-    rogue[TLS] = {**dict(rogue[TLS]), "root_ca_certificate": str(site / "site" / "ca.crt")}  # type: ignore[call-overload]
+    rogue[TLS] = {**dict(rogue[TLS]), "root_ca_certificate": str(site / "site" / "ca.crt")}  # type: ignore[call-overload]  # a setting may be of any type
     visitor = reader_settings(client(site, "visitor"), [endpoint])
     refused: list[tuple[str, dict[str, object]]] = [
         (endpoint, no_certificate),

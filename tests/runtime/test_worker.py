@@ -153,7 +153,7 @@ class SlowWorker:
 
 def slow(batch: list[Window]) -> tuple[Supervisor, SlowWorker]:
     supervisor, worker = Supervisor(state_for("R_a"), window_length=LENGTH), SlowWorker()
-    supervisor.worker = worker  # type: ignore[assignment]
+    supervisor.worker = worker  # type: ignore[assignment]  # has the methods that are used
     supervisor.submit(batch[0], 0.0)
     return supervisor, worker
 

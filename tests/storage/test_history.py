@@ -1,4 +1,4 @@
-"""The history: what is kept, bounded by age and size whatever the clock says, and a database that cannot be used."""
+"""The history: what is kept, bounded by age and size with any clock, and a database that cannot be used."""
 
 import shutil
 import signal
@@ -109,9 +109,18 @@ def test_beyond_the_size_reports_go_before_values_of_minutes(opened: Callable[..
     assert START + HOUR < first < end - HOUR
 
 
+def test_a_report_writes_little_more_than_it_contains(opened: Callable[..., Simulated], path: Path) -> None:
+    history, noise = opened(), np.random.default_rng(1)
+    assert history.writer._connection is not None
+    history.writer._connection.execute("PRAGMA wal_autocheckpoint = 0").fetchall()  # the log has all that was written
+    for report in documents(300):
+        history.write(report.model_copy(update={"notes": (noise.bytes(1200).hex(),)}))  # 1.5 kB when compressed
+    assert path.with_name(f"{path.name}-wal").stat().st_size / 300 < 16_000
+
+
 def test_a_lower_limit_makes_the_file_smaller(opened: Callable[..., Simulated], path: Path) -> None:
     history, noise = opened(Bounds(40 * MEGABYTE, 3650, 8760)), np.random.default_rng(1)
-    reports = [report.model_copy(update={"notes": (noise.bytes(5000).hex(),)}) for report in documents(2600)]
+    reports = [report.model_copy(update={"notes": (noise.bytes(5000).hex(),)}) for report in documents(3200)]
     for index in range(0, len(reports), 200):
         history.write(*reports[index : index + 200])
     history.writer._close()
@@ -241,7 +250,7 @@ def test_a_database_that_cannot_be_used_is_kept(
 def test_a_database_that_is_damaged_while_it_is_used_is_kept(opened: Callable[..., Simulated], path: Path) -> None:
     history = opened()
     history.write(*documents(500))
-    history.writer._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # type: ignore[union-attr]
+    history.writer._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # type: ignore[union-attr]  # it is open
     history.writer._close()
     history = opened()
     with path.open("r+b") as file:
@@ -298,7 +307,7 @@ def test_a_full_disk_is_logged_once_and_what_waits_is_written_later(
 ) -> None:
     writer = HistoryWriter(path, BOUNDS)
     numbers, _ = writer.open(START)
-    monkeypatch.setattr("otolith.storage.history_writer.WRITE_RETRY", 0.0)
+    monkeypatch.setattr("otolith.storage.writer_thread.WRITE_RETRY", 0.0)
     tries = list[int]()
 
     def full(*_: object) -> None:
@@ -312,7 +321,7 @@ def test_a_full_disk_is_logged_once_and_what_waits_is_written_later(
             writer.add(numbers.number(report))
         for count in (1, 2, 3):
             writer._wakeup.set()
-            wait_for(lambda least=count: len(tries) >= least)  # type: ignore[misc]
+            wait_for(lambda least=count: len(tries) >= least)  # type: ignore[misc]  # mypy infers no type of a default
         assert writer.dropped == 10
         assert writer.messages("report", 10) == []  # without waiting for the disk
     writer.stop(PATIENCE)
@@ -387,7 +396,7 @@ def test_a_clock_that_leaps_ahead_deletes_nothing_for_a_day(opened: Callable[...
     assert len(numbers_of(history.writer.reader)) == 200
     for hour in range(24):
         history.prune(wrong + hour * HOUR, HOUR)
-    assert len(history.writer.reader.samples(WINDOW, 0.0)) == 100  # a day after the leap, it is believed
+    assert len(history.writer.reader.samples(WINDOW, 0.0)) == 100  # a day after the leap, the clock is used
 
 
 WRITES_FOR_EVER = """

@@ -20,7 +20,8 @@ from otolith.discovery.adopted import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.storage import state_store
-from otolith.storage.state_store import StateStore, WriterThread
+from otolith.storage.state_store import StateStore
+from otolith.storage.state_writer import StateWriter
 from otolith_drivers.errors import OtolithError, ServiceError
 from tests.cli.replays import MACHINE
 from tests.waiting import PATIENCE, wait_for, within
@@ -53,21 +54,21 @@ def store(tmp_path: Path) -> StateStore:
 
 
 @pytest.fixture
-def writer(store: StateStore) -> Iterator[WriterThread]:
-    thread = WriterThread(store, store.decisions_time())
+def writer(store: StateStore) -> Iterator[StateWriter]:
+    thread = StateWriter(store, store.decisions_time())
     thread.start()
     yield thread
     thread.stop(1.0)
 
 
-def test_the_latest_components_are_on_disk_after_stop(store: StateStore, writer: WriterThread) -> None:
+def test_the_latest_components_are_on_disk_after_stop(store: StateStore, writer: StateWriter) -> None:
     for amplitude in (-0.001, -0.002, -0.003, -0.004):
         writer.save(with_friction(amplitude))
     writer.stop(PATIENCE)
     assert store.components() == SAVED
 
 
-def test_every_change_of_decisions_is_returned_once(store: StateStore, writer: WriterThread) -> None:
+def test_every_change_of_decisions_is_returned_once(store: StateStore, writer: StateWriter) -> None:
     assert writer.new_decisions() is None
     key = frozenset({FRICTION.key})
     for decisions in (OperatorDecisions(approved=key), OperatorDecisions(rejected=key)):
@@ -86,7 +87,7 @@ def test_every_change_of_decisions_is_returned_once(store: StateStore, writer: W
 
 def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> None:
     store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
-    writer = WriterThread(store, store.decisions_time())
+    writer = StateWriter(store, store.decisions_time())
     writer.start()
     writer.save(STATE)
     wait_for(store.components_path.exists)
@@ -95,7 +96,7 @@ def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> Non
 
 
 @pytest.mark.timed
-def test_callers_do_not_wait_for_a_disk_that_hangs(store: StateStore, writer: WriterThread) -> None:
+def test_callers_do_not_wait_for_a_disk_that_hangs(store: StateStore, writer: StateWriter) -> None:
     """A named pipe without a writer stands in for the decisions file: reading it blocks."""
     store.decisions_path.parent.mkdir(parents=True)
     os.mkfifo(store.decisions_path)
@@ -114,7 +115,7 @@ def test_callers_do_not_wait_for_a_disk_that_hangs(store: StateStore, writer: Wr
 
 
 def test_a_failed_write_is_tried_again_and_logged_once(
-    store: StateStore, writer: WriterThread, caplog: pytest.LogCaptureFixture
+    store: StateStore, writer: StateWriter, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = store.components_path.parent
     folder.write_text("a file where a folder should be", encoding="utf-8")
@@ -124,6 +125,22 @@ def test_a_failed_write_is_tried_again_and_logged_once(
     writer.stop(PATIENCE)
     assert store.components() == SAVED
     assert caplog.text.count("what was learned is not saved") == 1
+
+
+def test_no_error_ends_the_thread_and_decisions_are_read_after_it(
+    store: StateStore, writer: StateWriter, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_: AdaptationState) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "save", fail)
+        writer.save(STATE)
+        wait_for(lambda: "what was learned is not saved: MemoryError" in caplog.text)
+        store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
+        wait_for(lambda: writer.new_decisions() is not None)
+    writer.stop(PATIENCE)
+    assert store.components() == SAVED
 
 
 def test_a_second_process_cannot_take_the_lock(store: StateStore) -> None:

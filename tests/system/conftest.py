@@ -13,7 +13,8 @@ import psutil
 import pytest
 
 from otolith.health.schema import ReportDocument, Status
-from otolith.publishing.zenoh_session import Listener
+from otolith.publishing.subscriber import Subscriber
+from otolith.publishing.zenoh_config import Connection
 from tests.conftest import OwnMachine
 from tests.waiting import PATIENCE, wait_for
 
@@ -33,7 +34,7 @@ class Running:
         plays = [*machine.plays, "--truth", str(self.truth), "--summary", str(self.summary)]
         self.plant = self._start("plant", "plant", *plays) if machine.plays else None
         self._received: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._listener = Listener([machine.endpoint], "otolith/**/report", self._received.put)
+        self._subscriber = Subscriber(Connection((machine.endpoint,)), self._received.put)
         self.reports: list[ReportDocument] = []
 
     def _start(self, name: str, *arguments: str) -> "subprocess.Popen[bytes]":
@@ -69,7 +70,7 @@ class Running:
 
     def close(self) -> None:
         """End all processes."""
-        self._listener.__exit__(None, None, None)
+        self._subscriber.__exit__(None, None, None)
         for process in (self.daemon, self.plant):
             if process is not None and process.poll() is None:
                 process.terminate()

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from otolith.health.schema import ReportDocument
-from otolith.publishing.zenoh_session import Listener
+from otolith.publishing.subscriber import Subscriber
+from otolith.publishing.zenoh_config import Connection
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.cli.replays import MACHINE, PERIOD, recorded, written
 from tests.conftest import OwnMachine
@@ -76,7 +77,7 @@ def test_a_real_time_replay_estimates_as_the_fast_one(
         subprocess.Popen(
             [sys.executable, "-m", "otolith", "run", machine], stderr=subprocess.PIPE, text=True
         ) as daemon,
-        Listener([own_machine.endpoint], "otolith/**/report", received.put),
+        Subscriber(Connection((own_machine.endpoint,)), received.put),
     ):
         deadline = time.monotonic() + 2 * PATIENCE
         while len(reports) < 4:

@@ -1,6 +1,7 @@
 """The cache of compiled kernels: shared, private, bounded, and never stale."""
 
 import dataclasses
+import errno
 import subprocess
 import sys
 import time
@@ -65,6 +66,21 @@ def test_cache_folder_is_private(cache: Path) -> None:
     cache.chmod(0o777)
     with pytest.raises(ServiceError, match="writable by no other"):
         kernel_cache.load("other", lambda: "")
+
+
+def test_a_module_gets_its_name_when_it_is_on_the_disk(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", full)
+        for _ in range(3):
+            with pytest.raises(OSError, match="No space left"):
+                kernel_cache.load("durable", lambda: "number = 1")
+    (left,) = [path for path in cache.glob("*/*") if path.is_file()]
+    assert left.suffix == ".new"
+    assert kernel_cache.load("durable", lambda: "number = 2").number == 2
+    assert not left.exists()
 
 
 def test_library_version_changes_the_kernel(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,8 @@ import pytest
 
 from otolith.acquisition.window import Verdict
 from otolith.health.schema import CountersDocument, ParameterDocument, ReportDocument
-from otolith.publishing.zenoh_session import Listener
+from otolith.publishing.subscriber import Subscriber
+from otolith.publishing.zenoh_config import Connection
 from tests.conftest import EXAMPLES, free_port
 
 CHANNEL = "vcan0"
@@ -104,8 +105,8 @@ class ReportListener:
         """``alive`` returns why the daemon ended; empty while it runs."""
         self.reports: Reports = []
         self._alive = alive
-        self._heard: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._listener = Listener([endpoint], "otolith/**/report", self._heard.put)
+        self._received: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._subscriber = Subscriber(Connection((endpoint,)), self._received.put)
 
     def wait_for(self, enough: Callable[[Reports], bool], seconds: float = 60.0) -> Reports:
         """The reports, once there are enough of them."""
@@ -115,7 +116,7 @@ class ReportListener:
             said = [f"{report.window.index} {report.window.quality}" for report in self.reports]
             assert time.monotonic() < deadline, f"not enough in {seconds:g} s: {said}"
             try:
-                self.reports.append(ReportDocument.from_json(self._heard.get(timeout=0.5)))
+                self.reports.append(ReportDocument.from_json(self._received.get(timeout=0.5)))
             except queue.Empty:
                 continue
         return self.reports
@@ -127,7 +128,7 @@ class ReportListener:
 
     def close(self) -> None:
         """End the session."""
-        self._listener.__exit__(None, None, None)
+        self._subscriber.__exit__(None, None, None)
 
 
 class Machine:

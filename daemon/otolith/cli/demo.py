@@ -29,8 +29,9 @@ from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_styl
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
 from otolith.health.text import announcements, event_text, half_width_text, headline, summary
 from otolith.machine import LoadedMachine, load_machine
-from otolith.publishing.zenoh_config import SOCKET, listening
-from otolith.publishing.zenoh_session import REPORT, Listener
+from otolith.publishing.subscriber import Subscriber
+from otolith.publishing.zenoh_config import SOCKET, Connection, listening
+from otolith.publishing.zenoh_session import REPORT
 from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.plant.faults import Unbalance
@@ -191,7 +192,7 @@ class Demo:
             truth = str(self._folder / "truth.csv")
             buses = [argument for transport in self._transports for argument in ("--as", transport)]
             self._start("plant", "plant", scenario, *buses, "--truth", truth)
-            self._watch(endpoints, key, stopped)
+            self._watch(endpoints, stopped)
         finally:
             self._end()
         return INTERRUPTED if stopped() else self._verdict()
@@ -225,14 +226,14 @@ class Demo:
                 start_new_session=True,
             )
 
-    def _watch(self, endpoints: Sequence[str], key: str, stopped: Callable[[], bool]) -> None:
+    def _watch(self, endpoints: Sequence[str], stopped: Callable[[], bool]) -> None:
         """Collect the reports of ``duration`` seconds, and show them."""
         texts: queue.Queue[str] = queue.Queue()
         table = LiveTable(lambda: "waiting for the first window ...")
         live = self._console.is_terminal and not self._as_json
         end = time.monotonic() + self._duration
         shown = Live(table, console=self._console, refresh_per_second=5) if live else contextlib.nullcontext()
-        with Listener(endpoints, key, texts.put), shown:
+        with Subscriber(Connection(tuple(endpoints)), texts.put, self._machine.file.machine.name), shown:
             while time.monotonic() < end and not stopped():
                 self._refuse_ended()
                 self._add(map(table.add, drain(texts, PAUSE)), echo=not live and not self._as_json)

@@ -11,7 +11,7 @@ import zenoh
 
 from otolith.publishing.catch_up import MAX_REPLIES
 from otolith.publishing.zenoh_config import Connection, local_sockets, reader_settings
-from otolith.publishing.zenoh_session import ALIVE, REPORT, Topic, session
+from otolith.publishing.zenoh_session import ALIVE, REPORT, Topic, close_session, session
 from otolith_drivers.errors import ServiceError
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
@@ -158,7 +158,7 @@ class Subscriber:
         for thread in self._threads:  # a session that is left open would keep the process alive
             thread.join(QUERY_TIMEOUT)
         for each in self._sessions.values():
-            each.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+            close_session(each)
 
     def _connect(self) -> None:
         """Open a session for each endpoint, as soon as something answers there; it reconnects by itself."""

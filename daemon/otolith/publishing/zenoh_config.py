@@ -51,7 +51,7 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """What the machine file says of the session of its daemon; ``path`` is that of the file."""
+    """The tables of the machine file for the session of its daemon; ``path`` is that of the file."""
 
     zenoh: ZenohTable = field(default_factory=ZenohTable)
     path: Path = Path()
@@ -190,7 +190,7 @@ def reader_settings(credentials: Credentials, connect: Iterable[str]) -> Setting
         raise ConfigurationError("--certificate and --key belong together: give both")
     if credentials.ca is None:
         return settings
-    from otolith.publishing.certificates import Identity, authorities, check_identity, utc_now  # noqa: PLC0415
+    from otolith.publishing.certificates import Identity, authorities, check_identity, utc_now  # noqa: PLC0415 - slow
 
     authorities(credentials.ca, ())
     encryption: Settings = {"root_ca_certificate": str(credentials.ca.absolute()), **_VERIFIED}

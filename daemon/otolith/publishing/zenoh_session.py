@@ -1,14 +1,13 @@
-"""Zenoh: the session's configuration, the daemon's publisher, and a listener for the command line and tests."""
+"""Zenoh: the session's configuration and the daemon's publisher."""
 
 import json
 import logging
 import os
 import re
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Literal, Self
+from typing import Literal
 
 import zenoh
 
@@ -21,10 +20,8 @@ from otolith.publishing.zenoh_config import (
     SOCKET,
     SOCKET_UMASK,
     Access,
-    Credentials,
     Settings,
     raise_descriptor_limit,
-    reader_settings,
 )
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ServiceError
@@ -49,7 +46,7 @@ class Topic:
 REPORT = Topic("report")
 """JSON document ``otolith.report/1``, once per window; a query returns the latest one, or those that it selects."""
 PARAMETER = Topic("parameter/*")
-"""JSON object, once per window: what the report says of one parameter."""
+"""JSON object, once per window: the part of the report about one parameter."""
 EVENT = Topic("event")
 """JSON object, once when a window raises, changes or clears an event; a query returns those that it selects."""
 ALIVE = Topic("alive")
@@ -106,6 +103,14 @@ def session(
     finally:
         if umask is not None:
             os.umask(umask)
+
+
+def close_session(opened: zenoh.Session) -> None:
+    """Close a session; one that Zenoh cannot close in time is logged."""
+    try:
+        opened.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+    except zenoh.ZError as error:  # connections that never finish their handshake delay it beyond Zenoh's limit
+        log.warning("the Zenoh session was not closed in time: %s", _cause(str(error)))
 
 
 def _cause(message: str) -> str:
@@ -166,10 +171,7 @@ class Publisher:
 
     def close(self) -> None:
         """Close the session; subscribers see the liveliness token disappear."""
-        try:
-            self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
-        except zenoh.ZError as error:  # connections that never finish their handshake delay it beyond Zenoh's limit
-            log.warning("the Zenoh session was not closed in time: %s", _cause(str(error)))
+        close_session(self._session)
 
     def _answer(self, query: zenoh.Query) -> None:
         with self._lock:
@@ -180,33 +182,3 @@ class Publisher:
     def _answer_events(self, query: zenoh.Query) -> None:
         with query:
             answer(query, EVENT.under(self._site, self._machine), "event", None, self._archive)
-
-
-class Listener:
-    """Passes the reports under ``key`` to ``on_report``, beginning with the latest one of each machine if it exists."""
-
-    def __init__(
-        self,
-        connect: Iterable[str],
-        key: str,
-        on_report: Callable[[str], None],
-        credentials: Credentials = Credentials(),  # noqa: B008 - immutable
-    ) -> None:
-        self._session = session(connect=connect, settings=reader_settings(credentials, connect))
-        self._subscriber = self._session.declare_subscriber(key, lambda sample: on_report(sample.payload.to_string()))
-        for reply in self._session.get(key, timeout=1.0):
-            if reply.ok is not None:
-                on_report(reply.ok.payload.to_string())
-
-    @property
-    def connected(self) -> bool:
-        """Whether a daemon or a router is connected."""
-        return bool(self._session.info.peers_zid()) or bool(self._session.info.routers_zid())
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type

@@ -24,7 +24,7 @@ MAX_RUNNING = 2  # commands at a time
 MAX_WAITING_EVENTS = 64  # events that wait for a command; later ones are dropped and counted
 COMMAND_TIMEOUT = 30.0  # s until a command is killed with all processes of its session
 PRIVATE_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC")
-"""Of the environment: with them a command could speak to systemd in the name of the daemon."""
+"""Of the environment: with them a command could send systemd notifications as the daemon."""
 
 
 class EventCommand:

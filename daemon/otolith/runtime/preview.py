@@ -89,7 +89,7 @@ class SignalPreview:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedAccuracy:
-    """What the analysed windows can tell about one parameter."""
+    """How accurately the analysed windows determine one parameter."""
 
     unit: str
     nominal: float
@@ -268,7 +268,7 @@ def _moves(problem: Problem, window: Window) -> bool:
 
 
 def expected_accuracy(problem: Problem, windows: Sequence[Window]) -> dict[str, ExpectedAccuracy]:
-    """Return by name what each of ``windows`` can tell about the free parameters, if these are nominal."""
+    """Return by name how accurately ``windows`` determine the free parameters, if these are nominal."""
     required = problem.determined_within * problem.scale
     half_widths = np.full((len(windows), len(problem.free)), np.inf)
     reasons: list[list[tuple[Identifiability, str]]] = []

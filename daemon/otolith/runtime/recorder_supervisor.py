@@ -68,7 +68,7 @@ class RecorderSupervisor:
         log.info("recording to %s", path)
 
     def reload(self, machine: LoadedMachine, now: float, seconds: float) -> None:
-        """Go on with a new file as the changed machine file says; the old one is finished in up to ``seconds``."""
+        """Go on with a new file and the changed machine file; the old one is finished in up to ``seconds``."""
         self._process.stop(seconds)
         self._unanswered = self._unwritten = 0
         self._machine = machine

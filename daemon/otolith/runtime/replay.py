@@ -46,7 +46,7 @@ Stopped = Callable[[], bool]
 def open_recorded(machine: LoadedMachine, data: Path) -> Reader:
     """Open ``data`` as the signals of the twin of ``machine``.
 
-    A log of a CAN bus is decoded as ``[driver]`` and ``[signals]`` say. A table or a recording needs only the names of
+    A log of a CAN bus is decoded by ``[driver]`` and ``[signals]``. A table or a recording needs only the names of
     the signals, and uses the columns of ``[signals]`` if the machine file has ``type = "replay"``. The logs of several
     sources are one recording, written as ``drive=monday.log,encoder=monday.csv``.
 

@@ -35,10 +35,9 @@ from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.reload import reloaded
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
-from otolith.storage.history import history_path
-from otolith.storage.history_retention import Bounds
-from otolith.storage.history_writer import HistoryWriter, Numbers
-from otolith.storage.state_store import StateStore, WriterThread
+from otolith.storage.history_writer import Numbers, history_of
+from otolith.storage.state_store import store_of
+from otolith.storage.state_writer import StateWriter
 from otolith_drivers.errors import OtolithError
 
 log = logging.getLogger(__name__)
@@ -67,18 +66,11 @@ class Service:
         self._machine = machine
         self._listen = file.zenoh.listen if listen is None else listen
         plans = machine.plans(machine.driver.sampling)
-        delay = max(plan.delay for plan in plans)
-        capacity = RING_RATE * (RING_WINDOWS * longest + math.ceil(delay / period))
-        self._rings = Rings(machine.twin.signals, capacity, machine.observed)
+        self._rings = _rings(machine, max(plan.delay for plan in plans))
         self._windower = Windower(plans, machine.records, period, machine.limits)
-        self._store = StateStore(
-            file.machine.site, file.machine.name, machine.twin, signal_fingerprint=machine.signal_fingerprint
-        )
-        self._writer = WriterThread(self._store, self._store.decisions_time())
-        self._history: HistoryWriter | None = None
-        if (bounds := file.history).enabled:
-            kept = Bounds(bounds.max_megabytes * 1_000_000, bounds.days, bounds.resend_hours)
-            self._history = HistoryWriter(history_path(file.machine.site, file.machine.name), kept)
+        self._store = store_of(machine)
+        self._writer = StateWriter(self._store, self._store.decisions_time())
+        self._history = history_of(file)
         self._numbers = Numbers(time.time())
         self._notes: tuple[str, ...] = ()
         self._saved: tuple[str, ...] = ()
@@ -245,14 +237,25 @@ class Service:
         document = report.document
         latency = max(0.0, time.time() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
-        link = self._machine.driver.link()
-        driver = driver_document(link)
-        rings, driver_counters = self._rings.counters(), self._machine.driver.counters()
-        counters = CountersDocument(
+        driver = driver_document(self._machine.driver.link())
+        parameters = with_missing_sources(document.parameters, driver, report.traces)
+        update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
+        document = self._numbers.number(document.model_copy(update={**update, "notes": self._notes}))
+        if self._history is not None:
+            self._history.add(document)
+        if self._publisher is not None:
+            self._publisher.publish(document)
+        if self._machine.file.recording.enabled:
+            self._recorder.offer(Report(document, report.traces), time.monotonic())
+        self._log(document, time.monotonic())
+
+    def _counters(self) -> CountersDocument:
+        rings, driver = self._rings.counters(), self._machine.driver.counters()
+        return CountersDocument(
             received=rings.received,
-            bad=driver_counters.bad,
-            lost=driver_counters.lost + rings.overwritten,
-            reconnects=driver_counters.reconnects,
+            bad=driver.bad,
+            lost=driver.lost + rings.overwritten,
+            reconnects=driver.reconnects,
             windows=self._windows,
             windows_bad=self._windows_bad,
             windows_missed=self._supervisor.missed,
@@ -262,16 +265,6 @@ class Service:
             history_dropped=0 if self._history is None else self._history.dropped,
             commands_failed=self._command.failed,
         )
-        parameters = with_missing_sources(document.parameters, driver, report.traces)
-        update = {"cost": cost, "counters": counters, "driver": driver, "parameters": parameters, "notes": self._notes}
-        document = self._numbers.number(document.model_copy(update=update))
-        if self._history is not None:
-            self._history.add(document)
-        if self._publisher is not None:
-            self._publisher.publish(document)
-        if self._machine.file.recording.enabled:
-            self._recorder.offer(Report(document, report.traces), time.monotonic())
-        self._log(document, time.monotonic())
 
     def _log(self, document: ReportDocument, now: float) -> None:
         """Log the events that the window changed, and run the command for each; log the window once per hour.
@@ -307,6 +300,12 @@ class Service:
         if self._notifier.watchdog and not stalled and now - self._fed_at > self._notifier.watchdog / 4:
             self._fed_at = now
             self._notifier.send("WATCHDOG=1")
+
+
+def _rings(machine: LoadedMachine, delay: float) -> Rings:
+    """Return rings that hold ``RING_WINDOWS`` of the longest windows, and the longest ``delay`` of a signal (s)."""
+    records = RING_WINDOWS * machine.problem.window.longest + math.ceil(delay / machine.file.window.sample_period)
+    return Rings(machine.twin.signals, RING_RATE * records, machine.observed)
 
 
 def _keys(state: AdaptationState) -> tuple[str, ...]:

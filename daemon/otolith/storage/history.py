@@ -26,7 +26,8 @@ RESOLUTIONS = {WINDOW: "window", MINUTE: "minute", HOUR: "hour", DAY: "day"}
 """Seconds of an interval, and its name; 0 for the windows themselves."""
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 BUSY_TIMEOUT = 2.0  # s to wait for another process that reads or writes
-CHECKPOINT_PAGES = 250  # pages after which the write-ahead log is merged
+PAGE_BYTES = 1024  # of a page of a new database; each report writes every page that it changes as a whole
+CHECKPOINT_BYTES = 1 << 20  # of the write-ahead log, after which it is merged
 COMPRESSION = 1  # level of zlib
 FINDING_PAUSE = 3600.0  # s after which a finding that returns is a new one
 
@@ -91,6 +92,7 @@ def history_path(site: str, machine: str) -> Path:
 
 def create(connection: sqlite3.Connection, site: str, machine: str) -> None:
     """Make an empty database a history."""
+    connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute("PRAGMA journal_mode = WAL")
@@ -149,7 +151,8 @@ class Tables:
                 execute("INSERT OR REPLACE INTO finding VALUES (?, ?, ?, 1, ?)", (finding.id, end, end, text_of))
         if document.counters is not None:
             row_of = (end // HOUR * HOUR, self._run, document.counters.model_dump_json())
-            execute("INSERT OR REPLACE INTO counters VALUES (?, ?, ?)", row_of)
+            # Not by REPLACE, which would change the index as well.
+            execute("INSERT INTO counters VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET text = excluded.text", row_of)
 
     def forget_series(self) -> None:
         """Read the numbers of the series again: a transaction that added some was rolled back."""

@@ -10,7 +10,7 @@ from otolith.storage.history import DAY, HOUR, MINUTE, WINDOW
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 AGES = {WINDOW: 1.0 * DAY, MINUTE: 14.0 * DAY, HOUR: 366.0 * DAY}  # s; of days, events and findings the machine file
 MAX_LEAP = 1.0 * DAY  # s by which the clock may pass the time that the daemon ran
-LEAP_PATIENCE = 1.0 * DAY  # s of operation after which a clock that leapt is believed
+LEAP_PATIENCE = 1.0 * DAY  # s of operation after which a clock that leapt is used
 MAX_AHEAD = 1.0 * DAY  # s after the present from which a time is that of a wrong clock
 HARD_SHARE, PRUNED_SHARE = 0.9, 0.8  # of the size limit: never exceeded, and kept by deleting
 MIN_REPORTS = 1800  # that are kept before coarser values go
@@ -46,8 +46,8 @@ class Retention:
             while self._delete_samples(resolution, oldest):
                 pass
         # By sequence: a report from a time when the clock was ahead goes with those that were published after it.
-        oldest_rows = f"(SELECT sequence, time FROM report ORDER BY sequence LIMIT {CHUNK})"  # noqa: S608
-        latest = f"(SELECT max(sequence) FROM {oldest_rows} WHERE time < ?)"  # noqa: S608
+        oldest_rows = f"(SELECT sequence, time FROM report ORDER BY sequence LIMIT {CHUNK})"  # noqa: S608 - our own names
+        latest = f"(SELECT max(sequence) FROM {oldest_rows} WHERE time < ?)"  # noqa: S608 - our own names
         resend = clock - min(self._bounds.resend_hours * HOUR, longest)
         while self._delete_reports(f"sequence <= {latest}", resend):
             pass
@@ -77,7 +77,7 @@ class Retention:
         return pages
 
     def _clock(self, now: float, elapsed: float) -> float:
-        """Return ``now``, or after a leap of the clock the time until it is believed; a wrong clock deletes nothing."""
+        """Return ``now``, or the time without a leap of the clock until it is used: a wrong clock deletes nothing."""
         row = self._connection.execute("SELECT retention, waited FROM clock").fetchone()
         clock, waited = row or (now, 0.0)
         if now - clock <= MAX_LEAP + elapsed or waited + elapsed >= LEAP_PATIENCE:
@@ -97,7 +97,7 @@ class Retention:
     def _delete_samples(self, resolution: int, before: float = math.inf) -> int:
         """Delete at most ``CHUNK`` of the oldest values of a resolution."""
         chosen = "SELECT time, series FROM sample WHERE resolution = ?1 AND time < ?2 ORDER BY time LIMIT ?3"
-        query = f"DELETE FROM sample WHERE resolution = ?1 AND (time, series) IN ({chosen})"  # noqa: S608
+        query = f"DELETE FROM sample WHERE resolution = ?1 AND (time, series) IN ({chosen})"  # noqa: S608 - our own names
         return self._delete(query, resolution, before, CHUNK)
 
     def _delete_details(self, keep: int, latest: float) -> int:
@@ -117,15 +117,15 @@ class Retention:
     def _delete_reports(self, condition: str, *values: float) -> int:
         """Delete at most ``CHUNK`` of the oldest reports; the newest stays, as the next one refers to it."""
         newest = "sequence < (SELECT max(sequence) FROM report)"
-        chosen = f"SELECT sequence FROM report WHERE {newest} AND {condition} ORDER BY sequence LIMIT {CHUNK}"  # noqa: S608
-        return self._delete(f"DELETE FROM report WHERE sequence IN ({chosen})", *values)  # noqa: S608
+        chosen = f"SELECT sequence FROM report WHERE {newest} AND {condition} ORDER BY sequence LIMIT {CHUNK}"  # noqa: S608 - our own names
+        return self._delete(f"DELETE FROM report WHERE sequence IN ({chosen})", *values)  # noqa: S608 - our own names
 
     def _delete_rest(self) -> int:
         count = sum(map(self._delete_samples, (HOUR, DAY)))
         for table, order in (("event", "sequence"), ("finding", "last"), ("counters", "run, hour")):
             key = "(id, first)" if table == "finding" else "(hour, run)" if table == "counters" else "sequence"
-            chosen = f"SELECT {key.strip('()')} FROM {table} ORDER BY {order} LIMIT {CHUNK}"  # noqa: S608
-            count += self._delete(f"DELETE FROM {table} WHERE {key} IN ({chosen})")  # noqa: S608
+            chosen = f"SELECT {key.strip('()')} FROM {table} ORDER BY {order} LIMIT {CHUNK}"  # noqa: S608 - our own names
+            count += self._delete(f"DELETE FROM {table} WHERE {key} IN ({chosen})")  # noqa: S608 - our own names
         return count
 
     def _delete(self, query: str, *values: float) -> int:

@@ -15,9 +15,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from otolith.health.schema import EventDocument, ReportDocument
-from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_PAGES, HistoryReader, Tables, check, create
+from otolith.machine_file import MachineFile
+from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_BYTES, HistoryReader, Tables, check, create, history_path
 from otolith.storage.history_retention import Bounds, Retention
-from otolith.storage.state_store import WRITE_RETRY, give_to, opened_folder
+from otolith.storage.state_store import give_to, opened_folder
+from otolith.storage.writer_thread import WriterThread
 from otolith_drivers.errors import OtolithError, ServiceError
 
 log = logging.getLogger(__name__)
@@ -62,19 +64,18 @@ class Numbers:
         return self._next - 1
 
 
-class HistoryWriter:
+class HistoryWriter(WriterThread):
     """The history of one machine while its daemon runs."""
 
     def __init__(self, path: Path, bounds: Bounds) -> None:
         """``path`` as :func:`otolith.storage.history.history_path` returns it."""
+        super().__init__("history", PRUNE_INTERVAL, f"{path}: no history is written")
         self.reader = HistoryReader(path)
         self._path, self._bounds = path, bounds
         self._connection: sqlite3.Connection | None = None
         self._waiting: deque[ReportDocument] = deque()
-        self._lock, self._wakeup, self._stopping = threading.Lock(), threading.Event(), threading.Event()
-        self._written = threading.Event()
-        self._retry_at, self._pruned_at, self._last_error = 0.0, 0.0, ""
-        self._thread = threading.Thread(target=self._run, name="history", daemon=True)
+        self._lock, self._written = threading.Lock(), threading.Event()
+        self._pruned_at = 0.0
         self.dropped = 0
         """Reports that were not written."""
 
@@ -88,13 +89,13 @@ class HistoryWriter:
             note = self._open()
             numbers = self._begin_numbers(now)
         except (sqlite3.Error, OtolithError, OSError) as error:
-            self._fail(error)
+            self.fail(error)
         return numbers, note
 
     def start(self) -> None:
         """Start the thread that writes."""
         self._pruned_at = time.monotonic()
-        self._thread.start()
+        super().start()
 
     def add(self, document: ReportDocument) -> None:
         """Request that a report is written; if too many wait, the oldest is dropped."""
@@ -118,35 +119,24 @@ class HistoryWriter:
             log.debug("%s", error)
             return []
 
-    def stop(self, seconds: float) -> None:
-        """Write what is waiting, for up to ``seconds``, and end the thread."""
-        self._stopping.set()
-        self._wakeup.set()
-        if self._thread.is_alive():
-            self._thread.join(seconds)
-            if self._thread.is_alive():
-                log.warning("the last reports may not be in the history: writing took over %.1f s", seconds)
-
-    def _run(self) -> None:
-        while True:
-            self._wakeup.wait(PRUNE_INTERVAL)
-            self._wakeup.clear()
-            stopping = self._stopping.is_set()
-            if stopping or time.monotonic() >= self._retry_at:
-                try:
-                    self._work(time.monotonic())
-                except Exception as error:  # noqa: BLE001 - monitoring continues, and what is lost is counted
-                    self._fail(error)
-            if stopping:
+    def write(self) -> None:
+        """Write what is waiting, and delete what is too old or too much; the last call closes the database."""
+        try:
+            self._work(time.monotonic())
+        finally:
+            if self._stopping.is_set():
                 self._close()
-                return
+
+    def fail(self, error: Exception) -> None:
+        """Log an error, once while it stays the same; queries do not wait meanwhile."""
+        super().fail(error)
+        self._written.set()
 
     def _work(self, now: float) -> None:
-        """Write what is waiting, and delete what is too old or too much."""
         if self._connection is not None and not self._is_in_place():
             self._close()
             if not self._path.parent.parent.is_dir():
-                raise ServiceError("the state directory was removed")
+                raise ServiceError("the state directory was removed: restart the daemon")
         if self._connection is None:
             self._open()
         self._limit_log()
@@ -164,7 +154,6 @@ class HistoryWriter:
         if now - self._pruned_at >= PRUNE_INTERVAL:
             self._retention.by_age(time.time(), now - self._pruned_at)
             self._pruned_at = now
-        self._retry_at, self._last_error = 0.0, ""
 
     def _write_waiting(self) -> None:
         assert self._connection is not None  # noqa: S101 - for mypy
@@ -185,13 +174,6 @@ class HistoryWriter:
                 written = {id(document) for document in batch}
                 while self._waiting and id(self._waiting[0]) in written:
                     self._waiting.popleft()
-
-    def _fail(self, error: Exception) -> None:
-        """Log a fault once, and try again later; queries do not wait meanwhile."""
-        if str(error) != self._last_error:
-            log.warning("%s: no history is written: %s: check the disk and its permissions", self._path, error)
-        self._last_error, self._retry_at = str(error), time.monotonic() + WRITE_RETRY
-        self._written.set()
 
     def _is_in_place(self) -> bool:
         """Return whether the file was neither deleted nor moved by somebody: what is written there would be lost."""
@@ -262,7 +244,8 @@ class HistoryWriter:
             create(connection, self.reader.site, self.reader.machine)
         check(connection, self.reader.site, self.reader.machine)
         connection.execute("PRAGMA synchronous = NORMAL")
-        connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_PAGES}").fetchall()
+        (page_size,) = connection.execute("PRAGMA page_size").fetchone()
+        connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_BYTES // page_size}").fetchall()
         connection.execute("PRAGMA journal_size_limit = 0").fetchall()
         self._tables, self._retention = Tables(connection, int(time.time())), Retention(connection, self._bounds)
 
@@ -283,6 +266,15 @@ class HistoryWriter:
             with contextlib.suppress(sqlite3.Error):
                 self._connection.close()
             self._connection = None
+
+
+def history_of(file: MachineFile) -> HistoryWriter | None:
+    """Return the history of a machine; None if its file disables it. Raises as :func:`history_path`."""
+    table, names = file.history, file.machine
+    if not table.enabled:
+        return None
+    bounds = Bounds(table.max_megabytes * 1_000_000, table.days, table.resend_hours)
+    return HistoryWriter(history_path(names.site, names.name), bounds)
 
 
 def _code(error: sqlite3.Error) -> int:

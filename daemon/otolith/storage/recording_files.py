@@ -63,7 +63,7 @@ class RecordingFile:
 
 
 def recording_file(path: Path) -> RecordingFile | None:
-    """Return what name and status tell about ``path``; None for a file of another name, or one that is gone.
+    """Return what follows from name and status of ``path``; None for a file of another name, or one that is gone.
 
     Raises:
         PermissionError: the folder must not be searched.

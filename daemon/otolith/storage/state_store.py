@@ -1,4 +1,4 @@
-"""What was learned of a machine and what its operator decided, on disk; and the thread that writes for the daemon.
+"""What was learned of a machine and what its operator decided, on disk.
 
 Each file has one writer: the daemon writes the learned state under a lock, the command line writes operator decisions.
 """
@@ -7,9 +7,6 @@ import contextlib
 import fcntl
 import logging
 import os
-import threading
-import time
-from collections import deque
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +17,7 @@ from pydantic import Field, ValidationError
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
 from otolith.health.baseline import Baseline
 from otolith.health.prognosis import History
+from otolith.machine import LoadedMachine
 from otolith.storage.learned_state import (
     VERSION,
     LearnedState,
@@ -40,12 +38,10 @@ log = logging.getLogger(__name__)
 DECISIONS_VERSION = 2
 KEPT = ".kept.json"
 REMEDY = "move the file away to start without it"
-# Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
+# Thresholds: docs/reference/thresholds-storage.md has the origin of each.
 MAX_STATE_BYTES = 8 * 1024 * 1024
 MAX_KEPT = 8  # files that were not used and are kept under another name
 PROCESS_ID_BYTES = 20
-DECISIONS_INTERVAL = 0.5  # s between two checks for new operator decisions
-WRITE_RETRY = 30.0  # s after which a failed write is tried again
 
 StateModel = TypeVar("StateModel", bound=StrictModel)
 
@@ -271,6 +267,12 @@ class StateStore:
         return 0.0
 
 
+def store_of(machine: LoadedMachine) -> StateStore:
+    """Return the store of a machine."""
+    names = machine.file.machine
+    return StateStore(names.site, names.name, machine.twin, signal_fingerprint=machine.signal_fingerprint)
+
+
 def _read(path: Path, model: type[StateModel], newest: int) -> StateModel | None:
     try:
         with path.open("rb") as stream:
@@ -346,75 +348,3 @@ def give_to(owner: os.stat_result, handle: int) -> None:
     """Give what root has opened to an owner: the daemon runs as another user and must be able to use it."""
     if os.geteuid() == 0:
         os.fchown(handle, owner.st_uid, owner.st_gid)
-
-
-class WriterThread:
-    """Writes the learned state and reads operator decisions in the background; its callers never wait for the disk.
-
-    Only the latest value is kept in each direction.
-    """
-
-    def __init__(self, store: StateStore, decisions_time: float) -> None:
-        """``decisions_time`` is the :meth:`StateStore.decisions_time` of the decisions that are known already."""
-        self._store, self._decisions_time = store, decisions_time
-        self._to_save: deque[AdaptationState] = deque(maxlen=1)
-        self._new_decisions: deque[OperatorDecisions] = deque(maxlen=1)
-        self._wakeup, self._stopping = threading.Event(), threading.Event()
-        self._unsaved: AdaptationState | None = None
-        self._retry_at, self._last_error = 0.0, ""
-        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def save(self, state: AdaptationState) -> None:
-        """Request that ``state`` replaces what is on disk."""
-        self._to_save.append(state)
-        self._wakeup.set()
-
-    def new_decisions(self) -> OperatorDecisions | None:
-        """Return the operator's decisions if they have changed since the last call, otherwise None."""
-        return self._new_decisions.popleft() if self._new_decisions else None
-
-    def stop(self, seconds: float) -> None:
-        """Write what is still to be saved, for up to ``seconds``, and end the thread."""
-        self._stopping.set()
-        self._wakeup.set()
-        if self._thread.is_alive():
-            self._thread.join(seconds)
-            if self._thread.is_alive():
-                log.warning("what was learned may not be saved: writing took over %.1f s: check the disk", seconds)
-
-    def _run(self) -> None:
-        while True:
-            self._wakeup.wait(DECISIONS_INTERVAL)
-            self._wakeup.clear()
-            stopping = self._stopping.is_set()
-            if self._to_save:
-                self._unsaved, self._retry_at = self._to_save.popleft(), 0.0
-            if self._unsaved is not None and (stopping or time.monotonic() >= self._retry_at):
-                self._save(self._unsaved)
-            if stopping:
-                return
-            self._read_decisions()
-
-    def _save(self, state: AdaptationState) -> None:
-        try:
-            self._store.save(state)
-        except OtolithError as error:  # monitoring continues on a full disk
-            if str(error) != self._last_error:
-                log.warning("what was learned is not saved: %s", error)
-            self._last_error, self._retry_at = str(error), time.monotonic() + WRITE_RETRY
-        else:
-            self._last_error, self._unsaved = "", None
-
-    def _read_decisions(self) -> None:
-        decisions_time = self._store.decisions_time()
-        if decisions_time == self._decisions_time:
-            return
-        self._decisions_time = decisions_time
-        try:
-            self._new_decisions.append(self._store.decisions())
-        except OtolithError as error:
-            log.warning("%s", error)

@@ -54,16 +54,16 @@ class Printer(PythonCodePrinter):  # type: ignore[misc]  # sympy has no types
     def _print_component(self, expr: Any) -> str:
         return f"{expr.func.__name__}({', '.join(self._print(argument) for argument in expr.args)})"
 
-    def _print_Heaviside(self, expr: Any) -> str:  # noqa: N802
+    def _print_Heaviside(self, expr: Any) -> str:  # noqa: N802 - sympy's name
         return f"(1.0 if {self._print(expr.args[0])} > 0.0 else 0.0)"
 
-    def _print_Float(self, expr: Any) -> str:  # noqa: N802
+    def _print_Float(self, expr: Any) -> str:  # noqa: N802 - sympy's name
         return repr(float(expr))
 
-    def _print_Integer(self, expr: Any) -> str:  # noqa: N802
+    def _print_Integer(self, expr: Any) -> str:  # noqa: N802 - sympy's name
         return f"{int(expr)}.0"
 
-    def _print_Rational(self, expr: Any) -> str:  # noqa: N802
+    def _print_Rational(self, expr: Any) -> str:  # noqa: N802 - sympy's name
         return f"({int(expr.p)}.0/{int(expr.q)}.0)"
 
 

@@ -338,8 +338,9 @@ class Kernel:
         with kernel_cache.compiling(self._module, function, f"{self.definition.name}.{name}"):
             try:
                 result = function(*arguments)
-            except Exception:  # noqa: BLE001 - a truncated cache file raises any type; a fault of the equations is raised again below
+            except Exception:  # noqa: BLE001 - a truncated file of the cache raises errors of any type
                 kernel_cache.discard(self._module)
+                # Other errors are raised again here.
                 result = function(*arguments)
         self._compiled.add(name)
         return result

@@ -1,6 +1,6 @@
 """The generated kernel module of a twin: one template of source per kernel, filled with blocks of the twin's algebra.
 
-The text comes from SymPy expressions by a printer that knows arithmetic only; of a twin file nothing but names enters
+The text comes from SymPy expressions by a printer for arithmetic only; of a twin file nothing but names enters
 it, which :mod:`otolith.twin.expressions` has checked. The theory is in docs/explanation: ``kernels.md`` reads a
 predictor line by line, ``sensitivities.md`` derives the sensitivities, ``innovation-form.md`` the filter.
 """

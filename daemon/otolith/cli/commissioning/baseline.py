@@ -31,11 +31,10 @@ def baseline(file: Path, clear: bool) -> None:
       otolith baseline my-machine.toml --clear
     """
     from otolith.machine import load_machine
-    from otolith.storage.state_store import StateStore
+    from otolith.storage.state_store import store_of
 
     machine = load_machine(file, with_driver=False)
-    names = machine.file.machine
-    store = StateStore(names.site, names.name, machine.twin, signal_fingerprint=machine.signal_fingerprint)
+    store = store_of(machine)
     if clear:
         store.save_decisions(replace(store.decisions(), baselines={}))
         click.echo("limits in percent refer to the nominal values of the machine file")

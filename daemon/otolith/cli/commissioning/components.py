@@ -185,11 +185,10 @@ def reset(file: Path, names: tuple[str, ...], dry_run: bool) -> None:
 
 def _store(file: Path) -> "tuple[LoadedMachine, StateStore]":
     from otolith.machine import load_machine
-    from otolith.storage.state_store import StateStore
+    from otolith.storage.state_store import store_of
 
     machine = load_machine(file, with_driver=False)
-    names = machine.file.machine
-    return machine, StateStore(names.site, names.name, machine.twin, signal_fingerprint=machine.signal_fingerprint)
+    return machine, store_of(machine)
 
 
 @click.command()

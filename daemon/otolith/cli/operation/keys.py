@@ -41,7 +41,7 @@ def keys() -> None:
 def init(folder: Path) -> int:
     """Make the certificate authority of a site in DIR.
 
-    Keep DIR/ca.key where no daemon runs: whoever has it can make certificates.
+    Keep DIR/ca.key where no daemon runs: with it, anyone can make certificates that daemons accept.
 
     \b
     Examples:
