@@ -24,7 +24,6 @@ from otolith_drivers.canbus.monitoring import (
     PeriodEstimator,
     checksum_test,
     counter_by_name,
-    period_text,
 )
 from otolith_drivers.canbus.options import FrameOptions, MessageTable
 from otolith_drivers.canbus.signals import (
@@ -38,6 +37,7 @@ from otolith_drivers.canbus.signals import (
     request_bits,
     request_from_databases,
 )
+from otolith_drivers.common.periods import period_text
 from otolith_drivers.errors import ConfigurationError, nearest
 
 NO_READING = float("nan")

@@ -19,10 +19,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from pydantic import BeforeValidator, Field, model_validator
 
+from otolith_drivers.common.remote_clock import ExchangeClock, unix_time
+from otolith_drivers.common.scaled import ScaledSource
 from otolith_drivers.config_files import StrictModel, content
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.remote_clock import ExchangeClock, unix_time
-from otolith_drivers.scaled import ScaledSource
 from otolith_drivers.units import Quantity
 
 PEM_LIMIT = 1 << 16  # bytes of a certificate or key; a long chain has 10 kB

@@ -1,7 +1,7 @@
 """The OPC UA driver: subscribes to variables of a server, and reconnects after every fault. It can only read.
 
 The time of a sample is the source's time stamp, which is on the server's clock. That clock is compared with this
-computer's by the times in the answers, so the error of the times is bounded (see ``remote_clock.py``).
+computer's by the times in the answers, so the error of the times is bounded (see ``common/remote_clock.py``).
 """
 
 import asyncio
@@ -16,6 +16,8 @@ from typing import Any
 from asyncua import Client, ua
 
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
+from otolith_drivers.common.remote_clock import unix_time
+from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.opcua.connection import (
     OpcUaCredentials,
@@ -29,8 +31,6 @@ from otolith_drivers.opcua.connection import (
     unit_of,
 )
 from otolith_drivers.opcua.readings import NodeSignal, Readings
-from otolith_drivers.remote_clock import unix_time
-from otolith_drivers.scaled import Conversion
 
 __all__ = ["OpcuaSubscriber", "Options", "Source", "build"]
 
