@@ -21,7 +21,6 @@ from otolith_drivers.canbus.monitoring import (
     BusFaults,
     ChecksumTest,
     FrameCounter,
-    PeriodEstimator,
     checksum_test,
     counter_by_name,
 )
@@ -37,7 +36,7 @@ from otolith_drivers.canbus.signals import (
     request_bits,
     request_from_databases,
 )
-from otolith_drivers.common.periods import period_text
+from otolith_drivers.common.periods import PeriodEstimator, period_text
 from otolith_drivers.errors import ConfigurationError, nearest
 
 NO_READING = float("nan")

@@ -30,6 +30,8 @@ class NodeSignal:
     signal: Signal
     conversion: Conversion | None = None
     """None until the unit is known."""
+    node: Any = None
+    """Its variable on the server, a ``ua.NodeId``; None until it is looked up."""
     fault: str = ""
     """Why the server does not send it; empty if it does."""
     value: float = math.nan
