@@ -24,7 +24,7 @@ from otolith_drivers.canbus.bus import (
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import FrameOptions
 from otolith_drivers.canbus.signals import CanSource
-from otolith_drivers.common.reconnection import Backoff
+from otolith_drivers.common.reconnection import ReconnectBackoff
 from otolith_drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
@@ -189,7 +189,7 @@ class CanReceiver:
 
     def _reconnect(self) -> can.BusABC | None:
         """Try until it succeeds, with growing random pauses; None if the driver is closed meanwhile."""
-        backoff = Backoff()
+        backoff = ReconnectBackoff()
         while not self._stop.wait(backoff.next()):
             try:
                 bus = self._connect()

@@ -48,18 +48,15 @@ def certificate_and_key(certificate_path: Path, key_path: Path) -> tuple[x509.Ce
 
 
 def password(path: Path | None) -> str:
-    """Return the first line of a password file; empty without one.
+    """Return the first line of a password file; empty without one, or for a user without a password.
 
     Raises:
-        ConfigurationError: the file is missing, or its first line is empty.
+        ConfigurationError: the file cannot be read.
     """
     if path is None:
         return ""
-    where = ("driver", "password_file")
-    lines = content(path, SECRET_LIMIT, where).decode(errors="replace").splitlines()
-    if not lines or not lines[0]:
-        raise ConfigurationError(f"{path}: its first line is empty: write the password there", where)
-    return lines[0]
+    lines = content(path, SECRET_LIMIT, ("driver", "password_file")).decode(errors="replace").splitlines()
+    return lines[0] if lines else ""
 
 
 def _is_pem(data: bytes) -> bool:

@@ -8,7 +8,7 @@ import ssl
 BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
 
 
-class Backoff:
+class ReconnectBackoff:
     """Pauses between attempts to connect, doubled each time, with jitter so that clients do not come all at once."""
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class Reconnection:
     def __init__(self, title: str, log: logging.Logger) -> None:
         """``title`` begins each line of the log."""
         self.up, self.reason, self.count = False, "not opened yet", 0
-        self.backoff = Backoff()
+        self.backoff = ReconnectBackoff()
         self._title, self._log = title, log
         self._was_up = False
         self._logged = ""  # the latest reason

@@ -126,7 +126,6 @@ def test_a_server_that_is_no_broker_and_files_that_are_none_are_named(tmp_path: 
             wait_for(lambda: "is one there" in driver.link().reason)
         assert not driver.link().up
     (tmp_path / "none").write_text("nothing")
-    (tmp_path / "empty").write_text("\n")
     certificate(tmp_path, "own")
     for keys, fault in (
         ({"ca": "none"}, "none: is no X.509"),
@@ -134,7 +133,7 @@ def test_a_server_that_is_no_broker_and_files_that_are_none_are_named(tmp_path: 
         ({"ca": "absent"}, "absent: cannot be read"),
         ({"certificate": "none", "key": "own.pem"}, "none: is no X.509"),
         ({"certificate": "own.der", "key": "none"}, "none: is no private key"),
-        ({"user": "me", "password_file": "empty"}, "empty: its first line is empty"),
+        ({"user": "me", "password_file": "absent"}, "absent: cannot be read"),
     ):
         options = mqtt.Options.model_validate({"host": "a", "tls": True} | keys)
         with pytest.raises(ConfigurationError, match=fault):
