@@ -10,12 +10,13 @@ violated rule. See docs/your-own-driver.md.
 """
 
 import math
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
+from unittest import mock
 
 from otolith_drivers.base import Driver, Sample, Sampling, sampling_of
 
@@ -86,16 +87,17 @@ def link_is_up_while_samples_arrive(rig: Rig) -> None:
 
 def close_ends_everything_within_a_second(rig: Rig) -> None:
     """After close, which may be called twice, no thread or descriptor is left and no sample is delivered."""
-    threads, descriptors = set(threading.enumerate()), _descriptors()
-    with _opened(rig) as samples:
+    descriptors = _descriptors()
+    with _started_threads() as threads, _opened(rig) as samples:
         begun = time.monotonic()
         rig.driver.close()
         rig.driver.close()
         _require(time.monotonic() - begun < CLOSE_TIMEOUT, f"closing took {time.monotonic() - begun:.2f} s")
-    left = set(threading.enumerate()) - threads
-    _require(not left, f"threads left: {', '.join(thread.name for thread in left)}")
-    while (left_open := _descriptors() - descriptors) > 0:  # a source in this process closes its end later
-        _require(time.monotonic() - begun < CLOSE_TIMEOUT, f"{left_open} descriptors left open")
+    left = [thread.name for thread in threads if thread.is_alive()]
+    _require(not left, f"threads left: {', '.join(left)}")
+    while left_open := _descriptors() - descriptors:  # a source in this process closes its end later
+        in_time = time.monotonic() - begun < CLOSE_TIMEOUT
+        _require(in_time, f"descriptors left open: {', '.join(sorted(left_open))}")
         time.sleep(0.005)
     delivered = len(samples)
     rig.emit()
@@ -158,8 +160,27 @@ def _collect(rig: Rig) -> list[Sample]:
     return samples
 
 
-def _descriptors() -> int:
-    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - names are not needed
+@contextmanager
+def _started_threads() -> Iterator[set[threading.Thread]]:
+    """Yield the threads that the driver starts. Those that ran before are of the source, with those that they start."""
+    of_source, of_driver = set(threading.enumerate()) - {threading.current_thread()}, set[threading.Thread]()
+    start = threading.Thread.start
+
+    def start_and_note(thread: threading.Thread) -> None:
+        (of_source if threading.current_thread() in of_source else of_driver).add(thread)
+        start(thread)
+
+    with mock.patch.object(threading.Thread, "start", start_and_note):
+        yield of_driver
+
+
+def _descriptors() -> set[str]:
+    """Return number and target of each open descriptor of this process, like ``7 socket:[4711]``."""
+    targets = set()
+    for link in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # the descriptor of this listing is closed meanwhile
+            targets.add(f"{link.name} {link.readlink()}")
+    return targets
 
 
 def _require(condition: bool, rule: str) -> None:

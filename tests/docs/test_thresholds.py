@@ -14,7 +14,7 @@ SOURCES = {
     "cli": [DAEMON / "cli", DAEMON / "cli" / "commissioning", DAEMON / "cli" / "operation", DAEMON / "health"],
     "commissioning": [DAEMON / "commissioning"],
     "discovery": [DAEMON / "discovery"],
-    "drivers": [DRIVERS],
+    "drivers": [DRIVERS, DRIVERS / "common"],
     "estimation": [DAEMON / "estimation", DAEMON / "estimation" / "timing"],
     "health": [DAEMON / "health", DAEMON / "adaptation"],
     "modbus": [DRIVERS / "modbus"],

@@ -1,4 +1,4 @@
-"""Drivers on a real bus that is broken on demand, with their pauses shortened; for a process of its own."""
+"""Drivers on a real bus that is broken on demand; for a process of its own."""
 
 import contextlib
 import os
@@ -15,6 +15,7 @@ from otolith_drivers.base import Driver, Setup, Signal
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
 from otolith_drivers.canbus.signals import CanSource
+from otolith_drivers.common import reconnection
 from otolith_drivers.modbus import driver as modbus_poller
 from tests.conftest import EXAMPLES, free_port
 from tests.drivers.modbus_servers import Behaviour, odd_server
@@ -35,7 +36,7 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
         opened[:] = [bus]
         return bus
 
-    vars(can_receiver).update(open_bus=open_and_remember, BACKOFF_FIRST=SHORT)
+    vars(can_receiver).update(open_bus=open_and_remember)
     signals = (Signal("i", "A", CanSource(signal="ArmatureCurrent")),)
     driver = can_receiver.build(
         can_receiver.Options(**options.model_dump(), dbc=Path("dc-motor.dbc")), Setup(signals, EXAMPLES, PERIOD)
@@ -70,7 +71,7 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
 @contextmanager
 def modbus_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
     """The Modbus driver, and a function that cuts its connection."""
-    modbus_poller.BACKOFF_FIRST = SHORT
+    reconnection.BACKOFF_FIRST = SHORT
     port = free_port(socket.SOCK_STREAM)
     registers = dict(enumerate(struct.unpack(">2H", struct.pack(">f", 24.0))))
     source = modbus_poller.Source.model_validate({"register": 0, "type": "float32", "unit": "V"})

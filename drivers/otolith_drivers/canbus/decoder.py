@@ -21,10 +21,8 @@ from otolith_drivers.canbus.monitoring import (
     BusFaults,
     ChecksumTest,
     FrameCounter,
-    PeriodEstimator,
     checksum_test,
     counter_by_name,
-    period_text,
 )
 from otolith_drivers.canbus.options import FrameOptions, MessageTable
 from otolith_drivers.canbus.signals import (
@@ -38,6 +36,7 @@ from otolith_drivers.canbus.signals import (
     request_bits,
     request_from_databases,
 )
+from otolith_drivers.common.periods import PeriodEstimator, period_text
 from otolith_drivers.errors import ConfigurationError, nearest
 
 NO_READING = float("nan")

@@ -4,7 +4,6 @@ It cannot disturb the machine: nothing in this package sends. ``decoder.py`` mak
 """
 
 import logging
-import random
 import threading
 import time
 from dataclasses import replace
@@ -25,12 +24,12 @@ from otolith_drivers.canbus.bus import (
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import FrameOptions
 from otolith_drivers.canbus.signals import CanSource
+from otolith_drivers.common.reconnection import ReconnectBackoff
 from otolith_drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
 
 RECEIVE_TIMEOUT = 0.2  # s; how late a stop may be noticed
-FIRST_PAUSE, MAX_PAUSE = 0.2, 10.0  # s between attempts to reconnect
 MAX_STAMP_AGE = 1.0  # s; an older kernel stamp is from before the wall clock was set
 CLOCK_CHECK_PERIOD = 0.05  # s; how long a wall clock that was set can falsify times
 CLOCK_TRIES, CLOCK_PRECISION = 5, 2e-5  # s; readings of the clocks, and when one is good enough
@@ -190,8 +189,8 @@ class CanReceiver:
 
     def _reconnect(self) -> can.BusABC | None:
         """Try until it succeeds, with growing random pauses; None if the driver is closed meanwhile."""
-        pause = FIRST_PAUSE
-        while not self._stop.wait(pause * random.uniform(0.5, 1.0)):  # noqa: S311 - jitter, not a secret
+        backoff = ReconnectBackoff()
+        while not self._stop.wait(backoff.next()):
             try:
                 bus = self._connect()
             except Exception as error:  # noqa: BLE001 - as above
@@ -203,7 +202,6 @@ class CanReceiver:
                 _shut(bus)
                 failure = f"CAN bus {self._options.title()}: {cause}"
             self._link = Link(up=False, reason=failure)
-            pause = min(2 * pause, MAX_PAUSE)
         return None
 
 

@@ -4,7 +4,6 @@ import contextlib
 import errno
 import logging
 import math
-import os
 import socket
 import termios
 import threading
@@ -19,6 +18,7 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException
 from pymodbus.framer import FramerType
 
+from otolith_drivers.common.reconnection import cause_of
 from otolith_drivers.modbus.options import BIT_TABLES, LineOptions, Table
 from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyError, NoReplyError
 
@@ -89,7 +89,7 @@ class ReadOnlyClient:
             mismatch = self._headers.mismatch if self._headers is not None else ""
             raise NoReplyError(mismatch or f"no answer within {self._options.timeout:g} s") from error
         except OSError as error:
-            raise ConnectionLostError(error.strerror or str(error)) from error
+            raise ConnectionLostError(cause_of(error)) from error
         except Exception as error:  # the library's decoder may raise anything for corrupted bytes
             raise NoReplyError(f"an answer that cannot be decoded ({type(error).__name__})") from error
         if reply.isError():
@@ -250,9 +250,7 @@ def _client(
 
 
 def _cause(error: Exception) -> str:
-    if isinstance(error, OSError) and error.errno and error.errno > 0:
-        return os.strerror(error.errno)
     if isinstance(error, termios.error):  # not an OSError
         rejected = error.args[0] == errno.EINVAL
         return f"the port refuses these settings: {error.args[-1]}" if rejected else str(error.args[-1])
-    return (isinstance(error, OSError) and error.strerror) or str(error)
+    return cause_of(error)

@@ -6,13 +6,13 @@ trip.
 
 import logging
 import math
-import random
 import threading
 import time
 from collections import deque
 from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
+from otolith_drivers.common.reconnection import Reconnection
 from otolith_drivers.modbus.client import ReadOnlyClient
 from otolith_drivers.modbus.options import BIT_TABLES, ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.plausibility import OrderMonitor, StalenessMonitor
@@ -26,7 +26,6 @@ log = logging.getLogger(__name__)
 Options = ModbusOptions
 Source = ModbusSource
 
-BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect; engineering choice
 CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s. Only a name lookup in progress takes longer.
 BUSY_PAUSES = 10  # of a period: how often a busy device is asked again at most; engineering choice
 TRIPS = 100  # round trips of which the longest bounds the error of the times; engineering choice: a second at 100 Hz
@@ -61,15 +60,15 @@ class ModbusPoller:
         self._unjudged: dict[str, list[Sample]] = {}
         """Samples by signal that wait for the first judgement of the byte order."""
         self._staleness = StalenessMonitor()
-        self._received = self._bad = self._lost = self._reconnects = 0
+        self._received = self._bad = self._lost = 0
         self._rate_logged = False
-        self._up, self._was_up, self._reason = False, False, "not opened yet"
+        self._connection = Reconnection(options.title(), log)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
-        self._reason = "not connected yet"
+        self._connection.reason = "not connected yet"
         self._thread = threading.Thread(target=self._run, args=(deliver,), name="modbus-poll", daemon=True)
         self._thread.start()
 
@@ -82,7 +81,7 @@ class ModbusPoller:
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
-        return Counters(self._received, self._bad, self._lost, self._reconnects)
+        return Counters(self._received, self._bad, self._lost, self._connection.count)
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
@@ -95,7 +94,7 @@ class ModbusPoller:
             plan_text += f", times right within {500.0 * max(trips):.2g} ms"
         if self._closings >= MAX_FAILURES:
             plan_text += ", reconnected for each request, as the device closes the connection after each answer"
-        return Link(self._up, self._reason, tuple(warnings), plan_text, period)
+        return Link(self._connection.up, self._connection.reason, tuple(warnings), plan_text, period)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
@@ -110,14 +109,15 @@ class ModbusPoller:
 
     def _run(self, deliver: Deliver) -> None:
         self._schedule.start(time.monotonic())
-        connected, backoff = False, BACKOFF_FIRST
+        connected = False
         while not self._stop.is_set():
             try:
                 if not connected:
                     self._client.connect()
                     self._answers = 0
                     self._lost += self._schedule.pass_over(time.monotonic()) * len(self._signals)
-                    connected, backoff = True, BACKOFF_FIRST
+                    connected = True
+                    self._connection.backoff.reset()  # although a device may break each round before it is complete
                 self._wait()
                 if not self._stop.is_set():
                     connected = self._round(deliver)
@@ -128,8 +128,7 @@ class ModbusPoller:
                     log.exception("%s", self._options.title())
                 self._go_down(str(error) or type(error).__name__)
                 connected = False
-                self._stop.wait(backoff * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not a secret
-                backoff = min(2.0 * backoff, BACKOFF_MAX)
+                self._stop.wait(self._connection.backoff.next())
                 self._lost += self._schedule.pass_over(time.monotonic()) * len(self._signals)
         self._client.close()
 
@@ -163,7 +162,7 @@ class ModbusPoller:
                 waiting, busy = deque(busy), []
         self._end_reading(answered, deliver)
         if answered:
-            self._come_up()
+            self._connection.come_up("answers")
         if answered == len(self._signals):
             self._end_complete_round(time.monotonic() - begun, repeated=repeated)
         if not usable:
@@ -175,8 +174,8 @@ class ModbusPoller:
     def _refused(self, request: Request, error: ExceptionReplyError) -> list[Request]:
         """Return the request if the device is busy and can be asked again before the next round; else note it."""
         log.debug("%s: %s", request.describe(), error)
-        if not self._up:
-            self._reason = f"requests are refused: {error}"
+        if not self._connection.up:
+            self._connection.reason = f"requests are refused: {error}"
         now, schedule = time.monotonic(), self._schedule
         if error.code in BUSY_CODES and now + 2.0 * schedule.period / BUSY_PAUSES < schedule.due:
             return [request]
@@ -215,7 +214,7 @@ class ModbusPoller:
         self._client.close()
         self._client.connect()
         self._answers = 0
-        self._reconnects += 1
+        self._connection.count += 1
 
     def _read(self, request: Request, deliver: Deliver) -> bool:
         """Read one request and deliver its samples; return whether all registers repeat the previous values."""
@@ -266,15 +265,6 @@ class ModbusPoller:
             rate = self._schedule.describe()
             log.info("%s: %s, %s", self._options.title(), summary(self._requests.requests), rate)
 
-    def _come_up(self) -> None:
-        if not self._up:
-            self._up, self._reason = True, ""
-            self._reconnects += self._was_up
-            self._was_up = True
-            log.info("%s: answers", self._options.title())
-
     def _go_down(self, reason: str) -> None:
         self._client.close()
-        if reason != self._reason:
-            log.warning("%s: %s; retried until it answers", self._options.title(), reason)
-        self._up, self._reason = False, reason
+        self._connection.go_down(reason)

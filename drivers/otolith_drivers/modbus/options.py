@@ -8,10 +8,11 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Signal
+from otolith_drivers.common.scaled import Conversion, ScaledSource
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.modbus.protocol import Order, TypeName, bits, reader, registers_of
-from otolith_drivers.units import Quantity, factor
+from otolith_drivers.units import Quantity
 
 MAX_REGISTERS = 125  # of one request (Modbus Application Protocol V1.1b3, sections 6.3 and 6.4)
 HIGHEST_ADDRESS = 65535
@@ -90,7 +91,7 @@ class ModbusOptions(LineOptions):
     """Most registers that the device returns at once."""
 
 
-class ModbusSource(StrictModel):
+class ModbusSource(ScaledSource):
     """Registers of a signal: ``{ register = 100, type = "float32", unit = "V" }``."""
 
     register_: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1, alias="register")]
@@ -100,15 +101,10 @@ class ModbusSource(StrictModel):
     unit: str
     device: Device | None = None
     order: Order | None = None
-    scale: float = 1.0
-    """The value is ``scale * number + offset``, in ``unit``."""
-    offset: float = 0.0
     bits: str | None = None
     """``"3"`` or ``"4..7"``: the number is this bit field of an integer."""
     trusted: bool = False
     """Whether to skip the plausibility check of the byte order."""
-    range: tuple[float, float] | None = None
-    """In ``unit``; a value outside is no reading."""
     decimals: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1)] | None = None
     """Register with the number of decimals: the number is divided by 10 to its power."""
 
@@ -122,13 +118,9 @@ class ModbusSource(StrictModel):
         return written | {"type": "uint16"}
 
     @model_validator(mode="after")
-    def _is_consistent(self) -> Self:
+    def _has_the_bits(self) -> Self:
         if self.bits is not None:
             bits(self.bits, self.type)
-        if self.scale == 0.0:
-            raise ValueError("scale 0 makes every value the same: leave it out, or write what one step is worth")
-        if self.range is not None and not self.range[0] < self.range[1]:
-            raise ValueError(f"range {list(self.range)}: the lower end comes first")
         return self
 
 
@@ -147,9 +139,7 @@ class RegisterSignal:
     source: ModbusSource
     number: Callable[[Sequence[int]], float]
     """From registers to the number in them."""
-    scale: float
-    offset: float
-    """From the number to the target unit."""
+    conversion: Conversion
     decimals: "RegisterSignal | None" = None  # the register with their number
     is_sampled: bool = True  # False for a register of decimals, which is no signal of its own
 
@@ -172,13 +162,7 @@ class RegisterSignal:
         """Return the value in the target unit; NaN if the number is not finite or out of range."""
         if not 0.0 <= decimals <= MAX_DECIMALS:
             return math.nan
-        number = self.number(registers) / 10.0**decimals
-        if self.source.range is not None:
-            low, high = self.source.range
-            if not low <= self.source.scale * number + self.source.offset <= high:
-                return math.nan
-        value = self.scale * number + self.offset
-        return value if math.isfinite(value) else math.nan
+        return self.conversion.value(self.number(registers) / 10.0**decimals)
 
     def describe(self) -> str:
         """Return device, register, type, order and bit field in words."""
@@ -208,7 +192,7 @@ def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
             f"{source.type} has {count} registers, more than driver.max_registers = {options.max_registers}", key
         )
     try:
-        scale, offset = factor(source.unit, signal.unit)
+        conversion = Conversion.of(source, source.unit, signal.unit)
     except ValueError as error:
         raise ConfigurationError(str(error), key) from error
     order = source.order or options.order
@@ -227,8 +211,7 @@ def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
         order=order,
         source=source,
         number=_number_reader(source, order),
-        scale=scale * source.scale,
-        offset=scale * source.offset + offset,
+        conversion=conversion,
         decimals=decimals,
     )
 

@@ -5,8 +5,6 @@ the last seconds counts as one that took no time. Without one, it is the time of
 """
 
 import logging
-import os
-import random
 import ssl
 import threading
 import time
@@ -17,7 +15,8 @@ from paho.mqtt import client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
 
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
-from otolith_drivers.config_files import content
+from otolith_drivers.common.credentials import certificate, certificate_and_key, password
+from otolith_drivers.common.reconnection import Reconnection, cause_of
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.mqtt.topics import Messages, MqttOptions, MqttSource
 
@@ -28,12 +27,10 @@ log = logging.getLogger(__name__)
 Options = MqttOptions
 Source = MqttSource
 
-BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
 CONNECT_TIMEOUT = 3.0  # s for the network connection
 ANSWER_TIMEOUT = 5.0  # s for the broker to accept the client
 LOOP_TIMEOUT = 0.1  # s; how late a stop may be noticed
 CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s
-PASSWORD_LIMIT = 1 << 12  # bytes of the password file
 
 
 def build(options: MqttOptions, setup: Setup) -> "MqttListener":
@@ -42,26 +39,25 @@ def build(options: MqttOptions, setup: Setup) -> "MqttListener":
     Raises:
         ConfigurationError: a unit has the wrong dimension, or a certificate, key or password cannot be read.
     """
-    password = ""
-    if options.password_file is not None:
-        where = ("driver", "password_file")
-        lines = (
-            content(setup.folder / options.password_file, PASSWORD_LIMIT, where).decode(errors="replace").splitlines()
-        )
-        password = lines[0] if lines else ""
-    return MqttListener(options, Messages(options, setup.signals), password, _tls(options, setup.folder))
+    secret = None if options.password_file is None else setup.folder / options.password_file
+    return MqttListener(options, Messages(options, setup.signals), password(secret), _tls(options, setup.folder))
 
 
 def _tls(options: MqttOptions, folder: Path) -> ssl.SSLContext | None:
+    """Return what TLS needs; the files are checked one by one first, as its own errors do not name them."""
     if not options.tls:
         return None
+    if options.ca is not None:
+        certificate(folder / options.ca, "ca")
+    key = "ca"
     try:
-        context = ssl.create_default_context(cafile=folder / options.ca if options.ca is not None else None)
+        context = ssl.create_default_context(cafile=None if options.ca is None else folder / options.ca)
         if options.certificate is not None and options.key is not None:
-            context.load_cert_chain(folder / options.certificate, folder / options.key, password=lambda: b"")
+            key, files = "certificate", (folder / options.certificate, folder / options.key)
+            certificate_and_key(*files)
+            context.load_cert_chain(*files, password=lambda: b"")
     except (OSError, ValueError) as error:
-        cause = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ConfigurationError(f"ca, certificate or key cannot be read: {cause}", ("driver", "tls")) from error
+        raise ConfigurationError(f"is not in PEM, or not usable: {cause_of(error)}", ("driver", key)) from error
     return context
 
 
@@ -70,8 +66,7 @@ class MqttListener:
 
     def __init__(self, options: MqttOptions, messages: Messages, password: str, tls: ssl.SSLContext | None) -> None:
         self._options, self._messages, self._password, self._tls = options, messages, password, tls
-        self._up, self._was_up, self._reason = False, False, "not opened yet"
-        self._reconnects = 0
+        self._connection = Reconnection(options.title(), log)
         self._begun = 0.0  # s; when the broker accepted the subscription
         self._refusal = ""  # why the broker accepts neither client nor topic
         self._stop = threading.Event()
@@ -84,7 +79,7 @@ class MqttListener:
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
-        self._reason = "not connected yet"
+        self._connection.reason = "not connected yet"
         self._thread = threading.Thread(target=self._run, args=(deliver,), name="mqtt-listen", daemon=True)
         self._thread.start()
 
@@ -97,11 +92,11 @@ class MqttListener:
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
         messages = self._messages
-        return Counters(messages.received, messages.bad, messages.lost, self._reconnects)
+        return Counters(messages.received, messages.bad, messages.lost, self._connection.count)
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
-        now, messages = time.monotonic(), self._messages
+        now, messages, connection = time.monotonic(), self._messages, self._connection
         lines = [line for topic in messages.topics.values() for line in topic.warnings(now, self._begun)]
         facts = []
         if messages.retained:
@@ -110,7 +105,7 @@ class MqttListener:
             wall = time.time() - now
             ends = [f"{-wall - offset:+.4g} s" for offset in {min(offsets), max(offsets)}]
             facts.append(f"the senders' clocks minus this computer's: {' to '.join(sorted(ends))}, less the way here")
-        return Link(self._up, self._reason, tuple(lines) if self._up else (), ", ".join(facts))
+        return Link(connection.up, connection.reason, tuple(lines) if connection.up else (), ", ".join(facts))
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
@@ -125,20 +120,18 @@ class MqttListener:
         return lines
 
     def _run(self, deliver: Deliver) -> None:
-        backoff = BACKOFF_FIRST
         while not self._stop.is_set():
             client = self._client(deliver)
             try:
                 self._listen(client)
             except Exception as error:  # noqa: BLE001 - nothing that a broker sends may end the thread
-                backoff = BACKOFF_FIRST if self._up else min(2.0 * backoff, BACKOFF_MAX)
-                self._go_down(_cause(error))
+                self._connection.go_down(_cause(error))
             finally:
                 client.disconnect()
                 client.loop_misc()
                 if (connection := client.socket()) is not None:
                     connection.close()
-            self._stop.wait(backoff * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not a secret
+            self._stop.wait(self._connection.backoff.next())
 
     def _client(self, deliver: Deliver) -> mqtt.Client:
         options = self._options
@@ -161,7 +154,8 @@ class MqttListener:
             if refused:
                 self._refusal = f"the broker refuses the topics {', '.join(refused)}: may this user read them?"
             else:
-                self._come_up()
+                self._begun = time.monotonic()
+                self._connection.come_up("subscribed")
 
         def on_message(_: Any, __: Any, message: mqtt.MQTTMessage) -> None:
             samples = self._messages.take(
@@ -178,36 +172,22 @@ class MqttListener:
         self._refusal = ""
         host, port = self._options.address
         client.connect(host, port, keepalive=round(self._options.keepalive))
-        begun = time.monotonic()
+        begun, unanswered = time.monotonic(), "no answer of a broker: is one there, and is tls right?"
+        self._connection.reason = unanswered
         while not self._stop.is_set():
             code = client.loop(LOOP_TIMEOUT)
             if self._refusal:
                 raise ConnectionError(self._refusal)
             if code != mqtt.MQTT_ERR_SUCCESS:
                 ended = f"the connection was closed: {mqtt.error_string(code)}"
-                raise ConnectionError(ended if self._up else "no answer of a broker: is one there, and is tls right?")
-            if not self._up and time.monotonic() - begun > ANSWER_TIMEOUT:
-                raise ConnectionError(f"no answer of a broker within {ANSWER_TIMEOUT:g} s: is one there?")
-
-    def _come_up(self) -> None:
-        self._begun = time.monotonic()
-        if not self._up:
-            self._up, self._reason = True, ""
-            self._reconnects += self._was_up
-            self._was_up = True
-            log.info("%s: subscribed", self._options.title())
-
-    def _go_down(self, reason: str) -> None:
-        if reason != self._reason:
-            log.warning("%s: %s; retried until it answers", self._options.title(), reason)
-        self._up, self._reason = False, reason
+                raise ConnectionError(ended if self._connection.up else unanswered)
+            if not self._connection.up and time.monotonic() - begun > ANSWER_TIMEOUT:
+                raise ConnectionError(unanswered)
 
 
 def _cause(error: Exception) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"the broker's certificate is refused: {error.verify_message}: is ca right, and host its name?"
-    if isinstance(error, ssl.SSLError):
-        return f"TLS fails: {error.reason or error}"
-    if isinstance(error, OSError) and error.errno and error.errno > 0:
-        return os.strerror(error.errno)
-    return str(error) or type(error).__name__
+    if isinstance(error, TimeoutError) and not error.errno:
+        return f"no answer within {CONNECT_TIMEOUT:g} s: is a broker there, and is tls right?"
+    return cause_of(error)

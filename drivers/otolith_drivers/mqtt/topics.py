@@ -12,11 +12,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Sample, Signal
-from otolith_drivers.canbus.monitoring import PeriodEstimator
+from otolith_drivers.common.periods import PeriodEstimator
+from otolith_drivers.common.remote_clock import ArrivalClock, unix_time
+from otolith_drivers.common.scaled import Conversion, ScaledSource
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.remote_clock import ArrivalClock, unix_time
-from otolith_drivers.scaled import Conversion, ScaledSource
 from otolith_drivers.units import Quantity
 
 MAX_PAYLOAD = 1 << 16  # bytes of a message that is read

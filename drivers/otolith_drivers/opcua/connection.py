@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import os
 import time
 from collections import deque
 from collections.abc import AsyncIterator
@@ -16,16 +15,17 @@ from asyncua import Client, ua
 from asyncua.crypto import security_policies
 from asyncua.ua.ua_binary import struct_from_binary
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives import hashes
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.config_files import StrictModel, content
-from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.remote_clock import ExchangeClock, unix_time
-from otolith_drivers.scaled import ScaledSource
+from otolith_drivers.common.credentials import certificate, certificate_and_key, password
+from otolith_drivers.common.reconnection import cause_of
+from otolith_drivers.common.remote_clock import ExchangeClock, unix_time
+from otolith_drivers.common.scaled import ScaledSource
+from otolith_drivers.config_files import StrictModel
+from otolith_drivers.errors import nearest
 from otolith_drivers.units import Quantity
 
-PEM_LIMIT = 1 << 16  # bytes of a certificate or key; a long chain has 10 kB
 CLOSE_TIMEOUT = 0.4  # s for the server to end the session; the driver interface asks for 1 s in all
 MAX_BROWSED = 20_000  # nodes of a server that are looked at
 MODES = {"sign": ua.MessageSecurityMode.Sign, "sign and encrypt": ua.MessageSecurityMode.SignAndEncrypt}
@@ -122,43 +122,13 @@ class OpcUaCredentials:
         Raises:
             ConfigurationError: a file is missing, has other content, or key and certificate do not belong together.
         """
-        certificate = server = key = None
+        own = key = server = None
         if options.certificate is not None and options.key is not None:
-            certificate = _certificate(folder / options.certificate, "certificate")
-            key = _key(folder / options.key)
-            if key.public_key() != certificate.public_key():
-                raise ConfigurationError(
-                    f"{options.key}: is not the key of {options.certificate}: give those that belong together",
-                    ("driver", "key"),
-                )
+            own, key = certificate_and_key(folder / options.certificate, folder / options.key)
         if options.server_certificate is not None:
-            server = _certificate(folder / options.server_certificate, "server_certificate")
-        password = ""
-        if options.password_file is not None:
-            where = ("driver", "password_file")
-            lines = content(folder / options.password_file, PEM_LIMIT, where).decode(errors="replace").splitlines()
-            password = lines[0] if lines else ""
-        return cls(certificate, key, server, password)
-
-
-def _certificate(path: Path, key: str) -> x509.Certificate:
-    data = content(path, PEM_LIMIT, ("driver", key))
-    try:
-        is_pem = b"-----BEGIN" in data
-        return x509.load_pem_x509_certificate(data) if is_pem else x509.load_der_x509_certificate(data)
-    except ValueError as error:
-        raise ConfigurationError(f"{path}: is no X.509 certificate in PEM or DER", ("driver", key)) from error
-
-
-def _key(path: Path) -> Any:
-    data = content(path, PEM_LIMIT, ("driver", "key"))
-    load = serialization.load_pem_private_key if b"-----BEGIN" in data else serialization.load_der_private_key
-    try:
-        return load(data, None)
-    except (ValueError, TypeError) as error:
-        raise ConfigurationError(
-            f"{path}: is no private key in PEM or DER without a password", ("driver", "key")
-        ) from error
+            server = certificate(folder / options.server_certificate, "server_certificate")
+        secret = None if options.password_file is None else folder / options.password_file
+        return cls(own, key, server, password(secret))
 
 
 class RefusedError(Exception):
@@ -206,8 +176,8 @@ async def _secure(client: Client, options: OpcuaOptions, credentials: OpcUaCrede
     Raises:
         RefusedError: the server has not the policy, or not the certificate that the machine file names.
     """
-    certificate = credentials.certificate
-    assert certificate is not None  # noqa: S101 - for the type checker
+    own = credentials.certificate
+    assert own is not None  # noqa: S101 - for the type checker
     endpoints = await client.connect_and_get_server_endpoints()
     policy: Any = getattr(security_policies, f"SecurityPolicy{options.security}")
     suited = [
@@ -227,9 +197,9 @@ async def _secure(client: Client, options: OpcuaOptions, credentials: OpcUaCrede
         print_of = presented.fingerprint(hashes.SHA256()).hex(":")
         raise RefusedError(f"the server's certificate is not that of server_certificate: it has the SHA-256 {print_of}")
     with suppress(x509.ExtensionNotFound):  # the server compares it with the certificate
-        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        names = own.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         client.application_uri = (*names.get_values_for_type(x509.UniformResourceIdentifier), client.application_uri)[0]
-    client.security_policy = policy(presented, certificate, credentials.key, MODES[options.mode])
+    client.security_policy = policy(presented, own, credentials.key, MODES[options.mode])
     client.uaclient.set_security(client.security_policy)
 
 
@@ -248,13 +218,9 @@ def _cause(error: ua.UaError, options: OpcuaOptions) -> str:
 
 def reason(error: BaseException, timeout: float) -> str:
     """Return why the connection failed."""
-    if isinstance(error, RefusedError):
-        return str(error)
-    if isinstance(error, TimeoutError):
-        return f"no answer within {timeout:g} s"
-    if isinstance(error, OSError) and error.errno and error.errno > 0:
-        return os.strerror(error.errno)
-    return str(error) or type(error).__name__
+    if isinstance(error, TimeoutError) and not error.errno:
+        return f"no answer within {timeout:g} s: is an OPC UA server there?"
+    return cause_of(error)
 
 
 async def exchange(client: Client, clock: ExchangeClock) -> None:
@@ -279,8 +245,12 @@ async def node_id(client: Client, text: str) -> ua.NodeId:
         ValueError: the server has no such namespace.
     """
     node = ua.NodeId.from_string(text)
-    uri = getattr(node, "NamespaceUri", None)
-    return node if uri is None else ua.NodeId(node.Identifier, await client.get_namespace_index(uri), node.NodeIdType)
+    if (uri := getattr(node, "NamespaceUri", None)) is None:
+        return node
+    spaces = await client.get_namespace_array()
+    if uri not in spaces:
+        raise ValueError(f"the server has no namespace {uri!r}: {nearest(uri, spaces)}")
+    return ua.NodeId(node.Identifier, spaces.index(uri), node.NodeIdType)
 
 
 async def unit_of(client: Client, node: ua.NodeId) -> str:

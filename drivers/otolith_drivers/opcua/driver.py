@@ -1,13 +1,12 @@
 """The OPC UA driver: subscribes to variables of a server, and reconnects after every fault. It can only read.
 
 The time of a sample is the source's time stamp, which is on the server's clock. That clock is compared with this
-computer's by the times in the answers, so the error of the times is bounded (see ``remote_clock.py``).
+computer's by the times in the answers, so the error of the times is bounded (see ``common/remote_clock.py``).
 """
 
 import asyncio
 import logging
 import math
-import random
 import threading
 import time
 from collections.abc import Sequence
@@ -16,6 +15,9 @@ from typing import Any
 from asyncua import Client, ua
 
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
+from otolith_drivers.common.reconnection import Reconnection
+from otolith_drivers.common.remote_clock import unix_time
+from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.opcua.connection import (
     OpcUaCredentials,
@@ -29,8 +31,6 @@ from otolith_drivers.opcua.connection import (
     unit_of,
 )
 from otolith_drivers.opcua.readings import NodeSignal, Readings
-from otolith_drivers.remote_clock import unix_time
-from otolith_drivers.scaled import Conversion
 
 __all__ = ["OpcuaSubscriber", "Options", "Source", "build"]
 
@@ -39,7 +39,6 @@ log = logging.getLogger(__name__)
 Options = OpcuaOptions
 Source = OpcuaSource
 
-BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
 CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s
 FIRST_EXCHANGES = 5  # questions for the server's time before the first value is used
 EXCHANGE_PERIOD = 2.0  # s between two such questions later on
@@ -72,8 +71,7 @@ class OpcuaSubscriber:
 
     def __init__(self, options: OpcuaOptions, credentials: OpcUaCredentials, readings: Readings, period: float) -> None:
         self._options, self._credentials, self._readings, self._period = options, credentials, readings, period
-        self._up, self._was_up, self._reason = False, False, "not opened yet"
-        self._reconnects = 0
+        self._connection = Reconnection(f"OPC UA {options.endpoint}", log)
         self._latest = -math.inf  # s; time of the latest message
         self._slow = ""  # what the server grants less than was asked
         self._ended = ""  # why the server has ended the subscription
@@ -87,7 +85,7 @@ class OpcuaSubscriber:
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
-        self._reason = "not connected yet"
+        self._connection.reason = "not connected yet"
         self._thread = threading.Thread(
             target=lambda: asyncio.run(self._run(deliver)), name="opcua-subscribe", daemon=True
         )
@@ -104,11 +102,11 @@ class OpcuaSubscriber:
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
         readings = self._readings
-        return Counters(readings.received, readings.bad, readings.lost, self._reconnects)
+        return Counters(readings.received, readings.bad, readings.lost, self._connection.count)
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
-        readings, now = self._readings, time.monotonic()
+        readings, connection, now = self._readings, self._connection, time.monotonic()
         lines = [line for node in readings.signals for line in node.warnings(now)]
         if readings.server_stamped:
             lines.append(f"{readings.server_stamped} values without a source time stamp have that of the server")
@@ -119,7 +117,9 @@ class OpcuaSubscriber:
             plan = f"the server's clock is {abs(self._ahead):.4g} s {where} this computer's, known within {bound}"
             plan += f", set {counted(readings.clock.steps, 'time')}" if readings.clock.steps else ""
             plan += f", {self._slow}" if self._slow else ""
-        return Link(self._up, self._reason, tuple(lines) if self._up else (), plan, latency=self._interval)
+        return Link(
+            connection.up, connection.reason, tuple(lines) if connection.up else (), plan, latency=self._interval
+        )
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
@@ -132,17 +132,15 @@ class OpcuaSubscriber:
 
     async def _run(self, deliver: Deliver) -> None:
         self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
-        backoff = BACKOFF_FIRST
         while not self._stop.is_set():
             try:
                 await self._session(deliver)
             except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - nothing may end the thread
                 if self._stop.is_set():
                     return
-                backoff = BACKOFF_FIRST if self._up else min(2.0 * backoff, BACKOFF_MAX)
-                self._go_down(reason(error, self._options.timeout))
+                self._connection.go_down(reason(error, self._options.timeout))
             try:
-                await asyncio.sleep(backoff * random.uniform(0.5, 1.0))  # noqa: S311 - jitter, not a secret
+                await asyncio.sleep(self._connection.backoff.next())
             except asyncio.CancelledError:
                 return
 
@@ -151,7 +149,7 @@ class OpcuaSubscriber:
         async with connected(self._options, self._credentials) as client:
             for _ in range(FIRST_EXCHANGES):
                 await self._compare_clocks(client)
-            await self._learn_units(client)
+            await self._look_up(client)
             interval = await self._subscribe(client, deliver)
             limit = max(MIN_SILENCE, SILENT_INTERVALS * interval)
             while True:
@@ -169,14 +167,19 @@ class OpcuaSubscriber:
         self._ahead = time.monotonic() - time.time() - self._readings.clock.offset
         self._clocks_due = time.monotonic() + EXCHANGE_PERIOD
 
-    async def _learn_units(self, client: Client) -> None:
-        """Ask for the units that the machine file leaves out."""
+    async def _look_up(self, client: Client) -> None:
+        """Ask for the variables, and for the units that the machine file leaves out."""
         for node in self._readings.signals:
             node.fault = ""
+            try:
+                node.node = await node_id(client, node.source.node)
+            except ValueError as error:
+                node.fault = f"{node.source.node}: {error}"
+                continue
             if node.source.unit is not None:
                 continue
             try:
-                unit = await unit_of(client, await node_id(client, node.source.node))
+                unit = await unit_of(client, node.node)
                 node.conversion = Conversion.of(node.source, unit, node.signal.unit) if unit else None
                 node.fault = "" if unit else f"{node.source.node} has no unit on the server: set 'unit' beside it"
             except (ua.UaStatusCodeError, ValueError) as error:
@@ -207,9 +210,7 @@ class OpcuaSubscriber:
         if not indices:
             return []
         nodes = [self._readings.signals[index] for index in indices]
-        items = [
-            await self._item(client, node, index, by_stamp=by_stamp) for index, node in zip(indices, nodes, strict=True)
-        ]
+        items = [self._item(node, index, by_stamp=by_stamp) for index, node in zip(indices, nodes, strict=True)]
         asked = ua.CreateMonitoredItemsParameters(
             SubscriptionId=subscription, TimestampsToReturn=ua.TimestampsToReturn.Both, ItemsToCreate=items
         )
@@ -225,9 +226,7 @@ class OpcuaSubscriber:
                 self._slow = f"by its own account the server samples {node.signal.name} {rates}"
         return refused
 
-    async def _item(
-        self, client: Client, node: NodeSignal, index: int, *, by_stamp: bool
-    ) -> ua.MonitoredItemCreateRequest:
+    def _item(self, node: NodeSignal, index: int, *, by_stamp: bool) -> ua.MonitoredItemCreateRequest:
         """Return the request for a variable; with ``by_stamp`` it is also sent when only its time stamp changes."""
         parameters = ua.MonitoringParameters(
             ClientHandle=index,
@@ -237,7 +236,7 @@ class OpcuaSubscriber:
         )
         if by_stamp:
             parameters.Filter = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
-        where = ua.ReadValueId(NodeId=await node_id(client, node.source.node), AttributeId=ua.AttributeIds.Value)
+        where = ua.ReadValueId(NodeId=node.node, AttributeId=ua.AttributeIds.Value)
         return ua.MonitoredItemCreateRequest(
             ItemToMonitor=where, MonitoringMode=ua.MonitoringMode.Reporting, RequestedParameters=parameters
         )
@@ -256,17 +255,5 @@ class OpcuaSubscriber:
             self._clocks_due = now
         samples = readings.take(message, values, now)
         if samples and not self._stop.is_set():
-            self._come_up()
+            self._connection.come_up("sends values")
             deliver(samples)
-
-    def _come_up(self) -> None:
-        if not self._up:
-            self._up, self._reason = True, ""
-            self._reconnects += self._was_up
-            self._was_up = True
-            log.info("OPC UA %s: sends values", self._options.endpoint)
-
-    def _go_down(self, cause: str) -> None:
-        if cause != self._reason:
-            log.warning("OPC UA %s: %s; retried until it answers", self._options.endpoint, cause)
-        self._up, self._reason = False, cause

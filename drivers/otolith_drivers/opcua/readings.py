@@ -12,10 +12,10 @@ from typing import Any
 from asyncua import ua
 
 from otolith_drivers.base import Sample, Signal
-from otolith_drivers.canbus.monitoring import PeriodEstimator
+from otolith_drivers.common.periods import PeriodEstimator
+from otolith_drivers.common.remote_clock import ExchangeClock, unix_time
+from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.opcua.connection import OpcuaSource
-from otolith_drivers.remote_clock import ExchangeClock, unix_time
-from otolith_drivers.scaled import Conversion
 
 HOLD_INTERVALS = 5.0  # messages without a change, after which a value is repeated at each message
 MAX_AGE = 5.0  # s between the stamp of a value and its message; more is another clock, or a time zone
@@ -30,6 +30,8 @@ class NodeSignal:
     signal: Signal
     conversion: Conversion | None = None
     """None until the unit is known."""
+    node: Any = None
+    """Its variable on the server, a ``ua.NodeId``; None until it is looked up."""
     fault: str = ""
     """Why the server does not send it; empty if it does."""
     value: float = math.nan

@@ -14,8 +14,8 @@ from typing import Any
 from otolith_drivers.canbus import ASAMMDF, can
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT
 from otolith_drivers.canbus.signals import CLASSIC_LENGTH
+from otolith_drivers.common.remote_clock import unix_time
 from otolith_drivers.errors import ConfigurationError, some_names
-from otolith_drivers.remote_clock import unix_time
 from otolith_drivers.replay.formats import GZIP, seen
 
 STANDARD_DIGITS = 3  # of an identifier of 11 bits

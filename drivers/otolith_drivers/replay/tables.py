@@ -268,9 +268,11 @@ def _header_line(path: Path, file: TextIO) -> tuple[int, str, str]:
 
 def _missing(request: ColumnRequest, others: list[str], cells: list[str]) -> str:
     what = f"no column {request.column!r} ({'seconds' if request.column == TIME else request.unit})"
+    kind = seen(",".join(cells).encode())
+    other = f"; is the file {kind} instead of a table?" if kind else ""
     if len(cells) < 2:
-        return f"{what}, and no ',', ';' or tab between columns"
-    return f"{what}: {nearest(request.column, others) if others else 'add it'}"
+        return f"{what}, and no ',', ';' or tab between columns{other}"
+    return f"{what}: {nearest(request.column, others) if others else 'add it'}{other}"
 
 
 def _split_quoted(line: str, separator: str) -> list[str]:

@@ -123,11 +123,21 @@ def test_a_server_that_is_no_broker_and_files_that_are_none_are_named(tmp_path: 
         with opened(other.getsockname()[1], setup_of(omega=SPEED)) as (driver, _):
             with other.accept()[0] as connection:
                 connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-            wait_for(lambda: driver.link().reason != "not connected yet")
+            wait_for(lambda: "is one there" in driver.link().reason)
         assert not driver.link().up
-    (tmp_path / "ca").write_text("nothing")
-    with pytest.raises(ConfigurationError, match="cannot be read"):
-        mqtt.build(mqtt.Options(host="a", tls=True, ca=Path("ca")), setup_of(tmp_path, omega=SPEED))
+    (tmp_path / "none").write_text("nothing")
+    certificate(tmp_path, "own")
+    for keys, fault in (
+        ({"ca": "none"}, "none: is no X.509"),
+        ({"ca": "own.der"}, "PEM"),
+        ({"ca": "absent"}, "absent: cannot be read"),
+        ({"certificate": "none", "key": "own.pem"}, "none: is no X.509"),
+        ({"certificate": "own.der", "key": "none"}, "none: is no private key"),
+        ({"user": "me", "password_file": "absent"}, "absent: cannot be read"),
+    ):
+        options = mqtt.Options.model_validate({"host": "a", "tls": True} | keys)
+        with pytest.raises(ConfigurationError, match=fault):
+            mqtt.build(options, setup_of(tmp_path, omega=SPEED))
 
 
 @pytest.mark.parametrize(("time_format", "unit"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])

@@ -15,6 +15,7 @@ from click.testing import CliRunner
 
 from otolith.cli.main import cli
 from otolith_drivers.base import Sample, Setup, Signal
+from otolith_drivers.common import reconnection
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.opcua import driver as opcua
 from otolith_drivers.opcua.readings import MAX_AGE
@@ -55,7 +56,7 @@ def port() -> int:
 def test_a_server_that_hangs_or_is_killed_and_comes_back_costs_counted_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(opcua, "BACKOFF_MAX", 0.3)
+    monkeypatch.setattr(reconnection, "BACKOFF_MAX", 0.3)
     port = free_port(socket.SOCK_STREAM)
     with opcua_server(port, VALUES) as server, opened(port, tmp_path, timeout="0.5 s") as (driver, samples):
         wait_for(lambda: len(samples) > 100)
@@ -113,6 +114,15 @@ def test_an_unknown_node_and_a_missing_unit_are_named(port: int, tmp_path: Path)
     assert {sample.signal for sample in samples} == {"omega"}
     with opened(port, tmp_path, nodes={"i": "ns=0;i=2267"}) as (driver, _):
         wait_for(lambda: "set 'unit'" in driver.link().reason)
+
+
+def test_a_namespace_that_the_server_lacks_costs_only_its_signal(port: int, tmp_path: Path) -> None:
+    nodes = {"i": "ns=2;s=i", "omega": "nsu=urn:moter;s=omega"}
+    with opened(port, tmp_path, nodes=nodes) as (driver, samples):
+        wait_for(lambda: len(samples) > 10)
+        (warning,) = driver.link().warnings
+        assert "'urn:moter': did you mean 'urn:motor'?" in warning
+        assert {sample.signal for sample in samples} == {"i"}
 
 
 def test_a_server_of_another_kind_and_none_are_named(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ async def _browse(options: "OpcuaOptions", most: int) -> "list[Variable]":
     try:
         async with connected(options, credentials) as client:
             return await browse(client, most)
-    except Exception as error:
+    except Exception as error:  # the library raises anything that a server makes it raise
         raise DeviceError(f"OPC UA {options.endpoint}: {reason(error, options.timeout)}") from error
 
 

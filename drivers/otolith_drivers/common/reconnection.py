@@ -1,0 +1,61 @@
+"""A connection that is opened again after each fault: its state, the pauses between attempts, and causes in words."""
+
+import logging
+import os
+import random
+import ssl
+
+BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
+
+
+class ReconnectBackoff:
+    """Pauses between attempts to connect, doubled each time, with jitter so that clients do not come all at once."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin with the shortest pause again."""
+        self._pause = BACKOFF_FIRST
+
+    def next(self) -> float:
+        """Return the next pause, s."""
+        pause, self._pause = self._pause, min(2.0 * self._pause, BACKOFF_MAX)
+        return pause * random.uniform(0.5, 1.0)  # noqa: S311 - jitter, not a secret
+
+
+class Reconnection:
+    """Whether a connection is up, why it is down, and how often it came back. Each change is logged once."""
+
+    def __init__(self, title: str, log: logging.Logger) -> None:
+        """``title`` begins each line of the log."""
+        self.up, self.reason, self.count = False, "not opened yet", 0
+        self.backoff = ReconnectBackoff()
+        self._title, self._log = title, log
+        self._was_up = False
+        self._logged = ""  # the latest reason
+
+    def come_up(self, what: str) -> None:
+        """Note that the other end ``what``, like "answers"."""
+        if not self.up:
+            self.up, self.reason, self._logged = True, "", ""
+            self.count += self._was_up
+            self._was_up = True
+            self.backoff.reset()
+            self._log.info("%s: %s", self._title, what)
+
+    def go_down(self, reason: str) -> None:
+        """Note why the connection is down."""
+        if reason != self._logged:
+            self._logged = reason
+            self._log.warning("%s: %s; retried until it answers", self._title, reason)
+        self.up, self.reason = False, reason
+
+
+def cause_of(error: BaseException) -> str:
+    """Return why a connection failed, without the prefixes that libraries add to the texts of the system."""
+    if isinstance(error, ssl.SSLError):  # an OSError, but its number is none of the system
+        return f"TLS fails: {getattr(error, 'reason', '') or error}"
+    if isinstance(error, OSError) and error.errno and error.errno > 0:
+        return os.strerror(error.errno)
+    return (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__

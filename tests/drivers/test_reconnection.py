@@ -1,0 +1,53 @@
+"""The state of a connection that fails and returns, whichever driver has it."""
+
+import errno
+import logging
+import socket
+import ssl
+
+import pytest
+
+from otolith_drivers.common.reconnection import BACKOFF_FIRST, BACKOFF_MAX, Reconnection, cause_of
+
+
+def test_a_pause_grows_until_the_connection_is_up() -> None:
+    connection = Reconnection("line", logging.getLogger("test"))
+    pauses = [connection.backoff.next() for _ in range(10)]
+    for number, pause in enumerate(pauses):
+        longest = min(BACKOFF_FIRST * 2.0**number, BACKOFF_MAX)
+        assert 0.5 * longest <= pause <= longest
+    connection.come_up("answers")
+    assert connection.backoff.next() <= BACKOFF_FIRST
+
+
+def test_each_change_is_logged_once_and_each_return_counted(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    connection = Reconnection("line", logging.getLogger("test"))
+    assert (connection.up, connection.reason) == (False, "not opened yet")
+    for _ in range(2):
+        connection.come_up("answers")
+        connection.come_up("answers")
+        assert (connection.up, connection.reason) == (True, "")
+        for _ in range(3):
+            connection.reason = "waiting"  # between two attempts
+            connection.go_down("no answer")
+        assert (connection.up, connection.reason) == (False, "no answer")
+    assert connection.count == 1
+    assert caplog.messages == ["line: answers", "line: no answer; retried until it answers"] * 2
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (OSError(errno.ECONNREFUSED, "Connect call failed ('127.0.0.1', 4840)"), "Connection refused"),
+        (socket.gaierror(socket.EAI_NONAME, "Name or service not known"), "Name or service not known"),
+        (ConnectionError("the connection was closed"), "the connection was closed"),
+        (
+            ssl.SSLError(1, "[SSL: WRONG_VERSION_NUMBER] wrong version number"),
+            "TLS fails: [SSL: WRONG_VERSION_NUMBER] wrong version number",
+        ),
+        (ValueError(), "ValueError"),
+    ],
+)
+def test_a_cause_is_the_text_of_the_system_without_prefixes(error: Exception, cause: str) -> None:
+    assert cause_of(error) == cause
