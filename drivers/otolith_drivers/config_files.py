@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 
 from otolith_drivers.errors import ConfigurationError, nearest
 
@@ -28,6 +29,7 @@ TOML_TYPES = {
     "dict_type": "a table",
     "model_type": "a table",
     "string_type": "a text, in quotes",
+    "path_type": "a text, in quotes",
 }
 """How TOML writes what pydantic's error type asks for."""
 KINDS = {
@@ -58,6 +60,36 @@ class StrictModel(BaseModel):
     """A table of a file: unknown keys are errors, values are finite and immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_the_written_types(cls, table: object) -> object:
+        """Refuse what pydantic converts (a boolean for a number, a number for a boolean), and zero bytes."""
+        fields = {field.alias or name: field for name, field in cls.model_fields.items()}
+        for key, value in table.items() if isinstance(table, dict) else ():
+            if isinstance(value, str) and "\0" in value:
+                raise _ValueFaultError(key, f"{value!r} contains a zero byte")
+            if key in fields and isinstance(value, bool | int | float):
+                _check_number(key, value, fields[key])
+        return table
+
+
+class _ValueFaultError(ValueError):
+    """A fault of one key, found in its table."""
+
+    def __init__(self, key: str, message: str) -> None:
+        super().__init__(message)
+        self.key = key
+
+
+def _check_number(key: str, value: float, field: FieldInfo) -> None:
+    if any(isinstance(one, BeforeValidator) for one in field.metadata):
+        return  # it has a check of its own
+    kinds = {kind if isinstance(kind, type) else type(kind) for kind in _kinds(field.annotation)}
+    if isinstance(value, bool) and kinds & {int, float} and bool not in kinds:
+        raise _ValueFaultError(key, f"{str(value).lower()} is a boolean: write a number")
+    if not isinstance(value, bool) and bool in kinds and not kinds & {int, float}:
+        raise _ValueFaultError(key, f"{value!r} is a number: write true or false")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +129,20 @@ class Context:
             raise ConfigurationError(f"{self.file.place(self._location)}: {error}") from error
 
 
+def _kinds(annotation: Any) -> Iterator[Any]:
+    """Yield the types and literals of a union; not those of lists, and not those with a check of their own."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated and not any(isinstance(one, BeforeValidator) for one in arguments):
+        yield from _kinds(arguments[0])
+    elif origin in (typing.Union, types.UnionType):
+        for part in arguments:
+            yield from _kinds(part)
+    elif origin is typing.Literal:
+        yield from arguments
+    elif isinstance(annotation, type):
+        yield annotation
+
+
 def content(path: Path, limit: int, key: tuple[str, ...] = ()) -> bytes:
     """Return the bytes of ``path``; ``key`` is the key of the machine file that names it.
 
@@ -109,8 +155,8 @@ def content(path: Path, limit: int, key: tuple[str, ...] = ()) -> bytes:
         if path.stat().st_size > limit:
             raise ConfigurationError(f"{path}: larger than {limit} bytes, so it is not read", key)
         return path.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}", key) from error
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        raise ConfigurationError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}", key) from error
 
 
 def read(path: Path) -> SourceFile:
@@ -199,7 +245,9 @@ def _faults(error: ValidationError, data: Any, model: type[BaseModel]) -> Iterat
     """Yield location and message of each fault; where a union fails, that of its first member."""
     faults: dict[tuple[int | str, ...], Any] = {}
     for fault in error.errors():
-        faults.setdefault(_written(data, fault["loc"], is_missing=fault["type"] == "missing"), fault)
+        cause = fault.get("ctx", {}).get("error")
+        location = (*fault["loc"], cause.key) if isinstance(cause, _ValueFaultError) else fault["loc"]
+        faults.setdefault(_written(data, location, is_missing=fault["type"] == "missing"), fault)
     for at, fault in faults.items():
         # A table that fails because of its content adds nothing to the fault of the content.
         if not any(len(other) > len(at) and other[: len(at)] == at for other in faults):

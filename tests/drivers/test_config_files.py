@@ -1,7 +1,7 @@
 """TOML files as closed models: each fault names file, line, key and remedy."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pytest
 from hypothesis import given
@@ -22,6 +22,10 @@ class Outer(StrictModel):
     inner: Inner = Inner()
     entries: tuple[Inner, ...] = ()
     quantity: float | str = 0.0
+    choice: Literal[0, 1] | None = None
+    switch: bool = True
+    either: int | bool | None = None
+    folder: Path | None = None
     named: dict[str, Annotated[Inner, BeforeValidator(lambda value: value)]] | None = None
 
 
@@ -36,6 +40,11 @@ FAULTS = [
     ("name = 'x'\n[[entries]]\nspeed = 1.0\n[[entries]]\nspeed = 'fast'\n", "5: entries[1].speed: 'fast': the value"),
     ("name = 'x'\n[named.a]\ntorqe = 1.0\n", "3: named.a.torqe: unknown key 'torqe': did you mean 'torque'?"),
     ("name = 'x'\ninner = { speed = inf }\n", "2: inner.speed: inf: the value should be a finite number"),
+    ("name = 'x'\ninner = { speed = true }\n", "2: inner.speed: true is a boolean: write a number"),
+    ("name = 'x'\nchoice = true\n", "2: choice: true is a boolean: write a number"),
+    ("name = 'x'\nswitch = 0\n", "2: switch: 0 is a number: write true or false"),
+    ('name = "\\u0000"\n', "1: name: '\\x00' contains a zero byte"),
+    ("name = 'x'\nfolder = 1\n", "2: folder: 1: must be a text, in quotes"),
     ("name = 'x'\nquantity = [1]\n", "2: quantity: [1]: the value should be a valid number"),
     ("name = 'x'\nname = 'y'\n", "not valid TOML: "),
     ("[inner]\nspeed = 1.0\n", ": name: missing: this key must be set"),

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
 import can
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from otolith_drivers.config_files import StrictModel
-from otolith_drivers.errors import DeviceError, counted
+from otolith_drivers.errors import DeviceError, counted, nearest
 from otolith_drivers.units import Quantity
 
 RECEIVE_BUFFER = 8 << 20  # bytes; a second or two of a bus at its limit
@@ -68,6 +68,14 @@ class BusOptions(StrictModel):
     """Whether the adapter does not even acknowledge, if it can; ``false`` if no other node would."""
     port: Annotated[int, Field(ge=1024, le=65535)] = 43113
     """UDP port of ``udp_multicast``: two buses on one computer differ in it, or in their group."""
+
+    @field_validator("interface")
+    @classmethod
+    def _is_known(cls, interface: str) -> str:
+        known = ["auto", *can.VALID_INTERFACES]
+        if interface not in known:
+            raise ValueError(f"{interface!r} is no interface of python-can: {nearest(interface, known)}")
+        return interface
 
     @model_validator(mode="after")
     def _channel_fits(self) -> Self:
@@ -134,7 +142,7 @@ def open_bus(
     except (can.CanError, OSError, ImportError, ValueError, TypeError, AttributeError, NotImplementedError) as error:
         inner = error.__cause__ or error
         cause = (getattr(inner, "strerror", None) or str(inner) or type(inner).__name__).strip()
-        way_out = WAYS_OUT.get(interface, f"interfaces known here: {', '.join(sorted(can.VALID_INTERFACES))}")
+        way_out = WAYS_OUT.get(interface, "set driver.interface and driver.channel as python-can's documentation says")
         raise DeviceError(f"CAN bus {options.title()} cannot be opened: {cause}; {way_out}") from error
     return bus
 
