@@ -1,5 +1,6 @@
 """Child processes: a process that cannot be started, or dies, is restarted with growing pauses."""
 
+import os
 import signal
 import time
 from typing import Any
@@ -79,3 +80,17 @@ def sleep(connection: Any) -> None:
     """Main function of a child that never reads."""
     del connection
     time.sleep(60.0)
+
+
+def test_a_death_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    """A full disk delays the restart, not the message."""
+    child = ChildProcess("echo", "tests.runtime.test_process:echo", room=2)
+    child.start()
+    assert child._process is not None
+    os.kill(child._process.pid, signal.SIGKILL)
+    wait_for(lambda: not child.alive)
+    for _ in range(3):
+        child.may_restart(0.0)
+        child.count_failed_start()
+    child.stop(0.0)
+    assert caplog.messages == ["echo has ended with code -9, and is started again"]

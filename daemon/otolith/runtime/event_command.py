@@ -93,7 +93,7 @@ class EventCommand:
                 )
                 self._running.add(process)
         except (OSError, ValueError) as error:
-            return str(error)
+            return getattr(error, "strerror", None) or str(error)
         try:
             process.communicate(text.encode(), timeout=self._timeout)
         except subprocess.TimeoutExpired:

@@ -112,6 +112,9 @@ class ChildProcess:
         if self.alive:
             return False
         if self._restart_at is None:
+            if self._process is not None and self._process.exitcode != 0:
+                log.warning("%s has ended with code %s, and is started again", self.name, self._process.exitcode)
+                self._release()  # so that a start that fails does not log this again
             pause = FIRST_RESTART_PAUSE * 2 ** (self._deaths - 1) if self._deaths else 0.0
             self._deaths = min(self._deaths + 1, 16)
             self._restart_at = now + min(pause, MAX_RESTART_PAUSE)

@@ -158,11 +158,13 @@ class Supervisor:
             elif (report := self._take(reply)) is not None:
                 reports.append(report)
         if not self.worker.alive:
-            self._requeue("died")
+            self._requeue()
             if self.worker.may_restart(now):
                 self.start()
         elif self._current is not None and now > self._deadline:
-            self._requeue(f"has not finished window {self._current.index} in {self._allowed_seconds:.0f} s")
+            seconds = self._allowed_seconds
+            log.warning("the worker has not finished window %d in %.0f s and is killed", self._current.index, seconds)
+            self._requeue()
             self.worker.kill()
         self._dispatch(now)
         return reports
@@ -191,12 +193,11 @@ class Supervisor:
         self.progress += 1
         return result.report, result.seconds
 
-    def _requeue(self, reason: str) -> None:
+    def _requeue(self) -> None:
         """Put the current window back for the next worker, or count it as missed if it was put back before."""
         window, self._current = self._current, None
         if window is None:
             return
-        log.warning("the worker %s; it is restarted", reason)
         if window.index == self._retried:
             self._miss(window, "its worker died twice")
         else:
