@@ -142,10 +142,11 @@ class Subscriber:
         """Return what it waits for, in words."""
         addresses = ", ".join(self._endpoints or self._sessions)
         if self.connected:
-            return f"connected, waiting for {REPORT.under('*', self._machine)} ({addresses})"
+            reports = REPORT.under("*", self._machine)
+            return f"connected, waiting for {reports}, which the daemon may send to other readers only ({addresses})"
         if self._endpoints:
             return f"no daemon reached yet, or it refuses this reader; --connect sets where to look ({addresses})"
-        own = "no daemon of this user runs here, and no service that it may read"
+        own = "no daemon of this user has a socket here, and no service that it may read"
         return f"{own}: members of the group otolith may; --connect sets where to look"
 
     def __enter__(self) -> Self:
