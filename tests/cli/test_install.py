@@ -54,6 +54,17 @@ def test_every_step_is_shown_and_idempotent(file: Path, tmp_path: Path) -> None:
     assert "# changed" not in (root / f"{names[0]}~").read_text(encoding="utf-8")
 
 
+def test_a_file_that_another_machine_names_is_not_replaced_silently(file: Path, tmp_path: Path) -> None:
+    root, dbc = tmp_path / "root", tmp_path / "dc-motor.dbc"
+    installed(file, root)
+    other = Path(shutil.copy(file, tmp_path / "press-4.toml"))
+    assert "warning" not in installed(other, root)
+    dbc.write_bytes(dbc.read_bytes() + b"\n")
+    assert "dc-motor.dbc is also a file of press-3.toml: if they need another" in installed(other, root, "--dry-run")
+    assert "dc-motor.dbc is also a file of press-3.toml: if they need another" in installed(other, root)
+    assert "warning" not in installed(other, root)
+
+
 def test_the_shipped_unit_is_hardened(file: Path, tmp_path: Path) -> None:
     """Exposure by systemd's own measure, with the drop-in of the machine."""
     if shutil.which("systemd-analyze") is None:
@@ -83,6 +94,10 @@ def test_a_file_elsewhere_is_not_copied(file: Path, tmp_path: Path) -> None:
     deep.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigurationError, match="not in the folder of the machine file"):
         named_files(deep)
+    deep.write_text(text.replace("../dc-motor.dbc", "../deep/dc-motor.dbc"), encoding="utf-8")
+    shutil.copy(tmp_path / "dc-motor.dbc", tmp_path / "deep")
+    with pytest.raises(ConfigurationError, match="not in the folder of the machine file"):
+        named_files(deep)  # /etc/otolith/../deep would be another folder
     (tmp_path / "deep" / "link.dbc").symlink_to(tmp_path / "dc-motor.dbc")
     deep.write_text(text.replace("../dc-motor.dbc", "link.dbc"), encoding="utf-8")
     with pytest.raises(ConfigurationError, match="not in the folder of the machine file"):

@@ -1,5 +1,6 @@
 """``otolith install``: the service of one machine. Each step is idempotent, and shown by ``--dry-run``."""
 
+import contextlib
 import ipaddress
 import os
 import re
@@ -22,7 +23,7 @@ from otolith_drivers.errors import ConfigurationError, ServiceError
 
 UNIT, SYSUSERS = "otolith@.service", "otolith.sysusers.conf"
 PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
-USER = "otolith"
+USER, ETC = "otolith", Path("etc/otolith")
 # Drivers whose addresses are in the keys 'host', 'endpoint' and 'channel'.
 KNOWN_DRIVERS = {"can", "modbus", "mqtt", "opcua", "plant", "replay"}
 
@@ -58,7 +59,10 @@ def install(file: Path, dry_run: bool, root: Path) -> None:
         raise ServiceError("install needs root: use sudo, or --root DIR to look at the files, or --dry-run")
     files = list(_files(file))
     for item in files:
-        _put(item, root, dry_run=dry_run)
+        others = [other.name for other in _machines_with(root / item.path, root / ETC) if other.name != file.name]
+        if _put(item, root, dry_run=dry_run) and others:
+            remedy = "if they need another one, give this file another name"
+            click.echo(f"warning: {root / item.path} is also a file of {', '.join(others)}: {remedy}", err=True)
     private = [f"/{item.path}" for item in files if item.is_private]
     for command, user in _commands(file.stem, private):
         click.echo(f"{'run' if is_here and not dry_run else 'to run'}: {shlex.join(command)}")
@@ -80,17 +84,17 @@ def _files(file: Path) -> Iterator[InstalledFile]:
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", file.stem) or file.suffix != ".toml":
         raise ConfigurationError(f"{file}: its name becomes that of the service: use letters, digits, '_', '-', .toml")
     machine = load_machine(file)
-    shipped, etc = shipped_directory(), Path("etc")
+    shipped, etc = shipped_directory(), ETC.parent
     yield InstalledFile(etc / "systemd/system" / UNIT, (shipped / UNIT).read_bytes())
     yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
     zenoh = machine.file.zenoh
     text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect)
     yield InstalledFile(etc / f"systemd/system/otolith@{file.stem}.service.d/machine.conf", text.encode())
-    yield InstalledFile(etc / "otolith" / file.name, file.read_bytes())
+    yield InstalledFile(ETC / file.name, file.read_bytes())
     for name in named_files(file):
         source = file.parent / name
         is_private = not source.stat().st_mode & 0o004
-        yield InstalledFile(etc / "otolith" / name, source.read_bytes(), is_private)
+        yield InstalledFile(ETC / name, source.read_bytes(), is_private)
 
 
 def shipped_directory() -> Path:
@@ -110,7 +114,7 @@ def named_files(file: Path) -> list[Path]:
         name = Path(text)
         if text and len(text) < 255 and (file.parent / name).is_file() and not text.startswith("/dev/"):
             folder = file.parent.resolve()
-            if name.is_absolute() or folder not in (folder / name).resolve().parents:
+            if name.is_absolute() or ".." in name.parts or folder not in (folder / name).resolve().parents:
                 remedy = "the service reads /etc/otolith alone: copy it beside and name it so"
                 raise ConfigurationError(f"{file}: {text!r} is not in the folder of the machine file: {remedy}")
             names.append(name)
@@ -175,16 +179,24 @@ def _is_loopback(host: str) -> bool:
     return host == "localhost" or (address is not None and address.is_loopback)
 
 
-def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> None:
-    """Write a file as a whole, unless it is there; what it replaces is kept with a ``~``."""
+def _machines_with(path: Path, folder: Path) -> Iterator[Path]:
+    """Yield the machine files in ``folder`` that name the file ``path``."""
+    for machine in sorted(folder.glob("*.toml")):
+        with contextlib.suppress(ConfigurationError, OSError, ValueError):  # it is no machine file, or not readable
+            if path in [folder / name for name in named_files(machine)]:
+                yield machine
+
+
+def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
+    """Write a file as a whole; what it replaces is kept with a ``~``. Return whether it replaces another content."""
     path = root / item.path
     before = path.read_bytes() if path.is_file() else None
     if before == item.content:
         click.echo(f"unchanged: {path}")
-        return
+        return False
     click.echo(f"{'to ' if dry_run else ''}{'write' if before is None else 'replace'}: {path}")
     if dry_run:
-        return
+        return before is not None
     path.parent.mkdir(parents=True, exist_ok=True)
     if before is not None:
         shutil.copy2(path, path.with_name(f"{path.name}~"))
@@ -193,6 +205,7 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> None:
         stream.write(item.content)
         os.fchmod(stream.fileno(), 0o640 if item.is_private else 0o644)
     Path(temporary).replace(path)
+    return before is not None
 
 
 def _commands(name: str, private: list[str]) -> list[tuple[list[str], str | None]]:
