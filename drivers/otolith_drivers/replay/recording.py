@@ -94,7 +94,8 @@ class RecordingReader(Reader):
             ConfigurationError: the child was killed by a signal.
         """
         command = [sys.executable, "-c", READ_ALL, str(self.path)]
-        child = subprocess.run(command, capture_output=True, check=False)  # noqa: S603 - our own interpreter
+        # In a process group of its own: Ctrl-C would end it, which does not mean that the file is damaged.
+        child = subprocess.run(command, capture_output=True, check=False, process_group=0)  # noqa: S603 - our own interpreter
         if child.returncode < 0:
             raise ConfigurationError(f"{self.path}: damaged, or no recording (its reader aborts); {self._repair}")
 
