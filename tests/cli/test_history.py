@@ -14,11 +14,12 @@ import pytest
 from click.testing import CliRunner, Result
 
 from otolith.cli.main import cli
+from otolith.health.schema import EventChange
 from otolith.storage.history import HOUR, history_path
 from otolith.storage.history_retention import Bounds
-from otolith.storage.history_writer import HistoryWriter
+from otolith.storage.history_writer import HistoryWriter, Numbers
 from otolith_drivers.errors import ConfigurationError
-from tests.storage.histories import MACHINE, SITE, documents
+from tests.storage.histories import MACHINE, SITE, document, documents
 
 COUNT, LENGTH = 400, 30.0
 
@@ -55,6 +56,17 @@ def test_the_table_has_values_events_and_findings(written: HistoryWriter, is_run
     assert text.count("raised: WATCH: winding") == 4
     assert "finding: new torque on the shaft" in text
     assert f"in {COUNT // 2} windows" in text
+
+
+def test_a_cleared_event_says_so_once(written: HistoryWriter) -> None:
+    now = time.time()
+    cleared = document(COUNT, now, change=EventChange.CLEARED)
+    events = tuple(event.model_copy(update={"end": now}) for event in cleared.events)
+    numbers = Numbers(now)
+    written.add(numbers.number(cleared.model_copy(update={"events": events})))
+    written._write_waiting()
+    lines = run(MACHINE, "--events", width=400).stdout.splitlines()
+    assert len([line for line in lines if line.startswith("cleared: winding: short circuit")]) == 1
 
 
 @pytest.mark.parametrize("width", [40, 60])

@@ -150,6 +150,16 @@ def test_an_unclosed_recording_is_read_a_torn_one_repaired(
     assert len(reports(tmp_path / "whole.rrd", capsys)) >= 2
 
 
+def test_ctrl_c_does_not_call_a_recording_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal signals the process group; the child that tries the file is in another one."""
+    tested = "import os; os.kill(os.getpid(), 0 if os.getpgrp() != os.getpgid(os.getppid()) else 9)"
+    monkeypatch.setattr("otolith_drivers.replay.recording.READ_ALL", tested)
+    path = tmp_path / "empty.rrd"
+    path.touch()
+    with pytest.raises(ConfigurationError, match="file too small"):
+        RecordingReader(path, {})
+
+
 def test_a_recording_of_another_application_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.rrd"
     with pytest.raises(ConfigurationError, match="No such file"):

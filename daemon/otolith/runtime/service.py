@@ -14,11 +14,11 @@ import signal
 import sys
 import time
 from dataclasses import replace
-from datetime import UTC, datetime
 from multiprocessing.connection import wait
 from pathlib import Path
 from types import FrameType
 
+from otolith.acquisition.quality import time_text
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
@@ -161,9 +161,7 @@ class Service:
             log.warning("%s", text)
         self._notes, self._saved = tuple(notes), _keys(state)
         if math.isfinite(end := state.posterior.belief.end):
-            log.info(
-                "started with what was learned up to %s", datetime.fromtimestamp(end, UTC).isoformat(" ", "seconds")
-            )
+            log.info("started with what was learned up to %s", time_text(end))
         if state.adopted:
             remedy = "'otolith components forget' removes those that no longer exist"
             log.info(

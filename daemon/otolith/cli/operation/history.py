@@ -224,7 +224,8 @@ def _print_table(
     if samples:
         console.print(_table(samples, console.width))
     for event in events[-MAX_EVENTS:]:
-        console.print(f"{event.change}: {event_text(event, local_time)}", style=event_style(event), markup=False)
+        change = "" if event.end is not None else f"{event.change}: "  # the text of a cleared event begins with it
+        console.print(f"{change}{event_text(event, local_time)}", style=event_style(event), markup=False)
     if len(events) > MAX_EVENTS:
         console.print(f"and {len(events) - MAX_EVENTS} earlier changes of events: --events --csv has them")
     for finding in reader.findings(since) if with_findings else ():
