@@ -14,13 +14,13 @@ import pytest
 from hypothesis import settings
 
 from otolith.acquisition.window import Window
-from otolith.cli.common import examples_directory
+from otolith.cli.common import shipped_directory
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.progress import Progress
 from tests.waiting import EXACT
 
-EXAMPLES = examples_directory()
+EXAMPLES = shipped_directory("config")
 TESTS = Path(__file__).parent
 # Ports for tests. They are below the ephemeral range, so that the kernel never assigns them to another process.
 FIRST_PORT, LAST_PORT, PORTS = 10_000, 32_000, 400  # PORTS: ports of each process

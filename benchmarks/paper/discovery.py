@@ -17,7 +17,7 @@ from benchmarks.paper.scenarios import (
 )
 from benchmarks.paper.study import LENGTH, PERIOD, SEED, Curves, Kind, OnProgress, StepCounter, curves, reports_of
 from otolith.acquisition.window import Array, Window
-from otolith.cli.common import examples_directory
+from otolith.cli.common import shipped_directory
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import ComponentDocument, Report, ReportDocument
 from otolith_drivers.plant.faults import Step, Unbalance
@@ -129,7 +129,7 @@ def discover(job: Search, on_progress: OnProgress) -> Discovery:
     problem = problem_of(row, machine, deviations)
     records = round(LENGTH / record.period)
     reports = reports_of(problem, record, records, steps)
-    scenario = load_scenario(examples_directory() / "scenarios" / f"{row.name}.toml")
+    scenario = load_scenario(shipped_directory("config") / "scenarios" / f"{row.name}.toml")
     return _judged(job, scenario, list(record.windows(records)), reports, curves(problem, record, reports))
 
 

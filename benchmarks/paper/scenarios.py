@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.cli.common import examples_directory
+from otolith.cli.common import shipped_directory
 from otolith.estimation.problem import Problem
 from otolith.machine import LoadedMachine, load_machine
 from otolith_drivers.plant.scenario import load_scenario, simulate
@@ -270,7 +270,7 @@ def machine_of(row: AnyRow) -> LoadedMachine:
     Raises:
         OtolithError: its file cannot be used.
     """
-    return load_machine(examples_directory() / f"{row.machine}.toml", with_driver=False)
+    return load_machine(shipped_directory("config") / f"{row.machine}.toml", with_driver=False)
 
 
 def problem_of(row: AnyRow, machine: LoadedMachine, deviations: Mapping[str, float]) -> Problem:
@@ -298,7 +298,7 @@ def simulate_row(
     Raises:
         OtolithError: the scenario file cannot be used.
     """
-    scenario = load_scenario(examples_directory() / "scenarios" / f"{row.name}.toml")
+    scenario = load_scenario(shipped_directory("config") / "scenarios" / f"{row.name}.toml")
     noise = {sensor.plant: sensor.noise for sensor in sensors}
     scenario = scenario.model_copy(update={"noise": scenario.noise.model_copy(update=noise)})
     sources = [str(machine.file.signals[name]["signal"]) for name in machine.twin.signals]

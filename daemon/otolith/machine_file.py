@@ -3,6 +3,7 @@
 ``docs/reference/machine-file.md`` explains every key; paths are relative to the machine file.
 """
 
+import ipaddress
 import re
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,6 +35,21 @@ def _endpoint(text: str) -> str:
     if not text.startswith("unixsock-stream/") and not re.search(r":\d{1,5}$", text):
         raise ValueError(f'{text!r} has no port: write it like "tcp/127.0.0.1:7447"')
     return text
+
+
+def host_of(endpoint: str) -> str:
+    """Return the host of an endpoint like ``tcp/[::1]:7447``; empty for a socket of this computer."""
+    protocol, _, rest = endpoint.partition("/")
+    place = re.split(r"[?#]", rest)[0]
+    return "" if protocol.startswith("unix") else place.rpartition(":")[0].strip("[]")
+
+
+def address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """Return the address that ``host`` is; None for a name."""
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
 
 
 def _listening(text: str) -> str:

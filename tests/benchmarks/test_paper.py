@@ -32,7 +32,7 @@ from click.testing import CliRunner, Result
 from matplotlib.image import imread
 from rich.console import Console
 
-from otolith.cli.common import examples_directory
+from otolith.cli.common import shipped_directory
 from otolith.health.schema import Status
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.plant.scenario import load_scenario
@@ -112,7 +112,7 @@ def test_a_plot_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
 
 def test_every_row_estimates_its_drifting_parameter() -> None:
     for row in ROWS:
-        scenario = load_scenario(examples_directory() / "scenarios" / f"{row.name}.toml")
+        scenario = load_scenario(shipped_directory("config") / "scenarios" / f"{row.name}.toml")
         assert [getattr(fault, "parameter", None) for fault in scenario.faults] == [row.parameter]
         assert row.machine in SENSORS
     assert {row.machine for row in ROWS} >= set(LIMITING_SIGNAL)

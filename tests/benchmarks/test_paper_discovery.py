@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from matplotlib.image import imread
 from rich.console import Console
 
-from otolith.cli.common import examples_directory
+from otolith.cli.common import shipped_directory
 from otolith_drivers.plant.scenario import load_scenario
 
 SHORT = 20.0  # s
@@ -106,7 +106,7 @@ def test_discovery_plots_show_before_and_after(tmp_path: Path) -> None:
 
 def test_every_unknown_row_fits_its_scenario() -> None:
     for row in UNKNOWNS:
-        scenario = load_scenario(examples_directory() / "scenarios" / f"{row.name}.toml")
+        scenario = load_scenario(shipped_directory("config") / "scenarios" / f"{row.name}.toml")
         twin = machine_of(row).problem.twin
         assert len(scenario.faults) == 1
         assert row.component.split("/")[0] in [site.name for site in twin.sites]

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from otolith.cli.common import shipped_directory
 from otolith.cli.main import cli
-from otolith.cli.operation.install import UNIT, drop_in, named_files, shipped_directory
+from otolith.cli.operation.install import UNIT, drop_in, named_files
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 
@@ -45,7 +46,7 @@ def test_every_step_is_shown_and_idempotent(file: Path, tmp_path: Path) -> None:
     assert "compile /etc/otolith/press-3.toml" in shown
     installed(file, root)
     assert {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()} == set(names)
-    assert (root / names[2]).read_bytes() == (shipped_directory() / UNIT).read_bytes()
+    assert (root / names[2]).read_bytes() == (shipped_directory("systemd") / UNIT).read_bytes()
     assert (root / names[0]).stat().st_mode & 0o777 == 0o644
     again = installed(file, root)
     assert again.count("unchanged: ") == len(names)

@@ -21,7 +21,7 @@ from otolith.acquisition.windower import Windower
 from otolith_drivers.replay.readers import Integers, Rows
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
-RING_WINDOWS = 16  # windows that the rings hold
+REPLAY_RING_WINDOWS = 16  # windows that the rings of a replay hold
 MAX_RING_SAMPLES = 1 << 20  # samples of each signal, however many a window has
 MAX_SILENT_WINDOWS = 1  # window lengths; a longer time without any row is skipped
 
@@ -140,7 +140,7 @@ class Playback:
         if math.isinf(self._step):
             self._step = median_step(rows.times)
         step = min(old.sample_period, self._step)
-        held = RING_WINDOWS * old.length + max(plan.delay for plan in self._plans)
+        held = REPLAY_RING_WINDOWS * old.length + max(plan.delay for plan in self._plans)
         self._rings = Rings(old.signals, int(min(held / step, MAX_RING_SAMPLES)), self._observed)
         self._clock = self._begun = self._checked = float(rows.times[at])
 

@@ -111,7 +111,7 @@ def local_time(seconds: float) -> str:
     return time.strftime("%F %T", time.localtime(seconds))
 
 
-def examples_directory() -> Path:
-    """The folder of example machine files: in an installed package, or beside the sources of a checkout."""
-    installed = Path(__file__).parents[1] / "config"
-    return installed if installed.is_dir() else Path(__file__).parents[3] / "config"
+def shipped_directory(name: str) -> Path:
+    """The folder ``config`` or ``systemd``: in an installed package, or beside the sources of a checkout."""
+    installed = Path(__file__).parents[1] / name
+    return installed if installed.is_dir() else Path(__file__).parents[3] / name

@@ -24,9 +24,9 @@ from otolith.cli.common import (
     INTERRUPTED,
     MACHINE_FILE,
     StopSignal,
-    examples_directory,
     log_to_stderr,
     new_file,
+    shipped_directory,
 )
 from otolith.cli.operation.compile import compile_command
 from otolith.cli.operation.connection import endpoints, reader_options
@@ -280,9 +280,9 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
     from otolith.cli.demo import Demo
 
     stop = StopSignal()
-    machine = machine or examples_directory() / "dc-motor.toml"
-    scenario = scenario or examples_directory() / "scenarios" / "demo.toml"
-    code = Demo(machine, scenario, duration, as_json=as_json).run(stop.received)
+    examples = shipped_directory("config")
+    files = (machine or examples / "dc-motor.toml", scenario or examples / "scenarios" / "demo.toml")
+    code = Demo(*files, duration, as_json=as_json).run(stop.received)
     return stop.code() or code
 
 

@@ -1,6 +1,5 @@
 """Certificates: the checks of those that a session uses, and the small certificate authority of ``otolith keys``."""
 
-import ipaddress
 import os
 import stat
 from collections.abc import Iterable, Sequence
@@ -15,6 +14,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from otolith.machine_file import address_of
 from otolith_drivers.config_files import content
 from otolith_drivers.errors import ConfigurationError
 
@@ -126,18 +126,11 @@ def _is_for(names: set[str], host: str) -> bool:
 
     Clients may reach an address by any name, so an address is refused only if all names are other addresses.
     """
-    address = _address(host)
+    address = address_of(host)
     if address is None:
         host = host.lower()
         return bool(names & {host, f"*.{host.partition('.')[2]}"})
-    return str(address) in names or any(address.is_unspecified or _address(name) is None for name in names)
-
-
-def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(text)
-    except ValueError:
-        return None
+    return str(address) in names or any(address.is_unspecified or address_of(name) is None for name in names)
 
 
 def make_authority(folder: Path, now: datetime) -> datetime:
@@ -218,7 +211,7 @@ def _key_usage(*, authority: bool) -> x509.KeyUsage:
 
 
 def _host(text: str) -> x509.GeneralName:
-    address = _address(text)
+    address = address_of(text)
     return x509.DNSName(text) if address is None else x509.IPAddress(address)
 
 

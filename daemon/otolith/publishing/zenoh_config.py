@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from otolith.machine_file import LOCAL, ZenohTable
+from otolith.machine_file import LOCAL, ZenohTable, host_of
 from otolith_drivers.config_files import Context, read
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import runtime_directory, runtime_folders
@@ -83,7 +83,7 @@ class Access:
 
         table, folder = self.zenoh.tls, self.path.parent.absolute()
         identity = Identity(folder / table.ca, folder / table.certificate, folder / table.key)
-        hosts = [_host(endpoint) for endpoint in listen if endpoint.startswith(ENCRYPTED)]
+        hosts = [host_of(endpoint) for endpoint in listen if endpoint.startswith(ENCRYPTED)]
         keys = [("zenoh", "tls", name) for name in ("ca", "certificate", "key")]
         warning = check_identity(identity, keys, hosts, utc_now())
         own = {
@@ -153,11 +153,6 @@ def _limits() -> Settings:
     unicast = {"max_sessions": MAX_SESSIONS, "accept_pending": MAX_HALF_OPEN, "accept_timeout": HANDSHAKE_TIMEOUT}
     limits: Settings = {f"transport/unicast/{key}": value for key, value in unicast.items()}
     return {**limits, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
-
-
-def _host(endpoint: str) -> str:
-    """Return the host name or address of ``protocol/host:port``."""
-    return endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
 
 
 def _login(line: str, place: str, key: tuple[str, ...] = ()) -> tuple[str, str]:

@@ -4,7 +4,6 @@ It cannot disturb the machine: nothing in this package sends. ``decoder.py`` mak
 """
 
 import logging
-import threading
 import time
 from dataclasses import replace
 
@@ -25,6 +24,7 @@ from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import FrameOptions
 from otolith_drivers.canbus.signals import CanSource
 from otolith_drivers.common.reconnection import ReconnectBackoff
+from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
@@ -54,17 +54,15 @@ def build(options: CanOptions, setup: Setup) -> "CanReceiver":
     return CanReceiver(options, decoder_of(options, setup))
 
 
-class CanReceiver:
+class CanReceiver(ThreadedDriver):
     """Implements :class:`otolith_drivers.base.Driver` over python-can, with a receive thread of its own."""
 
     sampling = Sampling.CYCLIC
 
     def __init__(self, options: BusOptions, decoder: FrameDecoder) -> None:
-        self._options = options
-        self._decoder = decoder
+        super().__init__()
+        self._options, self._decoder = options, decoder
         self._link = Link(up=False, reason="not opened yet")
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self._reconnects = self._unreadable = self._consecutive_bad = 0
         self._drops = DropCounter()
         self._last_frame = self._opened = 0.0
@@ -78,14 +76,7 @@ class CanReceiver:
             log.warning("%s", line)
         self._last_frame = self._opened
         self._decoder.begin(self._opened)
-        self._thread = threading.Thread(target=self._receive, args=(bus, deliver), name="can-receive", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """See :meth:`otolith_drivers.base.Driver.close`."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=1.0)
+        self._start("can-receive", self._receive, bus, deliver)
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""

@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Signal
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT, CanDatabase
+from otolith_drivers.common.scaled import ScaledSource
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.units import UnitNameError, factor
@@ -150,8 +151,11 @@ KINDS: dict[str, tuple[str, ...]] = {
 EXAMPLES = '{ signal = "..." }, { id = "0x181", start = 0, length = 16, unit = "V" } or { node = 5, object = "0x6078" }'
 
 
-class CanSource(NumberFormat):
-    """Where a signal is: ``signal`` of a database, bits of the frames ``id``, or ``object`` of the CANopen ``node``."""
+class CanSource(NumberFormat, ScaledSource):
+    """Where a signal is: ``signal`` of a database, bits of the frames ``id``, or ``object`` of the CANopen ``node``.
+
+    ``unit`` and ``range`` replace those of the database; ``scale`` is per raw number, or per unit of the database.
+    """
 
     signal: str | None = None
     message: str | None = None
@@ -167,17 +171,8 @@ class CanSource(NumberFormat):
     object: str | None = None
     """``"0x6078"``, ``"0x6064:00"``, or the name in the object dictionary."""
 
-    unit: str | None = None
-    """On the bus; replaces that of the database."""
-    scale: float = 1.0
-    """``unit`` per raw number, or per unit of the database."""
-    offset: float = 0.0
-    """In ``unit``, added after ``scale``."""
-    range: tuple[float, float] | None = None
-    """In ``unit``; a value outside is no reading. Replaces that of the database."""
-
     @model_validator(mode="after")
-    def _is_consistent(self) -> Self:
+    def _is_one_place(self) -> Self:
         kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(kinds) != 1:
             raise ValueError(f"give one of 'signal', 'id' and 'node': {EXAMPLES}")
@@ -188,10 +183,6 @@ class CanSource(NumberFormat):
             raise ValueError("'scale' and 'offset' change the unit of the database: set 'unit' to the new one")
         if self.node is not None and self.object is None:
             raise ValueError("'object' is missing: write object = \"0x6078\" or the like")
-        if self.scale == 0.0:
-            raise ValueError("scale is 0: every value would be the offset")
-        if self.range is not None and not self.range[0] < self.range[1]:
-            raise ValueError(f"range: {self.range[0]:g} is not below {self.range[1]:g}")
         if self.id is not None:
             self.bits()
         return self

@@ -6,13 +6,13 @@ trip.
 
 import logging
 import math
-import threading
 import time
 from collections import deque
 from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
 from otolith_drivers.common.reconnection import Reconnection
+from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.modbus.client import ReadOnlyClient
 from otolith_drivers.modbus.options import BIT_TABLES, ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.plausibility import OrderMonitor, StalenessMonitor
@@ -26,7 +26,6 @@ log = logging.getLogger(__name__)
 Options = ModbusOptions
 Source = ModbusSource
 
-CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s. Only a name lookup in progress takes longer.
 BUSY_PAUSES = 10  # of a period: how often a busy device is asked again at most; engineering choice
 TRIPS = 100  # round trips of which the longest bounds the error of the times; engineering choice: a second at 100 Hz
 MAX_SLEEP = 0.2  # s that a stop between two rounds may go unnoticed; engineering choice
@@ -41,12 +40,13 @@ def build(options: ModbusOptions, setup: Setup) -> "ModbusPoller":
     return ModbusPoller(options, [register_signal(signal, options) for signal in setup.signals], setup.sample_period)
 
 
-class ModbusPoller:
+class ModbusPoller(ThreadedDriver):
     """Implements :class:`otolith_drivers.base.Driver` over pymodbus, with its own thread."""
 
     sampling = Sampling.POLLED
 
     def __init__(self, options: ModbusOptions, signals: Sequence[RegisterSignal], period: float) -> None:
+        super().__init__()
         self._options = options
         self._signals = signals
         self._client = ReadOnlyClient(options)
@@ -63,21 +63,17 @@ class ModbusPoller:
         self._received = self._bad = self._lost = 0
         self._rate_logged = False
         self._connection = Reconnection(options.title(), log)
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         self._connection.reason = "not connected yet"
-        self._thread = threading.Thread(target=self._run, args=(deliver,), name="modbus-poll", daemon=True)
-        self._thread.start()
+        self._start("modbus-poll", self._run, deliver)
 
     def close(self) -> None:
         """See :meth:`otolith_drivers.base.Driver.close`."""
         self._stop.set()
         self._client.abort()
-        if self._thread is not None:
-            self._thread.join(timeout=CLOSE_TIMEOUT)
+        super().close()
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""

@@ -6,7 +6,6 @@ the last seconds counts as one that took no time. Without one, it is the time of
 
 import logging
 import ssl
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.common.credentials import certificate, certificate_and_key, password
 from otolith_drivers.common.reconnection import Reconnection, cause_of
+from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.mqtt.topics import Messages, MqttOptions, MqttSource
 
@@ -30,7 +30,6 @@ Source = MqttSource
 CONNECT_TIMEOUT = 3.0  # s for the network connection
 ANSWER_TIMEOUT = 5.0  # s for the broker to accept the client
 LOOP_TIMEOUT = 0.1  # s; how late a stop may be noticed
-CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s
 
 
 def build(options: MqttOptions, setup: Setup) -> "MqttListener":
@@ -61,16 +60,15 @@ def _tls(options: MqttOptions, folder: Path) -> ssl.SSLContext | None:
     return context
 
 
-class MqttListener:
+class MqttListener(ThreadedDriver):
     """Implements :class:`otolith_drivers.base.Driver` over paho-mqtt, with its own thread."""
 
     def __init__(self, options: MqttOptions, messages: Messages, password: str, tls: ssl.SSLContext | None) -> None:
+        super().__init__()
         self._options, self._messages, self._password, self._tls = options, messages, password, tls
         self._connection = Reconnection(options.title(), log)
         self._begun = 0.0  # s; when the broker accepted the subscription
         self._refusal = ""  # why the broker accepts neither client nor topic
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     @property
     def sampling(self) -> Sampling:
@@ -80,14 +78,7 @@ class MqttListener:
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         self._connection.reason = "not connected yet"
-        self._thread = threading.Thread(target=self._run, args=(deliver,), name="mqtt-listen", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """See :meth:`otolith_drivers.base.Driver.close`."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=CLOSE_TIMEOUT)
+        self._start("mqtt-listen", self._run, deliver)
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""

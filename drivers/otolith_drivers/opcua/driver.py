@@ -7,7 +7,6 @@ computer's by the times in the answers, so the error of the times is bounded (se
 import asyncio
 import logging
 import math
-import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -18,6 +17,7 @@ from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.common.reconnection import Reconnection
 from otolith_drivers.common.remote_clock import unix_time
 from otolith_drivers.common.scaled import Conversion
+from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.opcua.connection import (
     OpcUaCredentials,
@@ -39,7 +39,6 @@ log = logging.getLogger(__name__)
 Options = OpcuaOptions
 Source = OpcuaSource
 
-CLOSE_TIMEOUT = 0.9  # s; the driver interface asks for 1 s
 FIRST_EXCHANGES = 5  # questions for the server's time before the first value is used
 EXCHANGE_PERIOD = 2.0  # s between two such questions later on
 SILENT_INTERVALS, MIN_SILENCE = 20.0, 2.0  # messages; s: without one, the connection is opened anew
@@ -64,12 +63,13 @@ def build(options: OpcuaOptions, setup: Setup) -> "OpcuaSubscriber":
     return OpcuaSubscriber(options, credentials, readings, setup.sample_period)
 
 
-class OpcuaSubscriber:
+class OpcuaSubscriber(ThreadedDriver):
     """Implements :class:`otolith_drivers.base.Driver` over asyncua, with a thread that runs its event loop."""
 
     sampling = Sampling.POLLED
 
     def __init__(self, options: OpcuaOptions, credentials: OpcUaCredentials, readings: Readings, period: float) -> None:
+        super().__init__()
         self._options, self._credentials, self._readings, self._period = options, credentials, readings, period
         self._connection = Reconnection(f"OPC UA {options.endpoint}", log)
         self._latest = -math.inf  # s; time of the latest message
@@ -80,24 +80,18 @@ class OpcuaSubscriber:
         self._clocks_due = 0.0  # s; when they are compared again
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         self._connection.reason = "not connected yet"
-        self._thread = threading.Thread(
-            target=lambda: asyncio.run(self._run(deliver)), name="opcua-subscribe", daemon=True
-        )
-        self._thread.start()
+        self._start("opcua-subscribe", lambda: asyncio.run(self._run(deliver)))
 
     def close(self) -> None:
         """See :meth:`otolith_drivers.base.Driver.close`."""
         self._stop.set()
         if self._loop is not None and self._task is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._task.cancel)
-        if self._thread is not None:
-            self._thread.join(timeout=CLOSE_TIMEOUT)
+        super().close()
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""

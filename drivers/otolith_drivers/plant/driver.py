@@ -4,11 +4,11 @@ The scenario's faults act as on a bus; a fault that needs a real bus is refused.
 """
 
 import logging
-import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
+from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.plant.faults import IN_PROCESS
@@ -73,7 +73,7 @@ def _find(signal: Signal, scenario: Scenario) -> PlantSignal:
         raise ConfigurationError(f"signal {source.signal!r}: {error}", key) from error
 
 
-class PlantDriver:
+class PlantDriver(ThreadedDriver):
     """Implements :class:`otolith_drivers.base.Driver` over a simulated machine, which runs in a thread of its own.
 
     A sample has the time at which a bus would have carried it, however busy this computer is.
@@ -82,23 +82,15 @@ class PlantDriver:
     sampling = Sampling.CYCLIC
 
     def __init__(self, scenario: Scenario, path: Path, wanted: list[PlantSignal]) -> None:
+        super().__init__()
         self._scenario, self._path, self._wanted = scenario, path, wanted
         self._counters = Counters()
         self._link = Link(up=False, reason="not opened yet")
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         self._link = Link(up=True)
-        self._thread = threading.Thread(target=self._run, args=(deliver,), name="plant", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """See :meth:`otolith_drivers.base.Driver.close`."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=1.0)
+        self._start("plant", self._run, deliver)
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""

@@ -5,13 +5,12 @@
 A chunk is read while the one before it is delivered, so that reading delays no sample.
 """
 
-import contextlib
 import logging
 import math
-import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,12 +18,12 @@ import numpy as np
 from pydantic import ConfigDict
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
+from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.config_files import StrictModel, validated
 from otolith_drivers.errors import ConfigurationError, DeviceError, OtolithError
 from otolith_drivers.replay.readers import Array, Reader, Rows, format_of, holds_frames
 
 # Engineering choices. The driver contract guards the delays of a stop, test_driver.py the chunks and rows at once.
-PREFETCHED_CHUNKS = 2  # read before they are needed; more would only take memory
 QUEUE_POLL = 0.1  # s; delay of a stop while a chunk is awaited
 MAX_WAIT = 0.2  # s; delay of a stop while the next row is awaited: a driver must close within 1 s
 MAX_ROWS_AT_ONCE = 500  # delivered together; bounds how long one call of deliver() takes
@@ -102,7 +101,7 @@ def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Rea
     return open_file
 
 
-class ReplayDriver:
+class ReplayDriver(ThreadedDriver):
     """Implements :class:`otolith_drivers.base.Driver` over a file."""
 
     def __init__(
@@ -114,6 +113,7 @@ class ReplayDriver:
         sampling: Sampling | Mapping[str, Sampling] = Sampling.TRUE,
     ) -> None:
         """``gap`` is the time in seconds from the last row to the first one of the next repetition."""
+        super().__init__()
         self.sampling = sampling
         self._open_file = open_file
         self._paced, self._repeat = options.pace == "real time", options.repeat
@@ -123,8 +123,6 @@ class ReplayDriver:
         self._down_reason = "not opened yet"
         self._received = self._bad = self._bad_before = self._lost_before = 0
         self._clock = -math.inf  # s, monotonic; time of the next row, or of the last one delivered
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
@@ -133,14 +131,7 @@ class ReplayDriver:
         except OtolithError as error:
             raise DeviceError(str(error)) from error
         self._down_reason, self._clock = "", time.monotonic()
-        self._thread = threading.Thread(target=self._run, args=(reader, deliver), name="replay", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """See :meth:`otolith_drivers.base.Driver.close`."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=1.0)
+        self._start("replay", self._run, reader, deliver)
 
     def counters(self) -> Counters:
         """See :meth:`otolith_drivers.base.Driver.counters`."""
@@ -223,39 +214,13 @@ def _samples(rows: Rows, times: Array, part: slice) -> list[Sample]:
 
 
 def prefetch(chunks: Iterator[Rows], stop: threading.Event) -> Iterator[Rows]:
-    """``chunks``, read in a thread of their own until ``stop`` is set; an exception in it is raised here."""
-    ready: queue.Queue[Rows | Exception | None] = queue.Queue(PREFETCHED_CHUNKS)
-    ended = threading.Event()
-    thread = threading.Thread(target=_read, args=(chunks, ready, ended), name="replay-read", daemon=True)
-    thread.start()
-    try:
+    """``chunks``, each read in another thread while the one before is used, until ``stop`` is set."""
+    with ThreadPoolExecutor(1, "replay-read") as reading:
+        following = reading.submit(next, chunks, None)
         while not stop.is_set():
-            with contextlib.suppress(queue.Empty):
-                rows = ready.get(timeout=QUEUE_POLL)
-                if isinstance(rows, Exception):
-                    raise rows
-                if rows is None:
-                    return
-                yield rows
-    finally:
-        ended.set()
-        thread.join(timeout=1.0)
-
-
-def _read(chunks: Iterator[Rows], ready: "queue.Queue[Rows | Exception | None]", ended: threading.Event) -> None:
-    """Put all chunks into ``ready``, then None or the exception that ended them."""
-
-    def put(rows: Rows | Exception | None) -> None:
-        while not ended.is_set():
-            with contextlib.suppress(queue.Full):
-                ready.put(rows, timeout=QUEUE_POLL)
+            if not wait([following], QUEUE_POLL).done:
+                continue
+            if (rows := following.result()) is None:
                 return
-
-    try:
-        for rows in chunks:
-            put(rows)
-            if ended.is_set():
-                return
-        put(None)
-    except Exception as error:  # noqa: BLE001 - it is raised again in prefetch
-        put(error)
+            following = reading.submit(next, chunks, None)
+            yield rows

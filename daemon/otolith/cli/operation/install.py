@@ -1,7 +1,6 @@
 """``otolith install``: the service of one machine. Each step is idempotent, and shown by ``--dry-run``."""
 
 import contextlib
-import ipaddress
 import os
 import re
 import shlex
@@ -18,7 +17,7 @@ from urllib.parse import urlsplit
 
 import click
 
-from otolith.cli.common import MACHINE_FILE
+from otolith.cli.common import MACHINE_FILE, shipped_directory
 from otolith_drivers.errors import ConfigurationError, ServiceError
 
 UNIT, SYSUSERS = "otolith@.service", "otolith.sysusers.conf"
@@ -84,7 +83,7 @@ def _files(file: Path) -> Iterator[InstalledFile]:
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", file.stem) or file.suffix != ".toml":
         raise ConfigurationError(f"{file}: its name becomes that of the service: use letters, digits, '_', '-', .toml")
     machine = load_machine(file)
-    shipped, etc = shipped_directory(), ETC.parent
+    shipped, etc = shipped_directory("systemd"), ETC.parent
     yield InstalledFile(etc / "systemd/system" / UNIT, (shipped / UNIT).read_bytes())
     yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
     zenoh = machine.file.zenoh
@@ -95,12 +94,6 @@ def _files(file: Path) -> Iterator[InstalledFile]:
         source = file.parent / name
         is_private = not source.stat().st_mode & 0o004
         yield InstalledFile(ETC / name, source.read_bytes(), is_private)
-
-
-def shipped_directory() -> Path:
-    """Return the folder of the unit: in an installed package, or beside the sources of a checkout."""
-    installed = Path(__file__).parents[2] / "systemd"
-    return installed if installed.is_dir() else Path(__file__).parents[4] / "systemd"
 
 
 def named_files(file: Path) -> list[Path]:
@@ -131,16 +124,19 @@ def _strings(value: Any) -> Iterator[str]:
 
 def drop_in(name: str, drivers: Sequence[Mapping[str, Any]], listen: Sequence[str], connect: Sequence[str]) -> str:
     """Return the drop-in of the unit: the devices and addresses that the machine file names, and no others."""
+    from otolith.machine_file import address_of, host_of
+
     lines = [f"# Made by 'otolith install' from /etc/otolith/{name}.toml.", "[Service]"]
     devices = [text.partition("@")[0] for text in _strings(drivers) if text.startswith("/dev/")]
     if devices:
         lines += ["PrivateDevices=no", "DevicePolicy=closed"]
         lines += [f"DeviceAllow={device} rw" for device in dict.fromkeys(devices)]
         lines += ["SupplementaryGroups=dialout"]
-    hosts = [host for endpoint in connect if (host := _host(endpoint))]
+    hosts = [host for endpoint in connect if (host := host_of(endpoint))]
     hosts += [host for driver in drivers for host in _hosts_of(driver)]
-    unknown = [host for host in hosts if not _address(host) and host != "localhost"]
-    unknown += [host for endpoint in listen if (host := _host(endpoint)) and not _is_loopback(host)]
+    unknown = [host for host in hosts if not address_of(host) and host != "localhost"]
+    published = [host for endpoint in listen if (host := host_of(endpoint)) and host != "localhost"]
+    unknown += [host for host in published if (address := address_of(host)) is None or not address.is_loopback]
     unknown += [f"driver {driver.get('type')!r}" for driver in drivers if driver.get("type") not in KNOWN_DRIVERS]
     if unknown:
         comment = (
@@ -148,7 +144,7 @@ def drop_in(name: str, drivers: Sequence[Mapping[str, Any]], listen: Sequence[st
         )
         return "\n".join([*lines, comment, ""])
     multicast = ["multicast"] if any(driver.get("type") == "can" for driver in drivers) else []
-    allowed = dict.fromkeys(["localhost", *multicast, *(host for host in hosts if _address(host))])
+    allowed = dict.fromkeys(["localhost", *multicast, *(host for host in hosts if address_of(host))])
     return "\n".join([*lines, "IPAddressDeny=any", *(f"IPAddressAllow={host}" for host in allowed), ""])
 
 
@@ -158,25 +154,6 @@ def _hosts_of(driver: Mapping[str, Any]) -> Iterator[str]:
         yield host
     if isinstance(endpoint := driver.get("endpoint"), str):
         yield urlsplit(endpoint).hostname or endpoint
-
-
-def _host(endpoint: str) -> str:
-    """Return the host of a Zenoh endpoint like ``tcp/[::1]:7447``; empty for a socket of this computer."""
-    protocol, _, rest = endpoint.partition("/")
-    place = re.split(r"[?#]", rest)[0]
-    return "" if protocol.startswith("unix") else place.rpartition(":")[0].strip("[]")
-
-
-def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(host)
-    except ValueError:
-        return None
-
-
-def _is_loopback(host: str) -> bool:
-    address = _address(host)
-    return host == "localhost" or (address is not None and address.is_loopback)
 
 
 def _machines_with(path: Path, folder: Path) -> Iterator[Path]:
