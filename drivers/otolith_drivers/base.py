@@ -107,7 +107,7 @@ Deliver = Callable[[Sequence[Sample]], None]
 
 
 class Driver(Protocol):
-    """A connection to one machine. Built from options, then opened and closed once; a failed opening may be repeated."""
+    """A connection to one machine. Opened and closed once; an opening that fails may be repeated."""
 
     @property
     def sampling(self) -> Sampling | Mapping[str, Sampling]:

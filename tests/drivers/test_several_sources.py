@@ -8,8 +8,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from otolith.estimation.information import Identifiability
 from otolith.acquisition.window import Window
+from otolith.estimation.information import Identifiability
 from otolith.health.schema import ParameterDocument, Status
 from otolith.publishing.connection import absent_sources, driver_document, with_absent_sources
 from otolith_drivers import conformance
