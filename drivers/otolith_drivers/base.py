@@ -107,7 +107,7 @@ Deliver = Callable[[Sequence[Sample]], None]
 
 
 class Driver(Protocol):
-    """A connection to one machine. Built from options, then opened once and closed once."""
+    """A connection to one machine. Opened and closed once; an opening that fails may be repeated."""
 
     @property
     def sampling(self) -> Sampling | Mapping[str, Sampling]:

@@ -1,12 +1,16 @@
 """Several drivers as one: a machine whose signals come from several buses or files."""
 
+import logging
 import threading
 from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sampling, SourceState, sampling_of
+from otolith_drivers.common.reconnection import ReconnectBackoff
+from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.errors import DeviceError
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,14 +22,17 @@ class NamedSource:
     signals: tuple[str, ...]
 
 
-class SeveralSources:
+class SeveralSources(ThreadedDriver):
     """Implements :class:`otolith_drivers.base.Driver` over other drivers, each of which keeps its own threads.
 
     All drivers stamp on this computer's monotonic clock, so their samples have one time base.
     """
 
     def __init__(self, sources: tuple[NamedSource, ...]) -> None:
+        super().__init__()
         self._sources = sources
+        self._faults: dict[str, str] = {}
+        """Why a source could not be opened, by its name; it is tried again until it can."""
 
     @property
     def sampling(self) -> Mapping[str, Sampling]:
@@ -35,18 +42,40 @@ class SeveralSources:
         }
 
     def open(self, deliver: Deliver) -> None:
-        """See :meth:`otolith_drivers.base.Driver.open`; if one driver cannot be opened, the others are closed."""
-        with ExitStack() as opened:
+        """See :meth:`otolith_drivers.base.Driver.open`; a source that cannot be opened does not keep the others back.
+
+        Raises:
+            DeviceError: no source can be opened.
+        """
+        for source in self._sources:
+            self._try_to_open(source, deliver)
+        if len(self._faults) == len(self._sources):
+            self.close()
+            raise DeviceError("; ".join(f"source {name!r}: {fault}" for name, fault in self._faults.items()))
+        if self._faults:
+            self._start("open-sources", self._open_the_rest, deliver)
+
+    def _try_to_open(self, source: NamedSource, deliver: Deliver) -> None:
+        try:
+            source.driver.open(deliver)
+        except Exception as error:  # noqa: BLE001 - whatever a driver of another package raises, the others go on
+            fault = str(error) if isinstance(error, DeviceError) else f"{type(error).__name__}: {error}"
+            if fault != self._faults.get(source.name):
+                log.warning("source %r: %s; tried again until it can be opened", source.name, fault)
+            self._faults[source.name] = fault
+        else:
+            self._faults.pop(source.name, None)
+
+    def _open_the_rest(self, deliver: Deliver) -> None:
+        backoff = ReconnectBackoff()
+        while self._faults and not self._stop.wait(backoff.next()):
             for source in self._sources:
-                opened.callback(source.driver.close)
-                try:
-                    source.driver.open(deliver)
-                except DeviceError as error:
-                    raise DeviceError(f"source {source.name!r}: {error}") from error
-            opened.pop_all()
+                if source.name in self._faults and not self._stop.is_set():
+                    self._try_to_open(source, deliver)
 
     def close(self) -> None:
         """See :meth:`otolith_drivers.base.Driver.close`; all drivers close at the same time."""
+        super().close()
         threads = [threading.Thread(target=source.driver.close, name="close") for source in self._sources]
         for thread in threads:
             thread.start()
@@ -68,8 +97,11 @@ class SeveralSources:
 
         A source that is down is a warning. The period is that of the fastest source, if all of them are polled.
         """
+        faults = {name: Link(up=False, reason=fault) for name, fault in list(self._faults.items())}
         states = tuple(
-            SourceState(source.name, source.signals, source.driver.link(), source.driver.counters())
+            SourceState(
+                source.name, source.signals, faults.get(source.name) or source.driver.link(), source.driver.counters()
+            )
             for source in self._sources
         )
         up, links = any(state.link.up for state in states), [state.link for state in states]

@@ -9,7 +9,7 @@ from otolith_drivers.conformance import CONTRACT
 from tests.conftest import EXAMPLES
 
 FOLDER = Path(__file__).parents[2] / "docs" / "example-driver"
-MODULE = "otolith_udp_json.py"
+MODULE = "otolith_tcp_json.py"
 
 
 def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -22,20 +22,22 @@ def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
 def test_example_driver_keeps_the_contract() -> None:
     done = run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(FOLDER), PYTHONDONTWRITEBYTECODE="1")
     assert done.returncode == 0, done.stdout
-    assert f"{len(CONTRACT) + 1} passed" in done.stdout  # and the test of bad datagrams
+    assert f"{len(CONTRACT) + 2} passed" in done.stdout  # and those of reconnection and bad lines
 
 
 def test_entry_point_registers_the_example_driver(tmp_path: Path) -> None:
     """The module and its metadata are in a folder of packages, as pip installs them."""
     (tmp_path / MODULE).write_bytes((FOLDER / MODULE).read_bytes())
-    metadata = tmp_path / "otolith_udp_json-0.1.0.dist-info"
+    metadata = tmp_path / "otolith_tcp_json-0.1.0.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: otolith-udp-json\nVersion: 0.1.0\n")
-    (metadata / "entry_points.txt").write_text("[otolith.drivers]\nudp_json = otolith_udp_json\n")
-    assert 'udp_json = "otolith_udp_json"' in (FOLDER / "pyproject.toml").read_text(encoding="utf-8")
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: otolith-tcp-json\nVersion: 0.1.0\n")
+    (metadata / "entry_points.txt").write_text("[otolith.drivers]\ntcp_json = otolith_tcp_json\n")
+    assert 'tcp_json = "otolith_tcp_json"' in (FOLDER / "pyproject.toml").read_text(encoding="utf-8")
 
     text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
-    text = text.replace('type = "can"\ndbc = "dc-motor.dbc"\n', 'type = "udp_json"\nport = 5005\n')
+    text = text.replace(
+        'type = "can"\ndbc = "dc-motor.dbc"\n', 'type = "tcp_json"\nhost = "192.168.0.10"\nport = 5005\n'
+    )
     for name, unit in (
         ("ArmatureVoltage", "V"),
         ("LoadTorque", "mN*m"),

@@ -8,9 +8,10 @@ from typing import cast
 import numpy as np
 import pytest
 
+from otolith.acquisition.window import Window
 from otolith.estimation.information import Identifiability
-from otolith.health.schema import ParameterDocument, Status, Traces
-from otolith.publishing.connection import driver_document, with_missing_sources
+from otolith.health.schema import ParameterDocument, Status
+from otolith.publishing.connection import absent_sources, driver_document, with_absent_sources
 from otolith_drivers import conformance
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sample, Sampling
 from otolith_drivers.conformance import CONTRACT, Rig
@@ -18,20 +19,20 @@ from otolith_drivers.errors import DeviceError
 from otolith_drivers.several_sources import NamedSource, SeveralSources
 from tests.conftest import OwnMachine
 from tests.drivers.rigs import RIGS
-from tests.waiting import PATIENCE, within
+from tests.waiting import PATIENCE, wait_for, within
 
 
 class FakeDriver:
     """Delivers one sample when it is opened."""
 
     def __init__(self, link: Link, counters: Counters, sampling: Sampling, fault: str = "") -> None:
-        self.sampling, self._link, self._counters, self._fault = sampling, link, counters, fault
+        self.sampling, self._link, self._counters, self.fault = sampling, link, counters, fault
         self.calls: list[str] = []
 
     def open(self, deliver: Deliver) -> None:
         self.calls.append("open")
-        if self._fault:
-            raise DeviceError(self._fault)
+        if self.fault:
+            raise DeviceError(self.fault)
         deliver([Sample("x", 1.0, 2.0)])
 
     def close(self) -> None:
@@ -86,11 +87,33 @@ def test_each_signal_has_the_sampling_of_its_source() -> None:
     assert sampling == {"V_a": Sampling.CYCLIC, "i": Sampling.CYCLIC, "omega": Sampling.POLLED}
 
 
-def test_a_source_that_cannot_be_opened_closes_the_others_and_is_named() -> None:
-    sources, (one, _) = both(UP, DOWN, fault="can9: no such interface")
-    with pytest.raises(DeviceError, match="source 'encoder': can9: no such interface"):
-        sources.open(lambda _: None)
+def test_a_source_that_cannot_be_opened_is_named_and_tried_again_while_the_others_deliver(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    sources, (one, two) = both(UP, UP, fault="can9: no such interface")
+    received: list[Sample] = []
+    sources.open(received.extend)
+    try:
+        assert len(received) == 1
+        assert sources.link().up
+        assert "source 'encoder' is down: can9: no such interface" in sources.link().warnings
+        wait_for(lambda: two.calls.count("open") >= 3)
+        two.fault = ""
+        wait_for(lambda: len(received) == 2)
+        wait_for(lambda: not any("is down" in warning for warning in sources.link().warnings))
+    finally:
+        sources.close()
     assert one.calls == ["open", "close"]
+    assert two.calls[-1] == "close"
+    assert caplog.text.count("can9: no such interface") == 1
+
+
+def test_sources_of_which_none_can_be_opened_are_an_error() -> None:
+    one, two = (FakeDriver(UP, Counters(), Sampling.TRUE, fault) for fault in ("can8: no such", "can9: no such"))
+    sources = SeveralSources((NamedSource("drive", one, ("i",)), NamedSource("encoder", two, ("omega",))))
+    with pytest.raises(DeviceError, match="source 'drive': can8: no such; source 'encoder': can9: no such"):
+        sources.open(lambda _: None)
+    assert one.calls == two.calls == ["open", "close"]
 
 
 def parameter(status: Status) -> ParameterDocument:
@@ -100,29 +123,38 @@ def parameter(status: Status) -> ParameterDocument:
     )  # fmt: skip
 
 
-def window(**missing: bool) -> Traces:
-    """The curves of a window in which some signals have no sample."""
-    values = {name: np.where(missing.get(name, False), np.nan, np.ones(3)) for name in ("i", "omega", "V_a")}
-    measured = np.column_stack([values["i"], values["omega"]])
-    return Traces(np.arange(3.0), ("i", "omega"), measured, None, (1.0, 1.0), ("V_a",), values["V_a"][:, None])
+def window(*missing: str) -> Window:
+    """A window in which some signals have no sample."""
+    whole = Window.whole(0, 0.0, 0.01, ("V_a", "i", "omega"), np.ones((3, 3)))
+    return replace(whole, missing=np.tile([name in missing for name in whole.signals], (3, 1)))
 
 
 @pytest.mark.parametrize(
-    ("link", "cause"),
+    ("link", "missing", "cause"),
     [
-        (DOWN, "is down: connection refused"),
-        (UP, "is silent: frame 0x1 is silent"),
-        (Link(up=True), "sent nothing in this window"),
+        (DOWN, (), "is down: connection refused"),
+        (UP, ("omega",), "is silent: frame 0x1 is silent"),
+        (Link(up=True), ("omega",), "sent nothing in this window"),
+        (Link(up=True), ("V_a",), ""),
+        (UP, ("i",), ""),
     ],
 )
-def test_a_parameter_that_is_not_estimated_names_the_source_that_gave_no_sample(link: Link, cause: str) -> None:
+def test_a_source_is_absent_if_it_is_down_or_gave_no_sample(link: Link, missing: tuple[str, ...], cause: str) -> None:
+    absent = absent_sources(both(UP, link)[0].link(), window(*missing), {"i", "omega"})
+    assert absent == ({"encoder": f"source 'encoder' (omega) {cause}"} if cause else {})
+
+
+def test_a_source_of_commands_may_be_silent() -> None:
+    assert not absent_sources(both(Link(up=True), UP)[0].link(), window("V_a", "i"), {"omega"})
+
+
+def test_a_parameter_that_is_not_estimated_names_the_absent_source() -> None:
     parameters = {"R_a": parameter(Status.ESTIMATED), "J": parameter(Status.HELD)}
-    driver = driver_document(both(UP, link)[0].link())
-    named = with_missing_sources(parameters, driver, window(omega=True))
+    named = with_absent_sources(parameters, {"encoder": "source 'encoder' (omega) is down: connection refused"})
     assert named["R_a"] == parameters["R_a"]
-    assert named["J"].reason == f"omega missing, because source 'encoder' {cause}; the current does not change"
-    assert with_missing_sources(parameters, driver, window()) == parameters
-    assert with_missing_sources(parameters, driver, window(i=True)) == parameters
+    cause = "source 'encoder' (omega) is down: connection refused"
+    assert named["J"].reason == f"{cause}; the current does not change"
+    assert with_absent_sources(parameters, None) == parameters
 
 
 @contextmanager

@@ -50,9 +50,11 @@ def report(
     status: Status = Status.ESTIMATED,
     findings: tuple[FindingDocument, ...] = (),
     components: tuple[ComponentDocument, ...] = (),
+    absent: dict[str, str] | None = None,
 ) -> ReportDocument:
     quality = QualityDocument(verdict=Verdict.GOOD, missing=0.0, longest_gap_s=0.0, jitter_s=0.0, skew_s=0.0)
-    window = WindowDocument(index=index, start=LENGTH * index, end=LENGTH * (index + 1), records=200, quality=quality)
+    start, end = LENGTH * index, LENGTH * (index + 1)
+    window = WindowDocument(index=index, start=start, end=end, records=200, quality=quality, absent=absent)
     parameter = ParameterDocument(
         value=value, sd=None if value is None else sd, unit="ohm", nominal=NOMINAL, status=status
     )
@@ -186,6 +188,29 @@ def test_bad_windows_are_no_data_and_hide_no_fault() -> None:
     assert during.health is not None
     assert during.health.state is Level.ACT
     assert state_of(documents[-1], "bus") is Level.OK
+
+
+def test_an_absent_source_is_an_event_of_the_bus_while_windows_stay_good() -> None:
+    gone = {"encoder": "source 'encoder' (omega) is down: connection refused"}
+    healthy = [report(index) for index in range(3)]
+    down = [report(index, absent=gone) for index in range(3, 8)]
+    back = [report(index, status=Status.HELD) for index in range(8, 12)]
+    documents = assessed([*healthy, *down, *back])
+    assert changes(documents) == [(5, EventChange.RAISED, Level.WATCH), (10, EventChange.CLEARED, Level.WATCH)]
+    (event,) = documents[7].events
+    assert (event.part, event.text, event.condition) == ("bus", gone["encoder"], "a source gives no samples")
+    assert event.start == 3 * LENGTH
+    assert [state_of(documents[7], part) for part in ("bus", "winding")] == [Level.WATCH, Level.OK]
+    assert documents[7].health is not None
+    assert documents[7].health.state is Level.WATCH
+
+
+def test_without_usable_data_an_absent_source_is_no_data() -> None:
+    bad = [report(index, decision=WindowDecision.BAD, absent={"drive": "source 'drive' is down"}) for index in range(4)]
+    last = assessed(bad)[-1]
+    assert last.health is not None
+    assert last.health.state is Level.NO_DATA
+    assert "a source gives no samples" in last.health.reason
 
 
 def finding(kind: FindingKind, subject: str, since: float) -> FindingDocument:

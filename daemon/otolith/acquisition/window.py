@@ -81,6 +81,8 @@ class Window:
     """None if every record has a sample of every input."""
     observed: Mapping[str, float] = field(default_factory=dict)
     """Mean over the window of each signal that only the judgement of the estimates needs, as a temperature."""
+    absent: Mapping[str, str] = field(default_factory=dict)
+    """Of several sources, those that are down or gave no sample: in words, by name."""
 
     @classmethod
     def whole(cls, index: int, start: float, sample_period: float, signals: tuple[str, ...], values: Array) -> Self:

@@ -32,6 +32,7 @@ class FindingKind(StrEnum):
     UNEXPLAINED = "unexplained"
     NO_DATA = "no data"
     NO_TEMPERATURE = "no temperature"
+    NO_SOURCE = "no source"
     """The temperature on which a parameter depends is not measured at present."""
 
 

@@ -1,6 +1,6 @@
 """What the report of a window shows about each condition of the machine, before any persistence."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from otolith.discovery.adopted import Approval
@@ -45,7 +45,8 @@ def observe(
     """Return the observations of a window after the levels ``before`` and sudden changes ``steps`` of parameters."""
     data = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.OK
     reasons = "; ".join(report.window.quality.reasons)
-    observations = [Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons, "no usable data")]
+    no_data = Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons, "no usable data")
+    observations = [*_of_sources(report, before), no_data]  # of one state, the first is more specific
     if report.decision is WindowDecision.REFUSED:
         features, text = FindingFeatures(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
         observations.append(Observation("unexplained", MACHINE, Level.WATCH, features, text, "an unknown change"))
@@ -60,6 +61,15 @@ def observe(
             texts = finding.text, finding.condition, finding.advice
             observations.append(Observation(finding.id, part, level, features, *texts, finding.since))
     return observations
+
+
+def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator[Observation]:
+    """Yield the absent sources, and those that were absent; a window may be good without one of several."""
+    absent = {f"source/{name}": text for name, text in (report.window.absent or {}).items()}
+    level = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.WATCH
+    for key in sorted(absent.keys() | {key for key in before if key.startswith("source/")}):
+        features = FindingFeatures(FindingKind.NO_SOURCE, subject=key.partition("/")[2])
+        yield Observation(key, BUS, level if key in absent else Level.OK, features, absent.get(key, ""))
 
 
 def _of_parameter(

@@ -204,6 +204,8 @@ class WindowDocument(StrictModel):
     quality: QualityDocument
     observed: dict[str, float] | None = None
     """Mean of each observed signal, as a temperature in K."""
+    absent: dict[str, str] | None = None
+    """Of several sources, those that are down or gave no sample: in words, by name."""
 
 
 class CrossingDocument(StrictModel):
@@ -434,6 +436,7 @@ def window_document(window: Window) -> WindowDocument:
         end=window.end,
         records=window.records,
         observed=dict(window.observed) or None,
+        absent=dict(window.absent) or None,
         quality=QualityDocument(
             verdict=quality.verdict,
             missing=quality.missing,

@@ -1,10 +1,9 @@
 """The connection to the machine in a report: its sources, and what is not known because one of them is silent."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
-import numpy as np
-
-from otolith.health.schema import DriverDocument, ParameterDocument, SourceDocument, Status, Traces
+from otolith.acquisition.window import Window
+from otolith.health.schema import DriverDocument, ParameterDocument, SourceDocument, Status
 from otolith_drivers.base import Link
 
 
@@ -26,34 +25,30 @@ def driver_document(link: Link) -> DriverDocument:
     return DriverDocument(up=link.up, reason=link.reason, warnings=link.warnings, plan=link.plan, sources=sources)
 
 
-def with_missing_sources(
-    parameters: Mapping[str, ParameterDocument], driver: DriverDocument, traces: Traces
+def absent_sources(link: Link, window: Window, outputs: Collection[str]) -> dict[str, str]:
+    """Return by name which of several sources are down or gave no sample in the window, in words.
+
+    A source that only has commands may be silent: none of them has changed.
+    """
+    absent = {}
+    for state in link.sources:
+        is_expected = bool(state.link.warnings) or not set(state.signals).isdisjoint(outputs)
+        what = f"source {state.name!r} ({', '.join(state.signals)})"
+        if not state.link.up:
+            absent[state.name] = f"{what} is down: {state.link.reason}"
+        elif is_expected and all(window.missing_in(name).all() for name in state.signals if name in window.signals):
+            silent = f"is silent: {state.link.warnings[0]}" if state.link.warnings else "sent nothing in this window"
+            absent[state.name] = f"{what} {silent}"
+    return absent
+
+
+def with_absent_sources(
+    parameters: Mapping[str, ParameterDocument], absent: Mapping[str, str] | None
 ) -> dict[str, ParameterDocument]:
-    """Return ``parameters``; each that this window did not estimate has in its reason which sources gave no sample."""
-    silent = "; ".join(
-        f"{', '.join(source.signals)} missing, because source {name!r} {_why(source)}"
-        for name, source in driver.sources.items()
-        if _is_silent(source, traces)
-    )
-    if not silent:
-        return dict(parameters)
+    """Return ``parameters``; each that this window did not estimate names the absent sources in its reason."""
     return {
         name: parameter
-        if parameter.status is Status.ESTIMATED
-        else parameter.model_copy(update={"reason": f"{silent}; {parameter.reason}"})
+        if parameter.status is Status.ESTIMATED or not absent
+        else parameter.model_copy(update={"reason": "; ".join([*absent.values(), parameter.reason])})
         for name, parameter in parameters.items()
     }
-
-
-def _is_silent(source: SourceDocument, traces: Traces) -> bool:
-    """Whether no signal of the source has a sample in the window; a command may have none because it did not change."""
-    outputs = dict(zip(traces.outputs, traces.measured.T, strict=True))
-    values = outputs | dict(zip(traces.inputs, traces.driving.T, strict=True))
-    is_expected = not source.up or bool(source.warnings) or not set(source.signals).isdisjoint(outputs)
-    return is_expected and not any(np.isfinite(values[signal]).any() for signal in source.signals)
-
-
-def _why(source: SourceDocument) -> str:
-    if not source.up:
-        return f"is down: {source.reason}"
-    return f"is silent: {source.warnings[0]}" if source.warnings else "sent nothing in this window"

@@ -26,7 +26,7 @@ from otolith.adaptation.state import AdaptationState, apply_decisions, initial_s
 from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
-from otolith.publishing.connection import driver_document, with_missing_sources
+from otolith.publishing.connection import absent_sources, driver_document, with_absent_sources
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.event_command import EventCommand
@@ -217,7 +217,8 @@ class Service:
             self._supervisor.revise(lambda state: apply_decisions(state, decisions))
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
-        self._supervisor.submit(window, now)
+        outputs = {output.name for output in self._machine.twin.outputs}
+        self._supervisor.submit(replace(window, absent=absent_sources(link, window, outputs)), now)
 
     def _adopt_achieved_period(self, period: float | None) -> None:
         """Use the sample period (s) that a polled machine achieves, if it is known, for the following windows."""
@@ -236,7 +237,7 @@ class Service:
         latency = max(0.0, time.time() - document.window.end)
         cost = document.cost.model_copy(update={"seconds": seconds, "latency_s": latency})
         driver = driver_document(self._machine.driver.link())
-        parameters = with_missing_sources(document.parameters, driver, report.traces)
+        parameters = with_absent_sources(document.parameters, document.window.absent)
         update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
         document = self._numbers.number(document.model_copy(update={**update, "notes": self._notes}))
         if self._history is not None:
