@@ -229,7 +229,9 @@ def _twin(file: MachineFile, path: Path, context: Context) -> Definition:
     if (file.twin.name is None) == (file.twin.file is None):
         context.fail(("twin",), 'write either name = "dc_motor", a twin of the library, or file = "my-twin.toml"')
     if file.twin.file is not None:
-        return load_twin(path.parent / file.twin.file)
+        with context.at("twin", "file"):
+            page = read(path.parent / file.twin.file)
+        return read_twin(page)
     with context.at("twin", "name"):
         return find_twin(file.twin.name or "")
 

@@ -159,16 +159,17 @@ def content(path: Path, limit: int, key: tuple[str, ...] = ()) -> bytes:
         raise ConfigurationError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}", key) from error
 
 
-def read(path: Path) -> SourceFile:
-    r"""Return the text of a file that the user named, with line ends ``\n``.
+def read(path: Path, key: tuple[str, ...] = ()) -> SourceFile:
+    r"""Return the text of a file that the user named, at ``key`` of the machine file, with line ends ``\n``.
 
     Raises:
         ConfigurationError: the file is missing, unreadable, too large, or not UTF-8.
     """
     try:
-        text = content(path, FILE_SIZE_LIMIT).decode("utf-8")
+        text = content(path, FILE_SIZE_LIMIT, key).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{path}: not UTF-8 text (byte {error.start}): is this the right file?") from error
+        text = f"{path}: not UTF-8 text (byte {error.start}): is this the right file?"
+        raise ConfigurationError(text, key) from error
     return SourceFile(path, re.sub("\r\n?", "\n", text))
 
 

@@ -1,10 +1,10 @@
-"""The demo simulates the machine on the bus that the machine file reads."""
+"""The demo: on which bus it simulates the machine, and what it calls a wrong estimate."""
 
 from pathlib import Path
 
 import pytest
 
-from otolith.cli.demo import transports_of
+from otolith.cli.demo import Comparison, transports_of
 from otolith.machine import load_machine
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
@@ -36,3 +36,20 @@ def test_a_gateway_for_serial_frames_is_refused(tmp_path: Path) -> None:
     path.write_text(text.replace("port = 1502", 'framing = "rtu"\nport = 1502'), encoding="utf-8")
     with pytest.raises(ConfigurationError, match="the demo simulates a machine on a CAN bus or on Modbus"):
         transports_of(load_machine(path, with_driver=False))
+
+
+@pytest.mark.parametrize(
+    ("estimated", "sd", "unknown", "wrong"),
+    [
+        (6.2383, 0.001, False, False),
+        (6.2865, 0.066, True, False),  # held while a busy computer lost windows: its interval contains the truth
+        (6.2865, 0.001, False, True),
+        (6.2400, 0.066, False, False),
+        (None, 0.0, True, False),
+    ],
+)
+def test_an_estimate_is_wrong_only_beyond_its_own_interval(
+    estimated: float | None, sd: float, unknown: bool, wrong: bool
+) -> None:
+    row = Comparison(33, 0.0, "R_a", 6.2383, estimated, sd)
+    assert (row.unknown, row.wrong) == (unknown, wrong)

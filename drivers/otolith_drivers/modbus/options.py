@@ -111,7 +111,7 @@ class ModbusSource(ScaledSource):
     @model_validator(mode="before")
     @classmethod
     def _give_a_bit_its_type(cls, written: object) -> object:
-        if not isinstance(written, dict) or written.get("table") not in BIT_TABLES:
+        if not isinstance(written, dict) or written.get("table") not in tuple(BIT_TABLES):
             return written
         if foreign := [key for key in ("type", "order", "bits", "decimals") if key in written]:
             raise ValueError(f"{foreign[0]!r} is of registers: a {written['table']} is 0 or 1")

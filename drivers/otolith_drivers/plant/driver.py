@@ -53,7 +53,7 @@ def build(options: PlantOptions, setup: Setup) -> "PlantDriver":
         ConfigurationError: a wrong scenario, a fault that needs a real bus, or a signal that the machine lacks.
     """
     path = setup.folder / options.scenario
-    scenario = load_scenario(path)
+    scenario = load_scenario(path, ("driver", "scenario"))
     try:
         refuse_unfit(scenario, IN_PROCESS)
     except ConfigurationError as error:

@@ -112,13 +112,13 @@ def _check_name(name: str, what: str, known: dict[str, str]) -> None:
         raise ValueError(f"a fault names {what} {name!r}: {nearest(name, list(known))}")
 
 
-def load_scenario(path: Path) -> Scenario:
-    """The scenario in ``path``; the paths in it are made relative to its folder.
+def load_scenario(path: Path, key: tuple[str, ...] = ()) -> Scenario:
+    """The scenario in ``path``, at ``key`` of the machine file; the paths in it are made relative to its folder.
 
     Raises:
         ConfigurationError: unreadable file, an unknown plant, or a line for each wrong key.
     """
-    page = read(path)
+    page = read(path, key)
     data = parse(page)
     expect(page, data, "plant")
     name = data.get("plant")
