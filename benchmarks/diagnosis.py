@@ -11,7 +11,7 @@ import json
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
@@ -38,6 +38,7 @@ from otolith_drivers.plant import faults
 from otolith_drivers.plant.scenario import load_scenario, simulate
 
 HEALTHY_WINDOWS, WINDOWS = 10, 40
+WEAR_WINDOWS = 170  # of a wear: each changes a parameter by at most 2 %
 START = 20.0  # s: end of the healthy windows of the motor
 OK = "OK"
 DAY = 86400.0  # s
@@ -54,7 +55,7 @@ class Situation:
     name: str
     machine: str
     """``motor``, ``hydraulics`` or ``pump``."""
-    windows: Callable[[LoadedMachine, int], Sequence[Window]]
+    windows: Callable[[LoadedMachine, int], Iterable[Window]]
     """Of a run, from the machine and the seed."""
     condition: str = OK
     """Part of the condition that is right; :data:`OK` if no event is."""
@@ -91,18 +92,16 @@ def machine_of(kind: str) -> LoadedMachine:
 
 def of_scenario(
     name: str, fault: dict[str, Any], machine: LoadedMachine, seed: int, *, count: int = WINDOWS, **changed: Any
-) -> list[Window]:
-    """Return ``count`` windows of a scenario with another fault."""
+) -> Iterator[Window]:
+    """Yield ``count`` windows of a scenario with another fault."""
     own = (KINDS[fault["kind"]].model_validate(fault),) if fault else ()
     scenario: Any = load_scenario(CONFIG / "scenarios" / f"{name}.toml")
     scenario = scenario.model_copy(update={"faults": own, "seed": seed, **changed})
     samples, period = simulate(scenario), scenario.sample_period
     names, records = {name: table["signal"] for name, table in machine.file.signals.items()}, machine.records
-    windows = []
     for index in range(count):
         rows = [[sample.measured[signal] for signal in names.values()] for sample in islice(samples, records)]
-        windows.append(Window.whole(index, index * records * period, period, tuple(names), np.array(rows)))
-    return windows
+        yield Window.whole(index, index * records * period, period, tuple(names), np.array(rows))
 
 
 def of_reversing_motor(torque: float, voltage: float, _: LoadedMachine, seed: int) -> list[Window]:
@@ -117,7 +116,7 @@ def of_reversing_motor(torque: float, voltage: float, _: LoadedMachine, seed: in
 
 def of_load_change(machine: LoadedMachine, seed: int) -> list[Window]:
     """Return windows of a motor whose measured load becomes half as large again."""
-    before, after = (of_scenario("demo", {}, machine, seed, load=load) for load in (0.006, 0.009))
+    before, after = (list(of_scenario("demo", {}, machine, seed, load=load)) for load in (0.006, 0.009))
     return [*before[:HEALTHY_WINDOWS], *after[HEALTHY_WINDOWS:]]
 
 
@@ -136,20 +135,20 @@ def _fault(kind: str, **keys: str | float) -> dict[str, Any]:
     return {"kind": kind, "start": f"{START} s", **keys}
 
 
-def _motor(name: str, condition: str, severity: str, fault: dict[str, Any]) -> Situation:
-    return Situation(name, "motor", partial(of_scenario, "demo", fault), condition, severity)
+def _motor(name: str, condition: str, severity: str, fault: dict[str, Any], count: int = WINDOWS) -> Situation:
+    return Situation(name, "motor", partial(of_scenario, "demo", fault, count=count), condition, severity)
 
 
 _RESISTANCE, _DAMPING = {"parameter": "R_a"}, {"parameter": "D"}
 SITUATIONS = (
     _motor("turns short out", "short circuit between turns", "ACT",
-           _fault("drift", **_RESISTANCE, amount="-0.044 ohm", rate="0.05 1/s")),
+           _fault("drift", **_RESISTANCE, amount="-0.044 ohm", rate="0.01 1/s"), WEAR_WINDOWS),
     _motor("bearing wear", "viscous friction of the bearings is higher", "ACT",
-           _fault("drift", **_DAMPING, amount="0.00015 N*m*s/rad", rate="0.05 1/s")),
+           _fault("drift", **_DAMPING, amount="0.00015 N*m*s/rad", rate="0.01 1/s"), WEAR_WINDOWS),
     _motor("unbalance", "unbalanced shaft", "ACT", _fault("unbalance", acceleration="4.5 rad/s^2", order=1.0)),
     Situation("fluid degradation", "hydraulics",
               partial(of_scenario, "hydraulic-fluid-visible",
-                      _fault("drift", **_DAMPING, amount="4.4 N*s/m", rate="0.015 1/s"), count=120),
+                      _fault("drift", **_DAMPING, amount="4.4 N*s/m", rate="0.01 1/s"), count=WEAR_WINDOWS),
               "damping of the hydraulic circuit has changed", "ACT"),
     Situation("leak", "hydraulics",
               partial(of_scenario, "hydraulic-leak", _fault("step", parameter="leak", amount="0.2 1")),

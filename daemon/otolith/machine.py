@@ -329,7 +329,16 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         name: _monitored(row, file.components.get(name, LimitsTable()), ("components", name), context)
         for name, row in amplitudes.items()
     }
-    return MonitoringPlan(parameters, components, load_rules())
+    known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
+    return MonitoringPlan(parameters, components, load_rules(), known=known)
+
+
+def _known(parameter: Parameter, context: Context) -> MonitoredQuantity:
+    """Return part and limits of a parameter that is not estimated; no limits if those of the twin do not fit it."""
+    try:
+        return _monitored(parameter, LimitsTable(), ("parameters", parameter.name), context)
+    except ConfigurationError:
+        return MonitoredQuantity(parameter.part or MACHINE, parameter.meaning, parameter.unit, parameter.nominal)
 
 
 def _with_temperature(

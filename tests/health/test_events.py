@@ -2,6 +2,7 @@
 
 import pickle
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from otolith.acquisition.window import Verdict
 from otolith.discovery.adopted import Approval
 from otolith.discovery.decision import WindowDecision
 from otolith.health.diagnosis import FindingKind
-from otolith.health.events import PERSISTENT_WINDOWS, HealthState, assess
+from otolith.health.events import HealthState, assess
 from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity, MonitoringPlan
+from otolith.health.observations import PERSISTENT_WINDOWS, RELEASE_WINDOWS, UNDECIDED
 from otolith.health.schema import (
     ComponentDocument,
     ComponentStatus,
@@ -70,11 +72,13 @@ def report(
     )
 
 
-def assessed(reports: Iterable[ReportDocument], state: HealthState | None = None) -> list[ReportDocument]:
+def assessed(
+    reports: Iterable[ReportDocument], state: HealthState | None = None, plan: MonitoringPlan = PLAN
+) -> list[ReportDocument]:
     """Assess one report after the other; the state is sent to another process between them."""
     state, documents = state or HealthState(), []
     for document in reports:
-        state, after = assess(PLAN, pickle.loads(pickle.dumps(state)), document)  # noqa: S301 - our own state
+        state, after = assess(plan, pickle.loads(pickle.dumps(state)), document)  # noqa: S301 - our own state
         documents.append(ReportDocument.from_json(after.to_json()))
     return documents
 
@@ -276,6 +280,54 @@ def unbalance(
         probability=0.99,
         onset=7.0,
     )
+
+
+def undecided(
+    index: int, decision: WindowDecision, kind: FindingKind = FindingKind.CLASS, **more: object
+) -> ReportDocument:
+    keys = {"id": "x", "kind": kind, "severity": Severity.WARNING, "condition": "", "text": "either", "since": 0.0}
+    return report(index, decision=decision, findings=(FindingDocument.model_validate({**keys, **more}),))
+
+
+def test_a_class_is_an_event_once_a_test_has_had_time_to_decide() -> None:
+    windows = [undecided(index, WindowDecision.AMBIGUOUS) for index in range(UNDECIDED.rise)]
+    assert changes(assessed(windows[:-1])) == []
+    assert changes(assessed(windows)) == [(UNDECIDED.rise - 1, EventChange.RAISED, Level.WATCH)]
+
+
+def test_a_window_with_one_leading_hypothesis_interrupts_a_class() -> None:
+    windows = [undecided(index, WindowDecision.AMBIGUOUS) for index in range(4 * UNDECIDED.rise)]
+    for index in range(2, len(windows), UNDECIDED.rise):
+        windows[index] = report(index, decision=WindowDecision.SUSPECTED)
+    assert changes(assessed(windows)) == []
+
+
+def test_a_class_that_shows_only_while_the_machine_moves_is_cleared_once() -> None:
+    moving = [undecided(index, WindowDecision.AMBIGUOUS) for index in range(60)]
+    for start in (10, 25, 40):
+        moving[start : start + 10] = [report(index) for index in range(start, start + 10)]
+    quiet = [report(index) for index in range(60, 60 + RELEASE_WINDOWS)]
+    documents = assessed([*moving, *quiet])
+    last = quiet[-1].window.index
+    assert [item[:2] for item in changes(documents)] == [(7, EventChange.RAISED), (last, EventChange.CLEARED)]
+
+
+@pytest.mark.parametrize(("value", "expected"), [(0.034, [Level.ACT]), (0.0372, [])])
+def test_a_known_parameter_that_has_moved_is_judged_by_the_limits_of_the_twin(
+    value: float, expected: list[Level]
+) -> None:
+    number = NumberDocument(value=value, sd=1e-5, low=value, high=value, unit="N*m/A")
+    limits = (Limit(Level.WATCH, 0.0361, True), Limit(Level.ACT, 0.0342, True))
+    known = {"K_t": MonitoredQuantity("magnets", "torque constant", "N*m/A", 0.038, limits)}
+    moved = [
+        undecided(index, WindowDecision.SUSPECTED, FindingKind.MOVED, subject="K_t", value=number) for index in range(9)
+    ]
+    documents = assessed(moved, plan=replace(PLAN, known=known))
+    assert [item[2] for item in changes(documents)] == expected
+    if expected:
+        event = events(documents[-1])["magnets"]
+        assert event.condition == "the magnetic field of the motor has dropped at once"
+        assert "0.034 N*m/A ± 2e-05 (-10.5%), stated as 0.038" in event.text
 
 
 def test_a_component_beyond_its_limit_is_an_event_since_its_onset() -> None:

@@ -13,6 +13,7 @@ from otolith.health.schema import EventChange, ReportDocument
 from otolith.health.text import announcements
 from otolith.machine import load_machine
 from otolith_drivers.plant.dc_motor import MotorScenario
+from otolith_drivers.plant.faults import Step
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES, SIGNALS
 
@@ -68,3 +69,11 @@ def test_a_frozen_sensor_of_the_motor_is_one_event() -> None:
     (event,) = [event for document in documents for event in announcements(document)]
     assert (event.part, event.state, event.condition) == ("sensors", Level.ACT, "a sensor is wrong")
     assert event.text.startswith("omega is frozen at ")
+
+
+def test_a_weaker_magnet_is_an_event_although_the_machine_file_gives_it_as_known() -> None:
+    step = Step.model_validate({"kind": "step", "parameter": "K_t", "start": "20 s", "amount": "-0.004 N*m/A"})
+    documents = reports(motor("demo").model_copy(update={"faults": (step,)}), 25)
+    (event,) = [event for document in documents for event in announcements(document)]
+    assert (event.part, event.state) == ("magnets", Level.ACT)
+    assert event.condition == "the magnetic field of the motor has dropped at once"

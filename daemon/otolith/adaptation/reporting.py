@@ -9,7 +9,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import AdaptationState
 from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives_of
-from otolith.discovery.decision import ACCEPTED, WindowDecision
+from otolith.discovery.decision import ACCEPTED, COMPONENT_PROBABILITY, COMPONENT_WINDOWS, WindowDecision
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
 from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_noise
 from otolith.discovery.sequential_test import SequentialTest
@@ -291,8 +291,7 @@ def _component_values(problem: Problem, known: Prior, slot: int) -> dict[str, Nu
     values = {}
     for name, at in zip(("amplitude", inner_name, "phase"), indices(problem, slot), strict=False):
         value, sd = float(known.mean[at]), float(deviations[at])
-        low, high = value - QUANTILE * sd, value + QUANTILE * sd
-        values[name] = NumberDocument(value=value, sd=sd, low=low, high=high, unit=problem.free[at].unit)
+        values[name] = _number(value, sd, problem.free[at].unit)
     return values
 
 
@@ -389,6 +388,7 @@ def _findings(
                 text=f"{best.reason}: {best.text} ({best.probability:.0%}){others}",
                 since=test.onset,
                 advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),
+                value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
             )
         )
     return tuple(findings)
@@ -401,11 +401,30 @@ def _kind_and_subject(decision: WindowDecision, test: SequentialTest) -> tuple[F
     fault = {WindowDecision.SENSOR: FaultType.SENSOR, WindowDecision.TIMING: FaultType.TIMING}.get(decision)
     excluding = next((item for item in test.hypotheses if item.type is fault), None)
     if excluding is None:
-        return FindingKind.OPEN, ""
+        return (FindingKind.MOVED, moved) if (moved := _moved_known(test)) else (FindingKind.OPEN, "")
     if fault is FaultType.TIMING:
         return FindingKind.TIMING, excluding.problem.delays[0][0]
     sites = [site_of(excluding.problem.base_model, item.site).into for item in excluding.problem.components[-1:]]
     return FindingKind.SENSOR, sites[0] if sites else ""
+
+
+def _moved_known(test: SequentialTest) -> str:
+    """Return the parameter that the machine file gives as known and that has moved for all that the test shows."""
+    names = {parameter.name for parameter in test.best.problem.free} & {name for name, _ in test.problem.known}
+    is_sure = test.leading >= COMPONENT_WINDOWS and test.probability(FaultType.PARAMETER) >= COMPONENT_PROBABILITY
+    return names.pop() if test.best.type is FaultType.PARAMETER and len(names) == 1 and is_sure else ""
+
+
+def _moved_value(test: SequentialTest, name: str) -> NumberDocument:
+    """Return the value that the leading hypothesis gives a parameter."""
+    problem, prior = test.best.problem, test.best.posterior.prior()
+    index = [item.name for item in problem.free].index(name)
+    return _number(float(prior.mean[index]), math.sqrt(float(prior.covariance[index, index])), problem.free[index].unit)
+
+
+def _number(value: float, sd: float, unit: str) -> NumberDocument:
+    reach = QUANTILE * sd
+    return NumberDocument(value=value, sd=sd, low=value - reach, high=value + reach, unit=unit)
 
 
 def _component_finding(component: ComponentDocument) -> FindingDocument:

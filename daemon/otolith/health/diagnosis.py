@@ -1,6 +1,7 @@
 """Diagnosis: from findings to conditions, causes and advice, by the rows of ``rules.toml``.
 
-A row matches a finding if every key that it has agrees. Of the rows that match, those with most keys rest on most
+A row matches a finding if every key that it has agrees; one of a limit that names a parameter also matches a parameter
+that has moved without being estimated. Of the rows that match, those with most keys rest on most
 evidence. If several remain, the data do not distinguish them: they are given together, and none is preferred.
 """
 
@@ -29,6 +30,8 @@ class FindingKind(StrEnum):
     """Several hypotheses explain the windows equally well."""
     OPEN = "open"
     """Hypotheses are being compared."""
+    MOVED = "moved"
+    """A parameter that the machine file gives as known is another."""
     UNEXPLAINED = "unexplained"
     NO_DATA = "no data"
     NO_TEMPERATURE = "no temperature"
@@ -84,7 +87,8 @@ class Rule(StrictModel):
         agree = all(not (own := getattr(self, key)) or getattr(features, key) in own for key in KEYS)
         low, high = self.order or (0.0, 0.0)
         in_order = self.order is None or (features.order is not None and low <= features.order <= high)
-        return self.finding is features.finding and agree and in_order
+        is_moved = features.finding is FindingKind.MOVED and self.finding is FindingKind.LIMIT and bool(self.subject)
+        return (self.finding is features.finding or is_moved) and agree and in_order
 
 
 class RulesFile(StrictModel):

@@ -12,7 +12,7 @@ from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingKind, diagnose
 from otolith.health.limits import MACHINE, Level, MonitoredQuantity, MonitoringPlan
-from otolith.health.observations import BUS, SENSORS, Observation, observe
+from otolith.health.observations import BUS, SENSORS, Observation, Persistence, observe
 from otolith.health.prognosis import History, forecast, is_due, with_point
 from otolith.health.schema import (
     EventChange,
@@ -26,8 +26,6 @@ from otolith.health.schema import (
     WindowDocument,
 )
 
-PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
-
 
 @dataclass(frozen=True, slots=True)
 class ConditionRecord:
@@ -38,6 +36,7 @@ class ConditionRecord:
     """The last observed levels with their windows."""
     event: EventDocument | None = None
     """None at :attr:`Level.OK`."""
+    persistence: Persistence = field(default_factory=Persistence)
 
     @property
     def is_over(self) -> bool:
@@ -86,7 +85,9 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     levels = {key: record.level for key, record in state.records.items()}
     is_informative = any(item.status is Status.ESTIMATED for item in report.parameters.values())  # not at rest
     absent = Level.OK if report.decision in ACCEPTED and is_informative else None
-    observations = {key: Observation(key, MACHINE, absent) for key in state.records}
+    observations = {
+        key: Observation(key, MACHINE, absent, persistence=record.persistence) for key, record in state.records.items()
+    }
     observations |= {item.key: item for item in observe(plan, report, levels, state.steps)}
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
     records, events = {}, []
@@ -161,9 +162,12 @@ def _advance(
     """Return the record after an observation, with its event; one that the window clears has an end."""
     event = before.event and before.event.model_copy(update={"change": None})
     if observed.level is None:
-        return replace(before, event=event)
-    recent = (*before.recent, (observed.level, report.window))[-PERSISTENT_WINDOWS:]
-    level, first = _persistent(before.level, [item[0] for item in recent]), recent[0][1]
+        is_interrupted = event is None and report.decision is WindowDecision.SUSPECTED  # something else may be true
+        return replace(before, event=event, recent=() if is_interrupted else before.recent)
+    persistence = observed.persistence
+    recent = (*before.recent, (observed.level, report.window))[-max(persistence.rise, persistence.fall) :]
+    level, count = _persistent(before.level, [item[0] for item in recent], persistence)
+    first = recent[-count:][0][1]
     if event is None and level is not Level.OK:
         start = min(first.start, first.start if observed.since is None else observed.since)
         evidence = EvidenceDocument(windows=(first.index, report.window.index))
@@ -180,15 +184,18 @@ def _advance(
         described = event.model_copy(update=_description(plan, event, observed, report.window.index))
         is_other = event.condition not in ("", described.condition) and event.change is None
         event = described.model_copy(update={"change": EventChange.CHANGED}) if is_other else described
-    return ConditionRecord(level, recent, event)
+    return ConditionRecord(level, recent, event, persistence)
 
 
-def _persistent(level: Level, recent: Sequence[Level]) -> Level:
-    """Return the level after the ``recent`` observations, which must agree that it is higher or lower."""
-    lowest, highest = min(recent, key=lambda item: item.rank), max(recent, key=lambda item: item.rank)
-    if len(recent) < PERSISTENT_WINDOWS:
-        return level
-    return lowest if lowest.rank > level.rank else highest if highest.rank < level.rank else level
+def _persistent(level: Level, recent: Sequence[Level], persistence: Persistence) -> tuple[Level, int]:
+    """Return the level after the ``recent`` observations, and how many of them agree that it is higher or lower."""
+    lowest = min(recent[-persistence.rise :], key=lambda item: item.rank)
+    highest = max(recent[-persistence.fall :], key=lambda item: item.rank)
+    if len(recent) >= persistence.rise and lowest.rank > level.rank:
+        return lowest, persistence.rise
+    if len(recent) >= persistence.fall and highest.rank < level.rank:
+        return highest, persistence.fall
+    return level, persistence.rise
 
 
 def _description(

@@ -121,6 +121,8 @@ class MonitoringPlan:
     rules: Sequence[Rule] = ()
     stated: Mapping[str, MonitoredQuantity] | None = None
     """The parameters as the machine file states them, if there is a baseline."""
+    known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
+    """Of the parameters that are not estimated, against the values of the machine file."""
 
     @property
     def parts(self) -> tuple[str, ...]:

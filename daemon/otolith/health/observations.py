@@ -1,22 +1,46 @@
 """What the report of a window shows about each condition of the machine, before any persistence."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from otolith.discovery.adopted import Approval
+from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS
 from otolith.discovery.decision import WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingFeatures, FindingKind, severity
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan, probability_beyond
-from otolith.health.schema import ComponentDocument, ComponentStatus, ParameterDocument, ReportDocument, Status
+from otolith.health.schema import (
+    ComponentDocument,
+    ComponentStatus,
+    FindingDocument,
+    ParameterDocument,
+    ReportDocument,
+    Status,
+)
 from otolith.health.text import forecast_text, interval_text, value_text
 
+PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
+RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine moves
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
 BUS, SENSORS = "bus", "sensors"  # parts that every machine has
 PARTS = {FindingKind.SENSOR: SENSORS, FindingKind.NOISE: SENSORS, FindingKind.TIMING: BUS}
 """Of findings that are about no part of the twin."""
 NOTHING = FindingFeatures(FindingKind.OPEN)
+
+
+@dataclass(frozen=True, slots=True)
+class Persistence:
+    """How many windows in a row must agree."""
+
+    rise: int = PERSISTENT_WINDOWS
+    """On a higher level."""
+    fall: int = PERSISTENT_WINDOWS
+    """On a lower one."""
+
+
+UNDECIDED = Persistence(MAX_OPEN_WINDOWS, RELEASE_WINDOWS)
+"""Of what an open test states: it may still be decided, and shows only in windows that excite it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +61,7 @@ class Observation:
     """Unix seconds; None for the first window that shows it."""
     numbers: Mapping[str, float | str] | None = None
     """For the evidence of the event."""
+    persistence: Persistence = Persistence()
 
 
 def observe(
@@ -49,17 +74,15 @@ def observe(
     observations = [*_of_sources(report, before), no_data]  # of one state, the first is more specific
     if report.decision is WindowDecision.REFUSED:
         features, text = FindingFeatures(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
-        observations.append(Observation("unexplained", MACHINE, Level.WATCH, features, text, "an unknown change"))
+        unexplained = Observation("unexplained", MACHINE, Level.WATCH, features, text, "an unknown change")
+        observations.append(replace(unexplained, persistence=Persistence(fall=RELEASE_WINDOWS)))
     observations += [_of_parameter(plan, report, name, before, steps.get(name, 0.0)) for name in report.parameters]
     observations += _without_temperature(plan, report)
     components = (_of_component(plan, report.twin, component, before) for component in report.components)
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
     for finding in report.findings:
         if finding.kind not in (FindingKind.OPEN, FindingKind.COMPONENT):
-            features = FindingFeatures(finding.kind, report.twin, finding.subject)
-            level, part = Level(severity(plan.rules, features)), PARTS.get(finding.kind, MACHINE)
-            texts = finding.text, finding.condition, finding.advice
-            observations.append(Observation(finding.id, part, level, features, *texts, finding.since))
+            observations.append(_of_finding(plan, report.twin, finding, before.get(finding.id, Level.OK)))
     return observations
 
 
@@ -70,6 +93,25 @@ def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator
     for key in sorted(absent.keys() | {key for key in before if key.startswith("source/")}):
         features = FindingFeatures(FindingKind.NO_SOURCE, subject=key.partition("/")[2])
         yield Observation(key, BUS, level if key in absent else Level.OK, features, absent.get(key, ""))
+
+
+def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Level) -> Observation:
+    """Return the observation of a finding; a parameter that has moved within the limits of the twin is none."""
+    features = FindingFeatures(finding.kind, twin, finding.subject)
+    part, texts = PARTS.get(finding.kind, MACHINE), (finding.text, finding.condition, finding.advice)
+    level, numbers, value = Level(severity(plan.rules, features)), None, finding.value
+    if value is not None:
+        quantity = plan.known.get(finding.subject, MonitoredQuantity())
+        deviation, (passed, limit) = value.value - quantity.nominal, quantity.level(value.value, value.sd, before)
+        level, part = passed if quantity.limits else level, quantity.part
+        side, numbers = "below" if deviation < 0.0 else "above", _numbers(value.value, value.sd, value.unit, limit)
+        features = replace(features, side=side, manner="step")
+        interval = interval_text(value.value, value.sd, value.unit)
+        share = f" ({deviation / quantity.nominal:+.1%})" if quantity.nominal else ""
+        text = f"{quantity.meaning} {finding.subject} is {interval}{share}, stated as {quantity.nominal:.5g}"
+        texts = (text, *texts[1:])
+    persistence = UNDECIDED if finding.kind in (FindingKind.CLASS, FindingKind.MOVED) else Persistence()
+    return Observation(finding.id, part, level, features, *texts, finding.since, numbers, persistence)
 
 
 def _of_parameter(

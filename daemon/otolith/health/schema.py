@@ -88,7 +88,9 @@ class FindingDocument(StrictModel):
     id: str
     kind: FindingKind
     subject: str = ""
-    """Signal or site that it is about."""
+    """Signal, site or parameter that it is about."""
+    value: NumberDocument | None = None
+    """Of a parameter that has moved."""
     severity: Severity
     condition: str
     text: str
