@@ -32,12 +32,24 @@ def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
     least = min((hypotheses[at].misfit for at in others), default=0.0)
     equal = [at for at in others if hypotheses[at].misfit <= least + DECISIVE]
     least_values = min((hypotheses[at].hypothesis.added for at in equal), default=0)
+    moved = [hypotheses[at] for at in equal if hypotheses[at].type is FaultType.PARAMETER]
+    simplest = min(moved, key=lambda item: (item.hypothesis.added, item.deviance), default=None)
     groups: dict[tuple[FaultType, tuple[str, ...]], list[int]] = {}
     for at in sorted(equal, key=lambda at: hypotheses[at].deviance):
         item = hypotheses[at]
         if item.type is not FaultType.COMPONENT or item.hypothesis.added <= least_values:
-            groups.setdefault((item.type, item.places), []).append(at)
+            groups.setdefault((item.type, _place(item, simplest)), []).append(at)
     return list(groups.values())
+
+
+def _place(item: TrackedHypothesis, simplest: TrackedHypothesis | None) -> tuple[str, ...]:
+    """Return what ``item`` is about: of moved parameters their names.
+
+    More moved parameters than those of the ``simplest`` hypothesis of moved parameters are a variant of it.
+    """
+    if simplest is None or item.type is not FaultType.PARAMETER:
+        return item.places
+    return ((item if item.hypothesis.added <= simplest.hypothesis.added else simplest).hypothesis.name,)
 
 
 def probabilities(hypotheses: Sequence[TrackedHypothesis], groups: Sequence[Sequence[int]]) -> list[float]:

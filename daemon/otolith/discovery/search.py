@@ -225,7 +225,7 @@ def _one_parameter_moved(problem: Problem, prior: Prior, response: LinearRespons
         else:
             rest = tuple(pair for pair in problem.known if pair[0] != parameter.name)
             wider = replace(problem, free=(*problem.free, parameter), known=rest)
-            extended = extend_prior(prior, problem, wider)
+            extended = forget_parameter(extend_prior(prior, problem, wider), wider, len(problem.free))
             proposals.append(Proposal(moved, wider, extended, extended.mean))
     return proposals
 

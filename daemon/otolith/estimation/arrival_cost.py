@@ -19,6 +19,7 @@ from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 
 INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative to the parameter's size
+MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
 MAX_TREND = 1.0  # 1/s: bound of a trend, relative to the parameter's size
 MIN_STATE_SINGULAR = 1e-10  # relative singular value below which a window does not determine the initial state
 MIN_SINGULAR = 1e-12  # relative singular value below which a direction has no uncertainty to speak of
@@ -69,9 +70,11 @@ def extend_prior(prior: Prior, problem: Problem, wider: Problem) -> Prior:
 
 
 def forget_parameter(prior: Prior, problem: Problem, index: int) -> Prior:
-    """Return ``prior`` with the initial prior for one parameter and its trend."""
+    """Return ``prior`` with the initial prior for one parameter, which may go on moving."""
     mean, covariance, fresh = prior.mean.copy(), prior.covariance.copy(), initial_prior(problem)
-    for at in (index, index + len(problem.free)):
+    trend = index + len(problem.free)
+    fresh.covariance[trend, trend] = (MOVED_TREND_SD * problem.scale[index]) ** 2
+    for at in (index, trend):
         mean[at] = fresh.mean[at]
         covariance[at, :] = covariance[:, at] = 0.0
         covariance[at, at] = fresh.covariance[at, at]
