@@ -293,9 +293,10 @@ class Demo:
         elif wrong:
             self._print(f"{wrong} estimates are wrong by more than {TOLERANCE:.1%}", "red")
         else:
-            self._print(f"no estimate is wrong by more than {TOLERANCE:.1%} of what was injected", "green")
+            which = "every other estimate" if unknown else "every estimate"
+            self._print(f"{which} is within {TOLERANCE:.1%} of what was injected", "green")
         if unknown:
-            text = f"{unknown} of {len(rows)} windows have no estimate that precise"
+            text = f"{unknown} of {len(rows)} estimates are missing or not that precise"
             self._print(f"{text}: the computer may be too busy to receive all samples", "yellow" if known else "red")
         for unbalance in unbalances:
             self._print(str(unbalance), "green" if unbalance.right else "red")
