@@ -25,7 +25,7 @@ from otolith.storage.state_store import StateStore
 from otolith_drivers.base import Sampling
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
-from tests.waiting import PATIENCE, within
+from tests.waiting import PATIENCE, wait_for, within
 
 # Friction near standstill: a turning shaft gives no evidence against it, so it is not removed during the test.
 FRICTION = Component("shaft", "Stribeck", "omega", -0.004, inner=0.01, low=0.005, high=0.02)
@@ -112,12 +112,21 @@ def test_the_watchdog_is_fed_by_finished_windows_only(
         service._notifier.close()
 
 
+def replaced_by_file(folder: Path) -> bool:
+    """Whether a file took the place of ``folder``, which the daemon may have made again meanwhile."""
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        folder.write_text("no folder any more", encoding="utf-8")
+    except IsADirectoryError:
+        return False
+    return True
+
+
 @pytest.mark.timed
 def test_windows_without_a_recorder_are_counted_as_dropped(running: Running) -> None:
     before = running.wait_for(lambda reports: len(reports) >= 2)[-1].counters
     os.kill(running.child("recorder").pid, signal.SIGKILL)
-    shutil.rmtree(running.folder / "state", ignore_errors=True)
-    (running.folder / "state").write_text("no folder any more", encoding="utf-8")
+    wait_for(lambda: replaced_by_file(running.folder / "state"))
     reports = running.wait_for(
         lambda reports: bool(reports and reports[-1].counters and reports[-1].counters.recordings_dropped >= 2)
     )

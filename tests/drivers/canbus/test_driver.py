@@ -31,6 +31,8 @@ SENDER = """
 import sys, time, can
 interface, channel, port, count, fd = sys.argv[1:]
 bus = can.Bus(interface=interface, channel=channel, port=int(port), hop_limit=0, fd=fd == "fd")
+print("ready", flush=True)
+sys.stdin.readline()
 for index in range(int(count)):
     data = (index % 1000).to_bytes(2, "little") + bytes(5) + bytes([index % 256]) + bytes(56 if fd == "fd" else 0)
     bus.send(can.Message(arbitration_id=0x181, data=data, is_extended_id=False, is_fd=fd == "fd"))
@@ -69,9 +71,13 @@ def test_frames_of_another_process_arrive_complete(bus_options: dict[str, Any], 
     wishes = RAW if kind == "classic" else {"V_a": ("V", {**RAW["V_a"][1], "fd": True})}
     options = {**bus_options, "fd": kind == "fd", "messages": COUNTED}
     driver, got = receiver(wishes, **options), list[Sample]()
-    driver.open(got.extend)
     arguments = ["udp_multicast", bus_options["channel"], str(bus_options["port"]), "500", kind]
-    subprocess.run([sys.executable, "-c", SENDER, *arguments], check=True, timeout=PATIENCE)
+    command = [sys.executable, "-c", SENDER, *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as sender:
+        assert sender.stdout is not None
+        assert sender.stdout.readline() == "ready\n"  # a bus that is silent for long is opened again
+        driver.open(got.extend)
+        sender.communicate("\n", timeout=PATIENCE)
     assert until(lambda: len(got) == 500)
     driver.close()
     assert [round(sample.value * 100) for sample in got] == [index % 1000 for index in range(500)]
