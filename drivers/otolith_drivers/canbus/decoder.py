@@ -290,7 +290,7 @@ class FrameDecoder:
         self._groups = groups or None
         self._nodes = tuple(nodes)
         self._handlers: dict[int, FrameHandler] = {
-            key: handler for node in nodes for key, handler in node.handlers().items()
+            key: handler for node in nodes for key, handler in node.handlers.items()
         }
         self._unreadable = 0
         self._begun: float | None = None
