@@ -12,7 +12,7 @@ from otolith.acquisition.alignment import CyclicSeries
 from otolith.acquisition.records import Records
 from otolith.acquisition.samples import SignalPlan
 from otolith.acquisition.time_grid import GridSpan, TimeGrid
-from otolith.acquisition.window import Array, Mask, Quality, Verdict
+from otolith.acquisition.window import Mask, Quality, Verdict
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 CALENDAR = (1e8, 1e11)  # s: a time between them is Unix time and shown as a date
@@ -62,7 +62,7 @@ def assess_quality(
     expected = [name for name in plans if name not in records.held]
     gaps = {name: longest_gap(present[name], records.grid, span.start, span.period) for name in expected}
     missing = {name: max(0.0, 1.0 - float(present[name].sum()) / max(slots, 1)) for name in expected}
-    jitters = {name: _rms(item.lateness) for name, item in cyclic.items()}
+    jitters = {name: float(np.sqrt(np.mean(item.lateness**2))) for name, item in cyclic.items() if len(item.lateness)}
     offsets = [float(np.median(item.lateness)) for item in cyclic.values() if len(item.lateness)]
     reasons = _useless(present, plans, records.unknown, span)
     reasons = reasons or [
@@ -139,10 +139,6 @@ def longest_gap(present: Mask, grid: TimeGrid, start: float, period: float) -> G
     lengths = np.diff(times) - period * (np.arange(len(times) - 1) > 0)
     at = int(np.argmax(lengths))
     return Gap(start + float(times[at]) + period * (at > 0), max(float(lengths[at]), 0.0))
-
-
-def _rms(lateness: Array) -> float:
-    return float(np.sqrt(np.mean(lateness**2))) if len(lateness) else 0.0
 
 
 class ReasonCounts:

@@ -17,17 +17,6 @@ OCTAVES = (-40, 40)  # of that histogram, in powers of two of a second
 SEED = 1
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedGap:
-    """A time without samples."""
-
-    seconds: float
-    start: float
-    """Time of the last sample before it, s."""
-    line: int
-    """Line, frame or record of the first sample after it."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalSampling:
     """How one signal was sampled."""
@@ -36,14 +25,18 @@ class SignalSampling:
     """Finite values."""
     blank: int
     """Rows without a value of this signal."""
-    interval: float
-    """Median time between two samples, s; infinity if there are not two."""
+    interval_s: float | None
+    """Median time between two samples; None if there are not two."""
     jitter: float
     """Standard deviation of the intervals that are no gaps, over their median."""
     gaps: int
     """Intervals of more than ``MAX_GAPLESS`` medians, up to the resolution of a histogram (9 %)."""
-    longest_gap: RecordedGap | None
+    longest_gap_s: float | None
     """The longest interval, if it is a gap."""
+    longest_gap_start: float | None
+    """Time of the last sample before it, s."""
+    longest_gap_line: int | None
+    """Line, frame or record of the first sample after it."""
     duplicates: int
     """Samples with time and value of the sample before."""
     repeated_times: int
@@ -81,7 +74,7 @@ class SignalStatistics:
         self.samples = self.blank = self.duplicates = self.repeated_times = self.repeats = 0
         self._values, self._intervals = RandomChoice(), RandomChoice()
         self._histogram = np.zeros((OCTAVES[1] - OCTAVES[0]) * BINS_PER_OCTAVE, dtype=np.int64)
-        self._longest = RecordedGap(0.0, math.nan, 0)
+        self._longest = (0.0, math.nan, 0)  # gap (s), its start (s) and the line after it
         self._runs, self._steps = RandomChoice(), RandomChoice()
         self._run: int | None = None  # samples since the last change; None before the first one
         self._last: tuple[float, float] | None = None
@@ -125,8 +118,8 @@ class SignalStatistics:
         bins = np.clip(bins, 0, len(self._histogram) - 1)
         self._histogram += np.bincount(bins, minlength=len(self._histogram))
         longest = int(np.argmax(intervals))
-        if intervals[longest] > self._longest.seconds:
-            self._longest = RecordedGap(float(intervals[longest]), float(before[longest]), int(lines[longest]))
+        if intervals[longest] > self._longest[0]:
+            self._longest = float(intervals[longest]), float(before[longest]), int(lines[longest])
 
     def summary(self) -> SignalSampling:
         """Return what was counted so far."""
@@ -134,14 +127,16 @@ class SignalStatistics:
         median = float(np.median(intervals)) if len(intervals) else math.inf
         gapless = intervals[intervals <= MAX_GAPLESS * median]
         edges = np.exp2(np.arange(len(self._histogram)) / BINS_PER_OCTAVE + OCTAVES[0])
-        gap = self._longest if self._longest.seconds > MAX_GAPLESS * median else None
+        gap = self._longest if self._longest[0] > MAX_GAPLESS * median else (None, None, None)
         return SignalSampling(
             samples=self.samples,
             blank=self.blank,
-            interval=median,
+            interval_s=median if len(intervals) else None,
             jitter=float(gapless.std() / median) if len(gapless) else 0.0,
-            gaps=max(int(self._histogram[edges > MAX_GAPLESS * median].sum()), int(gap is not None)),
-            longest_gap=gap,
+            gaps=max(int(self._histogram[edges > MAX_GAPLESS * median].sum()), int(gap[0] is not None)),
+            longest_gap_s=gap[0],
+            longest_gap_start=gap[1],
+            longest_gap_line=gap[2],
             duplicates=self.duplicates,
             repeated_times=self.repeated_times,
             repeats=self.repeats,

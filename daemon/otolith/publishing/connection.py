@@ -1,6 +1,7 @@
 """The connection to the machine in a report: its sources, and what is not known because one of them is silent."""
 
 from collections.abc import Collection, Mapping
+from dataclasses import asdict
 
 from otolith.acquisition.window import Window
 from otolith.health.schema import DriverDocument, ParameterDocument, SourceDocument, Status
@@ -15,10 +16,7 @@ def driver_document(link: Link) -> DriverDocument:
             up=state.link.up,
             reason=state.link.reason,
             warnings=state.link.warnings,
-            received=state.counters.received,
-            bad=state.counters.bad,
-            lost=state.counters.lost,
-            reconnects=state.counters.reconnects,
+            **asdict(state.counters),
         )
         for state in link.sources
     }

@@ -8,7 +8,7 @@ import math
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from statistics import median
 from typing import Any, Generic, TypeVar
@@ -64,25 +64,11 @@ class EvenSpread(Generic[Item]):
         return [self._kept[round(index * (len(self._kept) - 1) / max(count - 1, 1))] for index in range(count)]
 
 
-@dataclass(frozen=True, slots=True)
-class SignalPreview:
-    """How one signal was sampled; times in s."""
+@dataclass(frozen=True, slots=True, eq=False)
+class SignalPreview(SignalSampling):
+    """How one signal was sampled."""
 
     unit: str
-    samples: int
-    blank: int
-    interval_s: float | None
-    """Median; None if there are not two samples."""
-    jitter: float
-    """Standard deviation of the intervals over their median."""
-    gaps: int
-    longest_gap_s: float | None
-    longest_gap_start: float | None
-    longest_gap_line: int | None
-    duplicates: int
-    repeated_times: int
-    repeats: int
-    renewal: int
     step: float
     """Quantisation step in the unit of the signal; 0 if the values show none."""
 
@@ -157,7 +143,10 @@ class Preview:
 
     def document(self) -> dict[str, Any]:
         """Return the preview as plain values for JSON."""
-        return asdict(self)
+        document = asdict(self)
+        for signal in document["signals"].values():
+            del signal["values"]
+        return document
 
 
 def preview_recording(
@@ -307,7 +296,8 @@ def _without_constant_outputs(problem: Problem, window: Window) -> Window:
 
 def _proposed_period(statistics: RecordingStatistics, configured: float) -> float:
     """Return the interval of the fastest signal in s, with three digits; ``configured`` if that fits."""
-    fastest = min((sampling.interval for sampling in statistics.signals().values()), default=math.inf)
+    intervals = (sampling.interval_s for sampling in statistics.signals().values())
+    fastest = min((interval for interval in intervals if interval is not None), default=math.inf)
     if not math.isfinite(fastest) or abs(fastest / configured - 1.0) <= MAX_PERIOD_ERROR:
         return configured
     return float(f"{np.clip(fastest, 1e-4, 10.0):.3g}")
@@ -373,23 +363,8 @@ def _computing_seconds(machine: LoadedMachine, windows: Sequence[Window]) -> lis
 
 
 def _signal(unit: str, sampling: SignalSampling) -> SignalPreview:
-    gap = sampling.longest_gap
-    return SignalPreview(
-        unit=unit,
-        samples=sampling.samples,
-        blank=sampling.blank,
-        interval_s=sampling.interval if math.isfinite(sampling.interval) else None,
-        jitter=sampling.jitter,
-        gaps=sampling.gaps,
-        longest_gap_s=None if gap is None else gap.seconds,
-        longest_gap_start=None if gap is None else gap.start,
-        longest_gap_line=None if gap is None else gap.line,
-        duplicates=sampling.duplicates,
-        repeated_times=sampling.repeated_times,
-        repeats=sampling.repeats,
-        renewal=sampling.renewal,
-        step=adc_step(sampling.values),
-    )
+    counted_of = {item.name: getattr(sampling, item.name) for item in fields(sampling)}
+    return SignalPreview(**counted_of, unit=unit, step=adc_step(sampling.values))
 
 
 def _remarks(
@@ -415,16 +390,17 @@ def _remarks(
 
 
 def _renewal_remarks(sampling: SignalSampling) -> Iterator[str]:
-    if sampling.renewal > 1:
-        every = duration_text(sampling.renewal * sampling.interval)
+    if sampling.renewal > 1 and sampling.interval_s is not None:
+        every = duration_text(sampling.renewal * sampling.interval_s)
         yield f"the value changes with every {_ordinal(sampling.renewal)} sample only, about every {every}"
 
 
 def _signal_remarks(sampling: SignalSampling) -> Iterator[str]:
     if not sampling.samples:
         yield "no sample"
-    if (gap := sampling.longest_gap) is not None:
-        yield f"the longest gap is {duration_text(gap.seconds)}, from t = {gap.start:.12g} s to line {gap.line}"
+    if (gap := sampling.longest_gap_s) is not None:
+        start, line = sampling.longest_gap_start, sampling.longest_gap_line
+        yield f"the longest gap is {duration_text(gap)}, from t = {start:.12g} s to line {line}"
     if sampling.duplicates:
         share = sampling.duplicates / sampling.samples
         count = f"{counted(sampling.duplicates, 'sample')} ({share:.0%})"

@@ -10,7 +10,7 @@ import json
 import sqlite3
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +193,7 @@ class HistoryReader:
     def samples(self, resolution: int, since: float, names: Sequence[str] = ()) -> list[HistorySample]:
         """Return the values since a time, of the parameters ``names`` or of all, in the order of time."""
         chosen = f"AND name IN ({', '.join('?' * len(names))})" if names else ""
-        columns = "name, unit, time, count, min, mean, max, last, low, high, status"
+        columns = ", ".join(column.name for column in fields(HistorySample))
         query = (
             f"SELECT {columns} FROM sample JOIN series ON series.id = series "  # noqa: S608 - no text of a user
             f"WHERE resolution = ? AND time >= ? {chosen} ORDER BY time, series.id"

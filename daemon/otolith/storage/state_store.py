@@ -8,9 +8,10 @@ import fcntl
 import logging
 import os
 from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
 from pydantic import Field, ValidationError
 
@@ -52,9 +53,9 @@ class _DecisionsFile(StrictModel):
     version: int = DECISIONS_VERSION
     approved: tuple[str, ...] = ()
     rejected: tuple[str, ...] = ()
-    forgotten: Annotated[dict[str, float], Field(default_factory=dict)]
-    resets: Annotated[dict[str, float], Field(default_factory=dict)]
-    baselines: Annotated[dict[str, Baseline], Field(default_factory=dict)]
+    forgotten: dict[str, float] = Field(default_factory=dict)
+    resets: dict[str, float] = Field(default_factory=dict)
+    baselines: dict[str, Baseline] = Field(default_factory=dict)
 
 
 class StateStore:
@@ -237,9 +238,7 @@ class StateStore:
         Raises:
             ConfigurationError: the file is unreadable or not a decisions file.
         """
-        file = _read(self.decisions_path, _DecisionsFile, DECISIONS_VERSION)
-        if file is None:
-            return OperatorDecisions()
+        file = _read(self.decisions_path, _DecisionsFile, DECISIONS_VERSION) or _DecisionsFile()
         return OperatorDecisions(
             frozenset(file.approved), frozenset(file.rejected), file.forgotten, file.resets, file.baselines
         )
@@ -250,14 +249,8 @@ class StateStore:
         Raises:
             ServiceError: the file cannot be written.
         """
-        approved, rejected = tuple(sorted(decisions.approved)), tuple(sorted(decisions.rejected))
-        file = _DecisionsFile(
-            approved=approved,
-            rejected=rejected,
-            forgotten=dict(decisions.forgotten),
-            resets=dict(decisions.resets),
-            baselines=dict(decisions.baselines),
-        )
+        keys = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
+        file = _DecisionsFile.model_validate({**asdict(decisions), **keys})
         _write(self.decisions_path, file, f"{self.decisions_path.name}.{os.getpid()}.new")
 
     def decisions_time(self) -> float:

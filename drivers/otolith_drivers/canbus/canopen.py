@@ -340,15 +340,15 @@ class NodeMonitor:
     def __init__(self, node: int, emergency: int) -> None:
         """``emergency`` is the arbitration ID of its emergencies."""
         self.node = node
-        self._emergency = emergency
         self._code = 0
         self._code_time = 0.0
         self._state: int | None = None
         self._heartbeats = PeriodEstimator()
-
-    def handlers(self) -> dict[int, FrameHandler]:
+        self.handlers: dict[int, FrameHandler] = {
+            emergency: self._note_emergency,
+            HEARTBEAT_ID + node: self._note_heartbeat,
+        }
         """By arbitration ID, what takes the data of a frame and its time (s)."""
-        return {self._emergency: self._note_emergency, HEARTBEAT_ID + self.node: self._note_heartbeat}
 
     def warnings(self, now: float) -> list[str]:
         """What is wrong at ``now`` (s), a line each."""

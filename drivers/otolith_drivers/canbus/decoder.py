@@ -15,7 +15,13 @@ from cantools.database import Signal as CanSignal
 from otolith_drivers.base import Counters, Sample, Setup, Signal
 from otolith_drivers.canbus.canopen import CanopenDrive, FrameHandler, NodeMonitor
 from otolith_drivers.canbus.database import STANDARD_LIMIT, CanDatabase, load_database
-from otolith_drivers.canbus.j1939 import ParameterGroups, fault_of, highest_reading, names_any_source
+from otolith_drivers.canbus.j1939 import (
+    ParameterGroups,
+    fault_of,
+    has_several_frames,
+    highest_reading,
+    names_any_source,
+)
 from otolith_drivers.canbus.monitoring import (
     MIN_STUCK_FRAMES,
     BusFaults,
@@ -26,7 +32,6 @@ from otolith_drivers.canbus.monitoring import (
 )
 from otolith_drivers.canbus.options import FrameOptions, MessageTable
 from otolith_drivers.canbus.signals import (
-    CLASSIC_LENGTH,
     MAX_VALUE,
     BitRange,
     RawReader,
@@ -285,7 +290,7 @@ class FrameDecoder:
         self._groups = groups or None
         self._nodes = tuple(nodes)
         self._handlers: dict[int, FrameHandler] = {
-            key: handler for node in nodes for key, handler in node.handlers().items()
+            key: handler for node in nodes for key, handler in node.handlers.items()
         }
         self._unreadable = 0
         self._begun: float | None = None
@@ -308,10 +313,13 @@ class FrameDecoder:
             key = frame.arbitration_id + EXTENDED if frame.is_extended_id else frame.arbitration_id
             if self._handlers and (handler := self._handlers.get(key)) is not None:
                 handler(frame.data, time)
+            data: bytes | bytearray = frame.data
             if self._groups is not None and key >= EXTENDED and self._groups.wants(frame.arbitration_id):
-                key = self._groups.key(frame.arbitration_id)
+                if (message := self._groups.assembled(frame.arbitration_id, data, time)) is None:
+                    return NO_SAMPLES
+                key, data, time = self._groups.key(message), message.data, message.time
             reader = self._readers.get(key)
-            return reader.take(frame.data, time) if reader is not None else NO_SAMPLES
+            return reader.take(data, time) if reader is not None else NO_SAMPLES
         except Exception:  # noqa: BLE001 - interfaces deliver unchecked what was on the wire
             self._unreadable += 1
             return NO_SAMPLES
@@ -319,10 +327,10 @@ class FrameDecoder:
     @property
     def counters(self) -> Counters:
         """What has been received so far; ``reconnects`` stays 0."""
-        readers = self._readers.values()
+        readers, assembler = self._readers.values(), self._groups and self._groups.assembler
         return Counters(
             received=sum(reader.received for reader in readers),
-            bad=sum(reader.bad for reader in readers) + self._unreadable,
+            bad=sum(reader.bad for reader in readers) + self._unreadable + (assembler.broken if assembler else 0),
             # The period or the counter of a message shows overflows as well, unless it has neither.
             lost=max(sum(reader.lost for reader in readers), self.faults.overflows),
         )
@@ -334,12 +342,17 @@ class FrameDecoder:
         """
         if self._begun is None:
             self._begun = now
-        lines = self.faults.warnings(now) + (self._groups.warnings() if self._groups is not None else [])
+        lines = self.faults.warnings(now) + (self._groups.warnings(now) if self._groups is not None else [])
         for reader in self._readers.values():
             lines += reader.warnings(now, self._begun, unused=unused)
         for node in self._nodes:
             lines += node.warnings(now)
         return lines
+
+    @property
+    def latency(self) -> float:
+        """Time by which samples come after their times, s: a message of several frames has that of its announcement."""
+        return self._groups.assembler.latency if self._groups is not None and self._groups.assembler else 0.0
 
     def slowest_period(self) -> float | None:
         """The longest period (s) of the regular messages; None if there are none yet."""
@@ -419,21 +432,9 @@ class _FrameContent:
 
 
 def _is_j1939(content: _FrameContent, options: FrameOptions) -> bool:
-    """Whether the frames come from any node of J1939.
-
-    Raises:
-        ConfigurationError: the message is longer than a frame.
-    """
+    """Whether the frames are those of a parameter group of J1939."""
     message = content.messages[0]
-    if not options.j1939 or not names_any_source(message):
-        return False
-    if message.length > CLASSIC_LENGTH and not message.is_fd:
-        raise ConfigurationError(
-            f"message {message.name} has {message.length} bytes, which come in several frames (transport protocol of "
-            "J1939): that is not read",
-            ("signals", content.requests[0].name),
-        )
-    return True
+    return options.j1939 and (names_any_source(message) or has_several_frames(message))
 
 
 def _key(message: Message) -> int:

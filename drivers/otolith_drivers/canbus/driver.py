@@ -99,7 +99,8 @@ class CanReceiver(ThreadedDriver):
         now = time.monotonic()
         silence = now - self._last_frame
         silent = [f"no frame at all for {silence:.1f} s"] if silence > self._silence_limit() else []
-        return replace(link, warnings=(*silent, *self._drops.warnings(now), *self._decoder.warnings(now)))
+        warnings = (*silent, *self._drops.warnings(now), *self._decoder.warnings(now))
+        return replace(link, warnings=warnings, latency=self._decoder.latency)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""

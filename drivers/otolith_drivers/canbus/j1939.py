@@ -1,8 +1,7 @@
 """SAE J1939: messages by their parameter group (PGN) whatever node sends them, and numbers that are no readings.
 
 An identifier of 29 bits has a priority, the parameter group and the address of its source. A database gives the group,
-and as its source usually 0xFE, which stands for any. can-j1939 is not used for messages of several frames: it answers
-the node that sends them, and ignores those between other nodes.
+and as its source usually 0xFE, which stands for any.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,6 +10,8 @@ from dataclasses import dataclass, field
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
 
+from otolith_drivers.canbus.j1939_transport import DATA, MANAGEMENT, Assembler, WholeMessage
+from otolith_drivers.canbus.signals import CLASSIC_LENGTH
 from otolith_drivers.errors import ConfigurationError
 
 ANY_SOURCE = 0xFE  # the null address (SAE J1939-81), which databases give where the source is open
@@ -24,6 +25,11 @@ ERROR_BYTE, NOT_AVAILABLE_BYTE = 0xFE, 0xFF
 def names_any_source(message: Message) -> bool:
     """Whether the identifier of ``message`` has the source address that stands for any."""
     return message.is_extended_frame and message.frame_id & ADDRESS_MASK == ANY_SOURCE
+
+
+def has_several_frames(message: Message) -> bool:
+    """Whether ``message`` is longer than a frame, so that it comes by the transport protocol."""
+    return message.is_extended_frame and message.length > CLASSIC_LENGTH and not message.is_fd
 
 
 def group_of(identifier: int) -> int:
@@ -65,13 +71,16 @@ class ParameterGroup:
 
     key: int
     """Of the reader of its frames."""
+    title: str
+    declared: int | None
+    """Address of the source that the machine file or the database gives."""
     source: int | None
-    """Its address; None until a frame came, if the machine file gives none."""
+    """The address that is read; None until a frame came, if none is declared."""
     others: set[int] = field(default_factory=set)
 
 
 class ParameterGroups:
-    """Which frames of 29 bits belong to a message of a database whose source is open."""
+    """Which frames of 29 bits belong to a message of a database, whatever node sends it."""
 
     def __init__(self, messages: Sequence[tuple[int, Message]], source: int | None) -> None:
         """``messages`` have the key of their reader; ``source`` is the address of the machine file.
@@ -79,9 +88,13 @@ class ParameterGroups:
         Raises:
             ConfigurationError: two messages are the same parameter group.
         """
-        self._groups = {group_of(message.frame_id): ParameterGroup(key, source) for key, message in messages}
-        self._titles = {group_of(message.frame_id): message.name for _, message in messages}
-        self._declared = source is not None
+        self._groups: dict[int, ParameterGroup] = {}
+        for key, message in messages:
+            declared = source if names_any_source(message) else message.frame_id & ADDRESS_MASK
+            self._groups[group_of(message.frame_id)] = ParameterGroup(key, message.name, declared, declared)
+        long = [group_of(message.frame_id) for _, message in messages if has_several_frames(message)]
+        self.assembler = Assembler(long) if long else None
+        """Of the messages of several frames; None if there are none."""
         if len(self._groups) < len(messages):
             names = ", ".join(message.name for _, message in messages)
             raise ConfigurationError(f"of {names}, two have the same parameter group: read signals of one of them")
@@ -89,31 +102,41 @@ class ParameterGroups:
     def __bool__(self) -> bool:
         return bool(self._groups)
 
-    def key(self, identifier: int) -> int:
-        """Return the key of the reader of a frame that is wanted; ``NO_READER`` if another source is read."""
-        group = self._groups[group_of(identifier)]
-        source = identifier & ADDRESS_MASK
+    def assembled(self, identifier: int, data: bytes | bytearray, time: float) -> WholeMessage | None:
+        """Return the message that a frame is, or completes; None for a frame of another group or source."""
+        group, source = group_of(identifier), identifier & ADDRESS_MASK
+        if self.assembler is None or group not in (MANAGEMENT, DATA):
+            return WholeMessage(group, source, data, time) if group in self._groups else None
+        return self.assembler.take(group, (source, identifier >> GROUP_BITS & ADDRESS_MASK), data, time)
+
+    def key(self, message: WholeMessage) -> int:
+        """Return the key of the reader of a message; ``NO_READER`` if another source is read."""
+        group = self._groups[message.group]
         if group.source is None:
-            group.source = source
-        if source != group.source:
-            group.others.add(source)
+            group.source = message.source
+        if message.source != group.source:
+            group.others.add(message.source)
             return NO_READER
         return group.key
 
     def filters(self) -> Iterator[tuple[int, int]]:
         """Yield identifier and mask of each group."""
-        for group, one in self._groups.items():
-            yield filter_of(group, one.source if self._declared else None)
+        for number, group in self._groups.items():
+            yield filter_of(number, group.declared)
+        if self.assembler is not None:
+            yield from (filter_of(number, None) for number in (MANAGEMENT, DATA))
 
     def wants(self, identifier: int) -> bool:
         """Whether a frame belongs to a group, from whatever source."""
-        return group_of(identifier) in self._groups
+        group = group_of(identifier)
+        return group in self._groups or (self.assembler is not None and group in (MANAGEMENT, DATA))
 
-    def warnings(self) -> list[str]:
-        """Return a line for each group that several nodes send, although the machine file names none of them."""
-        return [
-            f"{self._titles[number]} (PGN {number}) comes from the addresses 0x{group.source:02X}, which is used, and "
+    def warnings(self, now: float) -> list[str]:
+        """Return a line for each group that several nodes send although none is declared, and for lost packets."""
+        lines = [] if self.assembler is None else self.assembler.warnings(now)
+        return lines + [
+            f"{group.title} (PGN {number}) comes from the addresses 0x{group.source:02X}, which is used, and "
             f"{', '.join(f'0x{other:02X}' for other in sorted(group.others))}: set source_address in [driver]"
             for number, group in list(self._groups.items())
-            if group.others and group.source is not None and not self._declared
+            if group.others and group.source is not None and group.declared is None
         ]

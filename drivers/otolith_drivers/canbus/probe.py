@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import STATES
+from otolith_drivers.canbus.j1939 import group_of
 from otolith_drivers.canbus.monitoring import error_classes
 from otolith_drivers.canbus.signals import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
 from otolith_drivers.errors import some_names
@@ -162,6 +163,7 @@ class Picture:
             for message in (database.messages if database else [])
             if not message.is_container
         }
+        self.has_database = bool(self._messages)
         self.observed: dict[tuple[int, bool], ObservedFrames] = {}
         self.errors: Counter[str] = Counter()
         """Error frames of each class."""
@@ -170,11 +172,6 @@ class Picture:
         """Frames that the interface could not unpack."""
         self.left_out = 0
         """Frames of the arbitration IDs beyond ``MAX_IDENTIFIERS``."""
-
-    @property
-    def has_database(self) -> bool:
-        """Whether a database describes any message."""
-        return bool(self._messages)
 
     @property
     def frames(self) -> int:
@@ -225,8 +222,7 @@ class Picture:
     def guess(self, observed: ObservedFrames) -> str:
         """What frames that no database describes may be, by their arbitration ID; empty if that is not known."""
         if observed.extended:
-            group = observed.identifier >> 8 & (0x3FFFF if observed.identifier >> 16 & 0xFF >= 0xF0 else 0x3FF00)
-            return f"PGN {group} from {observed.identifier & 0xFF}, if SAE J1939"
+            return f"PGN {group_of(observed.identifier)} from {observed.identifier & 0xFF}, if SAE J1939"
         if not (name := canopen_name(observed.identifier)):
             return ""
         if not self.is_canopen:

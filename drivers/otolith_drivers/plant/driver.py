@@ -4,8 +4,9 @@ The scenario's faults act as on a bus; a fault that needs a real bus is refused.
 """
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
 from otolith_drivers.common.threaded_driver import ThreadedDriver
@@ -36,8 +37,7 @@ class PlantSource(StrictModel):
 Options, Source = PlantOptions, PlantSource  # for base.DriverType
 
 
-@dataclass(frozen=True, slots=True)
-class PlantSignal:
+class PlantSignal(NamedTuple):
     """A wanted signal: its name in the daemon and in the machine, and the conversion between their units."""
 
     name: str
@@ -128,9 +128,5 @@ class PlantDriver(ThreadedDriver):
             return
         self._counters = replace(counters, received=counters.received + count)
         measured = scheduled.sample.measured
-        deliver(
-            [
-                Sample(wanted.name, scheduled.due, wanted.scale * measured[wanted.signal] + wanted.offset)
-                for wanted in self._wanted
-            ]
-        )
+        due = scheduled.due
+        deliver([Sample(name, due, scale * measured[signal] + offset) for name, signal, scale, offset in self._wanted])

@@ -27,7 +27,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from otolith_drivers.errors import DeviceError
 from otolith_drivers.plant.faults import BusEffect
-from otolith_drivers.plant.pseudo_terminal import LineTransport, SerialLine, default_link
+from otolith_drivers.plant.pseudo_terminal import LineTransport, SerialLine
 from otolith_drivers.plant.realtime import Node, NodeSummary, ScheduledSample
 from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
 from otolith_drivers.plant.scenario import Scenario
@@ -318,7 +318,7 @@ class RtuNode(_ModbusNode):
             DeviceError: its path exists, or the kernel has no terminal left.
         """
         super().__init__(scenario, point_to_point=False)
-        self._line = SerialLine(scenario.modbus.line or default_link())
+        self._line = SerialLine(scenario.modbus.line)
 
     def close(self) -> None:
         """See :meth:`otolith_drivers.plant.realtime.Node.close`."""

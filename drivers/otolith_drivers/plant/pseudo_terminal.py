@@ -32,20 +32,16 @@ class FrameReceiver(Protocol):
         """Take bytes that have arrived."""
 
 
-def default_link() -> Path:
-    """Default path of a line: in this user's runtime folder, else in the folder for temporary files."""
-    return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / DEFAULT_NAME
-
-
 class SerialLine:
     """Both ends of a pseudo-terminal, and a link to the one that a client opens."""
 
-    def __init__(self, link: Path) -> None:
-        """Create the line.
+    def __init__(self, link: Path | None) -> None:
+        """Create the line; by default ``link`` is in this user's runtime folder, else in that of temporary files.
 
         Raises:
             DeviceError: the path exists or cannot be created, or the kernel has no terminal left.
         """
+        link = link or Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / DEFAULT_NAME
         try:
             # This process keeps the client's end open too: Linux returns EIO to a reader if no process has it open.
             self.device_end, self._client_end = pty.openpty()

@@ -159,16 +159,13 @@ class RecordingReader(Reader):
             for name, buffer in buffers.items():
                 scale, offset = self._scales[name]
                 buffer.add(times + self._delays.get(name, 0), scale * values[self._places[name]] + offset)
-            fresh, until = fresh + values.size, times[-1] + min(map(self._delay, buffers))
+            fresh, until = fresh + values.size, times[-1] + min(self._delays.get(name, 0) for name in buffers)
             if fresh >= CHUNK:
                 fresh = 0
                 yield from self._rows(buffers, until)
         yield from self._rows(buffers, MAX_NS)
         if not self._records:
             raise ConfigurationError(f"{self.path}: no records")
-
-    def _delay(self, name: str) -> int:
-        return self._delays.get(name, 0)
 
     def _read_windows(self) -> Iterator[tuple[Integers, Array]]:
         """Yield times in ns and values (signals, records) of each window; a bad window has no readings."""

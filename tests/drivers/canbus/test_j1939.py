@@ -10,9 +10,9 @@ from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.driver import Options, Source
 from otolith_drivers.canbus.j1939 import group_of
-from otolith_drivers.errors import ConfigurationError
+from tests.drivers.canbus.test_j1939_transport import transfer_frames
 
-ENGINE, TORQUE, LONG, FIXED = 0x0CF004FE, 0x18EF00FE, 0x18FECAFE, 0x0CF00401
+ENGINE, TORQUE, LONG, FIXED, LONG_OF_ONE = 0x0CF004FE, 0x18EF00FE, 0x18FECAFE, 0x0CF00401, 0x18FECB21
 DATABASE = f"""VERSION ""
 
 NS_ :
@@ -31,6 +31,9 @@ BO_ {TORQUE | 1 << 31} Proprietary: 8 Engine
 
 BO_ {LONG | 1 << 31} Faults: 20 Engine
  SG_ Lamp : 0|8@1+ (1,0) [0|0] "1" Engine
+
+BO_ {LONG_OF_ONE | 1 << 31} Torques: 12 Engine
+ SG_ Torque : 0|8@1+ (1,0) [0|0] "1" Engine
 
 BO_ {FIXED | 1 << 31} Exact: 8 Engine
  SG_ Other : 0|8@1+ (1,0) [0|0] "1" Engine
@@ -129,10 +132,51 @@ def test_the_filters_of_the_kernel_pass_all_sources_of_a_group_and_nothing_else(
     assert not passed(one, 0x18F00404)
 
 
-def test_a_message_of_several_frames_is_refused_by_name(folder: Path) -> None:
-    signal = Signal("lamp", "1", Source(signal="Lamp"))
-    with pytest.raises(ConfigurationError, match="transport protocol"):
-        decoder_of(Options(dbc=Path("j.dbc")), Setup((signal,), folder, 0.01))
+def faults_decoder(folder: Path, **keys: object) -> FrameDecoder:
+    options = Options.model_validate({"dbc": "j.dbc"} | keys)
+    return decoder_of(options, Setup((Signal("lamp", "1", Source(signal="Lamp")),), folder, 0.01))
+
+
+def broadcast(source: int, data: bytes, identifier: int = LONG) -> list[tuple[int, bytes]]:
+    """The frames of a message of several frames to all nodes."""
+    frames = transfer_frames(group_of(identifier), data)
+    return [(group << 8 | 0x1C00FF00 | source, content) for group, content in frames]
+
+
+def test_a_message_of_several_frames_has_the_time_of_its_announcement(folder: Path) -> None:
+    decode = faults_decoder(folder)
+    frames = broadcast(0x21, bytes([7, *range(19)]))
+    samples = [sample for index, (identifier, data) in enumerate(frames) for sample in decode.decode(
+        can.Message(arbitration_id=identifier, data=data, is_extended_id=True), 10.0 + 0.05 * index)]  # fmt: skip
+    assert samples == [Sample("lamp", 10.0, 7.0)]
+    assert decode.latency == pytest.approx(0.15)
+    assert decode.counters.bad == 0
+    for identifier, _ in frames:
+        assert decode.wants(identifier, extended=True)
+        assert any(identifier & mask == number & mask for number, mask, _ in decode.filters())
+
+
+def test_of_messages_of_several_frames_one_source_is_read(folder: Path) -> None:
+    decode = faults_decoder(folder, source_address="0x03")
+    frames = [frame for source in (0x02, 0x03) for frame in broadcast(source, bytes([source, *range(19)]))]
+    assert [value for identifier, data in frames for value in sent(decode, identifier, data).values()] == [3.0]
+
+
+def test_a_long_message_of_which_the_database_names_the_source_is_read_from_there(folder: Path) -> None:
+    signal = Signal("torque", "1", Source(signal="Torque"))
+    decode = decoder_of(Options(dbc=Path("j.dbc")), Setup((signal,), folder, 0.01))
+    frames = [frame for source in (0x03, 0x21) for frame in broadcast(source, bytes([source] * 12), LONG_OF_ONE)]
+    assert [value for identifier, data in frames for value in sent(decode, identifier, data).values()] == [0x21]
+
+
+def test_an_incomplete_message_is_counted_and_named(folder: Path) -> None:
+    decode = faults_decoder(folder)
+    frames = broadcast(0x21, bytes(20))
+    del frames[2]
+    assert not any(sent(decode, identifier, data, 1.0) for identifier, data in frames)
+    assert decode.counters.bad == 1
+    assert "1 message of several frames incomplete, the last 0.5 s ago" in decode.warnings(1.5)
+    assert not any("incomplete" in line for line in decode.warnings(12.0))
 
 
 def test_other_identifiers_and_databases_that_are_not_of_j1939_stay_exact(folder: Path) -> None:

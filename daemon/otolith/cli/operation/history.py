@@ -6,7 +6,7 @@ import re
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -149,11 +149,12 @@ def _utc(seconds: float) -> str:
 
 
 def _print_samples(samples: "Iterable[HistorySample]") -> None:
-    columns = ("name", "unit", "time", "count", "min", "mean", "max", "last", "low", "high", "status")
+    from otolith.storage.history import HistorySample
+
     writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(("parameter", *columns[1:]))
+    writer.writerow(("parameter", *(column.name for column in fields(HistorySample)[1:])))
     for sample in samples:
-        writer.writerow([_utc(sample.time) if name == "time" else getattr(sample, name) for name in columns])
+        writer.writerow((asdict(sample) | {"time": _utc(sample.time)}).values())
 
 
 def _print_events(events: "Iterable[EventDocument]") -> None:
