@@ -15,8 +15,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.health.schema import ReportDocument
-from otolith.storage.history import DAY, HOUR, MINUTE, SUFFIX, WINDOW, HistoryReader, Tables, create
+from otolith.cli.common import examples_directory
+from otolith.health.limits import Level
+from otolith.health.schema import HealthDocument, PartDocument, ReportDocument
+from otolith.machine import load_machine
+from otolith.storage.history import (
+    DAY,
+    HOUR,
+    MINUTE,
+    SUFFIX,
+    WINDOW,
+    HistoryReader,
+    Tables,
+    create,
+    describe_machine,
+)
 from otolith.storage.history_retention import AGES, Bounds
 from otolith.storage.history_writer import KEPT, MAX_WAITING, HistoryWriter, Numbers
 from otolith_drivers.errors import ConfigurationError
@@ -92,6 +105,54 @@ def test_a_simulated_month_stays_within_its_size(opened: Callable[..., Simulated
     assert hours[-1].last == reports[-1].parameters["R_a"].value
     (finding,) = reader.findings(0.0)
     assert finding["count"] == 30 * DAY / length / 2
+
+
+def in_state(report: ReportDocument, state: Level, since: float) -> ReportDocument:
+    part = PartDocument(state=state, since=since)
+    health = HealthDocument(**part.model_dump(), parts={"winding": part})
+    return report.model_copy(update={"health": health})
+
+
+def test_each_state_is_kept_once_and_the_one_at_the_begin_is_read(opened: Callable[..., Simulated]) -> None:
+    history = opened(Bounds(20 * MEGABYTE, 10, 24))
+    changes = [(START, Level.OK), (START + 100.0, Level.WATCH), (START + 150.0, Level.ACT)]
+    for report in documents(100):
+        since, state = max(change for change in changes if change[0] < report.window.end)
+        history.write(in_state(report, state, since))
+    reader = history.writer.reader
+    assert reader.states(0.0) == [(part, *change) for change in changes for part in ("", "winding")]
+    assert [state for part, _, state in reader.states(START + 120.0) if part] == [Level.WATCH, Level.ACT]
+    history.prune(START + 10 * DAY + 120.0, 10 * DAY)
+    assert {state for _, _, state in reader.states(0.0)} == {Level.ACT}
+
+
+def test_the_machine_is_described_as_it_was_last(opened: Callable[..., Simulated]) -> None:
+    history = opened()
+    for text in ('{"title": "before"}', '{"title": "after"}'):
+        history.writer.description = text
+        history.write(*documents(2))
+    assert history.writer.reader.description() == {"title": "after"}
+    twin = load_machine(examples_directory() / "dc-motor.toml", with_driver=False)
+    history.writer.description = describe_machine(twin.twin, twin.plan)
+    history.write(*documents(2))
+    content = history.writer.reader.description()
+    assert content["limits"]["R_a"][0] == ["WATCH", 0.98 * 6.5, True]
+    assert content["equations"][0][0] == "der(i)"
+
+
+def test_a_history_of_an_earlier_version_gets_the_tables_that_it_lacks(opened: Callable[..., Simulated]) -> None:
+    history = opened()
+    history.write(*documents(2))
+    history.writer._close()
+    with sqlite3.connect(history.writer.reader.path) as connection:
+        connection.executescript("DROP TABLE state; DROP TABLE description")
+    assert history.writer.reader.states(0.0) == []
+    assert history.writer.reader.description() == {}
+    again = opened()
+    again.write(in_state(document(3, START + 6.0), Level.OK, START))
+    assert again.note == ""
+    assert [state for _, _, state in again.writer.reader.states(0.0)] == [Level.OK, Level.OK]
+    assert len(again.writer.reader.latest(10)) == 3
 
 
 def test_beyond_the_size_reports_go_before_values_of_minutes(opened: Callable[..., Simulated]) -> None:

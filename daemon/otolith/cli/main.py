@@ -33,6 +33,7 @@ from otolith.cli.operation.connection import endpoints, reader_options
 from otolith.cli.operation.history import history
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
+from otolith.cli.operation.report import report
 from otolith.cli.operation.view import view
 
 if TYPE_CHECKING:
@@ -296,6 +297,7 @@ COMMANDS: tuple[click.Command, ...] = (
     keys,
     noise,
     probe,
+    report,
     reset,
     twin,
     view,

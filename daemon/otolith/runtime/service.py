@@ -35,6 +35,7 @@ from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.reload import reloaded
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
+from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import Numbers, history_of
 from otolith.storage.state_store import store_of
 from otolith.storage.state_writer import StateWriter
@@ -241,6 +242,7 @@ class Service:
         update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
         document = self._numbers.number(document.model_copy(update={**update, "notes": self._notes}))
         if self._history is not None:
+            self._history.description = describe_machine(self._machine.twin, self._supervisor.state.plan)
             self._history.add(document)
         if self._publisher is not None:
             self._publisher.publish(document)

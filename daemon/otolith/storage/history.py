@@ -14,7 +14,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from otolith.health.limits import Level, MonitoringPlan
 from otolith.health.schema import EventDocument, NumberDocument, ParameterDocument, ReportDocument
+from otolith.twin.definition import Definition, Role
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.user_dirs import state_directory
 
@@ -46,6 +48,12 @@ CREATE TABLE finding (
 CREATE TABLE counters (hour REAL NOT NULL, run INTEGER NOT NULL, text TEXT NOT NULL, PRIMARY KEY (hour, run));
 CREATE TABLE clock (retention REAL NOT NULL, waited REAL NOT NULL);
 CREATE TABLE start (sequence INTEGER NOT NULL);
+"""
+# Also added to a database that an earlier version made; one that nobody has written since then lacks them.
+_LATER_SCHEMA = """
+CREATE TABLE IF NOT EXISTS state (
+    part TEXT NOT NULL, since REAL NOT NULL, state TEXT NOT NULL, PRIMARY KEY (part, since)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS description (text TEXT NOT NULL);
 """
 _SAMPLE = """
 INSERT INTO sample VALUES (?, ?, ?, 1, ?4, ?4, ?4, ?4, ?5, ?6, ?7) ON CONFLICT DO UPDATE SET
@@ -96,7 +104,7 @@ def create(connection: sqlite3.Connection, site: str, machine: str) -> None:
     connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute("PRAGMA journal_mode = WAL")
-    connection.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
+    connection.executescript(f"BEGIN; {_SCHEMA} {_LATER_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
     with connection:
         connection.execute("INSERT INTO identity VALUES (?, ?)", (site, machine))
 
@@ -120,6 +128,22 @@ def check(connection: sqlite3.Connection, site: str, machine: str) -> None:
         raise ValueError(f"it is of {other}")
 
 
+def add_later_tables(connection: sqlite3.Connection) -> None:
+    """Add the tables that a database of an earlier version lacks."""
+    connection.executescript(_LATER_SCHEMA)
+
+
+def describe_machine(twin: Definition, plan: MonitoringPlan) -> str:
+    """Return as JSON what reports do not repeat: the equations, and the meaning and the limits of each parameter."""
+    sides = [(name, text) for name, text, _ in twin.definitions]
+    values = {row.name: (row.nominal, row.unit, row.meaning) for row in twin.parameters if row.role is not Role.SETTING}
+    limits = {name: [(row.level, row.value, row.is_lower) for row in quantity.limits]
+              for name, quantity in {**plan.sites, **plan.parameters}.items()}  # fmt: skip
+    sites = {row.name: (row.into, row.mode, row.through) for row in twin.sites}
+    texts = {"title": twin.title, "equations": [*twin.equations, *sides]}
+    return json.dumps({**texts, "values": values, "limits": limits, "sites": sites}, ensure_ascii=False)
+
+
 class Tables:
     """Writes reports into the tables of an open database; the caller commits."""
 
@@ -127,9 +151,17 @@ class Tables:
         """``run`` distinguishes the counters of this daemon from those before: they begin at zero with each start."""
         self._connection, self._run = connection, run
         self._series: dict[tuple[str, str], int] = {}
+        self._description = ""
+
+    def describe(self, text: str) -> None:
+        """Write the description of the machine, as :func:`describe_machine` returns it, if it has changed."""
+        if text != self._description:
+            self._connection.execute("DELETE FROM description")
+            self._connection.execute("INSERT INTO description VALUES (?)", (text,))
+            self._description = text
 
     def add(self, document: ReportDocument) -> None:
-        """Write a report, its values, its events that changed, its findings and its counters."""
+        """Write a report, its values, its states and events that changed, its findings and its counters."""
         execute, end = self._connection.execute, document.window.end
         text = zlib.compress(document.to_json().encode(), COMPRESSION)
         execute("INSERT OR REPLACE INTO report VALUES (?, ?, ?)", (document.sequence, end, text))
@@ -137,6 +169,9 @@ class Tables:
             self._add_value(name, end, parameter, parameter.status)
         for component in document.components:
             self._add_value(component.id, end, component.values["amplitude"], component.status)
+        if (health := document.health) is not None:
+            states = [(name, part.since, part.state) for name, part in {"": health, **health.parts}.items()]
+            self._connection.executemany("INSERT OR IGNORE INTO state VALUES (?, ?, ?)", states)
         for event in document.events:
             if event.change is not None:
                 row = (event.sequence, end, event.model_dump_json(exclude_none=True))
@@ -157,6 +192,7 @@ class Tables:
     def forget_series(self) -> None:
         """Read the numbers of the series again: a transaction that added some was rolled back."""
         self._series.clear()
+        self._description = ""
 
     def _add_value(self, name: str, end: float, item: ParameterDocument | NumberDocument, status: str) -> None:
         if item.value is None:
@@ -217,9 +253,25 @@ class HistoryReader:
         return [{"first": first, "last": last, "count": count, **json.loads(text)} for first, last, count, text in rows]
 
     def counters(self, since: float) -> list[dict[str, Any]]:
-        """Return the last counters of each hour and start of the daemon since a time."""
-        rows = self._rows("SELECT hour, text FROM counters WHERE hour >= ? ORDER BY run, hour", since - HOUR)
-        return [{"hour": hour, **json.loads(text)} for hour, text in rows]
+        """Return the last counters of each hour and start (``run``) of the daemon since a time."""
+        rows = self._rows("SELECT hour, run, text FROM counters WHERE hour >= ? ORDER BY run, hour", since - HOUR)
+        return [{"hour": hour, "run": run, **json.loads(text)} for hour, run, text in rows]
+
+    def states(self, since: float) -> list[tuple[str, float, Level]]:
+        """Return part, begin and state of each change of a state, from the one at ``since`` on; the machine is ''."""
+        before = "(SELECT max(since) FROM state AS other WHERE other.part = state.part AND since <= ?1)"
+        query = f"SELECT * FROM state WHERE since >= coalesce({before}, ?1) ORDER BY since"  # noqa: S608 - our own text
+        return [(part, begin, Level(state)) for part, begin, state in self._later_rows("state", query, since)]
+
+    def description(self) -> dict[str, Any]:
+        """Return what :func:`describe_machine` wrote; empty if nobody did."""
+        rows = self._later_rows("description", "SELECT text FROM description")
+        return dict(json.loads(rows[0][0])) if rows else {}
+
+    def latest(self, count: int) -> list[ReportDocument]:
+        """Return the last reports, the newest first."""
+        rows = self._rows("SELECT text FROM report ORDER BY sequence DESC LIMIT ?", count)
+        return [ReportDocument.from_json(zlib.decompress(text).decode()) for (text,) in rows]
 
     def messages(
         self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
@@ -235,6 +287,11 @@ class HistoryReader:
         )
         rows = self._rows(query, after, start, end, limit)
         return [zlib.decompress(text).decode() if isinstance(text, bytes) else text for (text,) in rows]
+
+    def _later_rows(self, table: str, query: str, *values: object) -> list[tuple[Any, ...]]:
+        """Return the rows of a table that a database of an earlier version may lack; then there are none."""
+        exists = self._rows("SELECT 1 FROM sqlite_master WHERE name = ?", table)
+        return self._rows(query, *values) if exists else []
 
     def _rows(self, query: str, *values: object) -> list[tuple[Any, ...]]:
         if not self.path.exists():

@@ -51,7 +51,7 @@ class Retention:
         resend = clock - min(self._bounds.resend_hours * HOUR, longest)
         while self._delete_reports(f"sequence <= {latest}", resend):
             pass
-        for table, column in (("event", "time"), ("finding", "last"), ("counters", "hour")):
+        for table, column in (("event", "time"), ("finding", "last"), ("counters", "hour"), ("state", "since")):
             self._delete(f"DELETE FROM {table} WHERE {column} < ?", clock - longest)  # noqa: S608 - our own names
 
     def by_size(self, now: float) -> None:
@@ -122,9 +122,10 @@ class Retention:
 
     def _delete_rest(self) -> int:
         count = sum(map(self._delete_samples, (HOUR, DAY)))
-        for table, order in (("event", "sequence"), ("finding", "last"), ("counters", "run, hour")):
-            key = "(id, first)" if table == "finding" else "(hour, run)" if table == "counters" else "sequence"
-            chosen = f"SELECT {key.strip('()')} FROM {table} ORDER BY {order} LIMIT {CHUNK}"  # noqa: S608 - our own names
+        keys = {"event": "sequence", "finding": "(id, first)", "counters": "(hour, run)", "state": "(part, since)"}
+        orders = {"event": "sequence", "finding": "last", "counters": "run, hour", "state": "since"}
+        for table, key in keys.items():
+            chosen = f"SELECT {key.strip('()')} FROM {table} ORDER BY {orders[table]} LIMIT {CHUNK}"  # noqa: S608 - our own names
             count += self._delete(f"DELETE FROM {table} WHERE {key} IN ({chosen})")  # noqa: S608 - our own names
         return count
 

@@ -16,7 +16,16 @@ from pathlib import Path
 
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.machine_file import MachineFile
-from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_BYTES, HistoryReader, Tables, check, create, history_path
+from otolith.storage.history import (
+    BUSY_TIMEOUT,
+    CHECKPOINT_BYTES,
+    HistoryReader,
+    Tables,
+    add_later_tables,
+    check,
+    create,
+    history_path,
+)
 from otolith.storage.history_retention import Bounds, Retention
 from otolith.storage.state_store import give_to, opened_folder
 from otolith.storage.writer_thread import WriterThread
@@ -76,6 +85,8 @@ class HistoryWriter(WriterThread):
         self._waiting: deque[ReportDocument] = deque()
         self._lock, self._written = threading.Lock(), threading.Event()
         self._pruned_at = 0.0
+        self.description = ""
+        """As :func:`otolith.storage.history.describe_machine` returns it; it is written with the next report."""
         self.dropped = 0
         """Reports that were not written."""
 
@@ -165,6 +176,7 @@ class HistoryWriter(WriterThread):
                     return
             try:
                 with self._connection:
+                    self._tables.describe(self.description)
                     for document in batch:
                         self._tables.add(document)
             except BaseException:
@@ -243,6 +255,7 @@ class HistoryWriter(WriterThread):
         if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             create(connection, self.reader.site, self.reader.machine)
         check(connection, self.reader.site, self.reader.machine)
+        add_later_tables(connection)
         connection.execute("PRAGMA synchronous = NORMAL")
         (page_size,) = connection.execute("PRAGMA page_size").fetchone()
         connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_BYTES // page_size}").fetchall()

@@ -30,7 +30,7 @@ RANGE_COLUMNS = 24  # characters of its columns min and max
 WIDTH_WITH_RANGE = 100  # characters of a terminal that shows them
 
 
-def _since(_: click.Context, __: click.Parameter, text: str) -> float:
+def age_or_date(_: click.Context, __: click.Parameter, text: str) -> float:
     """Return the Unix time that ``text`` means: an age like ``30d``, or a date and time of this computer's zone."""
     if match := re.fullmatch(r"(\d{1,9}(?:\.\d+)?)\s*([smhdw])", text.strip()):
         return time.time() - float(match[1]) * SPANS[match[2]]
@@ -42,7 +42,7 @@ def _since(_: click.Context, __: click.Parameter, text: str) -> float:
 
 @click.command()
 @click.argument("machine", metavar="FILE|MACHINE")
-@click.option("--since", default="1d", callback=_since, metavar="AGE|DATE", help="Begin here, like 12h, 30d, 8w.")
+@click.option("--since", default="1d", callback=age_or_date, metavar="AGE|DATE", help="Begin here, like 12h, 30d, 8w.")
 @click.option("--parameter", "names", multiple=True, metavar="NAME", help="Only this one; may be repeated.")
 @click.option("--every", type=click.Choice(INTERVALS), show_default=False,
               help="Values of each window, minute, hour or day.  [default: as --since needs]")  # fmt: skip
@@ -77,14 +77,14 @@ def history(
         raise click.UsageError("give one of --csv, --json and --parquet")
     if only_events and parquet is not None:
         raise click.UsageError("--parquet has values only: give --csv or --json with --events")
-    reader = _reader(machine)
+    reader = reader_of(machine)
     _check_names(names, reader.names())
     events = [] if names and not only_events else reader.events(since)
     if only_events and as_csv:
         _print_events(events)
         return
-    interval = every or _interval(reader, since)
-    samples = [] if only_events else _samples(reader, interval, since, names)
+    interval = every or interval_since(reader, since)
+    samples = [] if only_events else samples_since(reader, interval, since, names)
     if as_csv:
         _print_samples(samples)
     elif parquet is not None:
@@ -95,7 +95,7 @@ def history(
         _print_table(reader, interval, since, samples, events, with_findings=only_events or not names)
 
 
-def _reader(machine: str) -> "HistoryReader":
+def reader_of(machine: str) -> "HistoryReader":
     """Return the history of a machine file, or of a machine by its name.
 
     Raises:
@@ -128,7 +128,7 @@ def _check_names(names: Sequence[str], known: list[str]) -> None:
             raise ConfigurationError(f"no value of {name!r} in the history: {nearest(name, known)}")
 
 
-def _interval(reader: "HistoryReader", since: float) -> str:
+def interval_since(reader: "HistoryReader", since: float) -> str:
     """Return the resolution that shows the time since then, as far as there are values."""
     from otolith.storage.history import DAY
 
@@ -137,7 +137,8 @@ def _interval(reader: "HistoryReader", since: float) -> str:
     return next((name for name, longest in LONGEST.items() if span <= longest), "day")
 
 
-def _samples(reader: "HistoryReader", interval: str, since: float, names: Sequence[str]) -> "list[HistorySample]":
+def samples_since(reader: "HistoryReader", interval: str, since: float, names: Sequence[str]) -> "list[HistorySample]":
+    """Return the values of each ``interval`` since a time, of the parameters ``names`` or of all."""
     from otolith.storage.history import RESOLUTIONS
 
     seconds = next(seconds for seconds, name in RESOLUTIONS.items() if name == interval)

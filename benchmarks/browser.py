@@ -1,0 +1,112 @@
+"""A headless Chromium, driven over its DevTools protocol by a pipe: what a page shows, requests and complains about."""
+
+import base64
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-dev-shm-usage",
+         "--remote-debugging-pipe")  # fmt: skip
+
+
+def program() -> str | None:
+    """Return the path of the browser; None where none is installed."""
+    return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+class Browser:
+    """One tab. ``events`` has what the browser has announced since the last page was opened."""
+
+    def __init__(self, commands: int, replies: int) -> None:
+        self._commands, self._replies = commands, replies
+        self._number, self._rest, self._session = 0, b"", {}
+        self.events: list[dict[str, Any]] = []
+        target = self._call("Target.createTarget", url="about:blank")["targetId"]
+        attached = self._call("Target.attachToTarget", targetId=target, flatten=True)
+        self._session = {"sessionId": attached["sessionId"]}
+        for domain in ("Page", "Network", "Runtime", "Log"):
+            self._call(f"{domain}.enable")
+
+    def open(self, path: Path, width: int, height: int, *, is_phone: bool = False) -> None:
+        """Open a file in a window of that size in pixels."""
+        self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
+                   mobile=is_phone)  # fmt: skip
+        self.events.clear()
+        self._call("Page.navigate", url=path.absolute().as_uri())
+        while not any(event["method"] == "Page.loadEventFired" for event in self.events):
+            self._receive()
+
+    def value(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression."""
+        return self._call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def picture(self) -> bytes:
+        """Return the window as PNG."""
+        return base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])
+
+    def pages(self) -> bytes:
+        """Return the page as it is printed on A4, as PDF."""
+        printed = self._call("Page.printToPDF", paperWidth=8.27, paperHeight=11.69, preferCSSPageSize=True)
+        return base64.b64decode(printed["data"])
+
+    def requested(self) -> list[str]:
+        """Return the addresses of everything that the page has requested."""
+        return [event["params"]["request"]["url"] for event in self.events
+                if event["method"] == "Network.requestWillBeSent"]  # fmt: skip
+
+    def complaints(self) -> list[str]:
+        """Return what is in the console: messages, errors and refused requests."""
+        methods = {"Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded"}
+        return [json.dumps(event["params"]) for event in self.events if event["method"] in methods]
+
+    def _call(self, method: str, **parameters: Any) -> Any:
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters, **self._session}
+        os.write(self._commands, json.dumps(message).encode() + b"\0")
+        while (reply := self._receive()).get("id") != self._number:
+            pass
+        if "error" in reply:
+            raise RuntimeError(f"{method}: {reply['error']}")
+        return reply["result"]
+
+    def _receive(self) -> dict[str, Any]:
+        while b"\0" not in self._rest:
+            if not (data := os.read(self._replies, 1 << 20)):
+                raise RuntimeError("the browser has ended")
+            self._rest += data
+        text, _, self._rest = self._rest.partition(b"\0")
+        message: dict[str, Any] = json.loads(text)
+        if "method" in message:
+            self.events.append(message)
+        return message
+
+
+@contextmanager
+def browser(path: str) -> Iterator[Browser]:
+    """A browser that ends with the block; ``path`` as :func:`program` returns it."""
+    (theirs_in, commands), (replies, theirs_out) = os.pipe(), os.pipe()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        # The protocol takes commands from file 3 and writes replies to file 4.
+        script = (
+            f"import os, sys; os.dup2({theirs_in}, 3); os.dup2({theirs_out}, 4); os.execv(sys.argv[1], sys.argv[1:])"
+        )
+        command = [sys.executable, "-c", script, path, *FLAGS, f"--user-data-dir={profile}", "about:blank"]
+        with subprocess.Popen(  # noqa: S603 - a browser of this computer
+            command, pass_fds=(theirs_in, theirs_out), stderr=subprocess.DEVNULL
+        ) as process:
+            os.close(theirs_in)
+            os.close(theirs_out)
+            try:
+                yield Browser(commands, replies)
+            finally:
+                process.kill()
+                os.close(commands)
+                os.close(replies)

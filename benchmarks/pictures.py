@@ -1,0 +1,128 @@
+"""The pictures of the docs: reports and recordings of a simulated motor, healthy and with three faults.
+
+    python -m benchmarks.pictures docs/pictures
+
+Reports are shown by a headless Chromium, recordings by the Rerun viewer under Xvfb. On Debian: ``apt install chromium
+xvfb mesa-vulkan-drivers libxkbcommon-x11-0 libx11-xcb1 libxcursor1 libxrandr2 libxi6``.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import click
+from PIL import Image
+
+from benchmarks.browser import browser, program
+from benchmarks.diagnosis import machine_of, of_scenario
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import initial_state
+from otolith.health.schema import CountersDocument, Report
+from otolith.machine import LoadedMachine
+from otolith.publishing.html_report import html_report
+from otolith.publishing.recorder import Recording
+from otolith.storage.history import SUFFIX, WINDOW, describe_machine
+from otolith.storage.history_retention import Bounds
+from otolith.storage.history_writer import HistoryWriter
+from otolith_drivers.base import Sampling
+
+START = 1_790_000_000.0  # Unix s of the first window
+COUNT, SEED = 60, 5
+SIZE = (1280, 720)
+COLOURS = 200  # of a PNG file
+MACHINE, SITE = "press-3", "hall-1"
+FAULTS: dict[str, dict[str, Any]] = {
+    "healthy": {},
+    "degrading": {"kind": "drift", "start": "20 s", "parameter": "R_a", "amount": "-0.013 ohm", "rate": "0.03 1/s"},
+    "unbalance": {"kind": "unbalance", "start": "60 s", "acceleration": "4.5 rad/s^2", "order": 1.0},
+    "sensor-fault": {"kind": "frozen", "start": "80 s", "signal": "ArmatureCurrent"},
+}
+
+
+@cache
+def motor() -> LoadedMachine:
+    """Return the machine of all pictures."""
+    return machine_of("motor")
+
+
+def simulated(situation: str, count: int = COUNT) -> list[Report]:
+    """Return the reports of the first ``count`` windows of a situation."""
+    machine = motor()
+    state = initial_state(MACHINE, SITE, machine.problem, machine.plan)
+    reports = []
+    for index, window in enumerate(of_scenario("demo", FAULTS[situation], machine, SEED, count=count), 1):
+        state, report = adapt(state, replace(window, start=START + window.start))
+        counters = CountersDocument(received=index * window.records * len(machine.twin.signals), windows=index)
+        reports.append(replace(report, document=report.document.model_copy(update={"counters": counters})))
+    return reports
+
+
+def page(reports: Sequence[Report], folder: Path) -> str:
+    """Return the page of a machine, whose history is in ``folder`` afterwards."""
+    writer = HistoryWriter(folder / f"{SITE}.{MACHINE}{SUFFIX}", Bounds(200_000_000, 3650.0, 24.0))
+    numbers, _ = writer.open(START)
+    writer.description = describe_machine(motor().twin, motor().plan)
+    for report in reports:
+        writer.add(numbers.number(report.document))
+        writer.write()
+    writer.stop(0.0)
+    writer.write()
+    samples = writer.reader.samples(WINDOW, START)
+    return html_report(writer.reader, samples, "window", START, reports[-1].document.window.end)
+
+
+def recording_picture(reports: Sequence[Report], folder: Path) -> bytes:
+    """Return what the viewer shows of a recording, as PNG; ``folder`` has the recording afterwards."""
+    path, image = folder / "recording.rrd", folder / "recording.png"
+    recording = Recording(path, replace(motor().recorded(Sampling.CYCLIC), title=f"{MACHINE} at {SITE}"))
+    for report in reports:
+        recording.add(report)
+    recording.close()
+    width, height = SIZE
+    screen = ["xvfb-run", "-a", "-s", f"-screen 0 {width}x{height}x24"]
+    viewer = [f"{sysconfig.get_path('scripts')}/rerun", "--port", "auto", "--bind", "127.0.0.1", "--renderer", "vulkan"]
+    target = ["--window-size", f"{width}x{height}", "--screenshot-to", str(image), str(path)]
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(folder)}
+    subprocess.run([viewer[0], "analytics", "disable"], env=environment, capture_output=True, check=True)  # noqa: S603 - our viewer
+    subprocess.run([*screen, *viewer, *target], env=environment, capture_output=True, check=True, timeout=180)  # noqa: S603 - our viewer
+    return image.read_bytes()
+
+
+def small(picture: bytes) -> bytes:
+    """Return a PNG file in its size on a screen and with few colours."""
+    output = BytesIO()
+    whole = Image.open(BytesIO(picture)).convert("RGB")
+    image = whole if whole.size == SIZE else whole.resize(SIZE, Image.Resampling.LANCZOS)
+    image.quantize(COLOURS, dither=Image.Dither.NONE).save(output, "PNG", optimize=True)
+    return output.getvalue()
+
+
+@click.command(help=__doc__)
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False, exists=True))
+def main(folder: Path) -> None:
+    path = program()
+    if path is None or shutil.which("xvfb-run") is None:
+        sys.exit("chromium or xvfb-run is not installed")
+    with tempfile.TemporaryDirectory() as name, browser(path) as tab:
+        for situation in FAULTS:
+            place = Path(name) / situation
+            place.mkdir()
+            reports = simulated(situation)
+            file = place / "report.html"
+            file.write_text(page(reports, place), encoding="utf-8")
+            tab.open(file, *SIZE)
+            (folder / f"report-{situation}.png").write_bytes(small(tab.picture()))
+            (folder / f"recording-{situation}.png").write_bytes(small(recording_picture(reports, place)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,349 @@
+"""The history of a machine as one HTML page that refers to no other file: state in words, curves, events, equations.
+
+The page is ``report.html``, a template that has the texts and escapes what it inserts. This module computes what it
+shows. Times are Unix seconds. Positions are in percent of a plot, from its left and from its top.
+"""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from itertools import pairwise
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+
+from otolith import __version__
+from otolith.health.limits import Level
+from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
+from otolith.health.text import (
+    duration_text,
+    forecast_text,
+    interval_text,
+    probability_text,
+    value_cells,
+    value_text,
+)
+from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample
+
+# Engineering choices, see docs/reference/thresholds-runtime.md.
+SILENT_WINDOWS = 3  # lengths of a window without a report until the state is NO DATA
+MAX_POINTS = 300  # of a curve
+MAX_ROWS = 40  # events or findings in a table
+LATEST_REPORTS = 200  # that are searched for advice
+GAP = 2.5  # median times between two values, from which a curve is interrupted
+FORECAST_SHARE = 0.3  # of the time that is shown, by which forecasts extend it
+NEAR_LIMITS = 3.0  # times the range of the values, or the distance to the nearest limit, within which limits are shown
+MARGIN = 0.12  # of the range of values, above and below it
+LABEL_HEIGHT = 10.0  # percent of a plot
+MAX_TICKS = 5
+STEPS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800,
+         604_800, 1_209_600, 2_592_000, 7_776_000, 31_536_000)  # s between two marks of time  # fmt: skip
+TRUSTED = frozenset({Status.ESTIMATED, "adopted"})  # the others are drawn pale
+
+Span = tuple[float, float]
+"""Begin and end of a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """The time from left to right."""
+
+    begin: float
+    now: float
+    """End of what is known; forecasts are beyond it."""
+    end: float
+
+    def x(self, seconds: float) -> float:
+        """Return the position of a time."""
+        return round(100.0 * (seconds - self.begin) / (self.end - self.begin), 2)
+
+    def span(self, begin: float, end: float) -> Span:
+        """Return position and length of what is on the axis of a time."""
+        first, last = (self.x(min(max(at, self.begin), self.end)) for at in (begin, end))
+        return first, round(last - first, 2)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """Return position and text of the marks of time, at round local times."""
+        span = self.end - self.begin
+        step = next((step for step in STEPS if span / step < MAX_TICKS), STEPS[-1])
+        form = "%H:%M:%S" if step < 60 else "%H:%M" if span < DAY else "%a %H:%M" if step < DAY else "%d %b"
+        form = "%b %Y" if step > 30 * DAY else form
+        zone = time.localtime(self.begin).tm_gmtoff
+        first = math.ceil((self.begin + zone) / step) * step - zone
+        times = (first + index * step for index in range(MAX_TICKS + 1))
+        return [(self.x(at), time.strftime(form, time.localtime(at))) for at in times if at <= self.end]
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """The nominal value, a limit or the present value: a line and an area beyond it, and a label beside the plot."""
+
+    style: str
+    value: float
+    line: float
+    area: Span = (0.0, 0.0)
+    """Begin and height."""
+    label: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """What is drawn of a curve: points as SVG takes them."""
+
+    band: tuple[str, ...]
+    """Polygons of the 95 % interval."""
+    lines: tuple[tuple[bool, str], ...]
+    """Whether the value was estimated at that time, and points."""
+    marks: tuple[Mark, ...]
+    expected: str
+    """Polygon of the 80 % intervals of the times at which limits are passed."""
+    median: str
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A parameter, or the amplitude of a component, over time."""
+
+    name: str
+    parameter: ParameterDocument | None
+    component: ComponentDocument | None
+    """None of a component that has left the twin."""
+    limits: tuple[tuple[Level, float, bool], ...]
+    """Level, value, and whether values below it are beyond it."""
+    last: HistorySample | None
+    away: Mapping[str, float]
+    """Percent of the windows with another status than estimated."""
+    plot: Plot | None = None
+
+    @property
+    def key(self) -> str:
+        """The condition that its limits lead to, as in the id of an event."""
+        row = self.component
+        return f"component/{row.site}/{row.family}" if row is not None else f"limit/{self.name}"
+
+
+def html_report(
+    reader: HistoryReader, samples: Iterable[HistorySample], interval: str, since: float, now: float
+) -> str:
+    """Return the page about the time from ``since`` to ``now``, from ``samples`` of each ``interval``.
+
+    Raises:
+        ConfigurationError: the history cannot be read.
+        ValueError: a document in it cannot be read.
+    """
+    reports, states, description = reader.latest(LATEST_REPORTS), reader.states(since), reader.description()
+    latest = reports[0] if reports else None
+    length = next(seconds for seconds, name in RESOLUTIONS.items() if name == interval)
+    rows = [row for row in samples if since - length < row.time <= now + DAY]
+    silence = now - latest.window.end if latest else 0.0
+    is_silent = latest is None or silence > SILENT_WINDOWS * (latest.window.end - latest.window.start)
+    begins = [row.time for row in rows[:1]] + [begin for _, begin, _ in states[:1]]
+    begin = max(since, min([*begins, latest.window.start if latest else since]))
+    until = latest.window.end if latest and not is_silent and silence > -DAY else now
+    axis = _axis(min(begin, until - 1.0), until, latest)
+    gaps = _gaps(sorted({row.time for row in rows}), length) + ([(latest.window.end, until)] if latest else [])
+    events = _events(reader, latest, since)
+    urgent = {event.id.rpartition("@")[0] for event, _, _ in events if event.end is None}
+    curves = sorted(_curves(axis, gaps, rows, latest, description), key=lambda curve: curve.key not in urgent)
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    filters = (duration_text, forecast_text, interval_text, probability_text, value_cells, value_text, _when)
+    environment.filters |= {function.__name__.strip("_"): function for function in filters}
+    template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
+    return template.render(
+        machine=reader.machine, site=reader.site, latest=latest, is_silent=is_silent, silence=silence, now=now,
+        description=description, interval=interval, version=__version__, axis=axis, levels=Level, max_rows=MAX_ROWS,
+        zone=time.strftime("%Z", time.localtime(now)), lanes=list(_lanes(axis, latest, states)), curves=curves,
+        gaps=[(*axis.span(*gap), *gap) for gap in gaps if axis.begin < gap[1] > gap[0]], events=events,
+        findings=reader.findings(since), undetermined=_undetermined(reports), equations=_equations(latest, description),
+        losses=_losses(reader.counters(since), since),
+    )  # fmt: skip
+
+
+def _when(seconds: float) -> str:
+    return time.strftime("%F %T", time.localtime(seconds))
+
+
+def _axis(begin: float, now: float, latest: ReportDocument | None) -> Axis:
+    """Return the axis with room for the forecasts."""
+    forecasts = [row.forecast for row in (latest.parameters.values() if latest else ()) if row.forecast]
+    ends = [row.high or row.at for item in forecasts for row in (item.watch, item.act) if row and row.at > now]
+    room = min(max(ends, default=now) - now, FORECAST_SHARE * (now - begin))
+    return Axis(begin, now, now + max(room, 0.0))
+
+
+def _gaps(times: Sequence[float], length: float) -> list[Span]:
+    """Return the times without values, each of an interval of ``length`` seconds."""
+    pauses = sorted(after - before for before, after in pairwise(times))
+    longest = GAP * pauses[len(pauses) // 2] if pauses else math.inf
+    return [(before + length, after) for before, after in pairwise(times) if after - before > longest]
+
+
+def _events(
+    reader: HistoryReader, latest: ReportDocument | None, since: float
+) -> list[tuple[EventDocument, Level, list[tuple[float, Level]]]]:
+    """Return events, their most severe states and all states with their begin: the open ones first, then the newest."""
+    rows = {event.id: event for event in (*reader.events(since), *(latest.events if latest else ()))}
+    states: dict[str, list[tuple[float, Level]]] = {key: [] for key in rows}
+    for change in reader.events(min((event.start for event in rows.values()), default=since)):
+        if change.id in rows and change.end is None and (change.since, change.state) not in states[change.id]:
+            states[change.id].append((change.since, change.state))
+    ordered = sorted(rows.values(), key=lambda event: (event.end is not None, -event.state.rank, -event.start))
+    worst = {key: max((level for _, level in own), key=lambda level: level.rank, default=rows[key].state)
+             for key, own in states.items()}  # fmt: skip
+    return [(event, worst[event.id], states[event.id]) for event in ordered]
+
+
+def _lanes(
+    axis: Axis, latest: ReportDocument | None, states: Sequence[tuple[str, float, Level]]
+) -> Iterator[tuple[str, Level, list[tuple[Level, float, float, float, float]]]]:
+    """Yield each part with its present state, and its states with position, length, begin and end."""
+    health = latest.health if latest else None
+    for part, present in ({"": health, **health.parts} if health else {}).items():
+        changes = [(begin, state) for name, begin, state in states if name == part]
+        changes = [*(changes or [(present.since, present.state)]), (axis.now, present.state)]
+        yield part, present.state, [(state, *axis.span(begin, end), begin, end)
+                                    for (begin, state), (end, _) in pairwise(changes) if end > axis.begin]  # fmt: skip
+
+
+def _curves(
+    axis: Axis, gaps: Sequence[Span], samples: Iterable[HistorySample], latest: ReportDocument | None,
+    description: Mapping[str, Any],
+) -> Iterator[Curve]:  # fmt: skip
+    """Yield the curves of parameters and components that have values, or that the latest report has."""
+    parameters = latest.parameters if latest else {}
+    components = {row.id: row for row in latest.components} if latest else {}
+    rows: dict[str, list[HistorySample]] = {name: [] for name in parameters}
+    for sample in samples:
+        rows.setdefault(sample.name, []).append(sample)
+    for name, own in rows.items():
+        parameter, component = parameters.get(name), components.get(name)
+        stated = description.get("limits", {}).get(component.site if component else name, ())
+        limits = tuple((Level(level), value, is_lower) for level, value, is_lower in stated)
+        same = [row for row in own if row.unit == own[-1].unit]
+        counts: Counter[str] = Counter()
+        for row in same:
+            counts[row.status] += row.count
+        away = {name: 100.0 * count / counts.total() for name, count in counts.items() if name not in TRUSTED}
+        curve = Curve(name, parameter, component, limits, same[-1] if same else None, away)
+        points = list(_thinned(axis, same))
+        yield replace(curve, plot=_plot(axis, gaps, points, curve)) if points else curve
+
+
+def _thinned(axis: Axis, samples: Iterable[HistorySample]) -> Iterator[HistorySample]:
+    """Yield at most some hundred values: of each piece of the axis the mean, and the ends of the intervals."""
+    pieces: dict[int, list[HistorySample]] = {}
+    for row in samples:
+        pieces.setdefault(int(MAX_POINTS / 100.0 * axis.x(row.time)), []).append(row)
+    for _, rows in sorted(pieces.items()):
+        mean = sum(row.mean * row.count for row in rows) / sum(row.count for row in rows)
+        low = min(row.mean if row.low is None else row.low for row in rows)
+        high = max(row.mean if row.high is None else row.high for row in rows)
+        yield replace(rows[-1], mean=mean, low=low, high=high)
+
+
+def _plot(axis: Axis, gaps: Sequence[Span], points: Sequence[HistorySample], curve: Curve) -> Plot:
+    """Return what is drawn of the ``points`` of a curve: with nominal value, near limits and forecast."""
+    last, parameter = points[-1].mean, curve.parameter
+    stated = 0.0 if parameter is None else parameter.nominal if parameter.baseline is None else parameter.baseline
+    seen = [stated, *(row.mean for row in points)]
+    near = max(max(seen) - min(seen), min((abs(value - last) for _, value, _ in curve.limits), default=0.0))
+    shown = [row for row in curve.limits if abs(row[1] - last) <= NEAR_LIMITS * near]
+    seen += [value for _, value, _ in shown]
+    half = 0.5 * (max(seen) - min(seen)) * (1.0 + 2.0 * MARGIN) or abs(last) * MARGIN or 1.0
+    top = 0.5 * (max(seen) + min(seen)) + half
+
+    def y(value: float) -> float:
+        return round(min(max(50.0 * (top - value) / half, -1e4), 1e4), 2)  # a band may be far outside
+
+    def line(places: Iterable[tuple[float, float | None]]) -> str:
+        return " ".join(f"{axis.x(at)},{y(value or 0.0)}" for at, value in places)
+
+    band, lines = [], []
+    for run in _runs(points, gaps):
+        upper, lower = [(row.time, row.high) for row in run], [(row.time, row.low) for row in run]
+        band.append(line((*upper, *reversed(lower))))
+        trusted = [row.status in TRUSTED for row in run]
+        changes = [index for index in range(1, len(run)) if trusted[index] is not trusted[index - 1]]
+        for begin, end in pairwise((0, *changes, len(run))):
+            lines.append((trusted[begin], line((row.time, row.mean) for row in run[begin : end + 1])))
+    marks = [Mark("nominal", stated, y(stated)), Mark("value", last, y(last))]
+    marks += [Mark(level.name, value, y(value), (y(value), 100.0 - y(value)) if is_lower else (0.0, y(value)))
+              for level, value, is_lower in shown]  # fmt: skip
+    forecast = parameter.forecast if parameter else None
+    both = (forecast.watch, forecast.act) if forecast else ()
+    ahead = sorted((row for row in both if row is not None and row.at > axis.now), key=lambda row: row.at)
+    now, far = (points[-1].time, last), 2.0 * axis.end - axis.begin
+    median = line((now, *((row.at, row.limit) for row in ahead)))
+    early = line((now, *((max(row.low, axis.now), row.limit) for row in ahead)))
+    late = line((row.high or far, row.limit) for row in reversed(ahead))
+    forecasts = (f"{early} {late}", median) if ahead else ("", "")
+    return Plot(tuple(band), tuple(lines), tuple(_labelled(marks)), *forecasts)
+
+
+def _runs(points: Sequence[HistorySample], gaps: Iterable[Span]) -> Iterator[Sequence[HistorySample]]:
+    """Yield the points between the gaps."""
+    ends = [begin for begin, _ in gaps]
+    cuts = [index for index in range(1, len(points))
+            if any(points[index - 1].time <= end < points[index].time for end in ends)]  # fmt: skip
+    for begin, end in pairwise((0, *cuts, len(points))):
+        yield points[begin:end]
+
+
+def _labelled(marks: Iterable[Mark]) -> Iterator[Mark]:
+    """Yield the marks from top to bottom with their labels, none of which covers another."""
+    ordered = sorted(marks, key=lambda mark: mark.line)
+    lowest = 100.0 - 0.5 * LABEL_HEIGHT
+    places = [min(max(mark.line, 0.5 * LABEL_HEIGHT), lowest) for mark in ordered]
+    for index in range(1, len(places)):
+        places[index] = max(places[index], places[index - 1] + LABEL_HEIGHT)
+    for index in reversed(range(len(places))):
+        places[index] = lowest = min(places[index], lowest)
+        lowest -= LABEL_HEIGHT
+    yield from (replace(mark, label=round(place, 1)) for mark, place in zip(ordered, places, strict=True))
+
+
+def _undetermined(reports: Sequence[ReportDocument]) -> dict[tuple[int, int, str, str], list[str]]:
+    """Return the parameters that some reports did not determine, by: how many, of how many, why, and advice."""
+    names: dict[tuple[int, int, str, str], list[str]] = {}
+    for name in reports[0].parameters if reports else ():
+        own = [report.parameters[name] for report in reports if name in report.parameters]
+        missing = [row for row in own if row.status is not Status.ESTIMATED]
+        if missing:
+            reason = next((row.reason for row in missing if row.reason), "")
+            advice = next((row.advice for row in missing if row.advice), "")
+            names.setdefault((len(missing), len(own), reason, advice), []).append(name)
+    return names
+
+
+def _equations(latest: ReportDocument | None, description: Mapping[str, Any]) -> list[str]:
+    """Return the equations of the twin with its components, a line each."""
+    equations, sites = dict(description.get("equations", ())), description.get("sites", {})
+    lines = []
+    for number, row in enumerate(latest.components if latest else (), 1):
+        into, mode, through = sites.get(row.site, ("", "", ""))
+        if into in equations:
+            factor = f"({through}) * " if set("+-/") & set(through) else "" if through == "1" else f"{through} * "
+            multiplied = f"({equations[into]}) * (1 + U{number})"
+            equations[into] = multiplied if mode == "multiplicative" else f"{equations[into]} + {factor}U{number}"
+        lines.append(f"U{number} = {row.equation}")
+    sides = {f"d{left[4:-1]}/dt" if left.startswith("der(") else left: right for left, right in equations.items()}
+    return [*(f"{left} = {right}" for left, right in sides.items()), *lines]
+
+
+def _losses(counters: Iterable[Mapping[str, Any]], since: float) -> Mapping[str, int]:
+    """Return what was counted since a time, to the hour: counters begin at zero with each start of the daemon."""
+    first: dict[int, Mapping[str, Any]] = {}
+    last: dict[int, Mapping[str, Any]] = {}
+    for row in counters:
+        if row["hour"] + HOUR <= since or (row["run"] < since and row["run"] not in first):
+            first[row["run"]] = row
+        last[row["run"]] = row
+    sums: Counter[str] = Counter()
+    for run, row in last.items():
+        before = first.get(run, {})
+        sums.update({name: value - before.get(name, 0) for name, value in row.items() if name not in {"hour", "run"}})
+    return sums

@@ -1,0 +1,275 @@
+"""The page of ``otolith report``: well formed, without references, harmless, and readable in a browser."""
+
+import re
+import sqlite3
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from benchmarks.browser import Browser, browser, program
+
+from benchmarks import pictures
+from otolith.health.limits import Level
+from otolith.health.schema import CountersDocument, EventChange, HealthDocument, PartDocument, ReportDocument, Status
+from otolith.publishing.html_report import MAX_ROWS, html_report
+from otolith.storage.history import HOUR, WINDOW, HistoryReader, history_path
+from otolith.storage.history_retention import Bounds
+from otolith.storage.history_writer import HistoryWriter
+from tests.storage.histories import MACHINE, SITE, START, document
+
+NOW = START + 400.0
+VOID = {"meta", "link", "br", "line", "rect", "polygon", "polyline"}
+"""Elements without an end, and those that the template closes by '/>'."""
+
+
+class Page(HTMLParser):
+    """The texts of a page; raises AssertionError where its elements are not nested, or refer to anything."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        assert not re.search(r"https?:|@import|url\(", text)
+        self._open: list[str] = []
+        self.texts: list[str] = []
+        self.elements: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert tag not in {"script", "img", "iframe", "object", "form", "base"}
+        self.elements.append(tag)
+        if tag not in VOID:
+            self._open.append(tag)
+        for name, value in attrs:
+            assert not name.startswith("on")
+            assert name not in {"src", "href", "srcset", "action"} or value == "data:,"
+            assert "url(" not in (value or "")
+            assert "nan" not in (value or "").split() or name == "title"
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.texts).split())
+
+
+def state_of(level: Level, since: float, reason: str = "") -> HealthDocument:
+    part = PartDocument(state=level, since=since, reason=reason)
+    return HealthDocument(state=level, since=since, reason=reason, parts={"winding": part})
+
+
+def written(reports: list[ReportDocument], *, machine: str = MACHINE, site: str = SITE) -> HistoryReader:
+    writer = HistoryWriter(history_path(site, machine), Bounds(20_000_000, 3650, 24))
+    numbers, _ = writer.open(START)
+    for report in reports:
+        writer.add(numbers.number(report.model_copy(update={"machine": machine, "site": site})))
+        writer._write_waiting()
+    writer._close()
+    return writer.reader
+
+
+def shown_text(reader: HistoryReader, *, now: float = NOW, since: float = START) -> str:
+    return html_report(reader, reader.samples(WINDOW, since), "window", since, now)
+
+
+def page(reader: HistoryReader, *, now: float = NOW, since: float = START) -> Page:
+    return Page(shown_text(reader, now=now, since=since))
+
+
+def reports(count: int, *, begin: float = START, health: HealthDocument | None = None) -> list[ReportDocument]:
+    state = health or state_of(Level.OK, START)
+    return [document(index, begin + 2.0 * (index + 1)).model_copy(update={"health": state}) for index in range(count)]
+
+
+def test_a_machine_without_events_is_ok_and_there_is_nothing_to_do() -> None:
+    text = page(written(reports(200))).text
+    assert "OK since 2023-11-14" in text
+    assert "What to do: nothing." in text
+    assert "Events None." in text
+    assert "Nothing was lost." in text
+
+
+def test_one_window_is_a_point() -> None:
+    shown = page(written(reports(1)), now=START + 2.0)
+    assert "polyline" in shown.elements
+    assert "6.5 ohm ± 0.02" in shown.text
+
+
+def test_a_history_without_a_report_is_no_data() -> None:
+    text = page(written([])).text
+    assert "NO DATA The history has no report. What to do:" in text
+
+
+def test_a_parameter_without_a_value_is_named_with_reason_and_advice() -> None:
+    report = reports(1, health=state_of(Level.NO_DATA, START, "not determined yet: R_a"))[0]
+    parameter = report.parameters["R_a"].model_copy(
+        update={"value": None, "sd": None, "low": None, "high": None, "status": Status.UNESTIMATED,
+                "reason": "the motor is at rest", "advice": "let it turn"})  # fmt: skip
+    text = page(written([report.model_copy(update={"parameters": {"R_a": parameter}})]), now=START + 2.0).text
+    assert "NO DATA since" in text
+    assert "not determined yet: R_a" in text
+    assert "No value in this time." in text
+    assert "R_a : not estimated in 1 of the last 1 windows: the motor is at rest What would help: let it turn" in text
+
+
+def test_gaps_are_hatched_and_interrupt_the_curve() -> None:
+    both = [*reports(50), *reports(50, begin=START + 300.0)]
+    shown = page(written(both))
+    assert shown.elements.count("polygon") == 2
+    assert "hatched: no values" in shown.text
+
+
+def test_a_daemon_that_has_stopped_is_no_data_with_the_last_state() -> None:
+    text = page(written(reports(50, health=state_of(Level.ACT, START, "worn"))), now=START + 7300.0).text
+    assert "NO DATA no report since" in text
+    assert "(2 h)" in text
+    assert "The last report: ACT since" in text
+
+
+def test_an_event_has_its_states_and_its_evidence() -> None:
+    changed = reports(200, health=state_of(Level.WATCH, START + 100.0, "short circuit between turns"))
+    raised = document(50, START + 102.0, change=EventChange.RAISED).events[0]
+    cleared = raised.model_copy(update={"change": EventChange.CLEARED, "end": START + 300.0})
+    for index, event in ((50, raised), (150, cleared)):
+        changed[index] = changed[index].model_copy(update={"events": (event,)})
+    text = page(written(changed)).text
+    assert text.count("winding: short circuit between turns") == 1
+    assert "cleared winding: short circuit" in text
+    assert "windows 50 to 50" in text
+
+
+def test_a_long_history_of_events_is_cut() -> None:
+    many = [document(index, START + 2.0 * index, change=EventChange.RAISED) for index in range(1, MAX_ROWS + 20)]
+    text = page(written(many)).text
+    assert f"and 19 more: otolith history {MACHINE} --events" in text
+
+
+def test_lost_data_of_the_time_are_counted_over_restarts(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = written(reports(20))
+    hour = START // HOUR * HOUR
+    counted = [(hour, -1e5, 5, 1), (hour + 2 * HOUR, -1e5, 9, 3), (hour + 3 * HOUR, 9e3, 2, 1)]
+    rows = [
+        {
+            "hour": begin,
+            "run": START + run,
+            **CountersDocument(received=number, lost=number, windows=windows).model_dump(),
+        }
+        for begin, run, number, windows in counted
+    ]
+    monkeypatch.setattr(HistoryReader, "counters", lambda *_: rows)
+    text = page(reader).text
+    assert "Received: 6 samples in 3 windows." in text
+    assert "6 samples lost" in text
+
+
+HARMFUL = "<script>window.hit=1<"
+TEXT = "\"'><img src=x onerror='window.hit=1'>&lt;"
+
+
+def harmful() -> HistoryReader:
+    report = reports(3, health=state_of(Level.ACT, START, TEXT))[-1]
+    event = document(3, START, change=EventChange.RAISED).events[0]
+    texts = dict.fromkeys(("part", "condition", "text", "advice", "cause", "source"), TEXT)
+    finding = report.model_copy(update={"findings": document(1, START).findings}).findings[0]
+    parameter = report.parameters["R_a"].model_copy(
+        update={"unit": TEXT, "reason": TEXT, "status": Status.HELD, "advice": TEXT}
+    )
+    harm = finding.model_copy(update={"text": TEXT, "condition": TEXT})
+    update = {"events": (event.model_copy(update=texts),), "parameters": {TEXT: parameter}, "twin": TEXT,
+              "findings": (harm,), "notes": (TEXT,)}  # fmt: skip
+    return written([report.model_copy(update=update)], machine=HARMFUL, site=HARMFUL)
+
+
+def test_texts_of_the_machine_are_harmless() -> None:
+    shown = page(harmful(), now=START + 6.0)
+    assert HARMFUL in shown.text
+    assert shown.text.count("onerror") > 10
+
+
+def test_a_history_of_an_earlier_version_has_no_lanes_but_is_shown() -> None:
+    reader = written(reports(20))
+    with sqlite3.connect(reader.path) as connection:
+        connection.executescript("DROP TABLE state; DROP TABLE description")
+    text = page(reader, now=START + 40.0).text
+    assert "OK since" in text
+    assert "The history has none: otolith twin show dc_motor" in text
+
+
+COUNTS = {"degrading": 55, "unbalance": 40, "sensor-fault": 48}
+"""Windows of each simulated situation: shortly after what is announced last."""
+ANNOUNCED = {
+    "degrading": ("WATCH winding: short circuit between turns", "reaches ACT in", "measure resistance and insulation"),
+    "unbalance": ("ACT shaft: unbalanced shaft", "amplitude", "balance the rotor", "+ (1/J) * U1", "ACT 0.004"),
+    "sensor-fault": ("ACT sensors: a sensor is wrong", "check the sensor and its cable", "R_a, D : not estimated in"),
+}
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The page of each situation."""
+    return {name: pictures.page(pictures.simulated(name, count), tmp_path_factory.mktemp(name))
+            for name, count in COUNTS.items()}  # fmt: skip
+
+
+@pytest.mark.parametrize("situation", COUNTS)
+def test_a_simulated_machine_is_described_in_words(simulated: dict[str, str], situation: str) -> None:
+    shown = Page(simulated[situation])
+    for text in (*ANNOUNCED[situation], "domega/dt = (K_t*i - T_load - D*omega) / J", "armature resistance"):
+        assert text in shown.text
+
+
+def test_a_far_limit_is_only_in_words(simulated: dict[str, str]) -> None:
+    shown = Page(simulated["degrading"])
+    assert "WATCH above 8.125" in shown.text
+    assert {"WATCH 6.37", "ACT 6.175"} <= set(shown.texts)
+    assert not {"WATCH 8.125", "ACT 9.425"} & set(shown.texts)
+
+
+@pytest.fixture(scope="module")
+def tab() -> Iterator[Browser]:
+    if (path := program()) is None:
+        pytest.skip("no browser: apt install chromium")
+    with browser(path) as opened:
+        yield opened
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (360, 740)])
+def test_a_browser_complains_of_nothing_and_requests_nothing(
+    simulated: dict[str, str], tab: Browser, tmp_path: Path, width: int, height: int
+) -> None:
+    for name, text in {**simulated, "harmful": shown_text(harmful()), "empty": shown_text(written([]))}.items():
+        path = tmp_path / f"{name}.html"
+        path.write_text(text, encoding="utf-8")
+        tab.open(path, width, height, is_phone=width < 500)
+        assert tab.complaints() == []
+        assert [address for address in tab.requested() if address != "data:,"] == [path.as_uri()]
+        assert tab.value("window.hit") is None
+        assert tab.value("innerWidth") == width  # a phone shows a page that is too wide as smaller
+        assert tab.value("document.documentElement.scrollWidth") <= width
+        assert tab.value(VERDICT) <= height
+        assert tab.value(SMALLEST) >= 11
+
+
+FIRST = "document.querySelectorAll('.verdict > .badge, .verdict .event:first-of-type')"
+VERDICT = f"Math.max(...[...{FIRST}].map(row => row.getBoundingClientRect().bottom))"
+"""Lower edge of the state and of the first event, px."""
+SMALLEST = (
+    "Math.min(...[...document.querySelectorAll('body *')].map(row => parseFloat(getComputedStyle(row).fontSize)))"
+)
+"""Size of the smallest text, px."""
+
+
+def test_a_printed_page_has_few_sheets_of_paper(simulated: dict[str, str], tab: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    path.write_text(simulated["unbalance"], encoding="utf-8")
+    tab.open(path, 1280, 720)
+    sheets = tab.pages()
+    assert sheets.startswith(b"%PDF")
+    assert 1 <= len(re.findall(rb"/Type\s*/Page\b", sheets)) <= 3
+    assert re.search(rb"/MediaBox\s*\[\s*0 0 59[45]\.?\d* 84[12]", sheets)  # A4
