@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS, interchangeable, probabilities, without_duplicates
+from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS, WRONG_WINDOW, interchangeable, probabilities, without_duplicates
 from otolith.discovery.hypotheses import (
     FaultType,
     FittedHypothesis,
@@ -39,7 +39,7 @@ MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is
 MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
 MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
 MAX_TOTAL_DEVIANCE = 60.0  # in -2 log evidence: a hypothesis can return when things change
-CLEAR_WINDOWS = 2  # after which one type must explain the windows best before a class counts as resolved
+CLEAR_WINDOWS = 2  # after which one cause must explain the windows best before a class counts as resolved
 PRUNED_AFTER = 3  # windows of a test after which a hypothesis must differ from the null hypothesis
 DIVERGED = 1e12  # χ² of a twin that explains nothing
 
@@ -72,12 +72,14 @@ class SequentialTest:
     last: FitSummary = FitSummary()
     """Of the last window."""
     clear: int = CLEAR_WINDOWS
-    """Consecutive windows after which one type of hypotheses explained all windows best."""
+    """Consecutive windows after which one cause explained all windows best."""
     quiet: int = 0
     """Consecutive windows, up to the last, that the filter expected, and that did not confirm the test."""
     against_filter: float = -MAX_WINDOW_EVIDENCE
     """Evidence against the filter, in -2 log likelihood, of the windows after the one that opened the test; without
     that one, they alone must pay for the complexity of a hypothesis."""
+    filter_deviance: float = 0.0
+    """-2 log likelihood of these windows under the filter, relative to the best hypothesis."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
 
@@ -97,14 +99,15 @@ class SequentialTest:
         return probabilities(self.hypotheses, self.groups)
 
     @property
-    def has_equal_types(self) -> bool:
-        """Whether hypotheses of several types explain the windows equally."""
-        return len({self.hypotheses[group[0]].type for group in self.groups}) > 1
+    def has_equal_causes(self) -> bool:
+        """Whether hypotheses of several types, or several sets of moved parameters, explain the windows equally."""
+        types = [self.hypotheses[group[0]].type for group in self.groups]
+        return len(set(types)) > 1 or types.count(FaultType.PARAMETER) > 1
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether hypotheses of several types explain the windows equally, or did so one window before."""
-        return self.clear < CLEAR_WINDOWS or self.has_equal_types
+        """Whether hypotheses of several causes explain the windows equally, or did so one window before."""
+        return self.clear < CLEAR_WINDOWS or self.has_equal_causes
 
     def probability(self, kind: FaultType) -> float:
         """Return the probability of all hypotheses of one type."""
@@ -117,9 +120,19 @@ class SequentialTest:
         return null <= DECISIVE
 
     @property
+    def filter_share(self) -> float:
+        """Probability that the window that opened the test was itself wrong, so that the filter's posterior holds."""
+        return float(WRONG_WINDOW / (WRONG_WINDOW + (1.0 - WRONG_WINDOW) * np.exp(0.5 * self.filter_deviance)))
+
+    @property
     def is_confirmed(self) -> bool:
         """Whether windows after the one that opened the test speak decisively against the filter."""
         return self.against_filter > DECISIVE
+
+    @property
+    def is_refuted(self) -> bool:
+        """Whether these windows speak decisively for the filter."""
+        return self.filter_deviance < -DECISIVE
 
     def with_steps(self, steps: tuple[float, ...]) -> "SequentialTest":
         """Return the test with the steps of converters that windows have shown since."""
@@ -135,10 +148,15 @@ class SequentialTest:
         The evidence against the filter is a cumulative sum (E. S. Page, Biometrika 41, 1954) with decisive evidence as
         its reference value. It falls in windows that give less, so that it is forgotten if it does not go on.
         """
-        last = self.last
+        last, limits = self.last, (-MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         more = (filtered.chi_square - last.chi_square) / residual_variance_factor([last.chi_square], last.count)
-        total = self.against_filter + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
-        return replace(self, against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)))
+        total = self.against_filter + np.clip(more - DECISIVE, *limits)
+        deviance = self.filter_deviance + np.clip(more, *limits)
+        return replace(
+            self,
+            against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)),
+            filter_deviance=float(np.clip(deviance, -MAX_TOTAL_DEVIANCE, MAX_TOTAL_DEVIANCE)),
+        )
 
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
@@ -215,12 +233,14 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     tracked = [item for item, _ in kept]
     if test.windows >= PRUNED_AFTER:
         tracked = prune(tracked, [deviance for _, deviance in kept])
+    filter_deviance = test.filter_deviance - min(item.deviance for item in tracked)
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     if test.windows > MAX_OPEN_WINDOWS:
         hypotheses = without_duplicates(hypotheses, interchangeable(hypotheses))
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     followed = replace(test, hypotheses=_screened(hypotheses, steps), leading=leading, last=last)
-    return replace(followed, clear=0 if followed.has_equal_types else test.clear + 1)
+    followed = replace(followed, filter_deviance=filter_deviance)
+    return replace(followed, clear=0 if followed.has_equal_causes else test.clear + 1)
 
 
 def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
@@ -295,9 +315,11 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     known = {item.hypothesis.name for item in test.hypotheses}
     added = [item for item in fresh.hypotheses if item.hypothesis.name not in known]
     lead = min(gain, MAX_WINDOW_EVIDENCE)
-    hypotheses = _sorted([*(item.worse_by(lead, lead) for item in test.hypotheses), *added])
+    together = [*(item.worse_by(lead, lead) for item in test.hypotheses), *added]
+    filter_deviance = test.filter_deviance + lead - min(item.deviance for item in together)
+    hypotheses = _sorted(together)[: 2 * MAX_HYPOTHESES]
     leading = test.leading if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
-    return replace(test, hypotheses=hypotheses[: 2 * MAX_HYPOTHESES], leading=leading)
+    return replace(test, hypotheses=hypotheses, leading=leading, filter_deviance=filter_deviance)
 
 
 def _sorted(tracked: list[TrackedHypothesis]) -> tuple[TrackedHypothesis, ...]:
