@@ -30,6 +30,7 @@ from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, open_test
 from otolith.estimation.augmented import slot_of
 from otolith.estimation.data_checks import CheckedWindow, check_window
+from otolith.estimation.imm_filter import CumulativeShifts
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
@@ -88,22 +89,26 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
     is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
+    alone = np.array([(parameter.value, parameter.sd) for parameter in estimated.parameters])
+    shifts = state.shifts.after(predicted.shifts(*alone.T))
+    moved = shifts.moved
     is_calm = is_expected and not screening.is_positive
     test = None if state.test is None else continue_test(state.test, predicted, screening).with_filter(estimated.fit)
     if test is not None and test.best.type is FaultType.NOTHING and not is_expected:
         test = None  # the window shows something else than what opened the test
     if test is not None:
-        act = _update_filter_beside if is_calm and not test.is_confirmed else _apply_decision
+        act = _update_filter_beside if is_calm and not moved and not test.is_confirmed else _apply_decision
         result = act(state, predicted, estimated, test)
     elif is_calm:
-        return _update_filter(state, predicted, estimated)
+        result = (_follow_shifts if moved else _update_filter)(state, predicted.reset_parameters(moved), estimated)
+        return replace(result, shifts=shifts)
     else:
         state, test = replace(state, test=None), open_test(predicted, screening)
         if is_expected and test.is_null_possible:
             result = _update_filter(state, predicted, estimated)
         else:
             result = _apply_decision(state, predicted, estimated, test)
-    return replace(result, searched=True)
+    return replace(result, searched=True, shifts=shifts)
 
 
 def _apply_decision(
@@ -146,6 +151,13 @@ def _update_filter(state: AdaptationState, predicted: Posterior, estimated: Wind
     posterior = predicted.update(estimated.evidence, estimated.advance)
     result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), (), estimate=estimated)
     return _without_faded(state, result, estimated) if state.adopted else result
+
+
+def _follow_shifts(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
+    """Return the result of a window that, with those before, shows a change; ``predicted`` forgets what has moved."""
+    again = estimate_window(predicted, estimated.fit.window)
+    result = _update_filter(state, predicted, again)
+    return replace(result, decision=WindowDecision.STEPPED, before=result.after)
 
 
 def _without_faded(state: AdaptationState, result: WindowResult, estimated: WindowEstimate) -> WindowResult:
@@ -222,11 +234,19 @@ def _next_state(
         learned=state.learned + result.is_accepted,
         contradictions=result.contradictions(state),
         adopted=result.adopted,
+        shifts=_next_shifts(state, result),
         noisier_since=result.noisier_since(state),
         previous=previous,
         health=health,
         records=_next_records(state, result),
     )
+
+
+def _next_shifts(state: AdaptationState, result: WindowResult) -> CumulativeShifts:
+    """Return the cumulative shifts; a posterior that replaces the filter's contains what shifted the windows before."""
+    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
+        return CumulativeShifts()
+    return state.shifts if result.shifts is None else result.shifts
 
 
 def _next_records(state: AdaptationState, result: WindowResult) -> int:

@@ -16,6 +16,7 @@ from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.augmented import equation, indices, site_of, source_of
 from otolith.estimation.data_checks import FaultySensor
+from otolith.estimation.imm_filter import CumulativeShifts
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
@@ -88,6 +89,8 @@ class WindowResult:
     """Whether ``after`` is the mixture of the hypotheses of an open test."""
     searched: bool = False
     """Whether other hypotheses were compared."""
+    shifts: CumulativeShifts | None = None
+    """With those of this window; None for a window that was not estimated from."""
 
     @classmethod
     def unchanged(  # noqa: PLR0913 - the optional parts of a result

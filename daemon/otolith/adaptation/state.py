@@ -8,6 +8,7 @@ import numpy as np
 from otolith.discovery.adopted import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.augmented import augment, indices, slot_of, without
+from otolith.estimation.imm_filter import CumulativeShifts
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
 from otolith.health.baseline import Baseline, with_baselines
@@ -46,6 +47,8 @@ class AdaptationState:
     """Keys of components that the operator approved."""
     adopted: tuple[AdoptedComponent, ...] = ()
     """The components in the twin."""
+    shifts: CumulativeShifts = field(default_factory=CumulativeShifts)
+    """How far windows that the filter expected have moved the parameters, all the same way."""
     noisier_since: float | None = None
     """Unix seconds from which on sensors are noisier than stated; None if they are not."""
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)
@@ -169,7 +172,7 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
     for index, parameter in enumerate(state.problem.free):
         if parameter.name == name:
             previous = {**state.previous, parameter.label: PreviousStatus()}
-            health, posterior = state.health.without_history(name), state.posterior.reset_parameter(index)
+            health, posterior = state.health.without_history(name), state.posterior.reset_parameters([index])
             return replace(state, posterior=posterior, previous=previous, test=None, health=health)
     for component in state.problem.components:
         if component.key == name:

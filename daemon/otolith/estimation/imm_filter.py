@@ -34,6 +34,10 @@ MAX_VARIANCE_RATIO = 1e4
 MAX_NIS_PER_DEGREE = 9.0  # above it a window raises the variance ratio no further; also the unit of inflate_variance
 NIS_DEVIATE = 6.0  # of the standard normal distribution: exceeded by one healthy window in a thousand million
 MAX_PRECISION = 1e7  # of a window: prior standard deviations over its own, in the direction of which it states most
+SHIFT_REFERENCE = 1.0  # standard deviations: a window that shifts a parameter by less speaks against a change
+LARGEST_SHIFT = 4.0  # standard deviations that one window counts: a wrong window alone does not reach the limit
+SHIFT_LIMIT = 5.0  # standard deviations: the sums of healthy windows exceed it once in a hundred thousand
+SHIFTED_ALONG = 0.5  # of the limit: sum of a parameter that has been shifted along with another
 MAX_INFLATION = 25.0  # largest factor by which one contradictory window raises the variance ratio
 
 Levels = NDArray[np.int64]
@@ -151,6 +155,35 @@ def nis(prediction: ImmPosterior, evidence: Evidence) -> float:
     """
     _, covariance, innovation = _innovation(prediction, evidence)
     return float(np.einsum("mi,mij,mj->m", innovation, np.linalg.inv(covariance), innovation).min())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CumulativeShifts:
+    """Cumulative sums of the shifts of parameters, upwards and downwards (E. S. Page, Biometrika 41, 1954).
+
+    They show a change that no single window shows. The innovation test of one window misses a step of a few standard
+    deviations, and the filter would follow it slowly, with an interval that excludes both values.
+    """
+
+    sums: Array | None = None
+    """(2, free); None if nothing is summed."""
+
+    def after(self, shifts: Array) -> "CumulativeShifts":
+        """Return the sums after a window of these ``shifts`` (free,), in standard deviations."""
+        both = np.clip([shifts, -shifts], None, LARGEST_SHIFT)
+        before = self.sums if self.sums is not None and self.sums.shape == both.shape else np.zeros(both.shape)
+        return CumulativeShifts(np.maximum(before + both - SHIFT_REFERENCE, 0.0))
+
+    @property
+    def moved(self) -> list[int]:
+        """Indices of the parameters that have moved: none until one has done so by more than its windows scatter.
+
+        The windows have shifted others along with it, which count from a smaller sum on.
+        """
+        if self.sums is None or not (self.sums > SHIFT_LIMIT).any():
+            return []
+        farthest: Array = self.sums.max(axis=0)
+        return np.flatnonzero(farthest > SHIFTED_ALONG * SHIFT_LIMIT).tolist()
 
 
 def nis_limit(degrees: float) -> float:

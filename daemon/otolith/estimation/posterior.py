@@ -5,6 +5,7 @@ times time, or by order times shaft angle. A tracked component therefore stays c
 more certain. Where the advance is not known, the phase is reset to unknown.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -126,6 +127,17 @@ class Posterior:
         """Whether the normalised innovation squared of a window is within what healthy windows reach."""
         return self.nis(evidence) <= imm_filter.nis_limit(2.0 * len(self.problem.free))
 
+    def shifts(self, values: Array, sd: Array) -> Array:
+        """Return by how many standard deviations a window alone differs from the prediction (free,).
+
+        ``values`` and ``sd`` (free,) are the estimates of that window. While nothing happens a shift is a standard
+        normal deviate, or less. Values of components do not count.
+        """
+        free, prior = len(self.problem.free), self.prior()
+        variance = self.belief.variance_ratio * sd**2 + np.diag(prior.covariance)[:free]
+        counted = np.isfinite(variance) & [not parameter.name.startswith("_") for parameter in self.problem.free]
+        return np.where(counted, (values - prior.mean[:free]) / np.sqrt(np.where(counted, variance, 1.0)), 0.0)
+
     def update(self, evidence: Evidence, phase: PhaseAdvance) -> "Posterior":
         """Return the posterior after a window, of which this is the prediction."""
         return replace(self, belief=imm_filter.update(self.belief, self._relative(evidence)), phase=phase)
@@ -145,12 +157,13 @@ class Posterior:
         scale = self.problem.scale[index]
         return replace(self, belief=imm_filter.reset_marginal(self.belief, index, sd / scale, value / scale))
 
-    def reset_parameter(self, index: int) -> "Posterior":
-        """Return the same with the initial prior for one parameter and its trend."""
+    def reset_parameters(self, moved: Iterable[int]) -> "Posterior":
+        """Return the same with the initial prior for the parameters at the indices ``moved``, and for their trends."""
         belief, prior, size = self.belief, initial_prior(self.problem), _size(self.problem)
-        for at in (index, index + len(self.problem.free)):
-            sd, value = float(np.sqrt(prior.covariance[at, at]) / size[at]), float(prior.mean[at] / size[at])
-            belief = imm_filter.reset_marginal(belief, at, sd, value)
+        for index in moved:
+            for at in (index, index + len(self.problem.free)):
+                sd, value = float(np.sqrt(prior.covariance[at, at]) / size[at]), float(prior.mean[at] / size[at])
+                belief = imm_filter.reset_marginal(belief, at, sd, value)
         return replace(self, belief=belief)
 
     def forget_phase(self, index: int) -> "Posterior":

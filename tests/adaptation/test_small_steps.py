@@ -1,0 +1,79 @@
+"""A step of a few standard deviations of one window, of a shaft that turns unevenly under a speed controller."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from benchmarks.changes.machines import ONE_MASS, twin_of
+
+from otolith.acquisition.window import Window
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import initial_state
+from otolith.discovery.decision import WindowDecision
+from otolith.estimation.imm_filter import CumulativeShifts
+from otolith.estimation.problem import Problem
+from otolith.health.schema import ReportDocument
+
+TWIN = twin_of(ONE_MASS)
+INERTIA, DAMPING, SPEED, GAIN = 0.12, 0.02, 30.0, 0.2  # kg*m^2, N*m*s/rad, rad/s, N*m*s/rad
+UNEVENNESS, NOISE = 0.1, 0.01  # rad/s/s^0.5, rad/s
+PERIOD, RECORDS, SUBSTEPS = 0.01, 200, 4
+BEFORE, AFTER, HEALTHY = 5, 8, 50  # windows
+SEEDS = 4
+FREE = tuple(TWIN.parameter(name) for name in ("J", "D"))
+KNOWN = (("T_c", 0.0), ("omega_s", 0.05))
+PROBLEM = Problem(TWIN, KNOWN, FREE, noise=(NOISE,), process_noise=(UNEVENNESS,))
+
+
+def simulate(count: int, step: float, at: int, seed: int) -> list[Window]:
+    """Windows of which those from number ``at`` on have (1 + step) times the damping."""
+    random, omega, rows = np.random.default_rng(seed), SPEED, []
+    dt = PERIOD / SUBSTEPS
+    for record in range(count * RECORDS):
+        damping = DAMPING * (1.0 + step * (record >= at * RECORDS))
+        target = SPEED * (0.95 if record // 50 % 2 else 1.05)
+        torque = DAMPING * target + GAIN * (target - omega)
+        rows.append((torque, omega + NOISE * random.standard_normal()))
+        for _ in range(SUBSTEPS):
+            omega += dt * (torque - damping * omega) / INERTIA
+        omega += UNEVENNESS * np.sqrt(PERIOD) * random.standard_normal()
+    pieces = np.array(rows).reshape(count, RECORDS, 2)
+    return [Window.whole(k, 2.0 * k, PERIOD, ("T", "omega"), piece) for k, piece in enumerate(pieces)]
+
+
+@lru_cache
+def reports(count: int, step: float, at: int, seed: int) -> list[ReportDocument]:
+    state, documents = initial_state("shaft", "bench", PROBLEM), []
+    for window in simulate(count, step, at, seed):
+        state, report = adapt(state, window)
+        documents.append(report.document)
+    return documents
+
+
+@pytest.mark.parametrize(("step", "within"), [(0.1, 2), (0.06, 4), (-0.06, 4)])
+def test_a_step_of_a_few_standard_deviations_is_followed(step: float, within: int) -> None:
+    """After so many windows the interval holds the new value, or both."""
+    inside, published = 0, 0
+    for seed in range(SEEDS):
+        for document in reports(BEFORE + AFTER, step, BEFORE, seed)[BEFORE + within :]:
+            damping = document.parameters["D"]
+            assert document.components == ()
+            assert document.decision is not WindowDecision.SENSOR
+            assert damping.low is not None
+            assert damping.high is not None
+            published += 1
+            inside += damping.low <= DAMPING * (1.0 + step) <= damping.high
+    assert published == SEEDS * (AFTER - within)
+    assert inside >= 0.9 * published
+
+
+def test_healthy_windows_shift_nothing() -> None:
+    decisions = [document.decision for document in reports(HEALTHY, 0.0, 0, 9)]
+    assert decisions == [WindowDecision.LEARNED] * HEALTHY
+
+
+def test_a_wrong_window_alone_moves_nothing() -> None:
+    once = CumulativeShifts().after(np.array([50.0]))
+    assert once.moved == []
+    assert once.after(np.array([0.5])).moved == []
+    assert once.after(np.array([4.0])).moved == [0]
