@@ -1,6 +1,5 @@
 """What the command lines of the benchmarks share: options, child processes, progress and tables."""
 
-import os
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -41,7 +40,6 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 def in_processes(jobs: Sequence[Callable[[], Result]], processes: int) -> list[Result]:
     """Return the results of the jobs, in their order; progress goes to the standard error."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the processes share the cores
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         pending = [pool.submit(job) for job in jobs]
         for count, _ in enumerate(as_completed(pending), 1):

@@ -1,7 +1,1 @@
 """How often the search identifies components, compared with PySINDy: ``python -m benchmarks.discovery``."""
-
-import os
-
-# One thread per process: two processes share two cores. The libraries read this when they are loaded.
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[_name] = "1"

@@ -129,6 +129,10 @@ class Definition:
     base: "Definition | None" = None
     """The author's twin, if this one is augmented (see :mod:`otolith.twin.augmentation`)."""
 
+    def __hash__(self) -> int:
+        """Of the name alone, as what is prepared once for a twin is looked up several times in each window."""
+        return hash(self.name)
+
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of all inputs and outputs; a machine file says where each is read."""

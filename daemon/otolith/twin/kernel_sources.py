@@ -114,22 +114,18 @@ def _swarm(code: KernelCode) -> Blocks:
 
 
 # dx is S, the derivative of the state, and dy is Y, that of the outputs; forcing[j - 1] is F at stage j. They hold the
-# columns that are asked for; the others share one more column, which nothing reads. d and b hold D, and B per
-# stage, by all parameters: loops copy them to the columns, as a line for each element takes compile time.
+# columns that are asked for. d and b hold D, and B per stage, by all parameters: loops copy them to the columns, as a
+# line for each element takes compile time.
 SENSITIVITIES = """
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, before_last, columns):
     records, count = inputs.shape[0], len(columns)
-    predicted = np.empty((records, $n_outputs))
-    position, drifting = np.full($n_columns, count), False
-    for column in range(count):
-        position[columns[column]] = column
-        drifting = drifting or columns[column] >= $n_constant
-    dy = np.zeros((records, $n_outputs, count + 1))
-    dx, forcing = np.zeros(($n_states, count + 1)), np.zeros((4, $n_states, count + 1))
+    predicted, dy = np.empty((records, $n_outputs)), np.zeros((records, $n_outputs, count))
+    dx, forcing = np.zeros(($n_states, count)), np.zeros((4, $n_states, count))
     d, b = np.zeros(($n_outputs, $n_parameters)), np.zeros((4, $n_states, $n_parameters))
-    for row in range($n_states):
-        dx[row, position[$n_parameters + row]] = 1.0
+    for column in range(count):
+        if $n_parameters <= columns[column] < $n_constant:
+            dx[columns[column] - $n_parameters, column] = 1.0
     correct = len(gain) > 0
     $read_parameters
     for record in range(records):
@@ -156,18 +152,18 @@ def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, be
             $linearised_stages
             $advance_state
             $store_b
-            for stage in range(4):
-                for row in range($n_states):
-                    for parameter in range($n_parameters):
-                        forcing[stage, row, position[parameter]] = b[stage, row, parameter]
-            if drifting:
-                start = time + substep * step
-                moments = (start + 0.0 * step, start + 0.5 * step, start + 0.5 * step, start + 1.0 * step)
-                for stage in range(4):
-                    for row in range($n_states):
-                        for parameter in range($n_parameters):
-                            column = position[$n_constant + parameter]
-                            forcing[stage, row, column] = moments[stage] * b[stage, row, parameter]
+            start = time + substep * step
+            moments = (start + 0.0 * step, start + 0.5 * step, start + 0.5 * step, start + 1.0 * step)
+            for column in range(count):
+                parameter = columns[column]
+                if parameter < $n_parameters:
+                    for stage in range(4):
+                        for row in range($n_states):
+                            forcing[stage, row, column] = b[stage, row, parameter]
+                elif parameter >= $n_constant:
+                    for stage in range(4):
+                        for row in range($n_states):
+                            forcing[stage, row, column] = moments[stage] * b[stage, row, parameter - $n_constant]
             for column in range(count):
                 $read_dx
                 $stage_dx
@@ -175,7 +171,7 @@ def sensitivities(parameters, initial, inputs, steps, counts, measured, gain, be
             $advance_inputs
     final = np.empty($n_states)
     $store_final
-    return predicted, dy[:, :, :count], final, dx[:, :count]
+    return predicted, dy, final, dx
 """
 
 
@@ -186,7 +182,6 @@ def sensitivities(code: KernelCode) -> list[str]:
     """
     parameters, states = len(code.p), len(code.x)
     blocks: Blocks = {
-        "n_columns": str(2 * parameters + states),
         "n_parameters": str(parameters),
         "n_constant": str(parameters + states),
         "store": [f"predicted[record, {index}] = {y}" for index, y in enumerate(code.y)],
@@ -210,12 +205,17 @@ def _output_slopes(code: KernelCode) -> Blocks:
         for row in range(len(code.x))
     }
     through_parameters = [f"d[{row}, {column}] = {value}" for row, column, value in code.d.named("d")]
+    constant = len(code.p) + len(code.x)
     if through_parameters:
         through_parameters += [
-            f"for row in range({len(code.y)}):",
-            f"    for parameter in range({len(code.p)}):",
-            "        dy[record, row, position[parameter]] += d[row, parameter]",
-            f"        dy[record, row, position[{len(code.p) + len(code.x)} + parameter]] += time * d[row, parameter]",
+            "for column in range(count):",
+            "    parameter = columns[column]",
+            f"    if parameter < {len(code.p)}:",
+            f"        for row in range({len(code.y)}):",
+            "            dy[record, row, column] += d[row, parameter]",
+            f"    elif parameter >= {constant}:",
+            f"        for row in range({len(code.y)}):",
+            f"            dy[record, row, column] += time * d[row, parameter - {constant}]",
         ]
     return {
         "dy_through_state": [f"dy[record, {row}, column] = {total(terms)}" for row, terms in through_state.items()],
