@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.cli.common import examples_directory
+from otolith.cli.common import shipped_directory
 from otolith.health.limits import Level
 from otolith.health.schema import HealthDocument, PartDocument, ReportDocument
 from otolith.machine import load_machine
@@ -132,7 +132,7 @@ def test_the_machine_is_described_as_it_was_last(opened: Callable[..., Simulated
         history.writer.description = text
         history.write(*documents(2))
     assert history.writer.reader.description() == {"title": "after"}
-    twin = load_machine(examples_directory() / "dc-motor.toml", with_driver=False)
+    twin = load_machine(shipped_directory("config") / "dc-motor.toml", with_driver=False)
     history.writer.description = describe_machine(twin.twin, twin.plan)
     history.write(*documents(2))
     content = history.writer.reader.description()

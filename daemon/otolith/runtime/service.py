@@ -35,8 +35,8 @@ from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.reload import reloaded
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
-from otolith.storage.history import describe_machine
 from otolith.storage.evidence import EvidenceWriter, files_of
+from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import Numbers, history_of
 from otolith.storage.state_store import StateWriter, store_of
 from otolith_drivers.errors import OtolithError
