@@ -1,6 +1,7 @@
 """A real MQTT broker in a process of its own: mosquitto where it is installed, else amqtt."""
 
 import asyncio
+import getpass
 import atexit
 import json
 import shutil
@@ -40,7 +41,7 @@ def mqtt_broker(
 ) -> "Iterator[subprocess.Popen[bytes]]":
     """The process of a broker on 127.0.0.1; ``tls`` is its certificate and key."""
     if (mosquitto := shutil.which("mosquitto")) is not None:
-        lines = [f"listener {port} 127.0.0.1", "allow_anonymous true"]
+        lines = [f"user {getpass.getuser()}", f"listener {port} 127.0.0.1", "allow_anonymous true"]
         lines += [f"certfile {tls[0]}", f"keyfile {tls[1]}"] if tls else []
         (folder / "mosquitto.conf").write_text("\n".join(lines), encoding="utf-8")
         command = [mosquitto, "-c", str(folder / "mosquitto.conf")]
