@@ -1,8 +1,8 @@
 """A real MQTT broker in a process of its own: mosquitto where it is installed, else amqtt."""
 
 import asyncio
-import getpass
 import atexit
+import getpass
 import json
 import shutil
 import socket

@@ -122,12 +122,8 @@ class Messages:
                 raise ConfigurationError(
                     f"{source.topic}: a plain number has no field {options.time!r}: give 'field'", key
                 )
-            try:
-                conversion = Conversion.of(source, source.unit, signal.unit)
-            except ValueError as error:
-                raise ConfigurationError(str(error), key) from error
             topic = self.topics.setdefault(source.topic, TopicSignals(source.topic))
-            topic.signals.append((signal.name, source.field, conversion))
+            topic.signals.append((signal.name, source.field, Conversion.for_signal(signal)))
 
     @property
     def bad(self) -> int:
