@@ -17,7 +17,6 @@ from otolith_drivers.common.reconnection import Reconnection, cause_of
 from otolith_drivers.common.scaled import Conversion, ScaledSource
 from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.config_files import StrictModel
-from otolith_drivers.errors import ConfigurationError
 
 MAX_LINE = 4096  # bytes
 CONNECT_TIMEOUT = 0.5  # s; below the second in which a driver closes
@@ -48,13 +47,7 @@ def build(options: Options, setup: Setup) -> "TcpJson":
     Raises:
         ConfigurationError: a unit has the wrong dimension.
     """
-    signals = {}
-    for signal in setup.signals:
-        try:
-            conversion = Conversion.of(signal.source, signal.source.unit, signal.unit)
-        except ValueError as error:  # the daemon adds file and line
-            raise ConfigurationError(str(error), ("signals", signal.name)) from error
-        signals[signal.name] = (signal.source.key, conversion)
+    signals = {signal.name: (signal.source.key, Conversion.for_signal(signal)) for signal in setup.signals}
     return TcpJson(options, signals)
 
 

@@ -59,16 +59,20 @@ class SeveralSources(ThreadedDriver):
         try:
             source.driver.open(deliver)
         except Exception as error:  # noqa: BLE001 - whatever a driver of another package raises, the others go on
-            fault = str(error) if isinstance(error, DeviceError) else f"{type(error).__name__}: {error}"
-            if fault != self._faults.get(source.name):
-                log.warning("source %r: %s; tried again until it can be opened", source.name, fault)
-            self._faults[source.name] = fault
+            is_known = isinstance(error, DeviceError)
+            self._faults[source.name] = str(error) if is_known else f"{type(error).__name__}: {error}"
         else:
             self._faults.pop(source.name, None)
 
     def _open_the_rest(self, deliver: Deliver) -> None:
-        backoff = ReconnectBackoff()
-        while self._faults and not self._stop.wait(backoff.next()):
+        backoff, logged = ReconnectBackoff(), dict[str, str]()
+        while self._faults:
+            for name, fault in self._faults.items():
+                if logged.get(name) != fault:
+                    log.warning("source %r: %s; tried again until it can be opened", name, fault)
+            logged = dict(self._faults)
+            if self._stop.wait(backoff.next()):
+                return
             for source in self._sources:
                 if source.name in self._faults and not self._stop.is_set():
                     self._try_to_open(source, deliver)

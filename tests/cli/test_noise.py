@@ -11,9 +11,9 @@ from benchmarks.sampling.measure import some_motor, write_machine
 from benchmarks.sampling.schedules import Schedule, Timing, record
 from click.testing import CliRunner, Result
 
-from otolith.cli.commissioning.noise import evenly_spread
 from otolith.cli.main import cli
 from otolith.machine import load_machine
+from otolith.runtime.preview import EvenSpread
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from tests.cli.replays import MACHINE, recorded, written
@@ -88,7 +88,10 @@ def test_data_without_a_usable_window_is_refused(tmp_path: Path, scenario: Motor
 
 @pytest.mark.parametrize(("count", "most", "kept"), [(0, 3, 0), (2, 3, 2), (5, 1, 1), (100, 7, 7)])
 def test_windows_are_spread_over_the_data(count: int, most: int, kept: int) -> None:
-    chosen = evenly_spread(range(count), most)
+    spread = EvenSpread[int](most)
+    for item in range(count):
+        spread.add(item)
+    chosen = spread.chosen()
     assert len(chosen) == kept == len(set(chosen))
     gaps = [later - earlier for earlier, later in pairwise(chosen)]
     assert max(gaps, default=0) <= 2 * min(gaps, default=0)

@@ -5,6 +5,7 @@ is intact and new, and reads its signals. No clock in here: the time of a frame 
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -42,12 +43,12 @@ from otolith_drivers.canbus.signals import (
     request_from_databases,
 )
 from otolith_drivers.common.periods import PeriodEstimator, period_text
+from otolith_drivers.common.reconnection import PassingFault
 from otolith_drivers.errors import ConfigurationError, nearest
 
 NO_READING = float("nan")
 NO_SAMPLES: list[Sample] = []
 EXTENDED = 1 << 29  # added to an extended arbitration ID, so that it differs from the same standard one
-REJECTION_SHOWN = 10.0  # s after the last frame or value of a kind that could not be used
 MIN_WAIT, WAIT_PERIODS = 3.0, 10.0  # s; periods: when a message is reported that has not come once
 GROUP_WAIT_PERIODS = 100.0  # periods of the message: the same for the signals of one multiplexer value
 MAX_WARNINGS = 20  # lines about the files; more of them do not help
@@ -69,15 +70,6 @@ class MessageRules:
     """Bytes that counter and checksum need."""
     is_j1939: bool = False
     """Whether its highest numbers are no readings."""
-
-
-@dataclass(slots=True)
-class _Rejection:
-    """Frames or values of one kind that could not be used."""
-
-    text: str
-    time: float = 0.0
-    count: int = 0
 
 
 @dataclass(slots=True)
@@ -110,7 +102,8 @@ class MessageReader:
         self._database_period = max((message.cycle_time or 0) * 1e-3 for message in messages)
         self._rows: list[Row] = []
         self._groups: dict[tuple[object, ...], _MultiplexedGroup] = {}
-        self._rejections: dict[str, _Rejection] = {}
+        self._rejections: defaultdict[str, PassingFault] = defaultdict(PassingFault)
+        """Frames or values that could not be used, by their kind."""
         self._standard = {request.name: request.signal for request in requests if rules.is_j1939}
         for request in requests:
             self._length = max(self._length, bytes_needed(request.signal))
@@ -156,12 +149,8 @@ class MessageReader:
             waited = now - begun
             limit = max(MIN_WAIT, WAIT_PERIODS * (self._declared_period or self._database_period))
             return [f"{self.title} has not come once in {waited:.1f} s"] if waited > limit else []
-        lines = [
-            f"{self.title}: {rejection.text}; {rejection.count} in all, "
-            f"the last {max(now - rejection.time, 0.0):.1f} s ago"
-            for rejection in list(self._rejections.values())  # the receive thread may add one
-            if unused and now - rejection.time < REJECTION_SHOWN
-        ]
+        rejections = list(self._rejections.values()) if unused else []  # the receive thread may add one
+        lines = [line for rejection in rejections for line in rejection.warnings(now, self.title)]
         if self._counter is not None and self._counter.repeated >= MIN_STUCK_FRAMES:
             lines.append(self._stuck_counter(self._counter))
         elif (silence := self.periods.silence(now)) is not None:
@@ -228,8 +217,7 @@ class MessageReader:
 
     def _count_rejection(self, kind: str, time: float, text: str) -> None:
         self.bad += 1
-        rejection = self._rejections.setdefault(kind, _Rejection(text))
-        rejection.count, rejection.time, rejection.text = rejection.count + 1, time, text
+        self._rejections[kind].note(text, time)
 
     def _stuck_counter(self, counter: FrameCounter) -> str:
         line = f"the counter {counter.name} of {self.title} has not changed for {counter.repeated} frames"
@@ -330,7 +318,7 @@ class FrameDecoder:
         readers, assembler = self._readers.values(), self._groups and self._groups.assembler
         return Counters(
             received=sum(reader.received for reader in readers),
-            bad=sum(reader.bad for reader in readers) + self._unreadable + (assembler.broken if assembler else 0),
+            bad=sum(reader.bad for reader in readers) + self._unreadable + (assembler.broken.count if assembler else 0),
             # The period or the counter of a message shows overflows as well, unless it has neither.
             lost=max(sum(reader.lost for reader in readers), self.faults.overflows),
         )

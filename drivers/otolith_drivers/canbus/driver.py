@@ -23,7 +23,7 @@ from otolith_drivers.canbus.bus import (
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import FrameOptions
 from otolith_drivers.canbus.signals import CanSource
-from otolith_drivers.common.reconnection import ReconnectBackoff
+from otolith_drivers.common.reconnection import Reconnection
 from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.errors import DeviceError
 
@@ -62,8 +62,8 @@ class CanReceiver(ThreadedDriver):
     def __init__(self, options: BusOptions, decoder: FrameDecoder) -> None:
         super().__init__()
         self._options, self._decoder = options, decoder
-        self._link = Link(up=False, reason="not opened yet")
-        self._reconnects = self._unreadable = self._consecutive_bad = 0
+        self._connection = Reconnection(f"CAN bus {options.title()}", log)
+        self._unreadable = self._consecutive_bad = 0
         self._drops = DropCounter()
         self._last_frame = self._opened = 0.0
         self._next_reopening = 0.0
@@ -72,6 +72,7 @@ class CanReceiver(ThreadedDriver):
     def open(self, deliver: Deliver) -> None:
         """See :meth:`otolith_drivers.base.Driver.open`."""
         bus = self._connect()
+        self._connection.come_up("is open")
         for line in self._decoder.configuration_warnings:
             log.warning("%s", line)
         self._last_frame = self._opened
@@ -86,21 +87,20 @@ class CanReceiver(ThreadedDriver):
             bad=counters.bad + self._unreadable,
             # The period or the counter of a message shows dropped frames as well, unless it has neither.
             lost=max(counters.lost, self._drops.total),
-            reconnects=self._reconnects,
+            reconnects=self._connection.count,
         )
 
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
-        link = self._link
-        if not link.up:
-            return link
+        if not self._connection.up:
+            return Link(up=False, reason=self._connection.reason)
         if self._decoder.faults.bus_off:
             return Link(up=False, reason="bus off: the controller has left the bus after too many errors")
         now = time.monotonic()
         silence = now - self._last_frame
         silent = [f"no frame at all for {silence:.1f} s"] if silence > self._silence_limit() else []
         warnings = (*silent, *self._drops.warnings(now), *self._decoder.warnings(now))
-        return replace(link, warnings=warnings, latency=self._decoder.latency)
+        return Link(up=True, warnings=warnings, latency=self._decoder.latency)
 
     def describe(self) -> list[str]:
         """See :meth:`otolith_drivers.base.Driver.describe`."""
@@ -117,7 +117,6 @@ class CanReceiver(ThreadedDriver):
         self._consecutive_bad = 0
         self._opened = time.monotonic()
         self._decoder.faults.bus_off = False
-        self._link = Link(up=True)
         return bus
 
     def _receive(self, bus: can.BusABC | None, deliver: Deliver) -> None:
@@ -125,8 +124,7 @@ class CanReceiver(ThreadedDriver):
             if bus is None:
                 bus = self._reconnect()
             elif (failure := self._take_frames(bus, deliver)) is not None:
-                self._link = Link(up=False, reason=failure)
-                log.warning("CAN bus %s: %s; reconnecting", self._options.title(), failure)
+                self._connection.go_down(failure)
                 _shut(bus)
                 bus = None
         if bus is not None:
@@ -181,19 +179,18 @@ class CanReceiver(ThreadedDriver):
 
     def _reconnect(self) -> can.BusABC | None:
         """Try until it succeeds, with growing random pauses; None if the driver is closed meanwhile."""
-        backoff = ReconnectBackoff()
-        while not self._stop.wait(backoff.next()):
+        while not self._stop.wait(self._connection.backoff.next()):
             try:
                 bus = self._connect()
             except Exception as error:  # noqa: BLE001 - as above
                 failure = str(error) if isinstance(error, DeviceError) else f"{type(error).__name__}: {error}"
             else:
                 if (cause := bus_error(bus)) is None:
-                    self._reconnects += 1
+                    self._connection.come_up("is open again")
                     return bus
                 _shut(bus)
                 failure = f"CAN bus {self._options.title()}: {cause}"
-            self._link = Link(up=False, reason=failure)
+            self._connection.reason = failure
         return None
 
 

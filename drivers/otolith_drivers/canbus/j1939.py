@@ -133,7 +133,7 @@ class ParameterGroups:
 
     def warnings(self, now: float) -> list[str]:
         """Return a line for each group that several nodes send although none is declared, and for lost packets."""
-        lines = [] if self.assembler is None else self.assembler.warnings(now)
+        lines = [] if self.assembler is None else self.assembler.broken.warnings(now)
         return lines + [
             f"{group.title} (PGN {number}) comes from the addresses 0x{group.source:02X}, which is used, and "
             f"{', '.join(f'0x{other:02X}' for other in sorted(group.others))}: set source_address in [driver]"

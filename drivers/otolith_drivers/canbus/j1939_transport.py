@@ -8,13 +8,12 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from otolith_drivers.errors import counted
+from otolith_drivers.common.reconnection import PassingFault
 
 MANAGEMENT, DATA = 0xEC00, 0xEB00  # the parameter groups of the protocol
 RTS, CTS, END, BAM, ABORT = 16, 17, 19, 32, 255  # what a frame of connection management is, by its first byte
 PACKET_BYTES, MIN_BYTES, MAX_BYTES = 7, 9, 1785
 MAX_PAUSE = 1.25  # s between two frames of a transfer: the longest timeout of the standard (T2, T3)
-BROKEN_SHOWN = 10.0  # s after the last incomplete message
 
 
 NodePair = tuple[int, int]
@@ -47,13 +46,12 @@ class Assembler:
 
     def __init__(self, groups: Collection[int]) -> None:
         """Only messages of these parameter groups are put together."""
-        self.broken = 0
+        self.broken = PassingFault()
         """Messages that were announced and are incomplete."""
         self.latency = 0.0
         """s from the announcement of the latest message to its last frame."""
         self._groups = frozenset(groups)
         self._transfers: dict[NodePair, _Transfer] = {}
-        self._broken_at = 0.0
 
     def take(self, group: int, pair: NodePair, data: bytes | bytearray, time: float) -> WholeMessage | None:
         """Take a frame of the protocol, and return the message that it completes."""
@@ -75,13 +73,6 @@ class Assembler:
         del self._transfers[pair]
         self.latency = time - transfer.begun
         return WholeMessage(transfer.group, pair[0], bytes(transfer.data[: transfer.size]), transfer.begun)
-
-    def warnings(self, now: float) -> list[str]:
-        """One line as long as an incomplete message is recent at ``now`` (s)."""
-        if not self.broken or now - self._broken_at > BROKEN_SHOWN:
-            return []
-        messages = counted(self.broken, "message")
-        return [f"{messages} of several frames incomplete, the last {max(now - self._broken_at, 0.0):.1f} s ago"]
 
     def _manage(self, pair: NodePair, data: bytes | bytearray, time: float) -> None:
         back = pair[1], pair[0]  # of the transfer that a receiver controls
@@ -105,4 +96,4 @@ class Assembler:
 
     def _drop(self, pair: NodePair, time: float) -> None:
         if self._transfers.pop(pair, None) is not None:
-            self.broken, self._broken_at = self.broken + 1, time
+            self.broken.note("a message of several frames is incomplete", time)

@@ -1,16 +1,35 @@
 """Certificates, private keys and passwords of a driver, read from the files that its table names."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
+from pydantic import model_validator
 
-from otolith_drivers.config_files import content
+from otolith_drivers.config_files import StrictModel, content
 from otolith_drivers.errors import ConfigurationError
 
 SECRET_LIMIT = 1 << 16  # bytes of a certificate, key or password file; a long chain has 10 kB
+
+
+class CredentialOptions(StrictModel):
+    """The keys of ``[driver]`` that prove who this client is; paths are relative to the machine file."""
+
+    certificate: Path | None = None
+    key: Path | None = None
+    """Certificate and private key of this client."""
+    user: str | None = None
+    password_file: Path | None = None
+    """A file whose first line is the password."""
+
+    @model_validator(mode="after")
+    def _are_pairs(self) -> Self:
+        for one, other in (("certificate", "key"), ("user", "password_file")):
+            if (getattr(self, one) is None) != (getattr(self, other) is None):
+                raise ValueError(f"{one} and {other} belong together: set both")
+        return self
 
 
 def certificate(path: Path, key: str) -> x509.Certificate:

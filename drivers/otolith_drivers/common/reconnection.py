@@ -1,11 +1,14 @@
-"""A connection that is opened again after each fault: its state, the pauses between attempts, and causes in words."""
+"""A connection that is opened again after each fault: its state, pauses between attempts, causes, passing faults."""
 
 import logging
+import math
 import os
 import random
 import ssl
+from dataclasses import dataclass
 
 BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
+FAULT_SHOWN = 10.0  # s after which a passing fault is no longer a warning
 
 
 class ReconnectBackoff:
@@ -50,6 +53,26 @@ class Reconnection:
             self._logged = reason
             self._log.warning("%s: %s; retried until it answers", self._title, reason)
         self.up, self.reason = False, reason
+
+
+@dataclass(slots=True)
+class PassingFault:
+    """A fault that ends no connection, such as an unusable value: counted, and a warning while it is recent."""
+
+    text: str = ""
+    """The latest one."""
+    count: int = 0
+    time: float = -math.inf
+
+    def note(self, text: str, now: float) -> None:
+        """Count a fault at ``now`` (s)."""
+        self.text, self.time, self.count = text, now, self.count + 1
+
+    def warnings(self, now: float, title: str = "") -> list[str]:
+        """Return a line that begins with ``title``, or none if the latest fault is long ago at ``now`` (s)."""
+        age = max(now - self.time, 0.0)
+        line = f"{title}: {self.text}" if title else self.text
+        return [f"{line}; {self.count} in all, the last {age:.1f} s ago"] if age < FAULT_SHOWN else []
 
 
 def cause_of(error: BaseException) -> str:

@@ -6,7 +6,9 @@ from typing import Self
 
 from pydantic import model_validator
 
+from otolith_drivers.base import Signal
 from otolith_drivers.config_files import StrictModel
+from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.units import factor
 
 
@@ -40,6 +42,18 @@ class Conversion:
     def of(cls, source: ScaledSource, unit: str, target: str) -> Self:
         """Return the conversion of ``source``, which is in ``unit``; raise ValueError if the quantities differ."""
         return cls(source, factor(unit, target))
+
+    @classmethod
+    def for_signal(cls, signal: Signal) -> Self:
+        """Return the conversion from the unit that the source of a signal names.
+
+        Raises:
+            ConfigurationError: it measures another quantity than the signal.
+        """
+        try:
+            return cls.of(signal.source, signal.source.unit, signal.unit)
+        except ValueError as error:
+            raise ConfigurationError(str(error), ("signals", signal.name)) from error
 
     def value(self, number: object) -> float:
         """Return the value; NaN if ``number`` is none, not finite, or out of range."""

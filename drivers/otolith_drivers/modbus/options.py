@@ -191,10 +191,6 @@ def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
         raise ConfigurationError(
             f"{source.type} has {count} registers, more than driver.max_registers = {options.max_registers}", key
         )
-    try:
-        conversion = Conversion.of(source, source.unit, signal.unit)
-    except ValueError as error:
-        raise ConfigurationError(str(error), key) from error
     order = source.order or options.order
     decimals = None
     if source.decimals is not None:
@@ -211,7 +207,7 @@ def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
         order=order,
         source=source,
         number=_number_reader(source, order),
-        conversion=conversion,
+        conversion=Conversion.for_signal(signal),
         decimals=decimals,
     )
 

@@ -12,23 +12,24 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Sample, Signal
+from otolith_drivers.common.credentials import CredentialOptions
 from otolith_drivers.common.periods import PeriodEstimator
+from otolith_drivers.common.reconnection import PassingFault
 from otolith_drivers.common.remote_clock import ArrivalClock, unix_time
 from otolith_drivers.common.scaled import Conversion, ScaledSource
-from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.units import Quantity
 
 MAX_PAYLOAD = 1 << 16  # bytes of a message that is read
 SAME_CLOCK = 0.2  # s between the offsets of two topics, below which their senders have one clock
-SHOWN = 10.0  # s after the last unusable message of a topic that the link has a warning of it
+FIRST_WAIT = 10.0  # s without a message of a topic, after which the link has a warning of it
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 PATH = re.compile(r"[^.\[\]\s]+(?:\[\d+\])*(?:\.[^.\[\]\s]+(?:\[\d+\])*)*|(?:\[\d+\])+")
 
 FieldPath = Annotated[str, Field(pattern=f"^(?:{PATH.pattern})$", max_length=200)]
 
 
-class MqttOptions(StrictModel):
+class MqttOptions(CredentialOptions):
     """``[driver]`` with ``type = "mqtt"``."""
 
     host: Annotated[str, Field(min_length=1)]
@@ -38,12 +39,6 @@ class MqttOptions(StrictModel):
     tls: bool = False
     ca: Path | None = None
     """The certificate of the authority that signed the broker's; by default those of the computer."""
-    certificate: Path | None = None
-    key: Path | None = None
-    """Certificate and private key of this client, PEM."""
-    user: str | None = None
-    password_file: Path | None = None
-    """A file whose first line is the password."""
     client_id: str = ""
     """By default a random one."""
     keepalive: Annotated[float, BeforeValidator(Quantity("s", 1.0, 3600.0))] = 10.0
@@ -55,10 +50,6 @@ class MqttOptions(StrictModel):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
-        if (self.user is None) != (self.password_file is None):
-            raise ValueError("user and password_file belong together: set both")
-        if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key belong together: set both")
         if not self.tls and (self.ca or self.certificate):
             raise ValueError("ca, certificate and key belong to tls = true")
         return self
@@ -102,17 +93,13 @@ class TopicSignals:
     clock: ArrivalClock = field(default_factory=ArrivalClock)
     retained: bool = False
     """Whether a retained message has come."""
-    bad: int = 0
-    fault: str = ""
-    """Why the latest unusable message or value could not be used."""
-    fault_time: float = -math.inf
+    unusable: PassingFault = field(default_factory=PassingFault)
+    """Messages and values that could not be used."""
 
     def warnings(self, now: float, begun: float) -> list[str]:
         """Return what is wrong at ``now`` (s) since the subscription at ``begun`` (s), a line each."""
-        lines = []
-        if now - self.fault_time < SHOWN:
-            lines.append(f"{self.name}: {self.fault}; {self.bad} in all, the last {now - self.fault_time:.1f} s ago")
-        if self.periods.last is None and now - begun > SHOWN:
+        lines = self.unusable.warnings(now, self.name)
+        if self.periods.last is None and now - begun > FIRST_WAIT:
             kind = "only a retained message, which is old" if self.retained else "no message"
             lines.append(f"{self.name}: {kind} since {now - begun:.0f} s: does its publisher run?")
         elif (silence := self.periods.silence(now)) is not None:
@@ -135,17 +122,13 @@ class Messages:
                 raise ConfigurationError(
                     f"{source.topic}: a plain number has no field {options.time!r}: give 'field'", key
                 )
-            try:
-                conversion = Conversion.of(source, source.unit, signal.unit)
-            except ValueError as error:
-                raise ConfigurationError(str(error), key) from error
             topic = self.topics.setdefault(source.topic, TopicSignals(source.topic))
-            topic.signals.append((signal.name, source.field, conversion))
+            topic.signals.append((signal.name, source.field, Conversion.for_signal(signal)))
 
     @property
     def bad(self) -> int:
         """Number of messages and values that could not be used."""
-        return sum(topic.bad for topic in self.topics.values())
+        return sum(topic.unusable.count for topic in self.topics.values())
 
     def take(self, name: str, payload: bytes, now: float, *, retained: bool) -> list[Sample]:
         """Return the samples of a message that came at ``now`` (s); none of one that is old or cannot be read."""
@@ -160,10 +143,10 @@ class Messages:
             content = _content(payload, plain=all(path is None for _, path, _ in topic.signals))
             time = now if self._path is None else self._time(topic, content, now)
         except ValueError as error:
-            self._reject(topic, str(error), now)
+            topic.unusable.note(str(error), now)
             return []
         if topic.time - time > SAME_CLOCK:
-            self._reject(topic, f"its time is {topic.time - time:.3g} s before that of the message before it", now)
+            topic.unusable.note(f"its time is {topic.time - time:.3g} s before that of the message before it", now)
             return []
         topic.time = time = max(time, topic.time)  # a faster message than all before it moves the offset a little
         samples = [self._sample(topic, signal, content, time, now) for signal in topic.signals]
@@ -204,13 +187,8 @@ class Messages:
         except ValueError as error:
             value, fault = math.nan, str(error)
         if fault:
-            self._reject(topic, fault, now)
+            topic.unusable.note(fault, now)
         return Sample(name, time, value)
-
-    @staticmethod
-    def _reject(topic: TopicSignals, why: str, now: float) -> None:
-        topic.bad += 1
-        topic.fault, topic.fault_time = why, now
 
 
 def _content(payload: bytes, *, plain: bool) -> Any:

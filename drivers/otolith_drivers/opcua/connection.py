@@ -18,11 +18,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.common.credentials import certificate, certificate_and_key, password
+from otolith_drivers.common.credentials import CredentialOptions, certificate, certificate_and_key, password
 from otolith_drivers.common.reconnection import cause_of
 from otolith_drivers.common.remote_clock import ExchangeClock, unix_time
 from otolith_drivers.common.scaled import ScaledSource
-from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import nearest
 from otolith_drivers.units import Quantity
 
@@ -40,22 +39,15 @@ REFUSALS = {
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs a traceback for each lost connection
 
 
-class OpcuaOptions(StrictModel):
+class OpcuaOptions(CredentialOptions):
     """``[driver]`` with ``type = "opcua"``."""
 
     endpoint: str
     """``opc.tcp://host:port`` with the path that the server asks for."""
     security: Literal["none", "Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss"] = "none"
     mode: Literal["sign", "sign and encrypt"] = "sign and encrypt"
-    certificate: Path | None = None
-    """Of this client, PEM or DER; the server must trust it."""
-    key: Path | None = None
-    """The private key of ``certificate``, PEM or DER, without a password."""
     server_certificate: Path | None = None
     """The only certificate that is accepted from the server; without it, any."""
-    user: str | None = None
-    password_file: Path | None = None
-    """A file whose first line is the password."""
     timeout: Annotated[float, BeforeValidator(Quantity("s", 0.1, 60.0))] = 4.0
     """Longest time (s) from a request to its answer."""
     interval: Annotated[float, BeforeValidator(Quantity("s", 0.005, 10.0))] = 0.05
@@ -72,10 +64,6 @@ class OpcuaOptions(StrictModel):
             raise ValueError(
                 'certificate and key belong to security = "Basic256Sha256" or another policy: set all three'
             )
-        if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key belong together: set both")
-        if (self.user is None) != (self.password_file is None):
-            raise ValueError("user and password_file belong together: set both")
         return self
 
     def describe(self) -> list[str]:

@@ -18,7 +18,7 @@ from otolith_drivers.common.reconnection import Reconnection
 from otolith_drivers.common.remote_clock import unix_time
 from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.common.threaded_driver import ThreadedDriver
-from otolith_drivers.errors import ConfigurationError, counted
+from otolith_drivers.errors import counted
 from otolith_drivers.opcua.connection import (
     OpcUaCredentials,
     OpcuaOptions,
@@ -56,10 +56,7 @@ def build(options: OpcuaOptions, setup: Setup) -> "OpcuaSubscriber":
     readings = Readings(setup.signals, setup.sample_period, use_server_stamps=options.stamps == "server")
     for node in readings.signals:
         if node.source.unit is not None:
-            try:
-                node.conversion = Conversion.of(node.source, node.source.unit, node.signal.unit)
-            except ValueError as error:
-                raise ConfigurationError(str(error), ("signals", node.signal.name)) from error
+            node.conversion = Conversion.for_signal(node.signal)
     return OpcuaSubscriber(options, credentials, readings, setup.sample_period)
 
 

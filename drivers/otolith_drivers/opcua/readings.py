@@ -13,13 +13,13 @@ from asyncua import ua
 
 from otolith_drivers.base import Sample, Signal
 from otolith_drivers.common.periods import PeriodEstimator
+from otolith_drivers.common.reconnection import PassingFault
 from otolith_drivers.common.remote_clock import ExchangeClock, unix_time
 from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.opcua.connection import OpcuaSource
 
 HOLD_INTERVALS = 5.0  # messages without a change, after which a value is repeated at each message
 MAX_AGE = 5.0  # s between the stamp of a value and its message; more is another clock, or a time zone
-SHOWN = 10.0  # s after the last unusable value of a signal that the link has a warning of it
 OVERFLOW = 0x480  # info bits of a status: of a data value, values before it were dropped (Part 4, 7.39.1)
 
 
@@ -42,10 +42,8 @@ class NodeSignal:
     """When the latest value arrived, s."""
     is_held: bool = False
     """Whether the latest sample was a repeated one."""
-    unusable: str = ""
-    """Why the latest unusable value cannot be used."""
-    unusable_count: int = 0
-    unusable_time: float = -math.inf
+    unusable: PassingFault = field(default_factory=PassingFault)
+    """Values that could not be used."""
     periods: PeriodEstimator = field(default_factory=PeriodEstimator)
 
     @property
@@ -56,14 +54,8 @@ class NodeSignal:
 
     def warnings(self, now: float) -> list[str]:
         """Return what is wrong at ``now`` (s), a line each."""
-        if self.fault:
-            return [f"{self.signal.name}: {self.fault}"]
-        if now - self.unusable_time < SHOWN:
-            count = self.unusable_count
-            return [
-                f"{self.signal.name}: {self.unusable}; {count} in all, the last {now - self.unusable_time:.1f} s ago"
-            ]
-        return []
+        name = self.signal.name
+        return [f"{name}: {self.fault}"] if self.fault else self.unusable.warnings(now, name)
 
 
 class Readings:
@@ -153,8 +145,7 @@ class Readings:
 
     def _reject(self, node: NodeSignal, why: str, now: float) -> None:
         self.bad += 1
-        node.unusable, node.unusable_time = why, now
-        node.unusable_count += 1
+        node.unusable.note(why, now)
 
     @staticmethod
     def _sample(node: NodeSignal, time: float, value: float) -> Sample:

@@ -67,7 +67,11 @@ def opened(bus_options: dict[str, Any]) -> Iterator[tuple[CanReceiver, can.BusAB
 
 
 @pytest.mark.parametrize("kind", ["classic", "fd"])
-def test_frames_of_another_process_arrive_complete(bus_options: dict[str, Any], kind: str) -> None:
+def test_frames_of_another_process_arrive_complete(
+    bus_options: dict[str, Any], kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for limit in ("MIN_SILENCE", "UNKNOWN_PERIOD_SILENCE"):  # a busy computer starts and ends the process slowly
+        monkeypatch.setattr(f"otolith_drivers.canbus.driver.{limit}", PATIENCE)
     wishes = RAW if kind == "classic" else {"V_a": ("V", {**RAW["V_a"][1], "fd": True})}
     options = {**bus_options, "fd": kind == "fd", "messages": COUNTED}
     driver, got = receiver(wishes, **options), list[Sample]()

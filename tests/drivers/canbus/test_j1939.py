@@ -175,7 +175,7 @@ def test_an_incomplete_message_is_counted_and_named(folder: Path) -> None:
     del frames[2]
     assert not any(sent(decode, identifier, data, 1.0) for identifier, data in frames)
     assert decode.counters.bad == 1
-    assert "1 message of several frames incomplete, the last 0.5 s ago" in decode.warnings(1.5)
+    assert "a message of several frames is incomplete; 1 in all, the last 0.5 s ago" in decode.warnings(1.5)
     assert not any("incomplete" in line for line in decode.warnings(12.0))
 
 

@@ -160,7 +160,7 @@ def test_a_time_may_be_iso_8601_and_a_step_back_is_bad() -> None:
     assert read.take("motor", document(1.0, "2026-03-02T13:05:12.260Z"), 9.01, retained=False)
     assert not read.take("motor", document(1.0, "2026-03-02T13:05:02Z"), 9.02, retained=False)
     assert not read.take("motor", document(1.0, "yesterday"), 9.03, retained=False)
-    assert "no ISO 8601" in read.topics["motor"].fault
+    assert "no ISO 8601" in read.topics["motor"].unusable.text
     assert read.bad == 2
 
 
@@ -179,7 +179,7 @@ def test_what_a_message_lacks_is_named() -> None:
     read = messages()
     (sample,) = read.take("motor", b'{"values": {"torque": 1}}', 1.0, retained=False)
     assert math.isnan(sample.value)
-    assert read.topics["motor"].fault == "a message without values.speed: it has torque"
+    assert read.topics["motor"].unusable.text == "a message without values.speed: it has torque"
 
 
 @given(st.binary(max_size=200) | st.text(max_size=100).map(str.encode) | st.just(b"[" * 50_000) | st.just(b"1" * 5000))

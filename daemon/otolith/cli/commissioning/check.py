@@ -155,7 +155,7 @@ def _listen(machine: LoadedMachine) -> tuple[Counter[str], list[str]]:
         of_source = next((state.signals for state in link.sources if state.name == table.get("name")), signals)
         if kind in PROBED and not set(of_source) <= set(latest):
             lines.append(f"'otolith probe {kind}' shows what is on the bus")
-    return counts, lines
+    return counts, list(dict.fromkeys(lines))
 
 
 def _causes(link: Link) -> list[str]:

@@ -1,9 +1,9 @@
 """``otolith noise``: noise levels and delays from recorded data of a healthy machine, as lines of its machine file."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from otolith.commissioning.delays import IdentifiedDelays
     from otolith.commissioning.identification import IdentifiedNoise, NoiseLevel
     from otolith.machine import LoadedMachine
-
-Item = TypeVar("Item")
 
 
 @click.command()
@@ -70,37 +68,24 @@ def _good_windows(machine: "LoadedMachine", data: Path, count: int) -> list["Win
     Raises:
         ConfigurationError: there is none; the message has the reason of the last bad one.
     """
+    from otolith.runtime.preview import EvenSpread
     from otolith.runtime.replay import Replay, open_recorded
     from otolith_drivers.errors import ConfigurationError
 
     reasons: tuple[str, ...] = ()
-
-    def good(windows: Iterable["Window"]) -> Iterator["Window"]:
-        nonlocal reasons
-        for window in windows:
+    spread = EvenSpread["Window"](count)
+    with open_recorded(machine, data) as recorded:
+        run = Replay(machine, recorded)
+        for window in run.windows():
             if window.quality.reasons:
                 reasons = window.quality.reasons
             else:
-                yield window
-
-    with open_recorded(machine, data) as recorded:
-        run = Replay(machine, recorded)
-        chosen = evenly_spread(good(run.windows()), count)
+                spread.add(window)
         echo_warnings(data, run.warnings())
-    if not chosen:
+    if not (chosen := spread.chosen()):
         length = f"no window of {machine.file.window.length:g} s can be used"
         raise ConfigurationError(f"{data}: {length}: {'; '.join(reasons) or 'the data is too short'}")
     return chosen
-
-
-def evenly_spread(items: Iterable[Item], count: int) -> list[Item]:
-    """At most ``count`` items, evenly spread; holds at most twice as many at a time, however many there are."""
-    from otolith.runtime.preview import EvenSpread
-
-    spread = EvenSpread[Item](count)
-    for item in items:
-        spread.add(item)
-    return spread.chosen()
 
 
 def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iterator[str]:
