@@ -1,6 +1,7 @@
 """``otolith keys``, the checks of the files that a session uses, and how readers find sockets."""
 
 import re
+import socket
 from datetime import timedelta
 from pathlib import Path
 
@@ -13,7 +14,15 @@ from otolith.cli.main import cli
 from otolith.machine_file import AccessTable, TlsTable, ZenohTable
 from otolith.publishing.certificates import CERTIFICATE_DAYS, make_authority, make_certificate, utc_now
 from otolith.publishing.subscriber import Subscriber
-from otolith.publishing.zenoh_config import Access, Connection, Credentials, listening, local_sockets, reader_settings
+from otolith.publishing.zenoh_config import (
+    SOCKET,
+    Access,
+    Connection,
+    Credentials,
+    listening,
+    local_sockets,
+    reader_settings,
+)
 from otolith.publishing.zenoh_session import Publisher
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from tests.health.test_events import report
@@ -178,6 +187,15 @@ def test_a_reader_learns_which_option_is_wrong(
     monkeypatch.chdir(site)
     with pytest.raises(ConfigurationError, match=cause):
         reader_settings(credentials, [ENDPOINT])
+
+
+def test_a_reader_names_a_socket_that_does_not_answer() -> None:
+    (endpoint,) = listening(["local"], "here.stopped")
+    with socket.socket(socket.AF_UNIX) as hung, Subscriber(Connection(), lambda _: None) as subscriber:
+        hung.bind(endpoint.removeprefix(SOCKET))
+        assert subscriber.state().startswith("no daemon reached yet")
+        assert endpoint in subscriber.state()
+    Path(endpoint.removeprefix(SOCKET)).unlink()
 
 
 def test_a_reader_finds_sockets_as_they_appear() -> None:

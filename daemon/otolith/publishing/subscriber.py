@@ -140,11 +140,11 @@ class Subscriber:
 
     def state(self) -> str:
         """Return what it waits for, in words."""
-        addresses = ", ".join(self._endpoints or self._sessions)
+        addresses = ", ".join(self._endpoints or self._sessions or local_sockets())
         if self.connected:
             reports = REPORT.under("*", self._machine)
             return f"connected, waiting for {reports}, which the daemon may send to other readers only ({addresses})"
-        if self._endpoints:
+        if addresses:
             return f"no daemon reached yet, or it refuses this reader; --connect sets where to look ({addresses})"
         own = "no daemon of this user has a socket here, and no service that it may read"
         return f"{own}: members of the group otolith may; --connect sets where to look"

@@ -31,9 +31,7 @@ WARM_UP_RECORDS = 80  # of the random window that makes a new worker compile eve
 MAX_WAITING_WINDOWS = 2  # for a busy worker; older ones are missed
 WINDOW_TIMEOUT = 20.0  # s for a window, in addition to twice its length
 COMPILE_TIMEOUT = 600.0  # s in addition, from one kernel to the next: while the worker starts or compiles a kernel
-NOT_READY = (
-    "the worker is starting; it compiles the kernels of a twin that is new on this computer, which takes minutes"
-)
+NOT_READY = "the worker is starting; if the twin is new on this computer, it compiles kernels, which takes minutes"
 
 
 @dataclass(frozen=True, slots=True)
