@@ -142,6 +142,12 @@ def test_a_window_that_is_too_short_for_its_noise_gets_a_longer_one(tmp_path: Pa
     assert previewed(tmp_path / "data.csv", pasted).windows.length_s == preview.proposed.length_s
 
 
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_no_window_is_proposed_that_the_data_cannot_fill(tmp_path: Path, rows: Lines, count: int) -> None:
+    preview = previewed(written(tmp_path, rows[:count]))
+    assert preview.proposed == preview.windows
+
+
 def test_the_accuracy_of_a_proposed_window_is_that_of_the_pasted_lines(tmp_path: Path, rows: Lines) -> None:
     """At irregular times process noise has the step of the sample period, whatever the mean step of the records is."""
     random = np.random.default_rng(1)

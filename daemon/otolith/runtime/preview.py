@@ -221,7 +221,8 @@ def _proposal(machine: LoadedMachine, survey: _Survey, again: Callable[[LoadedMa
     if (length, period) == (window.length, window.sample_period):
         return survey
     other = again(_with_window(machine, length, period))
-    return other if other.windows.usable_share >= survey.windows.usable_share else survey
+    is_better = other.windows.usable and other.windows.usable_share >= survey.windows.usable_share
+    return other if is_better else survey
 
 
 def _survey(
