@@ -102,3 +102,14 @@ def test_rounding_beside_noise_is_white() -> None:
     values = np.repeat([0.0, 1.0, 2.0, 3.0], 10)
     assert rounding_variance(values, 0.5, 0.0) == pytest.approx(1.0 / 12.0)
     assert rounding_variance(values, 0.49, 0.0) == pytest.approx(10.0 / 12.0)
+
+
+@pytest.mark.parametrize("size", [3.4e38, 1e5])
+def test_faulty_values_show_no_step(scenario: MotorScenario, windows: Cut, size: float) -> None:
+    """Such a step would stay, hide a frozen sensor, and in a saved state be refused as implausible."""
+    (window, _), *_ = windows(scenario.model_copy(update={"faults": ()}), 1)
+    values = window.values.copy()
+    values[:, CURRENT] = size * (np.arange(len(values)) % 7 == 0)
+    state, report = adapt(initial_state("motor", "bench", problem_of(FREE[0])), replace(window, values=values))
+    assert report.document.decision is not WindowDecision.LEARNED
+    assert state.posterior.problem.steps == ()

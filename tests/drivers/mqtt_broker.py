@@ -41,7 +41,8 @@ def mqtt_broker(
 ) -> "Iterator[subprocess.Popen[bytes]]":
     """The process of a broker on 127.0.0.1; ``tls`` is its certificate and key."""
     if (mosquitto := shutil.which("mosquitto")) is not None:
-        lines = [f"user {getpass.getuser()}", f"listener {port} 127.0.0.1", "allow_anonymous true"]
+        # As root it would become another user, who cannot read the certificate.
+        lines = [f"listener {port} 127.0.0.1", "allow_anonymous true", f"user {getpass.getuser()}"]
         lines += [f"certfile {tls[0]}", f"keyfile {tls[1]}"] if tls else []
         (folder / "mosquitto.conf").write_text("\n".join(lines), encoding="utf-8")
         command = [mosquitto, "-c", str(folder / "mosquitto.conf")]

@@ -181,6 +181,15 @@ def test_a_part_without_a_value_has_no_data() -> None:
     assert documents[-1].health.parts["winding"].reason == "not determined yet: R_a"
 
 
+def test_windows_with_unusable_values_state_why() -> None:
+    parameter = report(0, 6.5).parameters["R_a"].model_copy(update={"reason": "a value is not finite"})
+    bad = [
+        report(index, 6.5, decision=WindowDecision.BAD).model_copy(update={"parameters": {"R_a": parameter}})
+        for index in range(4)
+    ]
+    assert events(assessed(bad)[-1])["bus"].text == "a value is not finite"
+
+
 def test_bad_windows_are_no_data_and_hide_no_fault() -> None:
     raised = [report(index, 5.8) for index in range(5)]
     bad = [report(index, 5.8, decision=WindowDecision.BAD, status=Status.HELD) for index in range(5, 12)]

@@ -49,11 +49,14 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     if posterior is not state.posterior:
         state = with_posterior(state, posterior)
     posterior = state.posterior.with_steps(window)
-    if posterior is not state.posterior:
-        test = None if state.test is None else state.test.with_steps(posterior.problem.steps)
-        state = replace(state, posterior=posterior, test=test)
     predicted = posterior.predict(window)
     checked = check_window(window, predicted)
+    if posterior is not state.posterior:
+        if checked.is_usable:
+            test = None if state.test is None else state.test.with_steps(posterior.problem.steps)
+            state = replace(state, posterior=posterior, test=test)
+        else:  # steps between faulty values are none of a converter
+            predicted = state.posterior.predict(window)
     act = _estimate if checked.is_usable else _reject
     result = replace(act(state, predicted, checked), notes=checked.notes)
     if result.adopted:

@@ -81,7 +81,8 @@ class Past:
 def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], past: Past) -> list[Observation]:
     """Return the observations of a window after the levels ``before``."""
     data = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.OK
-    reasons = "; ".join(report.window.quality.reasons)
+    held = (parameter.reason for parameter in report.parameters.values() if parameter.reason)
+    reasons = "; ".join(report.window.quality.reasons) or next(held, "")  # where values, not times, are unusable
     no_data = Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons, "no usable data")
     observations = [*_of_sources(report, before), no_data]  # of one state, the first is more specific
     if report.decision is WindowDecision.REFUSED:

@@ -67,14 +67,25 @@ class ArrivalClock:
 
     def __init__(self) -> None:
         self._begun, self._least, self._previous = -math.inf, math.inf, math.inf
+        self._ahead = math.nan
 
-    def arrival(self, stamp: float, received: float) -> None:
-        """Take a message of the remote time ``stamp`` (s) that came at the local time ``received`` (s)."""
+    def arrival(self, stamp: float, received: float, most: float) -> bool:
+        """Take a message of the remote time ``stamp`` (s) that came at the local time ``received`` (s).
+
+        Return False, and do not use it, if it is more than ``most`` s ahead of all others and the message before it was
+        not ahead by as much: one wrong time would make all that follow old.
+        """
         if received - self._begun >= BLOCK:
             fresh = received - self._begun < 2.0 * BLOCK
             self._begun, self._previous = received, self._least if fresh else math.inf
             self._least = math.inf
-        self._least = min(self._least, received - stamp)
+        offset = received - stamp
+        known, before = self.offset, self._ahead
+        self._ahead = offset
+        if math.isfinite(known) and known - offset > most and not abs(offset - before) <= most:
+            return False
+        self._least = min(self._least, offset)
+        return True
 
     @property
     def offset(self) -> float:

@@ -171,7 +171,8 @@ class Messages:
             raise ValueError(f"{self._path} is {shown(written)}, no {kind}") from error
         if not math.isfinite(stamp):
             raise ValueError(f"{self._path} is not finite")
-        topic.clock.arrival(stamp, now)
+        if not topic.clock.arrival(stamp, now, SAME_CLOCK):
+            raise ValueError(f"{self._path} is {shown(written)}, ahead of the messages before it")
         own = topic.clock.offset
         others = (other.clock.offset for other in self.topics.values())
         return stamp + min(offset for offset in others if abs(offset - own) < SAME_CLOCK)

@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -162,6 +163,26 @@ def test_a_time_may_be_iso_8601_and_a_step_back_is_bad() -> None:
     assert not read.take("motor", document(1.0, "yesterday"), 9.03, retained=False)
     assert "no ISO 8601" in read.topics["motor"].unusable.text
     assert read.bad == 2
+
+
+@pytest.mark.parametrize("wrong", [1e15, 1.7e9 + 3600.0])
+def test_one_time_from_the_future_costs_one_message(wrong: float) -> None:
+    read = messages(time="t", time_format="s")
+    for index in range(100):
+        stamp, now = 1.7e9 + 0.01 * index, 5.0 + 0.01 * index
+        samples = read.take("motor", document(60.0, wrong if index % 40 == 20 else stamp), now, retained=False)
+        assert [sample.time for sample in samples] == pytest.approx([] if index % 40 == 20 else [now], abs=1e-4)
+    assert read.bad == 2
+    assert "ahead of the messages before it" in read.topics["motor"].fault
+
+
+def test_a_clock_that_is_set_ahead_costs_one_message() -> None:
+    read = messages(time="t", time_format="s")
+    taken = [
+        bool(read.take("motor", document(60.0, now + (3600.0 if now > 7.0 else 0.0)), now, retained=False))
+        for now in np.arange(5.0, 9.0, 0.01).tolist()
+    ]
+    assert taken.count(False) == read.bad == 1
 
 
 def test_senders_with_two_clocks_do_not_move_each_other() -> None:

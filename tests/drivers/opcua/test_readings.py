@@ -124,10 +124,10 @@ def test_the_clock_of_a_sender_follows_its_drift_and_its_steps() -> None:
     clock = ArrivalClock()
     for index in range(6000):
         now, late = 0.01 * index, 0.002 + 0.01 * (index % 7)
-        clock.arrival(now + 5.0 + 1e-4 * now, now + late)
+        clock.arrival(now + 5.0 + 1e-4 * now, now + late, 0.2)
         if index > 10:
             assert abs(clock.offset + 5.0 + 1e-4 * now) < 0.005
     for index in range(2500):
         now = 60.0 + 0.01 * index
-        clock.arrival(now - 3600.0, now + 0.002)
+        clock.arrival(now - 3600.0, now + 0.002, 0.2)
     assert clock.offset == pytest.approx(3600.002, abs=0.001)
