@@ -16,16 +16,9 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from otolith import __version__
+from otolith.health import text
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
-from otolith.health.text import (
-    duration_text,
-    forecast_text,
-    interval_text,
-    probability_text,
-    value_cells,
-    value_text,
-)
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample
 
 # Engineering choices, see docs/reference/thresholds-runtime.md.
@@ -42,6 +35,8 @@ MAX_TICKS = 5
 STEPS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800,
          604_800, 1_209_600, 2_592_000, 7_776_000, 31_536_000)  # s between two marks of time  # fmt: skip
 TRUSTED = frozenset({Status.ESTIMATED, "adopted"})  # the others are drawn pale
+
+FILTERS = ("duration_text", "forecast_text", "interval_text", "probability_text", "value_cells", "value_text")
 
 Span = tuple[float, float]
 """Begin and end of a time."""
@@ -150,8 +145,7 @@ def html_report(
     curves = sorted(_curves(axis, gaps, rows, latest, description), key=lambda curve: curve.key not in urgent)
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    filters = (duration_text, forecast_text, interval_text, probability_text, value_cells, value_text, _when)
-    environment.filters |= {function.__name__.strip("_"): function for function in filters}
+    environment.filters |= {name: getattr(text, name) for name in FILTERS} | {"when": _when}
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     return template.render(
         machine=reader.machine, site=reader.site, latest=latest, is_silent=is_silent, silence=silence, now=now,
