@@ -32,7 +32,8 @@ NEAR_LIMITS = 3.0  # times the range of the values, or the distance to the neare
 MARGIN = 0.12  # of the range of values, above and below it
 LABEL_HEIGHT = 10.0  # percent of a plot
 MAX_TICKS = 5
-STEPS = (1, 5, 15, 60, 300, 900, 3600, 10_800, 21_600, 43_200, 86_400, 172_800, 604_800, 2_592_000, 31_536_000)  # s
+STEPS = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800, 345_600,
+         604_800, 1_209_600, 2_592_000, 5_184_000, 10_368_000, 31_536_000, 63_072_000, 157_680_000)  # s  # fmt: skip
 TRUSTED = frozenset({Status.ESTIMATED, "adopted"})  # the others are drawn pale
 
 Span = tuple[float, float]
