@@ -3,6 +3,7 @@
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+PATIENCE = 120.0  # s
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-dev-shm-usage",
          "--remote-debugging-pipe")  # fmt: skip
 
@@ -79,6 +81,8 @@ class Browser:
 
     def _receive(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
+            if not select.select([self._replies], [], [], PATIENCE)[0]:
+                raise TimeoutError(f"no answer of the browser for {PATIENCE:g} s")
             if not (data := os.read(self._replies, 1 << 20)):
                 raise RuntimeError("the browser has ended")
             self._rest += data

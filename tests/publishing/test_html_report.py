@@ -1,5 +1,6 @@
 """The page of ``otolith report``: well formed, without references, harmless, and readable in a browser."""
 
+import json
 import re
 import sqlite3
 from collections.abc import Iterator
@@ -12,13 +13,14 @@ from benchmarks.browser import Browser, browser, program
 from benchmarks import pictures
 from otolith.health.limits import Level
 from otolith.health.schema import CountersDocument, EventChange, HealthDocument, PartDocument, ReportDocument, Status
-from otolith.publishing.html_report import MAX_ROWS, html_report
-from otolith.storage.history import HOUR, WINDOW, HistoryReader, history_path
+from otolith.publishing.html_report import MAX_ROWS, Axis, html_report
+from otolith.storage.history import DAY, HOUR, WINDOW, HistoryReader, history_path
 from otolith.storage.history_retention import Bounds
 from otolith.storage.history_writer import HistoryWriter
 from tests.storage.histories import MACHINE, SITE, START, document
 
 NOW = START + 400.0
+YEAR = 365.0 * DAY
 VOID = {"meta", "link", "br", "line", "rect", "polygon", "polyline"}
 """Elements without an end, and those that the template closes by '/>'."""
 
@@ -64,9 +66,12 @@ def state_of(level: Level, since: float, reason: str = "") -> HealthDocument:
     return HealthDocument(state=level, since=since, reason=reason, parts={"winding": part})
 
 
-def written(reports: list[ReportDocument], *, machine: str = MACHINE, site: str = SITE) -> HistoryReader:
+def written(
+    reports: list[ReportDocument], *, machine: str = MACHINE, site: str = SITE, description: str = ""
+) -> HistoryReader:
     writer = HistoryWriter(history_path(site, machine), Bounds(20_000_000, 3650, 24))
     numbers, _ = writer.open(START)
+    writer.description = description
     for report in reports:
         writer.add(numbers.number(report.model_copy(update={"machine": machine, "site": site})))
         writer._write_waiting()
@@ -169,7 +174,13 @@ def test_lost_data_of_the_time_are_counted_over_restarts(monkeypatch: pytest.Mon
 
 
 HARMFUL = "<script>window.hit=1<"
+LONG = "a_parameter_with_a_name_that_is_longer_than_a_phone_is_wide"
 TEXT = "\"'><img src=x onerror='window.hit=1'>&lt;"
+
+
+DESCRIPTION = json.dumps({
+    "title": TEXT, "equations": [[TEXT, LONG * 3]], "values": {LONG: [1.0, TEXT, TEXT]}, "limits": {}, "sites": {},
+})  # fmt: skip
 
 
 def harmful() -> HistoryReader:
@@ -181,15 +192,24 @@ def harmful() -> HistoryReader:
         update={"unit": TEXT, "reason": TEXT, "status": Status.HELD, "advice": TEXT}
     )
     harm = finding.model_copy(update={"text": TEXT, "condition": TEXT})
-    update = {"events": (event.model_copy(update=texts),), "parameters": {TEXT: parameter}, "twin": TEXT,
-              "findings": (harm,), "notes": (TEXT,)}  # fmt: skip
-    return written([report.model_copy(update=update)], machine=HARMFUL, site=HARMFUL)
+    update = {"events": (event.model_copy(update=texts),), "parameters": {TEXT: parameter, LONG: parameter},
+              "findings": (harm,), "notes": (TEXT,), "twin": TEXT}  # fmt: skip
+    return written([report.model_copy(update=update)], machine=HARMFUL, site=HARMFUL, description=DESCRIPTION)
 
 
 def test_texts_of_the_machine_are_harmless() -> None:
     shown = page(harmful(), now=START + 6.0)
     assert HARMFUL in shown.text
     assert shown.text.count("onerror") > 10
+
+
+@pytest.mark.parametrize("span", [0.5, 7.0, 100.0, 3600.0, 5e4, 7.0 * DAY, 40.0 * DAY, 3.0 * YEAR, 9.0 * YEAR])
+def test_marks_of_time_are_few_and_at_round_times(span: float) -> None:
+    marks = Axis(START, START + span, START + 1.2 * span).ticks()
+    assert len(marks) <= 5
+    assert span < 2.0 or len(marks) >= 2
+    assert all(0.0 <= place <= 100.0 for place, _ in marks)
+    assert len({text for _, text in marks}) == len(marks)
 
 
 def test_a_history_of_an_earlier_version_has_no_lanes_but_is_shown() -> None:

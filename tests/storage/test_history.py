@@ -15,7 +15,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.cli.common import shipped_directory
 from otolith.health.limits import Level
 from otolith.health.schema import HealthDocument, PartDocument, ReportDocument
 from otolith.machine import load_machine
@@ -33,6 +32,7 @@ from otolith.storage.history import (
 from otolith.storage.history_retention import AGES, Bounds
 from otolith.storage.history_writer import KEPT, MAX_WAITING, HistoryWriter, Numbers
 from otolith_drivers.errors import ConfigurationError
+from tests.conftest import EXAMPLES
 from tests.storage.histories import MACHINE, SITE, START, document, documents
 from tests.waiting import PATIENCE, wait_for
 
@@ -132,7 +132,7 @@ def test_the_machine_is_described_as_it_was_last(opened: Callable[..., Simulated
         history.writer.description = text
         history.write(*documents(2))
     assert history.writer.reader.description() == {"title": "after"}
-    twin = load_machine(shipped_directory("config") / "dc-motor.toml", with_driver=False)
+    twin = load_machine(EXAMPLES / "dc-motor.toml", with_driver=False)
     history.writer.description = describe_machine(twin.twin, twin.plan)
     history.write(*documents(2))
     content = history.writer.reader.description()
@@ -465,6 +465,7 @@ import sys
 from pathlib import Path
 from otolith.storage.history_retention import Bounds
 from otolith.storage.history_writer import HistoryWriter
+from tests.conftest import EXAMPLES
 from tests.storage.histories import START, documents
 writer = HistoryWriter(Path(sys.argv[1]), Bounds(20_000_000, 3650, 8760))
 numbers, note = writer.open(START)

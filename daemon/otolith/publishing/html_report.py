@@ -16,16 +16,9 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from otolith import __version__
+from otolith.health import text
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
-from otolith.health.text import (
-    duration_text,
-    forecast_text,
-    interval_text,
-    probability_text,
-    value_cells,
-    value_text,
-)
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample
 
 # Engineering choices, see docs/reference/thresholds-runtime.md.
@@ -39,8 +32,8 @@ NEAR_LIMITS = 3.0  # times the range of the values, or the distance to the neare
 MARGIN = 0.12  # of the range of values, above and below it
 LABEL_HEIGHT = 10.0  # percent of a plot
 MAX_TICKS = 5
-STEPS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800,
-         604_800, 1_209_600, 2_592_000, 7_776_000, 31_536_000)  # s between two marks of time  # fmt: skip
+STEPS = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800, 345_600,
+         604_800, 1_209_600, 2_592_000, 5_184_000, 10_368_000, 31_536_000, 63_072_000, 157_680_000)  # s  # fmt: skip
 TRUSTED = frozenset({Status.ESTIMATED, "adopted"})  # the others are drawn pale
 
 Span = tuple[float, float]
@@ -90,20 +83,6 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class Plot:
-    """What is drawn of a curve: points as SVG takes them."""
-
-    band: tuple[str, ...]
-    """Polygons of the 95 % interval."""
-    lines: tuple[tuple[bool, str], ...]
-    """Whether the value was estimated at that time, and points."""
-    marks: tuple[Mark, ...]
-    expected: str
-    """Polygon of the 80 % intervals of the times at which limits are passed."""
-    median: str
-
-
-@dataclass(frozen=True, slots=True)
 class Curve:
     """A parameter, or the amplitude of a component, over time."""
 
@@ -116,13 +95,9 @@ class Curve:
     last: HistorySample | None
     away: Mapping[str, float]
     """Percent of the windows with another status than estimated."""
-    plot: Plot | None = None
-
-    @property
-    def key(self) -> str:
-        """The condition that its limits lead to, as in the id of an event."""
-        row = self.component
-        return f"component/{row.site}/{row.family}" if row is not None else f"limit/{self.name}"
+    plot: Mapping[str, Sequence[Any]] | None = None
+    """``band``: polygons of the 95 % interval; ``lines``: whether the value was estimated then, and points; ``marks``;
+    ``forecast``: the polygon of its 80 % intervals and the points of its medians; all as SVG takes them."""
 
 
 def html_report(
@@ -147,11 +122,11 @@ def html_report(
     gaps = _gaps(sorted({row.time for row in rows}), length) + ([(latest.window.end, until)] if latest else [])
     events = _events(reader, latest, since)
     urgent = {event.id.rpartition("@")[0] for event, _, _ in events if event.end is None}
-    curves = sorted(_curves(axis, gaps, rows, latest, description), key=lambda curve: curve.key not in urgent)
+    curves = list(_curves(axis, gaps, rows, latest, description))
+    curves.sort(key=lambda row: not urgent & {f"limit/{row.name}", f"component/{row.name.rpartition('/')[0]}"})
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    filters = (duration_text, forecast_text, interval_text, probability_text, value_cells, value_text, _when)
-    environment.filters |= {function.__name__.strip("_"): function for function in filters}
+    environment.filters |= vars(text) | {"when": lambda at: time.strftime("%F %T", time.localtime(at))}
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     return template.render(
         machine=reader.machine, site=reader.site, latest=latest, is_silent=is_silent, silence=silence, now=now,
@@ -161,10 +136,6 @@ def html_report(
         findings=reader.findings(since), undetermined=_undetermined(reports), equations=_equations(latest, description),
         losses=_losses(reader.counters(since), since),
     )  # fmt: skip
-
-
-def _when(seconds: float) -> str:
-    return time.strftime("%F %T", time.localtime(seconds))
 
 
 def _axis(begin: float, now: float, latest: ReportDocument | None) -> Axis:
@@ -245,7 +216,7 @@ def _thinned(axis: Axis, samples: Iterable[HistorySample]) -> Iterator[HistorySa
         yield replace(rows[-1], mean=mean, low=low, high=high)
 
 
-def _plot(axis: Axis, gaps: Sequence[Span], points: Sequence[HistorySample], curve: Curve) -> Plot:
+def _plot(axis: Axis, gaps: Sequence[Span], points: Sequence[HistorySample], curve: Curve) -> dict[str, Sequence[Any]]:
     """Return what is drawn of the ``points`` of a curve: with nominal value, near limits and forecast."""
     last, parameter = points[-1].mean, curve.parameter
     stated = 0.0 if parameter is None else parameter.nominal if parameter.baseline is None else parameter.baseline
@@ -280,8 +251,8 @@ def _plot(axis: Axis, gaps: Sequence[Span], points: Sequence[HistorySample], cur
     median = line((now, *((row.at, row.limit) for row in ahead)))
     early = line((now, *((max(row.low, axis.now), row.limit) for row in ahead)))
     late = line((row.high or far, row.limit) for row in reversed(ahead))
-    forecasts = (f"{early} {late}", median) if ahead else ("", "")
-    return Plot(tuple(band), tuple(lines), tuple(_labelled(marks)), *forecasts)
+    future = (f"{early} {late}", median) if ahead else ()
+    return {"band": band, "lines": lines, "marks": list(_labelled(marks)), "forecast": future}
 
 
 def _runs(points: Sequence[HistorySample], gaps: Iterable[Span]) -> Iterator[Sequence[HistorySample]]:

@@ -49,7 +49,7 @@ CREATE TABLE counters (hour REAL NOT NULL, run INTEGER NOT NULL, text TEXT NOT N
 CREATE TABLE clock (retention REAL NOT NULL, waited REAL NOT NULL);
 CREATE TABLE start (sequence INTEGER NOT NULL);
 """
-# Also added to a database that an earlier version made; one that nobody has written since then lacks them.
+# Added by each writer: a database that an earlier version wrote last lacks them.
 _LATER_SCHEMA = """
 CREATE TABLE IF NOT EXISTS state (
     part TEXT NOT NULL, since REAL NOT NULL, state TEXT NOT NULL, PRIMARY KEY (part, since)) WITHOUT ROWID;
@@ -104,7 +104,7 @@ def create(connection: sqlite3.Connection, site: str, machine: str) -> None:
     connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute("PRAGMA journal_mode = WAL")
-    connection.executescript(f"BEGIN; {_SCHEMA} {_LATER_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
+    connection.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT")
     with connection:
         connection.execute("INSERT INTO identity VALUES (?, ?)", (site, machine))
 
@@ -128,11 +128,6 @@ def check(connection: sqlite3.Connection, site: str, machine: str) -> None:
         raise ValueError(f"it is of {other}")
 
 
-def add_later_tables(connection: sqlite3.Connection) -> None:
-    """Add the tables that a database of an earlier version lacks."""
-    connection.executescript(_LATER_SCHEMA)
-
-
 def describe_machine(twin: Definition, plan: MonitoringPlan) -> str:
     """Return as JSON what reports do not repeat: the equations, and the meaning and the limits of each parameter."""
     sides = [(name, text) for name, text, _ in twin.definitions]
@@ -152,6 +147,7 @@ class Tables:
         self._connection, self._run = connection, run
         self._series: dict[tuple[str, str], int] = {}
         self._description = ""
+        connection.executescript(_LATER_SCHEMA)
 
     def describe(self, text: str) -> None:
         """Write the description of the machine, as :func:`describe_machine` returns it, if it has changed."""

@@ -16,16 +16,7 @@ from pathlib import Path
 
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.machine_file import MachineFile
-from otolith.storage.history import (
-    BUSY_TIMEOUT,
-    CHECKPOINT_BYTES,
-    HistoryReader,
-    Tables,
-    add_later_tables,
-    check,
-    create,
-    history_path,
-)
+from otolith.storage.history import BUSY_TIMEOUT, CHECKPOINT_BYTES, HistoryReader, Tables, check, create, history_path
 from otolith.storage.history_retention import Bounds, Retention
 from otolith.storage.state_store import give_to, opened_folder
 from otolith.storage.writer_thread import WriterThread
@@ -255,7 +246,6 @@ class HistoryWriter(WriterThread):
         if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             create(connection, self.reader.site, self.reader.machine)
         check(connection, self.reader.site, self.reader.machine)
-        add_later_tables(connection)
         connection.execute("PRAGMA synchronous = NORMAL")
         (page_size,) = connection.execute("PRAGMA page_size").fetchone()
         connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_BYTES // page_size}").fetchall()

@@ -130,10 +130,11 @@ def _check_names(names: Sequence[str], known: list[str]) -> None:
 
 def interval_since(reader: "HistoryReader", since: float) -> str:
     """Return the resolution that shows the time since then, as far as there are values."""
-    from otolith.storage.history import DAY
+    from otolith.storage.history import DAY, RESOLUTIONS
 
-    first = reader.first(DAY)
-    span = time.time() - max(since, since if first is None else first)
+    firsts = [first for seconds in RESOLUTIONS if (first := reader.first(seconds)) is not None] or [since]
+    begin = max(first for first in firsts if first < min(firsts) + DAY)  # coarse intervals begin before their values
+    span = time.time() - max(since, begin)
     return next((name for name, longest in LONGEST.items() if span <= longest), "day")
 
 

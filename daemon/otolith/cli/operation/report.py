@@ -9,8 +9,6 @@ import click
 from otolith.cli.common import new_file
 from otolith.cli.operation.history import age_or_date, interval_since, reader_of, samples_since
 
-NAME = "%Y-%m-%dT%H%M%S.html"  # time in the name of a file, as strftime takes it
-
 
 @click.command()
 @click.argument("machine", metavar="FILE|MACHINE")
@@ -45,7 +43,7 @@ def report(machine: str, since: float, output: Path | None) -> None:
     if output == Path("-"):
         sys.stdout.buffer.write(content)
         return
-    path = output or Path(f"{reader.machine}-{time.strftime(NAME, time.localtime(now))}")
+    path = output or Path(f"{reader.machine}-{time.strftime('%FT%H%M%S', time.localtime(now))}.html")
     with path.open("xb") as file:
         try:
             file.write(content)
