@@ -229,6 +229,13 @@ class HistoryTable(StrictModel):
     """Age of whole reports, for subscribers that were away."""
 
 
+class EvidenceTable(StrictModel):
+    """Bundles with the evidence of each event."""
+
+    max_megabytes: Annotated[int, Field(ge=0, le=1_000_000)] = 100
+    """Size of all of them; with 0 there are none."""
+
+
 class MachineFile(StrictModel):
     """The whole file."""
 
@@ -255,6 +262,7 @@ class MachineFile(StrictModel):
     zenoh: ZenohTable = ZenohTable()
     recording: RecordingTable = RecordingTable()
     history: HistoryTable = HistoryTable()
+    evidence: EvidenceTable = EvidenceTable()
 
     @property
     def drivers(self) -> tuple[dict[str, Any], ...]:

@@ -40,7 +40,7 @@ def batch(scenario: MotorScenario, windows: Cut) -> list[Window]:
 
 @pytest.fixture
 def supervisor() -> Iterator[Supervisor]:
-    running = Supervisor(state_for("R_a"), window_length=LENGTH)
+    running = Supervisor(state_for("R_a"), length=LENGTH)
     running.start()
     yield running
     running.worker.kill()
@@ -102,7 +102,7 @@ def test_a_worker_that_hangs_is_killed(supervisor: Supervisor, batch: list[Windo
 
 
 def test_windows_beyond_the_queue_are_missed(batch: list[Window]) -> None:
-    supervisor = Supervisor(state_for("R_a"), window_length=LENGTH)
+    supervisor = Supervisor(state_for("R_a"), length=LENGTH)
     for window in batch:
         supervisor.submit(window, 0.0)
     assert supervisor.missed == len(batch) - MAX_WAITING_WINDOWS
@@ -120,7 +120,7 @@ def test_the_worker_is_stateless(batch: list[Window]) -> None:
 def test_windows_missed_during_compilation_are_logged_once(
     batch: list[Window], caplog: pytest.LogCaptureFixture
 ) -> None:
-    supervisor = Supervisor(state_for("R_a"), window_length=LENGTH)
+    supervisor = Supervisor(state_for("R_a"), length=LENGTH)
     for window in batch:
         supervisor.submit(window, 0.0)
     assert supervisor.missed == len(batch) - MAX_WAITING_WINDOWS
@@ -152,7 +152,7 @@ class SlowWorker:
 
 
 def slow(batch: list[Window]) -> tuple[Supervisor, SlowWorker]:
-    supervisor, worker = Supervisor(state_for("R_a"), window_length=LENGTH), SlowWorker()
+    supervisor, worker = Supervisor(state_for("R_a"), length=LENGTH), SlowWorker()
     supervisor.worker = worker  # type: ignore[assignment]  # has the methods that are used
     supervisor.submit(batch[0], 0.0)
     return supervisor, worker

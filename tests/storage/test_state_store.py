@@ -20,8 +20,7 @@ from otolith.discovery.adopted import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.storage import state_store
-from otolith.storage.state_store import StateStore
-from otolith.storage.state_writer import StateWriter
+from otolith.storage.state_store import StateStore, StateWriter
 from otolith_drivers.errors import OtolithError, ServiceError
 from tests.cli.replays import MACHINE
 from tests.waiting import PATIENCE, wait_for, within

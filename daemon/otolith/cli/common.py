@@ -108,7 +108,10 @@ def echo_warnings(data: Path, lines: Iterable[str]) -> None:
 
 def local_time(seconds: float) -> str:
     """Unix ``seconds`` as date and time of this computer's time zone."""
-    return time.strftime("%F %T", time.localtime(seconds))
+    try:
+        return time.strftime("%F %T", time.localtime(seconds))
+    except (ValueError, OverflowError, OSError):
+        return f"{seconds:g} s"  # no clock has such a time, but a file may
 
 
 def shipped_directory(name: str) -> Path:

@@ -33,6 +33,7 @@ from otolith.cli.operation.connection import endpoints, reader_options
 from otolith.cli.operation.history import history
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
+from otolith.cli.operation.reproduce import reproduce
 from otolith.cli.operation.view import view
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ EXIT_CODES = """\b
 Exit codes:
   0    done; run and plant also when stopped by SIGTERM
   1    demo: an estimate was wrong; probe: nothing answered or was received;
-       check: a signal was missing, or no window of DATA can be used
+       check: a signal was missing, or no window of DATA can be used;
+       reproduce: a report was not the same
   2    a file, option, bus or port cannot be used; the message says which, why
        and what to do
   78   the same of 'run' for a machine file that is wrong: no restart helps
@@ -296,6 +298,7 @@ COMMANDS: tuple[click.Command, ...] = (
     keys,
     noise,
     probe,
+    reproduce,
     reset,
     twin,
     view,

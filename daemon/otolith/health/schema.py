@@ -351,6 +351,8 @@ class CountersDocument(StrictModel):
     recorder_restarts: int = 0
     history_dropped: int = 0
     """Windows that the history did not take: its disk was full or too slow."""
+    evidence_dropped: int = 0
+    """Changes of events without a bundle: the disk was full or too slow, or it would have been too large."""
     commands_failed: int = 0
     """Events for which ``on_event`` failed."""
 

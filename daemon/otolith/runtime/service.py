@@ -35,9 +35,9 @@ from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.reload import reloaded
 from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
+from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history_writer import Numbers, history_of
-from otolith.storage.state_store import store_of
-from otolith.storage.state_writer import StateWriter
+from otolith.storage.state_store import StateWriter, store_of
 from otolith_drivers.errors import OtolithError
 
 log = logging.getLogger(__name__)
@@ -71,12 +71,13 @@ class Service:
         self._store = store_of(machine)
         self._writer = StateWriter(self._store, self._store.decisions_time())
         self._history = history_of(file)
+        self._evidence = EvidenceWriter(machine)
         self._numbers = Numbers(time.time())
         self._notes: tuple[str, ...] = ()
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
         state = initial_state(file.machine.name, file.machine.site, machine.problem, machine.plan)
-        self._supervisor = Supervisor(state, longest * period)
+        self._supervisor = Supervisor(state, longest * period, self._evidence.add)
         self._recorder = RecorderSupervisor(machine, recording)
         self._command = EventCommand(file.machine.on_event, file.machine.name, file.machine.site)
         self._publisher: Publisher | None = None
@@ -125,6 +126,7 @@ class Service:
         self._publisher = Publisher(identity.site, identity.name, listen, access, self._history)
         driver.open(self._rings.deliver)
         self._writer.start()
+        self._evidence.start()
         self._supervisor.start()
         if self._machine.file.recording.enabled:
             self._recorder.start(time.monotonic())
@@ -143,6 +145,7 @@ class Service:
                 steps.callback(self._history.stop, WRITER_FLUSH)
             steps.callback(self._command.stop, COMMAND_FLUSH)
             steps.callback(self._writer.stop, WRITER_FLUSH)
+            steps.callback(self._evidence.stop, WRITER_FLUSH)
             steps.callback(self._recorder.stop, RECORDER_FLUSH)
             steps.callback(self._supervisor.worker.kill)
             steps.callback(self._machine.driver.close)
@@ -189,6 +192,8 @@ class Service:
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
         if change.limits:
             self._supervisor.revise(lambda state: replace(state, plan=change.machine.plan))
+        if not change.needs_restart:
+            self._evidence.files = files_of(self._machine)
         if change.recording:
             self._recorder.reload(self._machine, time.monotonic(), RECORDER_FLUSH)
 
@@ -262,6 +267,7 @@ class Service:
             recordings_dropped=self._recorder.dropped,
             recorder_restarts=self._recorder.restarts,
             history_dropped=0 if self._history is None else self._history.dropped,
+            evidence_dropped=self._evidence.dropped,
             commands_failed=self._command.failed,
         )
 

@@ -99,8 +99,9 @@ def warm_up(state: AdaptationState) -> str:
 class Supervisor:
     """Runs the worker process and keeps the adaptation state. Times are monotonic seconds, given by the caller."""
 
-    def __init__(self, state: AdaptationState, window_length: float) -> None:
-        """``window_length`` is that of the longest window, s."""
+    def __init__(self, state: AdaptationState, length: float, keep: Callable[..., None] = lambda *_: None) -> None:
+        """``length`` is that of the longest window, s; ``keep`` takes state, window, report and next state of each."""
+        self._keep = keep
         self.state = state
         """State after the last finished window."""
         self.missed = 0
@@ -111,7 +112,7 @@ class Supervisor:
         """Whether the worker starts, or compiles or loads a kernel."""
         self._is_ready = False
         self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
-        self._timeout = WINDOW_TIMEOUT + 2 * window_length
+        self._timeout = WINDOW_TIMEOUT + 2 * length
         self.worker = ChildProcess("otolith-worker", "otolith.runtime.worker:main", room=1)
         self._waiting: deque[Window] = deque()
         self._current: Window | None = None
@@ -188,6 +189,7 @@ class Supervisor:
         if result.report is None:
             self._miss(window, result.failure)
             return None
+        self._keep(self.state, window, result.report, result.state)
         self.state = result.state
         self.finished += 1
         self.progress += 1

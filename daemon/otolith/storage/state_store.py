@@ -7,6 +7,7 @@ import contextlib
 import fcntl
 import logging
 import os
+from collections import deque
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,6 +29,7 @@ from otolith.storage.learned_state import (
     restored,
     twin_fingerprint,
 )
+from otolith.storage.writer_thread import WriterThread
 from otolith.twin.definition import Definition
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
@@ -42,6 +44,7 @@ REMEDY = "move the file away to start without it"
 MAX_STATE_BYTES = 8 * 1024 * 1024
 MAX_KEPT = 8  # files that were not used and are kept under another name
 PROCESS_ID_BYTES = 20
+DECISIONS_INTERVAL = 0.5  # s between two checks for decisions
 
 StateModel = TypeVar("StateModel", bound=StrictModel)
 
@@ -209,7 +212,7 @@ class StateStore:
         try:
             learned = learned_state(state, self._signal_fingerprint)
         except (ValueError, ArithmeticError, LookupError) as error:
-            raise ServiceError(f"{self.components_path}: kept as it was: {_reason(error)}") from error
+            raise ServiceError(f"{self.components_path}: kept as it was: {reason_of(error)}") from error
         self._write_learned(learned)
 
     def save_components(self, components: tuple[ComponentRecord, ...]) -> None:
@@ -267,6 +270,46 @@ class StateStore:
         return 0.0
 
 
+class StateWriter(WriterThread):
+    """Keeps only the latest value in each direction."""
+
+    def __init__(self, store: StateStore, decisions_time: float) -> None:
+        """``decisions_time`` is the :meth:`StateStore.decisions_time` of the decisions that are known already."""
+        super().__init__("writer", DECISIONS_INTERVAL, "what was learned is not saved")
+        self._store, self._decisions_time = store, decisions_time
+        self._to_save: deque[AdaptationState] = deque(maxlen=1)
+        self._unsaved: AdaptationState | None = None
+        self._new_decisions: deque[OperatorDecisions] = deque(maxlen=1)
+
+    def save(self, state: AdaptationState) -> None:
+        """Request that ``state`` replaces what is on disk."""
+        self._to_save.append(state)
+        self._wakeup.set()
+
+    def new_decisions(self) -> OperatorDecisions | None:
+        """Return the operator's decisions if they have changed since the last call, otherwise None."""
+        return self._new_decisions.popleft() if self._new_decisions else None
+
+    def write(self) -> None:
+        """Save the latest state."""
+        if self._to_save:
+            self._unsaved = self._to_save.popleft()
+        if self._unsaved is not None:
+            self._store.save(self._unsaved)
+            self._unsaved = None
+
+    def read(self) -> None:
+        """Read the decisions if their file has changed."""
+        decisions_time = self._store.decisions_time()
+        if decisions_time == self._decisions_time:
+            return
+        self._decisions_time = decisions_time
+        try:
+            self._new_decisions.append(self._store.decisions())
+        except OtolithError as error:
+            log.warning("%s", error)
+
+
 def store_of(machine: LoadedMachine) -> StateStore:
     """Return the store of a machine."""
     names = machine.file.machine
@@ -285,10 +328,10 @@ def _read(path: Path, model: type[StateModel], newest: int) -> StateModel | None
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
-        raise ConfigurationError(f"{path}: {_reason(error)}: {REMEDY}") from error
+        raise ConfigurationError(f"{path}: {reason_of(error)}: {REMEDY}") from error
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
     """Return the text of an error in one line; of a document that does not fit its schema, the first fault."""
     if not isinstance(error, ValidationError):
         return str(error)
@@ -303,12 +346,23 @@ def _limited(data: bytes) -> bytes:
 
 
 def _write(path: Path, model: StrictModel, temporary: str) -> None:
+    """Replace a file as :func:`replace_file` does."""
+    try:
+        data = _limited((model.model_dump_json() + "\n").encode())
+    except ValueError as error:
+        raise ServiceError(f"{path}: not written: {error}") from error
+    replace_file(path, data, temporary)
+
+
+def replace_file(path: Path, data: bytes, temporary: str) -> None:
     """Replace a file, all or nothing, also if the computer loses power meanwhile; ``temporary`` is a name beside it.
 
     All names are relative to the open folder: its owner could replace a path while root writes there.
+
+    Raises:
+        ServiceError: the file cannot be written.
     """
     try:
-        data = _limited((model.model_dump_json() + "\n").encode())
         with opened_folder(path.parent) as folder:
             with contextlib.suppress(FileNotFoundError):  # left by a process that was killed
                 os.unlink(temporary, dir_fd=folder)
@@ -327,8 +381,6 @@ def _write(path: Path, model: StrictModel, temporary: str) -> None:
                 raise
     except OSError as error:
         raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
-    except ValueError as error:
-        raise ServiceError(f"{path}: not written: {error}") from error
 
 
 @contextlib.contextmanager

@@ -1,0 +1,261 @@
+"""Evidence of events: bundles with all that is needed to compute the reports around an event again, bit for bit.
+
+A bundle is a ZIP archive with a :class:`Bundle` as JSON, the twin, and for people the machine file without secrets.
+The main thread of the daemon only keeps what it has anyway, and a thread of its own writes: a disk that is full or slow
+costs evidence, never monitoring.
+"""
+
+import contextlib
+import io
+import json
+import logging
+import platform
+import re
+import zipfile
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from otolith.acquisition.window import Window
+from otolith.adaptation.state import AdaptationState
+from otolith.health.schema import EventDocument, Report
+from otolith.health.text import announcements
+from otolith.machine import FINGERPRINT_KEYS, LIBRARY, LoadedMachine
+from otolith.storage.exact_values import Decoder, encoded
+from otolith.storage.recording_files import STAMP
+from otolith.storage.state_store import reason_of, replace_file
+from otolith.storage.writer_thread import WRITE_RETRY, WriterThread
+from otolith.twin.language import read_twin
+from otolith_drivers.config_files import FILE_SIZE_LIMIT, SourceFile, parse, read
+from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.user_dirs import state_directory
+
+log = logging.getLogger(__name__)
+
+VERSION = 1
+EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
+NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-\d{8}T\d{6}\.zip")
+LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")
+"""On whose versions the last bit of a report may depend, beside Python and the processor."""
+PUBLIC_KEYS = {"driver": ("type", "name", *FINGERPRINT_KEYS), "machine": ("name", "site"), "zenoh": ()}
+"""Keys of tables of a machine file that bundles have; others may be secrets."""
+# Thresholds: docs/reference/thresholds-storage.md has the origin of each.
+MAX_EVIDENCE_BYTES = 64 << 20  # of a bundle, packed and unpacked
+MAX_BUNDLES = 1000  # of a machine
+MIN_WINDOWS = 16  # before a change of an event that its bundle has, and at most twice as many
+MAX_WINDOW_BYTES = 8 << 20  # of windows after which fewer are enough
+MAX_WAITING_BUNDLES = 4  # for the disk; more are dropped
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceWindow:
+    """A window with the report of it."""
+
+    state: AdaptationState | None
+    """The state before it; None if it is the one after the window before."""
+    window: Window
+    report: str
+    """JSON, without what the daemon adds when it publishes: numbers, counters, connection and computing time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """The evidence of the events that the last of its windows changed."""
+
+    version: int
+    versions: Mapping[str, str]
+    """Of what computed the reports."""
+    events: tuple[EventDocument, ...]
+    state: AdaptationState
+    """The state before the first window."""
+    windows: tuple[EvidenceWindow, ...]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computes here."""
+    names = [platform.machine()]
+    with contextlib.suppress(OSError):
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+        names += re.findall(r"^model name\s*: (.+)$", text, re.MULTILINE)[:1]
+    libraries = {name: version(name) for name in LIBRARIES}
+    return {"python": platform.python_version(), **libraries, "processor": ", ".join(names)}
+
+
+def pack(bundle: Bundle, files: Mapping[str, str]) -> bytes:
+    """Return a bundle as an archive; ``files`` are the texts beside it, by name.
+
+    Raises:
+        ValueError: it would be larger than what is read.
+    """
+    is_small = 2 * sum(_bytes(item.window) for item in bundle.windows) <= MAX_EVIDENCE_BYTES  # as text they take more
+    text = encoded(bundle) if is_small else ""
+    if not 0 < len(text) <= MAX_EVIDENCE_BYTES:
+        raise ValueError(f"its windows and state take more than {MAX_EVIDENCE_BYTES} bytes")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in {**files, EVIDENCE: text}.items():
+            archive.writestr(name, content)
+    return packed.getvalue()
+
+
+def _bytes(window: Window) -> int:
+    return window.values.nbytes * (1 if window.bridge_error is None else 5)
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Return the bundle in a file; nothing of it is unpacked to disk.
+
+    Raises:
+        ConfigurationError: it cannot be read, or is no bundle that this version can use.
+    """
+    try:
+        return _read_bundle(path)
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # of any type, from archives and values that are damaged or forged
+        text = printable((reason_of(error) or type(error).__name__).splitlines()[0])
+        raise ConfigurationError(f"{path}: no evidence that this Otolith can use, or damaged: {text}") from error
+
+
+def _read_bundle(path: Path) -> Bundle:
+    with path.open("rb") as stream:
+        archive = zipfile.ZipFile(io.BytesIO(_limited(stream, MAX_EVIDENCE_BYTES)))
+    with archive.open(EVIDENCE) as evidence, archive.open(TWIN) as text:
+        content = json.loads(_limited(evidence, MAX_EVIDENCE_BYTES))
+        twin = read_twin(SourceFile(Path(TWIN), _limited(text, FILE_SIZE_LIMIT).decode()))
+    if (number := content["version"]) != VERSION:
+        raise ValueError(f"version {number!r:.20} of the format: this Otolith reads {VERSION}")
+    bundle: Bundle = Decoder(twin).decode(Bundle, content)
+    if not bundle.windows:
+        raise ValueError("it has no windows")
+    return bundle
+
+
+def _limited(stream: Any, limit: int) -> bytes:
+    if len(content := stream.read(limit + 1)) > limit:
+        raise ValueError(f"larger than {limit} bytes")
+    return bytes(content)
+
+
+def printable(text: str) -> str:
+    """Return ``text`` without what would control a terminal: a bundle may come from anywhere."""
+    return "".join(character if character.isprintable() else "?" for character in text)
+
+
+def files_of(machine: LoadedMachine) -> dict[str, str]:
+    """Return the texts of twin and machine file, as bundles have them.
+
+    Raises:
+        ConfigurationError: one of them cannot be read any more.
+    """
+    table = machine.file.twin
+    source = read(LIBRARY / f"{table.name}.toml" if table.file is None else machine.path.parent / table.file)
+    return {TWIN: source.text, MACHINE: public_text(parse(read(machine.path)))}
+
+
+def public_text(tables: Mapping[str, Any]) -> str:
+    """Return the tables of a machine file as TOML, without comments and secrets."""
+    lines: list[str] = []
+    for name, content in tables.items():
+        for table in content if isinstance(content, list) else [content]:
+            keys = PUBLIC_KEYS.get(name, tuple(table))
+            own = {"file": TWIN} if name == "twin" else {key: table[key] for key in keys if key in table}
+            lines.append(f"[[{name}]]" if isinstance(content, list) else f"[{name}]")
+            lines += [f"{_toml(key)} = {_toml(item)}" for key, item in own.items()]
+    return "\n".join([*lines, ""])
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{_toml(key)} = {_toml(item)}' for key, item in value.items())} }}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, str | bool):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return str(value)
+
+
+class WindowMemory:
+    """The last windows with the state before the first of them: ``MIN_WINDOWS`` at least, at most twice as many."""
+
+    def __init__(self) -> None:
+        self._older: tuple[EvidenceWindow, ...] = ()
+        self._newer: tuple[EvidenceWindow, ...] = ()
+        self._states: tuple[AdaptationState, ...] = ()  # before the first of the older and of the newer ones
+        self._after: AdaptationState | None = None
+
+    def add(self, before: AdaptationState, window: Window, report: Report, after: AdaptationState) -> None:
+        """Add a window, its report and the states before and after it; older windows are dropped."""
+        size = sum(_bytes(item.window) for item in self._newer)
+        if not self._states or len(self._newer) >= MIN_WINDOWS or size >= MAX_WINDOW_BYTES:
+            self._older, self._newer, self._states = self._newer, (), (*self._states[-1:], before)
+        state = None if before is self._after else before
+        self._newer, self._after = (*self._newer, EvidenceWindow(state, window, report.document.to_json())), after
+
+    def bundle(self, versions: Mapping[str, str], events: tuple[EventDocument, ...]) -> Bundle:
+        """Return the windows, in their order, as the evidence of ``events``."""
+        return Bundle(VERSION, versions, events, self._states[0], (*self._older, *self._newer))
+
+
+class EvidenceWriter(WriterThread):
+    """The bundles of one machine while its daemon runs; the oldest are deleted for new ones."""
+
+    def __init__(self, machine: LoadedMachine) -> None:
+        """Raise ServiceError if the state directory is not writable, and ConfigurationError as :func:`files_of`."""
+        self.folder = state_directory() / "evidence"
+        super().__init__("evidence", WRITE_RETRY, f"{self.folder}: no evidence of events is kept")
+        self.files, self.max_bytes = files_of(machine), machine.file.evidence.max_megabytes * 1_000_000
+        self.dropped = 0
+        """Changes of events without a bundle."""
+        names = machine.file.machine
+        self._key, self._versions, self._memory = f"{names.site}.{names.name}", versions(), WindowMemory()
+        self._waiting: deque[Bundle] = deque()
+
+    def add(self, before: AdaptationState, window: Window, report: Report, after: AdaptationState) -> None:
+        """Keep a finished window, and request a bundle if it changed an event."""
+        if not self.max_bytes:
+            return
+        self._memory.add(before, window, report, after)
+        if events := tuple(announcements(report.document)):
+            is_full = len(self._waiting) >= MAX_WAITING_BUNDLES
+            self.dropped += is_full
+            self._waiting += [] if is_full else [self._memory.bundle(self._versions, events)]
+            self._wakeup.set()
+
+    def write(self) -> None:
+        """Write the bundles that wait."""
+        while self._waiting:
+            bundle = self._waiting[0]
+            names = ", ".join(event.id for event in bundle.events)
+            try:
+                data = pack(bundle, self.files)
+                path = self._path(bundle, len(data))
+            except (TypeError, ValueError) as error:
+                self.dropped += 1
+                log.warning("%s: no evidence of %s: %s", self.folder, names, error)
+            else:
+                replace_file(path, data, f"{self._key}.new")
+                log.info("evidence of %s: %s", names, path)
+            self._waiting.popleft()
+
+    def _path(self, bundle: Bundle, size: int) -> Path:
+        """Delete the oldest bundles for one of ``size`` bytes, and return its path; its number is above all others.
+
+        Raises:
+            ValueError: it is larger than what all may take.
+        """
+        if size > self.max_bytes:
+            raise ValueError(f"it takes {size} bytes, more than all may take")
+        named = ((NAME.fullmatch(path.name), path) for path in self.folder.glob("*.zip"))
+        own = sorted((int(match["number"]), path) for match, path in named if match and match["key"] == self._key)
+        number, total = own[-1][0] + 1 if own else 1, size + sum(path.stat().st_size for _, path in own)
+        while own and (total > self.max_bytes or len(own) >= MAX_BUNDLES):
+            _, oldest = own.pop(0)
+            total -= oldest.stat().st_size
+            oldest.unlink()
+        stamp = datetime.fromtimestamp(bundle.windows[-1].window.end, UTC).strftime(STAMP)
+        return self.folder / f"{self._key}-{number:06d}-{stamp}.zip"
