@@ -1,6 +1,7 @@
 """A daemon that is killed, stopped or started twice, with real processes and files."""
 
 import json
+import os
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -23,8 +24,10 @@ from otolith.health.schema import (
 )
 from otolith.machine import load_machine
 from otolith.runtime.service import Service
+from otolith.storage.evidence import read_bundle
 from otolith.storage.history import HistoryReader, history_path
 from otolith.storage.state_store import StateStore
+from otolith_drivers.user_dirs import state_directory
 from tests.conftest import OwnMachine
 from tests.system.conftest import OTOLITH, Running, is_estimated
 from tests.waiting import PATIENCE, wait_for
@@ -98,6 +101,26 @@ def test_the_first_reports_after_a_restart_hold_the_truth(
     history = HistoryReader(history_path("demo", "dc-motor"))
     expected = {report.to_json() for report in (*first.reports, *reports)}
     wait_for(lambda: expected <= set(history.messages("report", 1000)))  # the last one may still be written
+
+
+def bundles_about(part: str) -> list[Path]:
+    """Return the evidence of events of a part."""
+    paths = (state_directory() / "evidence").glob("*.zip")
+    return [path for path in paths if any(event.part == part for event in read_bundle(path).events)]
+
+
+def test_the_evidence_of_a_killed_daemon_is_reproduced_by_another_process(start: Start, healthy: OwnMachine) -> None:
+    text = healthy.machine.read_text(encoding="utf-8")
+    healthy.machine.write_text(text.replace('R_a = { value = "6.5 ohm"', 'R_a = { value = "7.2 ohm"'), encoding="utf-8")
+    running = start()
+    wait_for(lambda: bool(bundles_about("winding")) or running.daemon.poll() is not None, 3 * PATIENCE)
+    running.stop(signal.SIGKILL)
+    environment = {**os.environ, "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo"}
+    command = [*OTOLITH, "reproduce", str(bundles_about("winding")[0])]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "raised: ACT: winding: " in done.stdout
+    assert "the same to the last bit: " in done.stdout
 
 
 def test_a_second_daemon_of_the_same_name_ends_with_an_error(start: Start, healthy: OwnMachine) -> None:

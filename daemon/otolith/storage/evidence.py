@@ -29,7 +29,6 @@ from otolith.storage.exact_values import Decoder, encoded
 from otolith.storage.recording_files import STAMP
 from otolith.storage.state_store import reason_of, replace_file
 from otolith.storage.writer_thread import WRITE_RETRY, WriterThread
-from otolith.twin.definition import Definition
 from otolith.twin.language import read_twin
 from otolith_drivers.config_files import FILE_SIZE_LIMIT, SourceFile, parse, read
 from otolith_drivers.errors import ConfigurationError
@@ -86,14 +85,14 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **libraries, "processor": ", ".join(names)}
 
 
-def pack(bundle: Bundle, twin: Definition, files: Mapping[str, str]) -> bytes:
+def pack(bundle: Bundle, files: Mapping[str, str]) -> bytes:
     """Return a bundle as an archive; ``files`` are the texts beside it, by name.
 
     Raises:
         ValueError: it would be larger than what is read.
     """
     is_small = 2 * sum(_bytes(item.window) for item in bundle.windows) <= MAX_EVIDENCE_BYTES  # as text they take more
-    text = encoded(bundle, twin) if is_small else ""
+    text = encoded(bundle) if is_small else ""
     if not 0 < len(text) <= MAX_EVIDENCE_BYTES:
         raise ValueError(f"its windows and state take more than {MAX_EVIDENCE_BYTES} bytes")
     packed = io.BytesIO()
@@ -213,8 +212,7 @@ class EvidenceWriter(WriterThread):
         self.dropped = 0
         """Changes of events without a bundle."""
         names = machine.file.machine
-        self._key, self._twin = f"{names.site}.{names.name}", machine.twin
-        self._versions, self._memory = versions(), WindowMemory()
+        self._key, self._versions, self._memory = f"{names.site}.{names.name}", versions(), WindowMemory()
         self._waiting: deque[Bundle] = deque()
 
     def add(self, before: AdaptationState, window: Window, report: Report, after: AdaptationState) -> None:
@@ -234,9 +232,9 @@ class EvidenceWriter(WriterThread):
             bundle = self._waiting[0]
             names = ", ".join(event.id for event in bundle.events)
             try:
-                data = pack(bundle, self._twin, self.files)
+                data = pack(bundle, self.files)
                 path = self._path(bundle, len(data))
-            except ValueError as error:
+            except (TypeError, ValueError) as error:
                 self.dropped += 1
                 log.warning("%s: no evidence of %s: %s", self.folder, names, error)
             else:

@@ -26,19 +26,13 @@ REFERENCE, AUGMENTED, BITS = "=", "augmented", "bits"
 """Keys of an object that was written before, of a twin, and of numbers of NumPy."""
 
 
-def encoded(value: Any, twin: Definition) -> str:
-    """Return a dataclass of a machine with this ``twin`` as JSON.
-
-    Raises:
-        ValueError: it has another twin, or a type that cannot be read again.
-    """
+def encoded(value: Any) -> str:
+    """Return a dataclass as JSON; raise TypeError if a part of it has a type that cannot be read again."""
     numbers: dict[int, int] = {}
 
     def encode(item: Any) -> Any:
         if isinstance(item, Definition):
-            if item not in (twin, augmented_model(twin)):
-                raise ValueError(f"{item.name} is another twin")
-            return {AUGMENTED: item != twin}
+            return {AUGMENTED: item.base is not None}
         if isinstance(item, np.ndarray):  # hexadecimal digits are quicker to write and to read than numbers
             order, bits = ("F", item.tobytes("F")) if item.flags.fnc else ("C", item.tobytes())
             return {"type": item.dtype.str, "shape": item.shape, "order": order, BITS: bits.hex()}
@@ -46,8 +40,6 @@ def encoded(value: Any, twin: Definition) -> str:
             return item.model_dump(mode="json")
         if isinstance(item, frozenset):
             return sorted(item)
-        if not dataclasses.is_dataclass(item):
-            raise ValueError(f"{type(item).__name__} cannot be written")
         if id(item) in numbers:
             return {REFERENCE: numbers[id(item)]}
         numbers[id(item)] = len(numbers)
