@@ -13,7 +13,7 @@ from otolith.discovery.decision import WindowDecision
 from otolith.health.diagnosis import FindingKind
 from otolith.health.events import HealthState, assess
 from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity, MonitoringPlan
-from otolith.health.observations import PERSISTENT_WINDOWS, RELEASE_WINDOWS, UNDECIDED
+from otolith.health.observations import LOST_AFTER, PERSISTENT_WINDOWS, RELEASE_WINDOWS, UNDECIDED
 from otolith.health.schema import (
     ComponentDocument,
     ComponentStatus,
@@ -386,3 +386,76 @@ def test_the_values_distinguish_a_sudden_change_from_a_slow_one() -> None:
     causes = [events(assessed(reports)[-1])["winding"].cause for reports in (step, slow)]
     assert causes[0] == "the insulation has broken down at once"
     assert causes[1].startswith("the insulation between turns fails slowly")
+
+
+def falling(hours: float, share: float, quantity: MonitoredQuantity = RESISTANCE) -> list[ReportDocument]:
+    """A resistance that falls by ``share`` of the way to WATCH, within 120 windows over ``hours``."""
+    random, step = np.random.default_rng(3), hours * 3600.0 / 120
+    way = share * (WATCH - NOMINAL) * (1.0 if quantity is RESISTANCE else -1.0)
+    documents = []
+    for index in range(120):
+        one = report(index, NOMINAL + way * index / 120 + 0.002 * random.standard_normal(), 0.002)
+        window = one.window.model_copy(update={"start": step * index, "end": step * (index + 1)})
+        documents.append(one.model_copy(update={"window": window}))
+    return documents
+
+
+def test_a_trend_is_an_event_before_the_limit_is_reached() -> None:
+    documents = assessed(falling(6.0, 0.9))
+    (raised,) = [event for document in documents for event in document.events if event.change is EventChange.RAISED]
+    assert (raised.part, raised.state) == ("winding", Level.WATCH)
+    assert raised.condition == "a parameter is on its way to a limit"
+    assert "reaches WATCH in" in raised.text
+    assert state_of(documents[-1], "winding") is Level.WATCH
+
+
+def test_a_trend_becomes_the_event_of_the_limit() -> None:
+    documents = assessed(falling(6.0, 2.0))
+    assert {event.id.partition("/")[0] for event in documents[-1].events if event.end is None} == {"limit"}
+    assert {event.id.partition("/")[0] for document in documents for event in document.events} == {"trend", "limit"}
+
+
+def test_a_trend_of_minutes_is_no_event() -> None:
+    assert changes(assessed(falling(0.5, 0.9))) == []
+
+
+@pytest.mark.parametrize(("temperature", "expected"), [("", 0), ("winding", 1)])
+def test_a_trend_that_warming_may_explain_is_no_event_without_a_temperature(temperature: str, expected: int) -> None:
+    limits = (Limit(Level.WATCH, NOMINAL + (NOMINAL - WATCH), False),)
+    copper = replace(RESISTANCE, limits=limits, temperature_coefficient=0.00393, temperature=temperature)
+    documents = falling(6.0, 0.9, copper)
+    for at, document in enumerate(documents):
+        window = document.window.model_copy(update={"observed": {"winding": 293.15}})
+        documents[at] = document.model_copy(update={"window": window})
+    found = changes(assessed(documents, plan=replace(PLAN, parameters={"R_a": copper})))
+    assert len(found) == expected
+
+
+def lost(index: int, *, others: bool = True) -> ReportDocument:
+    held = ParameterDocument(
+        value=6.5, sd=2.0, unit="ohm", nominal=NOMINAL, status=Status.HELD, reason="no current", advice="a step of V_a",
+        progress=0.4,
+    )  # fmt: skip
+    one = report(index)
+    known = {"D": one.parameters["R_a"]} if others else {}
+    return one.model_copy(update={"parameters": {"R_a": held, **known}})
+
+
+def test_a_parameter_that_is_no_longer_determined_is_an_event_after_an_hour() -> None:
+    windows = [*[report(index) for index in range(5)], *[lost(index) for index in range(5, 2000)]]
+    documents = assessed([*windows, *[report(index) for index in range(2000, 2005)]])
+    (raised, cleared) = [event for document in documents for event in document.events if event.change is not None]
+    assert (raised.part, raised.state, raised.condition) == (
+        "winding",
+        Level.NO_DATA,
+        "a parameter is no longer determined",
+    )
+    assert (raised.start, "no current" in raised.text) == (10.0, True)
+    assert raised.advice.endswith("; a step of V_a")
+    assert raised.evidence.windows[1] * LENGTH == pytest.approx(10.0 + LOST_AFTER, abs=4.0 * LENGTH)
+    assert (cleared.change, cleared.id) == (EventChange.CLEARED, raised.id)
+
+
+def test_a_machine_at_rest_has_not_lost_a_parameter() -> None:
+    windows = [*[report(index) for index in range(5)], *[lost(index, others=False) for index in range(5, 2000)]]
+    assert changes(assessed(windows)) == []

@@ -12,8 +12,8 @@ from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingKind, diagnose
 from otolith.health.limits import MACHINE, Level, MonitoredQuantity, MonitoringPlan
-from otolith.health.observations import BUS, SENSORS, Observation, Persistence, observe
-from otolith.health.prognosis import History, forecast, is_due, with_point
+from otolith.health.observations import BUS, SENSORS, Observation, Past, Persistence, is_determined, observe
+from otolith.health.prognosis import History, forecast, is_due, span, with_point
 from otolith.health.schema import (
     EventChange,
     EventDocument,
@@ -57,6 +57,8 @@ class HealthState:
     histories: Mapping[str, History] = field(default_factory=dict)
     """Of the parameters with limits, since their last sudden change."""
     forecasts: Mapping[str, ForecastDocument] = field(default_factory=dict)
+    determined: Mapping[str, float] = field(default_factory=dict)
+    """End of the last window after which each parameter was determined, Unix s."""
     inside: frozenset[str] = frozenset()
     """Keys of conditions that were at OK in some window."""
     document: HealthDocument | None = None
@@ -88,7 +90,11 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     observations = {
         key: Observation(key, MACHINE, absent, persistence=record.persistence) for key, record in state.records.items()
     }
-    observations |= {item.key: item for item in observe(plan, report, levels, state.steps)}
+    spans = {name: span(history) for name, history in state.histories.items()}
+    now = {name: report.window.end for name, item in report.parameters.items() if is_determined(item)}
+    state = replace(state, determined={**state.determined, **now})
+    past = Past(state.steps, spans, state.determined)
+    observations |= {item.key: item for item in observe(plan, report, levels, past)}
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
     records, events = {}, []
     for key, observed in observations.items():

@@ -21,6 +21,8 @@ from otolith.health.text import forecast_text, interval_text, value_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
 RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine moves
+MIN_TREND_SPAN = 3600.0  # s: of a history whose trend is announced before a limit is passed
+LOST_AFTER = 3600.0  # s for which a parameter was not determined
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
 BUS, SENSORS = "bus", "sensors"  # parts that every machine has
@@ -64,10 +66,20 @@ class Observation:
     persistence: Persistence = Persistence()
 
 
-def observe(
-    plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], steps: Mapping[str, float]
-) -> list[Observation]:
-    """Return the observations of a window after the levels ``before`` and sudden changes ``steps`` of parameters."""
+@dataclass(frozen=True, slots=True)
+class Past:
+    """What earlier windows showed of the parameters."""
+
+    steps: Mapping[str, float]
+    """Last sudden change of each."""
+    spans: Mapping[str, float]
+    """Length of the history of each, s."""
+    determined: Mapping[str, float]
+    """End of the last window after which each was determined, Unix s."""
+
+
+def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], past: Past) -> list[Observation]:
+    """Return the observations of a window after the levels ``before``."""
     data = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.OK
     reasons = "; ".join(report.window.quality.reasons)
     no_data = Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons, "no usable data")
@@ -76,7 +88,11 @@ def observe(
         features, text = FindingFeatures(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
         unexplained = Observation("unexplained", MACHINE, Level.WATCH, features, text, "an unknown change")
         observations.append(replace(unexplained, persistence=Persistence(fall=RELEASE_WINDOWS)))
-    observations += [_of_parameter(plan, report, name, before, steps.get(name, 0.0)) for name in report.parameters]
+    for name, parameter in report.parameters.items():
+        own = _of_parameter(plan, report, name, before, past.steps.get(name, 0.0))
+        since = past.determined.get(name, report.window.end)
+        observations += [own, _of_trend(plan, report, name, own.level, past.spans.get(name, 0.0))]
+        observations.append(_of_lost(plan, report, name, parameter, since))
     observations += _without_temperature(plan, report)
     components = (_of_component(plan, report.twin, component, before) for component in report.components)
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
@@ -139,6 +155,46 @@ def _of_parameter(
     text += _warming(quantity, deviation)
     condition, numbers = f"{quantity.meaning} is {limit.side} its limit", _numbers(*referred, unit, limit)
     return Observation(key, quantity.part, level, features, text, condition, numbers=numbers)
+
+
+def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Level | None, span: float) -> Observation:
+    """Return whether a parameter at ``level`` is on its way to a limit, by a history of ``span`` s.
+
+    A trend that warming explains is none where no temperature is measured.
+    """
+    parameter, quantity = report.parameters[name], plan.parameters.get(name, MonitoredQuantity())
+    forecast, key = parameter.forecast, f"trend/{name}"
+    if level is not Level.OK or forecast is None or parameter.value is None:
+        return Observation(key, quantity.part, level and Level.OK)
+    crossings = [item for item in (forecast.watch, forecast.act) if item is not None and item.low > report.window.end]
+    is_sure = span >= MIN_TREND_SPAN and bool(crossings) and crossings[0].high is not None
+    if not is_sure or _warming(quantity, crossings[0].limit - quantity.nominal):
+        return Observation(key, quantity.part, Level.OK)
+    side = "below" if crossings[0].limit < quantity.nominal else "above"
+    features = FindingFeatures(FindingKind.TREND, report.twin, name, side, "trend")
+    expected = forecast_text(parameter, report.window.end)
+    text = f"{quantity.meaning} {name} is {value_text(parameter)} and {expected} (80 %)"
+    return Observation(key, quantity.part, Level(severity(plan.rules, features)), features, text)
+
+
+def _of_lost(
+    plan: MonitoringPlan, report: ReportDocument, name: str, parameter: ParameterDocument, since: float
+) -> Observation:
+    """Return whether a parameter has not been determined since ``since`` although the machine moves."""
+    part, key = plan.parameters.get(name, MonitoredQuantity()).part, f"lost/{name}"
+    if is_determined(parameter):
+        return Observation(key, part, Level.OK)
+    others = [item for item in report.parameters.values() if item.status is Status.ESTIMATED]
+    if report.window.end - since <= LOST_AFTER or not others:
+        return Observation(key, part, None)
+    text = f"{name} is {value_text(parameter)}: {parameter.reason}"
+    features = FindingFeatures(FindingKind.LOST, report.twin, name)
+    return Observation(key, part, Level.NO_DATA, features, text, advice=parameter.advice or "", since=since)
+
+
+def is_determined(parameter: ParameterDocument) -> bool:
+    """Whether the interval of a parameter is as narrow as is required."""
+    return parameter.value is not None and (parameter.progress >= 1.0 or parameter.status is Status.ESTIMATED)
 
 
 def _numbers(value: float, sd: float, unit: str, limit: Limit | None) -> dict[str, float | str]:
