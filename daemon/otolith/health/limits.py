@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from otolith.estimation.information import QUANTILE
+from otolith.health.catalogue import Catalogue, Language, catalogue
 from otolith.health.diagnosis import Rule
 
 RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
@@ -121,8 +122,15 @@ class MonitoringPlan:
     rules: Sequence[Rule] = ()
     stated: Mapping[str, MonitoredQuantity] | None = None
     """The parameters as the machine file states them, if there is a baseline."""
+    language: Language = "en"
+    """Of the texts for people."""
     known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Of the parameters that are not estimated, against the values of the machine file."""
+
+    @property
+    def texts(self) -> Catalogue:
+        """The texts in the language of the machine."""
+        return catalogue(self.language)
 
     @property
     def parts(self) -> tuple[str, ...]:
