@@ -60,6 +60,18 @@ def test_what_the_library_and_the_states_name_is_translated(language: Language) 
     assert words - set(catalogue(language).phrases) - {""} == set()
 
 
+@pytest.mark.parametrize("language", OTHERS)
+def test_every_phrase_is_one_that_the_program_composes(language: Language) -> None:
+    """Its longest part without a name or mark is in the source: a text that changes there changes here."""
+    folder = Path(module.__file__).parents[1]
+    paths = [path for path in folder.rglob("*") if path.suffix in {".py", ".toml"} and path.parent.name != "texts"]
+    source = "".join(path.read_text(encoding="utf-8") for path in paths)
+    parts = {
+        phrase: max(re.split(r"{\w+}|[:;,()]| if ", phrase), key=len).strip() for phrase in catalogue(language).phrases
+    }
+    assert {phrase: part for phrase, part in parts.items() if part not in source} == {}
+
+
 @pytest.mark.parametrize(
     ("english", "german"),
     [

@@ -126,7 +126,9 @@ def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
     say = plan.texts.translated
     if plan.language == "en":
         return report
-    quality = report.window.quality.model_copy(update={"reasons": tuple(map(say, report.window.quality.reasons))})
+    quality, absent = report.window.quality, report.window.absent
+    quality = quality.model_copy(update={"reasons": tuple(map(say, quality.reasons))})
+    absent = absent and {name: say(text) for name, text in absent.items()}
     findings = [
         item.model_copy(update={key: say(getattr(item, key)) for key in ("condition", "text", "advice")})
         for item in report.findings
@@ -136,8 +138,9 @@ def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
         for name, item in report.parameters.items()
     }
     components = [item.model_copy(update={"meaning": say(item.meaning)}) for item in report.components]
+    window = report.window.model_copy(update={"quality": quality, "absent": absent})
     changed = {"findings": tuple(findings), "parameters": parameters, "components": tuple(components)}
-    return report.model_copy(update={**changed, "window": report.window.model_copy(update={"quality": quality})})
+    return report.model_copy(update={**changed, "window": window})
 
 
 def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:

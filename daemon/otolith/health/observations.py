@@ -82,7 +82,7 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     data = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.OK
     reasons = "; ".join(report.window.quality.reasons)
     no_data = Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons)
-    observations = [*_of_sources(plan, report, before), no_data]  # of one state, the first is more specific
+    observations = [*_of_sources(report, before), no_data]  # of one state, the first is more specific
     if report.decision is WindowDecision.REFUSED:
         features = FindingFeatures(FindingKind.UNEXPLAINED, report.twin)
         text = plan.texts.translated(report.decision)
@@ -102,9 +102,9 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     return observations
 
 
-def _of_sources(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level]) -> Iterator[Observation]:
+def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator[Observation]:
     """Yield the absent sources, and those that were absent; a window may be good without one of several."""
-    absent = {f"source/{name}": plan.texts.translated(text) for name, text in (report.window.absent or {}).items()}
+    absent = {f"source/{name}": text for name, text in (report.window.absent or {}).items()}
     level = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.WATCH
     for key in sorted(absent.keys() | {key for key in before if key.startswith("source/")}):
         features = FindingFeatures(FindingKind.NO_SOURCE, subject=key.partition("/")[2])
