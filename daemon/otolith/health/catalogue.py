@@ -28,7 +28,7 @@ class Catalogue:
     phrases: dict[str, str]
     """Translations by the English phrase; empty for English."""
     patterns: tuple[tuple[re.Pattern[str], str], ...]
-    """The phrases with names in braces."""
+    """The phrases with names in braces; the first that matches counts."""
 
     def __call__(self, key: str, **values: object) -> str:
         """Return the text of ``key`` with its values."""
@@ -59,5 +59,6 @@ def catalogue(language: Language) -> Catalogue:
 
 
 def _pattern(phrase: str) -> re.Pattern[str]:
-    """Return the expression of a phrase: each name in braces is any text."""
-    return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>.*?)", re.escape(phrase)), re.DOTALL)
+    """Return the expression of a phrase: each name in braces is any text, and ``share`` is a number."""
+    expression = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.*?)", re.escape(phrase)).replace("<share>.*?", r"<share>[\d.]+")
+    return re.compile(expression, re.DOTALL)
