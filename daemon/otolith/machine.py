@@ -14,8 +14,8 @@ from typing import Any
 from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
-from otolith.health.catalogue import Language, catalogue
 from otolith.health.diagnosis import Rule, RulesFile, worded
+from otolith.health.language import Language, texts_in
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan
 from otolith.machine_drivers import build_driver, driver_configs, observed_signals, own_keys
 from otolith.machine_file import (
@@ -365,7 +365,7 @@ def _with_temperature(
 def load_rules(language: Language = "en") -> tuple[Rule, ...]:
     """Return the rules of the diagnosis."""
     source = read(RULES)
-    return worded(validate(parse(source), RulesFile, source).rule, catalogue(language))
+    return worded(validate(parse(source), RulesFile, source).rule, texts_in(language))
 
 
 def _monitored(parameter: Parameter, table: LimitsTable, where: tuple[str, ...], context: Context) -> MonitoredQuantity:

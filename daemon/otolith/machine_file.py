@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.acquisition.samples import Check
-from otolith.health.catalogue import Language
+from otolith.health.language import Language
 from otolith_drivers.base import Sampling
 from otolith_drivers.config_files import Limits, StrictModel
 from otolith_drivers.units import Quantity

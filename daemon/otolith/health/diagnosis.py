@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from otolith.health.catalogue import Catalogue, catalogue
+from otolith.health.language import Texts, texts_in
 from otolith_drivers.config_files import StrictModel
 
 KEYS = ("twin", "subject", "side", "manner", "family", "input")
@@ -67,7 +67,7 @@ class Rule(StrictModel):
     """A row: the values that it matches, and what they mean. A key without values matches everything."""
 
     id: str
-    """Key of its texts in the catalogue."""
+    """Key of its texts in `texts/`."""
     finding: FindingKind
     twin: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
@@ -78,7 +78,7 @@ class Rule(StrictModel):
     order: tuple[float, float] | None = None
     """Lowest and highest order."""
     condition: str = ""
-    """This one, cause and advice are those of the catalogue."""
+    """This one, cause and advice are from there."""
     cause: str = ""
     advice: str = ""
     severity: Literal["WATCH", "ACT"] = "WATCH"
@@ -112,17 +112,17 @@ def matching(rules: Sequence[Rule], features: FindingFeatures) -> list[Rule]:
     return [rule for rule in rows if rule.specificity == most]
 
 
-def worded(rules: Sequence[Rule], texts: Catalogue) -> tuple[Rule, ...]:
+def worded(rules: Sequence[Rule], texts: Texts) -> tuple[Rule, ...]:
     """Return the rules with condition, cause and advice in the language of ``texts``."""
     return tuple(rule.model_copy(update=texts.rules[rule.id]) for rule in rules)
 
 
-def diagnose(rules: Sequence[Rule], features: FindingFeatures, texts: Catalogue | None = None) -> dict[str, str]:
+def diagnose(rules: Sequence[Rule], features: FindingFeatures, texts: Texts | None = None) -> dict[str, str]:
     """Return ids, condition, cause, advice and source of the rows that match, alternatives joined; empty without one.
 
     ``texts`` has the joints; English by default.
     """
-    rows, texts = matching(rules, features), texts or catalogue("en")
+    rows, texts = matching(rules, features), texts or texts_in("en")
     joints = {
         "condition_id": ("id", " "),
         "condition": ("condition", texts("or")),

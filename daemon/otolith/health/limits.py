@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from otolith.estimation.information import QUANTILE
-from otolith.health.catalogue import Catalogue, Language, catalogue
 from otolith.health.diagnosis import Rule
+from otolith.health.language import Language, Texts, texts_in
 
 RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
 MIN_TEMPERATURE_FACTOR = 0.1  # relative value at a temperature, below which the temperature cannot be true
@@ -128,9 +128,9 @@ class MonitoringPlan:
     """Of the parameters that are not estimated, against the values of the machine file."""
 
     @property
-    def texts(self) -> Catalogue:
+    def texts(self) -> Texts:
         """The texts in the language of the machine."""
-        return catalogue(self.language)
+        return texts_in(self.language)
 
     @property
     def parts(self) -> tuple[str, ...]:

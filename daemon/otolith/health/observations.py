@@ -7,8 +7,8 @@ from otolith.discovery.adopted import Approval
 from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS
 from otolith.discovery.decision import WindowDecision
 from otolith.estimation.information import QUANTILE
-from otolith.health.catalogue import Catalogue
 from otolith.health.diagnosis import FindingFeatures, FindingKind, severity
+from otolith.health.language import Texts
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan, probability_beyond
 from otolith.health.schema import (
     ComponentDocument,
@@ -215,11 +215,11 @@ def _numbers(value: float, sd: float, unit: str, limit: Limit | None) -> dict[st
     return numbers | {"limit": limit.value, "probability": probability_beyond(limit, value, sd)}
 
 
-def _at_temperature(quantity: MonitoredQuantity, texts: Catalogue) -> str:
+def _at_temperature(quantity: MonitoredQuantity, texts: Texts) -> str:
     return texts("at_temperature", temperature=f"{quantity.reference - 273.15:.3g}") if quantity.temperature else ""
 
 
-def _warming(quantity: MonitoredQuantity, deviation: float, texts: Catalogue) -> str:
+def _warming(quantity: MonitoredQuantity, deviation: float, texts: Texts) -> str:
     """Return by how much warmer a parameter without a measured temperature would have to be for its deviation."""
     if quantity.temperature or not quantity.temperature_coefficient or not quantity.nominal:
         return ""

@@ -14,8 +14,8 @@ from otolith.discovery.adopted import Approval
 from otolith.discovery.decision import WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.information import Identifiability, Outcome
-from otolith.health.catalogue import Language
 from otolith.health.diagnosis import FindingKind
+from otolith.health.language import Language
 from otolith.health.limits import Level
 from otolith_drivers.config_files import StrictModel
 

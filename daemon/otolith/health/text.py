@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from otolith.acquisition.quality import time_text
 from otolith.estimation.information import QUANTILE
-from otolith.health.catalogue import Language, catalogue
+from otolith.health.language import Language, texts_in
 from otolith.health.schema import (
     ComponentDocument,
     CrossingDocument,
@@ -67,7 +67,7 @@ def finding_text(finding: FindingDocument) -> str:
 
 def event_text(event: EventDocument, when: Callable[[float], str] = time_text) -> str:
     """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text."""
-    texts = catalogue(event.language)
+    texts = texts_in(event.language)
     part, condition = texts.translated(event.part), event.condition
     if event.end is not None:
         return texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
@@ -82,7 +82,7 @@ def probability_text(event: EventDocument) -> str:
     """How sure it is that the limit is passed; empty if the event has none."""
     if (probability := event.evidence.probability) is None:
         return ""
-    texts = catalogue(event.language)
+    texts = texts_in(event.language)
     return texts("nearly_sure") if probability > 0.999 else texts("probability", share=f"{100.0 * probability:.3g}")
 
 
@@ -95,7 +95,7 @@ def duration_text(seconds: float) -> str:
 
 def crossing_text(crossing: CrossingDocument, level: str, now: float, language: Language = "en") -> str:
     """When a limit is passed, from ``now`` in Unix s: ``reaches ACT in 3.1 h to 5 h``."""
-    texts, low = catalogue(language), duration_text(crossing.low - now)
+    texts, low = texts_in(language), duration_text(crossing.low - now)
     level = texts.translated(level)
     if crossing.high is None:
         return texts("reaches_after", level=level, low=low)
@@ -122,7 +122,7 @@ def announcements(document: ReportDocument) -> list[EventDocument]:
 
 def headline(health: HealthDocument, when: Callable[[float], str] = time_text) -> str:
     """State of the machine, since when, and which parts are in it and why."""
-    texts, parts = catalogue(health.language), health.parts.items()
+    texts, parts = texts_in(health.language), health.parts.items()
     reasons = {name: part.reason for name, part in parts if part.state is health.state and part.reason}
     why = "; ".join(f"{texts.translated(name)}: {reason}" for name, reason in reasons.items())
     state = f"{texts.translated(health.state)} {texts('since', time=when(health.since))}"

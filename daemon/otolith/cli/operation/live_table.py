@@ -13,8 +13,8 @@ from rich.text import Text
 
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import local_time
-from otolith.health.catalogue import catalogue
 from otolith.health.diagnosis import FindingKind
+from otolith.health.language import texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import event_text, forecast_text, headline, interval_text, value_cells
@@ -121,7 +121,7 @@ def state_lines(document: ReportDocument) -> list[Text]:
     if health is None:
         return []
     parts = Text()
-    say = catalogue(health.language).translated
+    say = texts_in(health.language).translated
     for name, part in health.parts.items():
         parts.append(f"{say(name)} ").append(say(part.state), style=LEVEL_STYLES[part.state]).append("  ")
     current = [event for event in document.events if event.end is None]

@@ -1,4 +1,4 @@
-"""The catalogue: every language has the same texts, and what people read is in the language of the machine."""
+"""The texts: every language has the same texts, and what people read is in the language of the machine."""
 
 import re
 import tomllib
@@ -11,8 +11,8 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.health import catalogue as module
-from otolith.health.catalogue import LANGUAGES, Language, catalogue
+from otolith.health import language as module
+from otolith.health.language import LANGUAGES, Language, texts_in
 from otolith.health.limits import MACHINE, Level
 from otolith.health.observations import BUS, SENSORS
 from otolith.health.schema import ReportDocument
@@ -21,7 +21,7 @@ from otolith.machine import find_twin, library_twins, load_machine, load_rules
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES, SIGNALS, OwnMachine
 
-GERMAN = catalogue("de")
+GERMAN = texts_in("de")
 OTHERS = [language for language in LANGUAGES if language != "en"]
 
 
@@ -31,7 +31,7 @@ def names(text: str) -> list[str]:
 
 @pytest.mark.parametrize("language", OTHERS)
 def test_every_language_has_the_same_keys_and_names(language: Language) -> None:
-    own, english = catalogue(language), catalogue("en")
+    own, english = texts_in(language), texts_in("en")
     assert {key: names(text) for key, text in own.texts.items()} == {
         key: names(text) for key, text in english.texts.items()
     }
@@ -57,7 +57,7 @@ def test_what_the_library_and_the_states_name_is_translated(language: Language) 
     for twin in twins:
         words |= {parameter.meaning for parameter in twin.parameters} | {site.meaning for site in twin.sites}
         words |= {parameter.part for parameter in twin.parameters} | {site.part for site in twin.sites}
-    assert words - set(catalogue(language).phrases) - {""} == set()
+    assert words - set(texts_in(language).phrases) - {""} == set()
 
 
 @pytest.mark.parametrize("language", OTHERS)
@@ -67,7 +67,7 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
     paths = [path for path in folder.rglob("*") if path.suffix in {".py", ".toml"} and path.parent.name != "texts"]
     source = "".join(path.read_text(encoding="utf-8") for path in paths)
     parts = {
-        phrase: max(re.split(r"{\w+}|[:;,()]| if ", phrase), key=len).strip() for phrase in catalogue(language).phrases
+        phrase: max(re.split(r"{\w+}|[:;,()]| if ", phrase), key=len).strip() for phrase in texts_in(language).phrases
     }
     assert {phrase: part for phrase, part in parts.items() if part not in source} == {}
 
@@ -103,7 +103,7 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
 )
 def test_what_the_core_composes_is_translated_in_parts(english: str, german: str) -> None:
     assert GERMAN.translated(english) == german
-    assert catalogue("en").translated(english) == english
+    assert texts_in("en").translated(english) == english
 
 
 def reports(own_machine: OwnMachine, scenario: str, count: int) -> list[ReportDocument]:

@@ -17,7 +17,7 @@ ALTERNATIVES, PARTS = "; or ", "; "  # between the parts of a sentence
 
 
 @dataclass(frozen=True, slots=True)
-class Catalogue:
+class Texts:
     """The texts of a language."""
 
     language: Language
@@ -50,12 +50,12 @@ class Catalogue:
 
 
 @lru_cache
-def catalogue(language: Language) -> Catalogue:
+def texts_in(language: Language) -> Texts:
     """Return the texts of a language."""
     content = tomllib.loads(files("otolith.health").joinpath("texts", f"{language}.toml").read_text(encoding="utf-8"))
     phrases: dict[str, str] = content.get("phrases", {})
     patterns = tuple((_pattern(phrase), text) for phrase, text in phrases.items() if "{" in phrase)
-    return Catalogue(language, content["rules"], content["texts"], phrases, patterns)
+    return Texts(language, content["rules"], content["texts"], phrases, patterns)
 
 
 def _pattern(phrase: str) -> re.Pattern[str]:
