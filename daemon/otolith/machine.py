@@ -14,7 +14,8 @@ from typing import Any
 from otolith.acquisition.quality import QualityLimits
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key_of
-from otolith.health.diagnosis import Rule, RulesFile
+from otolith.health.diagnosis import Rule, RulesFile, worded
+from otolith.health.language import Language, texts_in
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan
 from otolith.machine_drivers import build_driver, driver_configs, observed_signals, own_keys
 from otolith.machine_file import (
@@ -330,7 +331,8 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         for name, row in amplitudes.items()
     }
     known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
-    return MonitoringPlan(parameters, components, load_rules(), known=known)
+    language = file.machine.language
+    return MonitoringPlan(parameters, components, load_rules(language), language=language, known=known)
 
 
 def _known(parameter: Parameter, context: Context) -> MonitoredQuantity:
@@ -360,10 +362,10 @@ def _with_temperature(
     return replace(quantity, temperature_coefficient=coefficient, temperature=temperature, reference=reference)
 
 
-def load_rules() -> tuple[Rule, ...]:
+def load_rules(language: Language = "en") -> tuple[Rule, ...]:
     """Return the rules of the diagnosis."""
     source = read(RULES)
-    return validate(parse(source), RulesFile, source).rule
+    return worded(validate(parse(source), RulesFile, source).rule, texts_in(language))
 
 
 def _monitored(parameter: Parameter, table: LimitsTable, where: tuple[str, ...], context: Context) -> MonitoredQuantity:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.acquisition.samples import Check
+from otolith.health.language import Language
 from otolith_drivers.base import Sampling
 from otolith_drivers.config_files import Limits, StrictModel
 from otolith_drivers.units import Quantity
@@ -80,6 +81,8 @@ class MachineTable(StrictModel):
 
     name: Name
     site: Name = "site"
+    language: Language = "en"
+    """Of states, events and advice."""
     on_event: Annotated[tuple[str, ...], AfterValidator(_command)] = ()
     """Command and arguments that the daemon runs for each event."""
 

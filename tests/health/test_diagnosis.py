@@ -106,7 +106,7 @@ def test_conditions_that_the_data_do_not_distinguish_are_one_class() -> None:
 
 def test_a_class_calls_for_action_only_if_each_member_does() -> None:
     rows = [
-        Rule(finding=FindingKind.SENSOR, condition=level, cause="c", advice="a", severity=level, source="s")
+        Rule(id=level, finding=FindingKind.SENSOR, condition=level, cause="c", advice="a", severity=level, source="s")
         for level in ("ACT", "WATCH")
     ]
     features = FindingFeatures(FindingKind.SENSOR)

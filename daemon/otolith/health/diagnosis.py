@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from otolith.health.language import Texts, texts_in
 from otolith_drivers.config_files import StrictModel
 
 KEYS = ("twin", "subject", "side", "manner", "family", "input")
@@ -65,6 +66,8 @@ class FindingFeatures:
 class Rule(StrictModel):
     """A row: the values that it matches, and what they mean. A key without values matches everything."""
 
+    id: str
+    """Key of its texts in `texts/`."""
     finding: FindingKind
     twin: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
@@ -74,9 +77,10 @@ class Rule(StrictModel):
     input: tuple[str, ...] = ()
     order: tuple[float, float] | None = None
     """Lowest and highest order."""
-    condition: str
-    cause: str
-    advice: str
+    condition: str = ""
+    """This one, cause and advice are from there."""
+    cause: str = ""
+    advice: str = ""
     severity: Literal["WATCH", "ACT"] = "WATCH"
     """Level of what has no limits."""
     source: str
@@ -108,12 +112,28 @@ def matching(rules: Sequence[Rule], features: FindingFeatures) -> list[Rule]:
     return [rule for rule in rows if rule.specificity == most]
 
 
-def diagnose(rules: Sequence[Rule], features: FindingFeatures) -> dict[str, str]:
-    """Return condition, cause, advice and source of the rows that match, alternatives joined; empty without one."""
-    rows = matching(rules, features)
-    joints = {"condition": " or ", "cause": "; or ", "advice": "; ", "source": "; "}
+def worded(rules: Sequence[Rule], texts: Texts) -> tuple[Rule, ...]:
+    """Return the rules with condition, cause and advice in the language of ``texts``."""
+    return tuple(rule.model_copy(update=texts.rules[rule.id]) for rule in rules)
+
+
+def diagnose(rules: Sequence[Rule], features: FindingFeatures, texts: Texts | None = None) -> dict[str, str]:
+    """Return ids, condition, cause, advice and source of the rows that match, alternatives joined; empty without one.
+
+    ``texts`` has the joints; English by default.
+    """
+    rows, texts = matching(rules, features), texts or texts_in("en")
+    joints = {
+        "condition_id": ("id", " "),
+        "condition": ("condition", texts("or")),
+        "cause": ("cause", texts("alternatives")),
+        "advice": ("advice", "; "),
+        "source": ("source", "; "),
+    }
     return {
-        key: joint.join(dict.fromkeys(getattr(rule, key) for rule in rows)) for key, joint in joints.items() if rows
+        name: joint.join(dict.fromkeys(getattr(rule, key) for rule in rows))
+        for name, (key, joint) in joints.items()
+        if rows
     }
 
 

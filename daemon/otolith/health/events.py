@@ -5,7 +5,7 @@
 Times are those of the windows. A window that determines nothing about a condition leaves it as it was.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
@@ -78,6 +78,7 @@ class HealthState:
 
 def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> tuple[HealthState, ReportDocument]:
     """Return the state after ``report``, and the report with states and events."""
+    report = _translated(plan, report)
     state = _with_forecasts(plan, _with_steps(state, report), report)
     parameters = {
         name: item.model_copy(update={"forecast": state.forecasts.get(name), **_judged(plan, report, name)})
@@ -106,7 +107,8 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
         if not record.is_over:
             records[key] = record
     events.sort(key=lambda event: -event.state.rank)
-    document = _states(plan, state.document, report, [event for event in events if event.end is None])
+    current = [event for event in events if event.end is None]
+    document = _states(plan, state.document, report, current, state.determined)
     changed = {"health": document, "events": tuple(events)}
     state = replace(state, records=records, document=document, inside=state.inside | was_ok)
     return state, report.model_copy(update=changed)
@@ -117,6 +119,28 @@ def _from_start(observed: Observation) -> Observation:
     if observed.features.finding is not FindingKind.LIMIT:
         return observed
     return replace(observed, features=replace(observed.features, finding=FindingKind.LIMIT_FROM_START))
+
+
+def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
+    """Return the report with the texts of the core in the language of the machine."""
+    say = plan.texts.translated
+    if plan.language == "en":
+        return report
+    quality, absent = report.window.quality, report.window.absent
+    quality = quality.model_copy(update={"reasons": tuple(map(say, quality.reasons))})
+    absent = absent and {name: say(text) for name, text in absent.items()}
+    findings = [
+        item.model_copy(update={key: say(getattr(item, key)) for key in ("condition", "text", "advice")})
+        for item in report.findings
+    ]
+    parameters = {
+        name: item.model_copy(update={"reason": say(item.reason), "advice": item.advice and say(item.advice)})
+        for name, item in report.parameters.items()
+    }
+    components = [item.model_copy(update={"meaning": say(item.meaning)}) for item in report.components]
+    window = report.window.model_copy(update={"quality": quality, "absent": absent})
+    changed = {"findings": tuple(findings), "parameters": parameters, "components": tuple(components)}
+    return report.model_copy(update={**changed, "window": window})
 
 
 def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
@@ -179,7 +203,7 @@ def _advance(
         evidence = EvidenceDocument(windows=(first.index, report.window.index))
         event = EventDocument(
             id=f"{observed.key}@{start:.1f}", part=observed.part, state=level, change=EventChange.RAISED,
-            start=start, since=start, condition="", text="", evidence=evidence,
+            start=start, since=start, condition="", text="", evidence=evidence, language=plan.language,
         )  # fmt: skip
     elif event is not None and level is not before.level:
         is_over = level is Level.OK
@@ -188,7 +212,7 @@ def _advance(
         event = event.model_copy(update={"change": change, **changed})
     if event is not None and observed.level is not Level.OK:
         described = event.model_copy(update=_description(plan, event, observed, report.window.index))
-        is_other = event.condition not in ("", described.condition) and event.change is None
+        is_other = event.condition_id not in ("", described.condition_id) and event.change is None
         event = described.model_copy(update={"change": EventChange.CHANGED}) if is_other else described
     return ConditionRecord(level, recent, event, persistence)
 
@@ -208,21 +232,26 @@ def _description(
     plan: MonitoringPlan, event: EventDocument, observed: Observation, window: int
 ) -> dict[str, str | EvidenceDocument]:
     """Return text, diagnosis and evidence of an observation that shows the condition, by the keys of the event."""
-    texts = {"condition": observed.condition, **diagnose(plan.rules, observed.features)}
+    texts = {"condition": str(observed.features.finding), "condition_id": str(observed.features.finding)}
+    texts |= {"language": plan.language, **diagnose(plan.rules, observed.features, plan.texts)}
     texts["advice"] = "; ".join(filter(None, (texts.get("advice"), observed.advice)))
     numbers = {"windows": (event.evidence.windows[0], window), **(observed.numbers or {})}
     return {**texts, "text": observed.text, "evidence": event.evidence.model_copy(update=numbers)}
 
 
 def _states(
-    plan: MonitoringPlan, before: HealthDocument | None, report: ReportDocument, events: Sequence[EventDocument]
+    plan: MonitoringPlan,
+    before: HealthDocument | None,
+    report: ReportDocument,
+    events: Sequence[EventDocument],
+    determined: Collection[str],
 ) -> HealthDocument:
     """Return the states of parts and machine; ``events`` begin with the most severe."""
     worst = {event.part: event for event in reversed(events)}
     silent = next((event for event in events if event.state is Level.NO_DATA and event.part == BUS), None)
     parts: dict[str, PartDocument] = {}
     for part in dict.fromkeys((*plan.parts, SENSORS, BUS, *worst)):
-        event, missing = worst.get(part, silent), _undetermined(plan, part, report)
+        event, missing = worst.get(part, silent), _undetermined(plan, part, report, determined)
         state = event.state if event else Level.NO_DATA if missing else Level.OK
         since, reason = (event.since, event.condition) if event else (report.window.start, missing)
         parts[part] = _kept(before.parts.get(part) if before else None, state, since, reason)
@@ -233,7 +262,7 @@ def _states(
     reason = "; ".join(dict.fromkeys(item.reason for item in same if item.reason))
     since = min(item.since for item in same) if levels else report.window.start
     whole = _kept(before, state, since, reason)
-    return HealthDocument(state=state, since=whole.since, reason=reason, parts=parts)
+    return HealthDocument(state=state, since=whole.since, reason=reason, parts=parts, language=plan.language)
 
 
 def _kept(before: PartDocument | None, state: Level, since: float, reason: str) -> PartDocument:
@@ -242,8 +271,12 @@ def _kept(before: PartDocument | None, state: Level, since: float, reason: str) 
     return PartDocument(state=state, since=since, reason=reason)
 
 
-def _undetermined(plan: MonitoringPlan, part: str, report: ReportDocument) -> str:
-    """Return why nothing is known of a part of the twin; empty if something is."""
+def _undetermined(plan: MonitoringPlan, part: str, report: ReportDocument, determined: Collection[str]) -> str:
+    """Return why nothing is known of a part of the twin; empty if something is.
+
+    ``determined`` are the parameters that once were.
+    """
     own = [name for name, quantity in plan.parameters.items() if quantity.part == part] or list(report.parameters)
     known = any(report.parameters[name].value is not None for name in own if name in report.parameters)
-    return "" if known or part not in plan.parts else f"not determined yet: {', '.join(own)}"
+    key = "no_longer" if any(name in determined for name in own) else "not_yet"
+    return "" if known or part not in plan.parts else plan.texts(key, names=", ".join(own))

@@ -12,6 +12,7 @@ from enum import StrEnum
 
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import Rule
+from otolith.health.language import Language, Texts, texts_in
 
 RELEASE = 0.1  # of the distance from the nominal value to a limit, by which a value must be back inside
 MIN_TEMPERATURE_FACTOR = 0.1  # relative value at a temperature, below which the temperature cannot be true
@@ -121,8 +122,15 @@ class MonitoringPlan:
     rules: Sequence[Rule] = ()
     stated: Mapping[str, MonitoredQuantity] | None = None
     """The parameters as the machine file states them, if there is a baseline."""
+    language: Language = "en"
+    """Of the texts for people."""
     known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Of the parameters that are not estimated, against the values of the machine file."""
+
+    @property
+    def texts(self) -> Texts:
+        """The texts in the language of the machine."""
+        return texts_in(self.language)
 
     @property
     def parts(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS
 from otolith.discovery.decision import WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingFeatures, FindingKind, severity
+from otolith.health.language import Texts
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan, probability_beyond
 from otolith.health.schema import (
     ComponentDocument,
@@ -55,8 +56,6 @@ class Observation:
     """None if the window does not show it."""
     features: FindingFeatures = NOTHING
     text: str = ""
-    condition: str = ""
-    """What it is called if no rule matches."""
     advice: str = ""
     """Beside that of the rules."""
     since: float | None = None
@@ -83,11 +82,12 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
     data = Level.NO_DATA if report.decision is WindowDecision.BAD else Level.OK
     held = (parameter.reason for parameter in report.parameters.values() if parameter.reason)
     reasons = "; ".join(report.window.quality.reasons) or next(held, "")  # where values, not times, are unusable
-    no_data = Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons, "no usable data")
+    no_data = Observation("data", BUS, data, FindingFeatures(FindingKind.NO_DATA), reasons)
     observations = [*_of_sources(report, before), no_data]  # of one state, the first is more specific
     if report.decision is WindowDecision.REFUSED:
-        features, text = FindingFeatures(FindingKind.UNEXPLAINED, report.twin), str(report.decision)
-        unexplained = Observation("unexplained", MACHINE, Level.WATCH, features, text, "an unknown change")
+        features = FindingFeatures(FindingKind.UNEXPLAINED, report.twin)
+        text = plan.texts.translated(report.decision)
+        unexplained = Observation("unexplained", MACHINE, Level.WATCH, features, text)
         observations.append(replace(unexplained, persistence=Persistence(fall=RELEASE_WINDOWS)))
     for name, parameter in report.parameters.items():
         own = _of_parameter(plan, report, name, before, past.steps.get(name, 0.0))
@@ -115,7 +115,7 @@ def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator
 def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Level) -> Observation:
     """Return the observation of a finding; a parameter that has moved within the limits of the twin is none."""
     features = FindingFeatures(finding.kind, twin, finding.subject)
-    part, texts = PARTS.get(finding.kind, MACHINE), (finding.text, finding.condition, finding.advice)
+    part, text = PARTS.get(finding.kind, MACHINE), finding.text
     level, numbers, value = Level(severity(plan.rules, features)), None, finding.value
     if value is not None:
         quantity = plan.known.get(finding.subject, MonitoredQuantity())
@@ -125,10 +125,10 @@ def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, befor
         features = replace(features, side=side, manner="step")
         interval = interval_text(value.value, value.sd, value.unit)
         share = f" ({deviation / quantity.nominal:+.1%})" if quantity.nominal else ""
-        text = f"{quantity.meaning} {finding.subject} is {interval}{share}, stated as {quantity.nominal:.5g}"
-        texts = (text, *texts[1:])
+        what, stated = plan.texts.translated(quantity.meaning), f"{quantity.nominal:.5g}"
+        text = plan.texts("moved", what=what, name=finding.subject, value=interval, change=share, stated=stated)
     persistence = UNDECIDED if finding.kind in (FindingKind.CLASS, FindingKind.MOVED) else Persistence()
-    return Observation(finding.id, part, level, features, *texts, finding.since, numbers, persistence)
+    return Observation(finding.id, part, level, features, text, finding.advice, finding.since, numbers, persistence)
 
 
 def _of_parameter(
@@ -147,15 +147,23 @@ def _of_parameter(
         return Observation(key, quantity.part, level)
     manner = _manner(parameter, deviation, step)
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
-    against = " of the baseline" if quantity.has_baseline else ""
+    texts = plan.texts
+    against = texts("of_baseline") if quantity.has_baseline else ""
     share = f"{deviation / quantity.nominal:+.1%}" if quantity.nominal else ""
-    change = f" ({share}{against}{_at_temperature(quantity)})" if share else ""
-    beyond = f"{limit.side} its limit {limit.value:.4g} {unit}"
-    expected = forecast_text(parameter, report.window.end)
-    text = f"{quantity.meaning} {name} is {value_text(parameter)}{change}, {beyond}{expected and f', {expected}'}"
-    text += _warming(quantity, deviation)
-    condition, numbers = f"{quantity.meaning} is {limit.side} its limit", _numbers(*referred, unit, limit)
-    return Observation(key, quantity.part, level, features, text, condition, numbers=numbers)
+    expected = forecast_text(parameter, report.window.end, texts.language)
+    text = texts(
+        "limit",
+        what=texts.translated(quantity.meaning),
+        name=name,
+        value=value_text(parameter),
+        change=f" ({share}{against}{_at_temperature(quantity, texts)})" if share else "",
+        side=texts(limit.side),
+        limit=f"{limit.value:.4g}",
+        unit=unit,
+        expected=expected and f", {expected}",
+        warming=_warming(quantity, deviation, texts),
+    )
+    return Observation(key, quantity.part, level, features, text, numbers=_numbers(*referred, unit, limit))
 
 
 def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Level | None, span: float) -> Observation:
@@ -169,12 +177,13 @@ def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Le
         return Observation(key, quantity.part, level and Level.OK)
     crossings = [item for item in (forecast.watch, forecast.act) if item is not None and item.low > report.window.end]
     is_sure = span >= MIN_TREND_SPAN and bool(crossings) and crossings[0].high is not None
-    if not is_sure or _warming(quantity, crossings[0].limit - quantity.nominal):
+    if not is_sure or _warming(quantity, crossings[0].limit - quantity.nominal, plan.texts):
         return Observation(key, quantity.part, Level.OK)
     side = "below" if crossings[0].limit < quantity.nominal else "above"
     features = FindingFeatures(FindingKind.TREND, report.twin, name, side, "trend")
-    expected = forecast_text(parameter, report.window.end)
-    text = f"{quantity.meaning} {name} is {value_text(parameter)} and {expected} (80 %)"
+    expected = forecast_text(parameter, report.window.end, plan.language)
+    what = plan.texts.translated(quantity.meaning)
+    text = plan.texts("trend", what=what, name=name, value=value_text(parameter), expected=expected)
     return Observation(key, quantity.part, Level(severity(plan.rules, features)), features, text)
 
 
@@ -182,13 +191,15 @@ def _of_lost(
     plan: MonitoringPlan, report: ReportDocument, name: str, parameter: ParameterDocument, since: float
 ) -> Observation:
     """Return whether a parameter has not been determined since ``since`` although the machine moves."""
-    part, key = plan.parameters.get(name, MonitoredQuantity()).part, f"lost/{name}"
+    quantity, key = plan.parameters.get(name, MonitoredQuantity()), f"lost/{name}"
+    part, texts = quantity.part, plan.texts
     if is_determined(parameter):
         return Observation(key, part, Level.OK)
     others = [item for item in report.parameters.values() if item.status is Status.ESTIMATED]
     if report.window.end - since <= LOST_AFTER or not others:
         return Observation(key, part, None)
-    text = f"{name} is {value_text(parameter)}: {parameter.reason}"
+    value = texts("unknown") if parameter.value is None else value_text(parameter)
+    text = texts("lost", what=texts.translated(quantity.meaning), name=name, value=value, reason=parameter.reason)
     features = FindingFeatures(FindingKind.LOST, report.twin, name)
     return Observation(key, part, Level.NO_DATA, features, text, advice=parameter.advice or "", since=since)
 
@@ -205,18 +216,16 @@ def _numbers(value: float, sd: float, unit: str, limit: Limit | None) -> dict[st
     return numbers | {"limit": limit.value, "probability": probability_beyond(limit, value, sd)}
 
 
-def _at_temperature(quantity: MonitoredQuantity) -> str:
-    return f" at {quantity.reference - 273.15:.3g} °C" if quantity.temperature else ""
+def _at_temperature(quantity: MonitoredQuantity, texts: Texts) -> str:
+    return texts("at_temperature", temperature=f"{quantity.reference - 273.15:.3g}") if quantity.temperature else ""
 
 
-def _warming(quantity: MonitoredQuantity, deviation: float) -> str:
+def _warming(quantity: MonitoredQuantity, deviation: float, texts: Texts) -> str:
     """Return by how much warmer a parameter without a measured temperature would have to be for its deviation."""
     if quantity.temperature or not quantity.temperature_coefficient or not quantity.nominal:
         return ""
     kelvin = deviation / quantity.nominal / quantity.temperature_coefficient
-    if kelvin <= 0.0:
-        return ""
-    return f"; being {kelvin:.3g} K warmer than at the nominal value would explain it: no temperature is measured"
+    return texts("warming", kelvin=f"{kelvin:.3g}") if kelvin > 0.0 else ""
 
 
 def _without_temperature(plan: MonitoringPlan, report: ReportDocument) -> list[Observation]:
@@ -225,10 +234,9 @@ def _without_temperature(plan: MonitoringPlan, report: ReportDocument) -> list[O
     for name, quantity in plan.parameters.items():
         if quantity.temperature:
             is_known = quantity.referred(1.0, 0.0, report.window.observed or {}) is not None
-            text = f"no usable value of {quantity.temperature}: the limits of {name} are not judged"
+            text = plan.texts("no_temperature", signal=quantity.temperature, name=name)
             level, features = Level.OK if is_known else Level.NO_DATA, FindingFeatures(FindingKind.NO_TEMPERATURE)
-            key, condition = f"temperature/{name}", "no temperature"
-            observations.append(Observation(key, quantity.part, level, features, text, condition))
+            observations.append(Observation(f"temperature/{name}", quantity.part, level, features, text))
     return observations
 
 
@@ -266,8 +274,6 @@ def _of_component(
     elif size > QUANTILE * amplitude.sd and not is_expected:
         level = Level(severity(plan.rules, features))
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
-    text = f"new {component.meaning} {component.equation}, amplitude {interval}"
+    text = plan.texts("component", what=component.meaning, equation=component.equation, value=interval)
     numbers = _numbers(size, amplitude.sd, amplitude.unit, limit)
-    return Observation(
-        key, quantity.part, level, features, text, component.conditions, since=component.onset, numbers=numbers
-    )
+    return Observation(key, quantity.part, level, features, text, since=component.onset, numbers=numbers)

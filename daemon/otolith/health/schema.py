@@ -15,6 +15,7 @@ from otolith.discovery.decision import WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.information import Identifiability, Outcome
 from otolith.health.diagnosis import FindingKind
+from otolith.health.language import Language
 from otolith.health.limits import Level
 from otolith_drivers.config_files import StrictModel
 
@@ -140,10 +141,14 @@ class EventDocument(StrictModel):
     """Begin of the present state."""
     end: float | None = None
     condition: str
+    condition_id: str = ""
+    """Ids of the rules that the condition is from, with spaces between; the same in all languages."""
     text: str
     cause: str = ""
     advice: str = ""
     source: str = ""
+    language: Language = "en"
+    """Of condition, text, cause and advice."""
     evidence: EvidenceDocument
 
     @property
@@ -165,6 +170,8 @@ class HealthDocument(PartDocument):
     """State of the machine and of its parts."""
 
     parts: dict[str, PartDocument]
+    language: Language = "en"
+    """Of the reasons."""
 
 
 SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"

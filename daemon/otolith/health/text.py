@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from otolith.acquisition.quality import time_text
 from otolith.estimation.information import QUANTILE
+from otolith.health.language import Language, texts_in
 from otolith.health.schema import (
     ComponentDocument,
     CrossingDocument,
@@ -66,18 +67,23 @@ def finding_text(finding: FindingDocument) -> str:
 
 def event_text(event: EventDocument, when: Callable[[float], str] = time_text) -> str:
     """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text."""
+    texts = texts_in(event.language)
+    part, condition = texts.translated(event.part), event.condition
     if event.end is not None:
-        return f"cleared: {event.part}: {event.condition}, from {when(event.start)} to {when(event.end)}"
+        return texts("cleared", part=part, condition=condition, start=when(event.start), end=when(event.end))
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
     advice = f"; {event.advice}" if event.advice else ""
-    return f"{event.state}: {event.part}: {event.condition} since {when(event.since)}: {event.text}{sure}{advice}"
+    state, since = texts.translated(event.state), when(event.since)
+    values = {"state": state, "part": part, "condition": condition, "since": since, "text": event.text}
+    return texts("event", **values, sure=sure, advice=advice)
 
 
 def probability_text(event: EventDocument) -> str:
     """How sure it is that the limit is passed; empty if the event has none."""
     if (probability := event.evidence.probability) is None:
         return ""
-    return f"with {'over 99.9' if probability > 0.999 else f'{100.0 * probability:.3g}'} % probability"
+    texts = texts_in(event.language)
+    return texts("nearly_sure") if probability > 0.999 else texts("probability", share=f"{100.0 * probability:.3g}")
 
 
 def duration_text(seconds: float) -> str:
@@ -87,22 +93,25 @@ def duration_text(seconds: float) -> str:
     return f"{number:.0f} {unit}" if number >= 10.0 else f"{number:.2g} {unit}"
 
 
-def crossing_text(crossing: CrossingDocument, level: str, now: float) -> str:
+def crossing_text(crossing: CrossingDocument, level: str, now: float, language: Language = "en") -> str:
     """When a limit is passed, from ``now`` in Unix s: ``reaches ACT in 3.1 h to 5 h``."""
-    low = duration_text(crossing.low - now)
+    texts, low = texts_in(language), duration_text(crossing.low - now)
+    level = texts.translated(level)
     if crossing.high is None:
-        return f"reaches {level} in more than {low}"
+        return texts("reaches_after", level=level, low=low)
     high = duration_text(crossing.high - now)
-    return f"reaches {level} in {low} to {high}" if low != high else f"reaches {level} in {low}"
+    return texts("reaches" if low == high else "reaches_between", level=level, low=low, high=high)
 
 
-def forecast_text(parameter: ParameterDocument, now: float) -> str:
+def forecast_text(parameter: ParameterDocument, now: float, language: Language = "en") -> str:
     """When a parameter passes its limits, from ``now`` in Unix s; empty without a forecast of the time after it."""
     if (forecast := parameter.forecast) is None:
         return ""
     levels = (("WATCH", forecast.watch), ("ACT", forecast.act))
     return ", ".join(
-        crossing_text(crossing, level, now) for level, crossing in levels if crossing is not None and crossing.at > now
+        crossing_text(crossing, level, now, language)
+        for level, crossing in levels
+        if crossing is not None and crossing.at > now
     )
 
 
@@ -113,9 +122,11 @@ def announcements(document: ReportDocument) -> list[EventDocument]:
 
 def headline(health: HealthDocument, when: Callable[[float], str] = time_text) -> str:
     """State of the machine, since when, and which parts are in it and why."""
-    reasons = {name: part.reason for name, part in health.parts.items() if part.state is health.state and part.reason}
-    why = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-    return f"{health.state} since {when(health.since)}" + (f": {why}" if why else "")
+    texts, parts = texts_in(health.language), health.parts.items()
+    reasons = {name: part.reason for name, part in parts if part.state is health.state and part.reason}
+    why = "; ".join(f"{texts.translated(name)}: {reason}" for name, reason in reasons.items())
+    state = f"{texts.translated(health.state)} {texts('since', time=when(health.since))}"
+    return state + (f": {why}" if why else "")
 
 
 def summary(document: ReportDocument) -> str:

@@ -21,6 +21,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from otolith.acquisition.window import Array, Verdict
+from otolith.health.language import texts_in
 from otolith.health.limits import MACHINE, MonitoredQuantity
 from otolith.health.schema import Report, ReportDocument, Status
 from otolith.health.text import announcements, event_text
@@ -264,7 +265,8 @@ class Recording:
             lane = "state/" + re.sub(r"\W+", "_", part)
             if lane not in self._states:
                 names, colours = [str(level) for level in STATES], list(STATES.values())
-                configuration = rr.StateConfiguration(values=names, labels=names, colors=colours)
+                labels = [texts_in(health.language).translated(name) for name in names] if health else names
+                configuration = rr.StateConfiguration(values=names, labels=labels, colors=colours)
                 self._stream.log(lane, configuration, static=True)
             if self._states.get(lane) != row.state:
                 self._rows[lane].append((end, str(row.state)))

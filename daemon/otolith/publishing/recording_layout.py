@@ -6,6 +6,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from otolith.acquisition.quality import time_text
+from otolith.health.language import texts_in
 from otolith.health.limits import Level, MonitoredQuantity
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.health.text import event_text, headline, probability_text, value_text
@@ -32,7 +33,8 @@ def operator_text(document: ReportDocument) -> str:
     health = document.health
     if health is None:
         return f"# {document.machine}\n\nno state yet"
-    lines = [f"# {health.state}\nsince {time_text(health.since)}"]
+    texts = texts_in(health.language)
+    lines = [f"# {texts.translated(health.state)}\n{texts('since', time=time_text(health.since))}"]
     lines += [_paragraph(event) for event in document.events if event.end is None]
     if health.reason and len(lines) == 1:
         lines.append(_plain(health.reason))
@@ -41,8 +43,10 @@ def operator_text(document: ReportDocument) -> str:
 
 def _paragraph(event: EventDocument) -> str:
     """Return what is the matter, since when, how sure, and what to do."""
+    say = texts_in(event.language)
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
-    what = f"**{_plain(f'{event.state}: {event.part}: {event.condition}')}**, since {time_text(event.since)}"
+    what = _plain(f"{say.translated(event.state)}: {say.translated(event.part)}: {event.condition}")
+    what = f"**{what}**, {say('since', time=time_text(event.since))}"
     advice = f"**{_plain(event.advice)}**" if event.advice else ""
     return "  \n".join(filter(None, [what, _plain(f"{event.text}{sure}"), advice]))
 

@@ -14,6 +14,7 @@ from rich.text import Text
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import local_time
 from otolith.health.diagnosis import FindingKind
+from otolith.health.language import texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import event_text, forecast_text, headline, interval_text, value_cells
@@ -120,8 +121,9 @@ def state_lines(document: ReportDocument) -> list[Text]:
     if health is None:
         return []
     parts = Text()
+    say = texts_in(health.language).translated
     for name, part in health.parts.items():
-        parts.append(f"{name} ").append(part.state, style=LEVEL_STYLES[part.state]).append("  ")
+        parts.append(f"{say(name)} ").append(say(part.state), style=LEVEL_STYLES[part.state]).append("  ")
     current = [event for event in document.events if event.end is None]
     events = [Text(event_text(event, local_time), style=event_style(event)) for event in current]
     return [Text(headline(health, local_time), style=LEVEL_STYLES[health.state]), parts, *events]
@@ -185,7 +187,8 @@ def _messages(document: ReportDocument) -> list[Text]:
     bad = document.window.quality.reasons
     lines = [Text(f"bad window: {reason}", style="red") for reason in bad]
     for name, parameter in document.parameters.items():
-        if expected := forecast_text(parameter, document.window.end):
+        language = "en" if document.health is None else document.health.language
+        if expected := forecast_text(parameter, document.window.end, language):
             lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
         if parameter.reason and not bad:
             lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
