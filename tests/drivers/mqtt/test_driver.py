@@ -173,7 +173,7 @@ def test_one_time_from_the_future_costs_one_message(wrong: float) -> None:
         samples = read.take("motor", document(60.0, wrong if index % 40 == 20 else stamp), now, retained=False)
         assert [sample.time for sample in samples] == pytest.approx([] if index % 40 == 20 else [now], abs=1e-4)
     assert read.bad == 2
-    assert "ahead of the messages before it" in read.topics["motor"].fault
+    assert "ahead of the messages before it" in read.topics["motor"].unusable.text
 
 
 def test_a_clock_that_is_set_ahead_costs_one_message() -> None:
