@@ -397,15 +397,20 @@ def test_the_values_distinguish_a_sudden_change_from_a_slow_one() -> None:
     assert causes[1].startswith("the insulation between turns fails slowly")
 
 
+def of_length(document: ReportDocument, seconds: float) -> ReportDocument:
+    index = document.window.index
+    window = document.window.model_copy(update={"start": seconds * index, "end": seconds * (index + 1)})
+    return document.model_copy(update={"window": window})
+
+
 def falling(hours: float, share: float, quantity: MonitoredQuantity = RESISTANCE) -> list[ReportDocument]:
-    """A resistance that falls by ``share`` of the way to WATCH, within 120 windows over ``hours``."""
-    random, step = np.random.default_rng(3), hours * 3600.0 / 120
+    """A resistance that falls by ``share`` of the way to WATCH, within 50 windows over ``hours``."""
+    random, step = np.random.default_rng(3), hours * 3600.0 / 50
     way = share * (WATCH - NOMINAL) * (1.0 if quantity is RESISTANCE else -1.0)
     documents = []
-    for index in range(120):
-        one = report(index, NOMINAL + way * index / 120 + 0.002 * random.standard_normal(), 0.002)
-        window = one.window.model_copy(update={"start": step * index, "end": step * (index + 1)})
-        documents.append(one.model_copy(update={"window": window}))
+    for index in range(50):
+        one = report(index, NOMINAL + way * index / 50 + 0.002 * random.standard_normal(), 0.002)
+        documents.append(of_length(one, step))
     return documents
 
 
@@ -451,20 +456,23 @@ def lost(index: int, *, others: bool = True) -> ReportDocument:
 
 
 def test_a_parameter_that_is_no_longer_determined_is_an_event_after_an_hour() -> None:
-    windows = [*[report(index) for index in range(5)], *[lost(index) for index in range(5, 2000)]]
-    documents = assessed([*windows, *[report(index) for index in range(2000, 2005)]])
-    (raised, cleared) = [event for document in documents for event in document.events if event.change is not None]
-    assert (raised.part, raised.state, raised.condition) == (
-        "winding",
-        Level.NO_DATA,
-        "a parameter is no longer determined",
-    )
-    assert (raised.start, "no current" in raised.text) == (10.0, True)
+    windows = [report(index) if index < 5 or index >= 100 else lost(index) for index in range(105)]
+    documents = assessed(of_length(window, 60.0) for window in windows)
+    raised, cleared = (event for document in documents for event in document.events if event.change is not None)
+    assert (raised.part, raised.state, raised.condition_id) == ("winding", Level.NO_DATA, "lost")
+    assert "no current" in raised.text
     assert raised.advice.endswith("; a step of V_a")
-    assert raised.evidence.windows[1] * LENGTH == pytest.approx(10.0 + LOST_AFTER, abs=4.0 * LENGTH)
+    assert raised.evidence.windows[1] * 60.0 == pytest.approx(300.0 + LOST_AFTER, abs=240.0)
     assert (cleared.change, cleared.id) == (EventChange.CLEARED, raised.id)
 
 
 def test_a_machine_at_rest_has_not_lost_a_parameter() -> None:
-    windows = [*[report(index) for index in range(5)], *[lost(index, others=False) for index in range(5, 2000)]]
-    assert changes(assessed(windows)) == []
+    windows = [report(index) if index < 5 else lost(index, others=False) for index in range(100)]
+    assert changes(assessed(of_length(window, 60.0) for window in windows)) == []
+
+
+def test_a_machine_that_starts_after_a_night_has_not_lost_what_it_determines_later() -> None:
+    evening = [of_length(report(index), 60.0) for index in range(5)]
+    night = [of_length(lost(index, others=False), 60.0) for index in range(5, 300)]
+    morning = [of_length(lost(index), 60.0) for index in range(1000, 1010)]
+    assert changes(assessed([*evening, *night, *morning])) == []

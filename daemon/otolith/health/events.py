@@ -57,8 +57,8 @@ class HealthState:
     histories: Mapping[str, History] = field(default_factory=dict)
     """Of the parameters with limits, since their last sudden change."""
     forecasts: Mapping[str, ForecastDocument] = field(default_factory=dict)
-    determined: Mapping[str, float] = field(default_factory=dict)
-    """End of the last window after which each parameter was determined, Unix s."""
+    undetermined: Mapping[str, float] = field(default_factory=dict)
+    """Time for which the machine has moved since each parameter was determined, s; none of those that never were."""
     inside: frozenset[str] = frozenset()
     """Keys of conditions that were at OK in some window."""
     document: HealthDocument | None = None
@@ -92,9 +92,8 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
         key: Observation(key, MACHINE, absent, persistence=record.persistence) for key, record in state.records.items()
     }
     spans = {name: span(history) for name, history in state.histories.items()}
-    now = {name: report.window.end for name, item in report.parameters.items() if is_determined(item)}
-    state = replace(state, determined={**state.determined, **now})
-    past = Past(state.steps, spans, state.determined)
+    state = replace(state, undetermined=_undetermined_times(state.undetermined, report, is_moving=is_informative))
+    past = Past(state.steps, spans, state.undetermined)
     observations |= {item.key: item for item in observe(plan, report, levels, past)}
     was_ok = {key for key, item in observations.items() if item.level is Level.OK}
     records, events = {}, []
@@ -108,10 +107,17 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
             records[key] = record
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None]
-    document = _states(plan, state.document, report, current, state.determined)
+    document = _states(plan, state.document, report, current, state.undetermined)
     changed = {"health": document, "events": tuple(events)}
     state = replace(state, records=records, document=document, inside=state.inside | was_ok)
     return state, report.model_copy(update=changed)
+
+
+def _undetermined_times(before: Mapping[str, float], report: ReportDocument, *, is_moving: bool) -> dict[str, float]:
+    """Return for how long the machine has moved since each parameter was determined: rest does not count."""
+    length = report.window.end - report.window.start if is_moving else 0.0
+    now = {name for name, item in report.parameters.items() if is_determined(item)}
+    return {name: 0.0 if name in now else before.get(name, 0.0) + length for name in (*before, *now)}
 
 
 def _from_start(observed: Observation) -> Observation:

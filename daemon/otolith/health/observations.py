@@ -73,8 +73,8 @@ class Past:
     """Last sudden change of each."""
     spans: Mapping[str, float]
     """Length of the history of each, s."""
-    determined: Mapping[str, float]
-    """End of the last window after which each was determined, Unix s."""
+    undetermined: Mapping[str, float]
+    """Time for which the machine has moved since each was determined, s."""
 
 
 def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], past: Past) -> list[Observation]:
@@ -91,9 +91,8 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
         observations.append(replace(unexplained, persistence=Persistence(fall=RELEASE_WINDOWS)))
     for name, parameter in report.parameters.items():
         own = _of_parameter(plan, report, name, before, past.steps.get(name, 0.0))
-        since = past.determined.get(name, report.window.end)
         observations += [own, _of_trend(plan, report, name, own.level, past.spans.get(name, 0.0))]
-        observations.append(_of_lost(plan, report, name, parameter, since))
+        observations.append(_of_lost(plan, report, name, parameter, past.undetermined.get(name, 0.0)))
     observations += _without_temperature(plan, report)
     components = (_of_component(plan, report.twin, component, before) for component in report.components)
     observations += sorted(components, key=lambda item: item.level.rank if item.level else 0)  # the last one counts
@@ -188,20 +187,19 @@ def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Le
 
 
 def _of_lost(
-    plan: MonitoringPlan, report: ReportDocument, name: str, parameter: ParameterDocument, since: float
+    plan: MonitoringPlan, report: ReportDocument, name: str, parameter: ParameterDocument, seconds: float
 ) -> Observation:
-    """Return whether a parameter has not been determined since ``since`` although the machine moves."""
+    """Return whether a parameter is not determined any more, after ``seconds`` in which the machine has moved."""
     quantity, key = plan.parameters.get(name, MonitoredQuantity()), f"lost/{name}"
     part, texts = quantity.part, plan.texts
     if is_determined(parameter):
         return Observation(key, part, Level.OK)
-    others = [item for item in report.parameters.values() if item.status is Status.ESTIMATED]
-    if report.window.end - since <= LOST_AFTER or not others:
+    if seconds <= LOST_AFTER:
         return Observation(key, part, None)
     value = texts("unknown") if parameter.value is None else value_text(parameter)
     text = texts("lost", what=texts.translated(quantity.meaning), name=name, value=value, reason=parameter.reason)
     features = FindingFeatures(FindingKind.LOST, report.twin, name)
-    return Observation(key, part, Level.NO_DATA, features, text, advice=parameter.advice or "", since=since)
+    return Observation(key, part, Level.NO_DATA, features, text, advice=parameter.advice or "")
 
 
 def is_determined(parameter: ParameterDocument) -> bool:
