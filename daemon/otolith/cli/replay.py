@@ -21,7 +21,7 @@ from otolith.health.schema import EventDocument, ReportDocument, Status
 from otolith.health.text import component_text, event_text, finding_text, headline, value_cells
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import computing_time_text, preview_recording, short_lines
-from otolith.runtime.replay import RealTimePacer, Replay, ReplayRecorder, open_recordings
+from otolith.runtime.replay import RealTimePacer, Replay, open_recordings, replay_recorder
 from otolith_drivers.errors import OtolithError, counted
 
 PLAIN_WIDTH = 110  # columns of a summary that goes into a file
@@ -129,12 +129,12 @@ def replay(
         wait = RealTimePacer(stopped).wait if real_time else None
         run = Replay(machine, recorded, stopped, wait, timing=timing)
         with (
-            ReplayRecorder(recording, machine.recorded(recorded.sampling)) as recorder,
+            replay_recorder(recording, machine.recorded(recorded.sampling)) as record,
             progress_line("reading", enabled=not as_json) as show,
         ):
             for report in run.reports():
                 summary.add(report.document)
-                recorder.add(report)
+                record(report)
                 show(f"window {report.document.window.index}, {run.progress:.0%} of the data")
                 if as_json:
                     click.echo(report.document.to_json())

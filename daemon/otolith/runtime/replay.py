@@ -11,8 +11,6 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -31,9 +29,6 @@ from otolith_drivers.errors import ConfigurationError, ServiceError, counted
 from otolith_drivers.replay.readers import Reader, Rows, format_of, holds_frames
 from otolith_drivers.replay.several_files import JoinedReader, MergedReader
 from otolith_drivers.user_dirs import writable
-
-if TYPE_CHECKING:
-    from otolith.publishing.recorder import Recording
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_SLEEP = 0.1  # s; bounds the reaction time to a stop signal
@@ -326,35 +321,30 @@ def _standstill(rows: Rows) -> str:
     return f"t is {rows.times[first]:.12g} from line {rows.lines[first]} to line {rows.lines[last]}"
 
 
-class ReplayRecorder:
-    """Records the reports of a replay into an ``.rrd`` file; without a path it does nothing."""
+@contextlib.contextmanager
+def replay_recorder(path: Path | None, source: RecordedMachine) -> Iterator[Callable[[Report], None]]:
+    """Yield what records a report into the ``.rrd`` file ``path``, which the first one creates; nothing without a path.
 
-    def __init__(self, path: Path | None, source: RecordedMachine) -> None:
-        self._path = path
-        self._source = source
-        self._recording: Recording | None = None
+    It raises ServiceError if the folder cannot be written, or its disk is full.
+    """
+    if path is None:
+        yield lambda _: None
+        return
+    from otolith.publishing.recorder import Recording  # noqa: PLC0415 - takes 0.5 s
 
-    def __enter__(self) -> Self:
-        return self
+    recording: Recording | None = None
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        if self._recording is not None:
-            self._recording.close()
+    def add(report: Report) -> None:
+        nonlocal recording
+        if recording is None:
+            writable(path.parent)
+        if shortage_of(path.parent) > 0:
+            raise ServiceError(f"{path}: less than {MIN_FREE_BYTES >> 20} MB are free on its disk")
+        recording = recording or Recording(path, source)
+        recording.add(report)
 
-    def add(self, report: Report) -> None:
-        """Append a window; the first one creates the file.
-
-        Raises:
-            ServiceError: the folder cannot be written, or its disk is full.
-        """
-        if self._path is None:
-            return
-        from otolith.publishing.recorder import Recording  # noqa: PLC0415 - takes 0.5 s
-
-        if self._recording is None:
-            writable(self._path.parent)
-        if shortage_of(self._path.parent) > 0:
-            raise ServiceError(f"{self._path}: less than {MIN_FREE_BYTES >> 20} MB are free on its disk")
-        if self._recording is None:
-            self._recording = Recording(self._path, self._source)
-        self._recording.add(report)
+    try:
+        yield add
+    finally:
+        if recording is not None:
+            recording.close()

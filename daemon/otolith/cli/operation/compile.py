@@ -20,16 +20,6 @@ def compile_command(file: Path) -> None:
     Example:
       otolith compile config/dc-motor.toml
     """
-    compile_kernels(file)
-
-
-def compile_kernels(file: Path) -> None:
-    """Compile the kernels that are missing in the cache, and print how many.
-
-    Raises:
-        ConfigurationError: something in the machine file is wrong.
-        ServiceError: the cache cannot be used, or a kernel cannot be compiled.
-    """
     from otolith import kernel_cache
     from otolith.adaptation.state import initial_state
     from otolith.machine import load_machine
