@@ -3,8 +3,9 @@
     python -m benchmarks.false_events --hours 24
 
 Healthy motors with changing set-points, at constant speed, with a measured load that changes each hour, and with a
-winding that warms up by 40 K; and motors and a hydraulic lift that wear until the last hour. The exit code is 1 if more
-than 0.5 events a simulated day are false, or if a wear is not announced.
+winding that warms up by 40 K; and motors and a hydraulic lift that wear until the last hour, where a trend that is
+announced before its limit is right. The exit code is 1 if more than 0.5 events a simulated day are false, or if a wear
+is not announced.
 """
 
 import json
@@ -128,9 +129,13 @@ def run(case: str, seed: int, hours: float) -> Result:
     for window in windows(machine, seed, hours):
         state, report = adapt(state, window)
         raised |= {event.id: event for event in report.document.events}
-    right = [bool(condition) and condition in event.condition for event in raised.values()]
-    false = tuple(event_text(event) for event, good in zip(raised.values(), right, strict=True) if not good)
-    return Result(case, hours, any(right) or not condition, false)
+    is_announced = any(condition in event.condition for event in raised.values()) or not condition
+    false = [
+        event_text(event)
+        for event in raised.values()
+        if not condition or (condition not in event.condition and event.condition_id != "trend")
+    ]
+    return Result(case, hours, is_announced, tuple(false))
 
 
 @click.command(help=__doc__)
