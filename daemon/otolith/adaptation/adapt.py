@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.reporting import WindowResult, make_report
+from otolith.adaptation.reporting import OPEN, WindowResult, make_report
 from otolith.adaptation.state import AdaptationState, with_posterior
 from otolith.adaptation.unbridged_gap import unbridged_gap
 from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
-from otolith.discovery.ambiguity import mixture
+from otolith.discovery.ambiguity import WRONG_WINDOW, mixture
 from otolith.discovery.decision import (
     MAX_COST,
     UPDATES,
@@ -32,13 +32,13 @@ from otolith.estimation.augmented import slot_of
 from otolith.estimation.data_checks import CheckedWindow, check_window
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
+from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Search, WindowEstimate, estimate, estimate_window
 from otolith.estimation.window_length import WindowExcitation, next_records
 from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
 
-QUIET_WINDOWS = 8  # consecutive windows after which a test is closed that none of them supports
 UNUSED = "window not estimated from: "
 
 
@@ -128,12 +128,14 @@ def _update_filter_beside(
 ) -> WindowResult:
     """Update the filter with a window that shows nothing of what opened the test.
 
-    The windows that opened it may have been wrong, so that the filter goes on. But windows of a machine at rest
-    are no evidence against its hypotheses, so it is closed only after several of them.
+    The window that opened it may have been wrong, so that the filter goes on. But windows of a machine at rest are no
+    evidence against its hypotheses: it is closed only when windows speak decisively for the filter. Until then the
+    filter is one of the hypotheses.
     """
-    test = replace(test, quiet=test.quiet + 1)
-    still_open = test if test.quiet < QUIET_WINDOWS else None
-    return replace(_update_filter(state, predicted, estimated), test=still_open)
+    result = _update_filter(state, predicted, estimated)
+    if test.is_refuted or test.best.type is FaultType.NOTHING:
+        return result
+    return _with_mixture(replace(result, test=replace(test, quiet=test.quiet + 1)), state.problem)
 
 
 def _update_filter(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
@@ -192,11 +194,17 @@ def _keep_posterior(
 ) -> WindowResult:
     """Return the result of a window that leaves the test open: the posterior stays, the mixture is published."""
     result = WindowResult.unchanged(state, predicted, decision, estimate=estimated, test=test)
-    if not result.is_mixture:
+    return _with_mixture(result, state.problem) if decision in OPEN else result
+
+
+def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:
+    """Return the result with the mixture of the hypotheses of its test and of the filter as what is known."""
+    test = result.test
+    if test is None or result.posterior.problem.free != problem.free:
         return result
-    before = None if test.windows > 1 and result.is_explained else result.before
-    mixed = mixture(test.hypotheses, test.probabilities, state.problem, before)
-    return replace(result, before=mixed, after=mixed)
+    wrong = test.filter_share if result.is_explained else max(test.filter_share, WRONG_WINDOW)
+    mixed = mixture(test.hypotheses, test.probabilities, problem, result.after, wrong)
+    return replace(result, before=mixed, after=mixed, is_mixture=True)
 
 
 def _next_state(

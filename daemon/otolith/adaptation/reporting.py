@@ -84,6 +84,8 @@ class WindowResult:
     """Those whose samples made it unusable."""
     notes: tuple[str, ...] = ()
     """What the data checks left out."""
+    is_mixture: bool = False
+    """Whether ``after`` is the mixture of the hypotheses of an open test."""
     searched: bool = False
     """Whether other hypotheses were compared."""
 
@@ -106,11 +108,6 @@ class WindowResult:
     def is_accepted(self) -> bool:
         """Whether the window updated the posterior."""
         return self.decision in ACCEPTED
-
-    @property
-    def is_mixture(self) -> bool:
-        """Whether ``after`` is the mixture of the hypotheses of an open test."""
-        return self.test is not None and self.decision in OPEN
 
     @property
     def is_explained(self) -> bool:
@@ -136,7 +133,7 @@ def make_report(
     previous, parameters = _parameters(state, result)
     _add_advice(parameters, result, situation)
     components = _component_documents(problem, result.after, result.adopted)
-    undecided = None if result.is_accepted else result.test
+    undecided = None if result.is_accepted and not result.is_mixture else result.test
     explanations = _explanations(undecided)
     document = ReportDocument(
         machine=state.machine,
@@ -175,12 +172,12 @@ def _parameters(
     documents: dict[str, ParameterDocument] = {}
     previous: dict[str, PreviousStatus] = {}
     required = problem.determined_within * problem.scale
-    contradictions, is_mixture = result.contradictions(state), result.is_mixture
+    contradictions = result.contradictions(state)
     variance_ratio, reason = result.posterior.belief.variance_ratio, _reason(state, result)
     for index, (parameter, marginal) in enumerate(zip(problem.free, _marginals(result), strict=True)):
         alone = None if estimated is None else estimated.parameters[index]
         evidence = WindowEvidence(
-            alone, result.decision, contradictions, variance_ratio, is_mixture, result.is_explained, reason
+            alone, result.decision, contradictions, variance_ratio, result.is_mixture, result.is_explained, reason
         )
         before = state.previous.get(parameter.label, PreviousStatus())
         previous[parameter.label], document = publish(parameter, float(required[index]), marginal, evidence, before)
@@ -214,7 +211,7 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     reasons = [*result.notes]
     if decision is not WindowDecision.LEARNED:
         reasons.append(decision.value)
-    if test is not None and decision in OPEN:
+    if test is not None and result.is_mixture:
         others = [f"or {other.text} ({other.probability:.0%})" for other in alternatives_of(test, test.best)[:2]]
         reasons.append("; ".join([f"{describe_hypothesis(test.best)} ({test.probabilities[0]:.0%})", *others]))
     if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:

@@ -72,16 +72,15 @@ def without_duplicates(
 
 
 def mixture(
-    hypotheses: Sequence[TrackedHypothesis], shares: Sequence[float], problem: Problem, before: Prior | None = None
+    hypotheses: Sequence[TrackedHypothesis], shares: Sequence[float], problem: Problem, before: Prior, wrong: float
 ) -> Prior:
     """Return what is known of the free parameters of ``problem`` under all hypotheses, as one normal distribution.
 
-    ``shares`` are their probabilities. What was known ``before`` a window that may itself be wrong counts as much as
-    all of them.
+    ``shares`` are their probabilities if the window that opened the test is right; with probability ``wrong`` it is not,
+    and ``before`` holds, which is known without it.
     """
-    priors, weights = [item.known(problem) for item in hypotheses], np.array(shares)
-    if before is not None:
-        priors, weights = [*priors, before], np.append((1.0 - WRONG_WINDOW) * weights, WRONG_WINDOW)
+    priors = [*(item.known(problem) for item in hypotheses), before]
+    weights = np.append((1.0 - wrong) * np.array(shares), wrong)
     means = np.array([prior.mean for prior in priors])
     mean: Array = weights @ means
     offsets = means - mean

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS, interchangeable, probabilities, without_duplicates
+from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS, WRONG_WINDOW, interchangeable, probabilities, without_duplicates
 from otolith.discovery.hypotheses import (
     FaultType,
     FittedHypothesis,
@@ -78,6 +78,8 @@ class SequentialTest:
     against_filter: float = -MAX_WINDOW_EVIDENCE
     """Evidence against the filter, in -2 log likelihood, of the windows after the one that opened the test; without
     that one, they alone must pay for the complexity of a hypothesis."""
+    filter_deviance: float = 0.0
+    """-2 log likelihood of these windows under the filter, relative to the best hypothesis."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
 
@@ -117,9 +119,19 @@ class SequentialTest:
         return null <= DECISIVE
 
     @property
+    def filter_share(self) -> float:
+        """Probability that the window that opened the test was itself wrong, so that the filter's posterior holds."""
+        return float(WRONG_WINDOW / (WRONG_WINDOW + (1.0 - WRONG_WINDOW) * np.exp(0.5 * self.filter_deviance)))
+
+    @property
     def is_confirmed(self) -> bool:
         """Whether windows after the one that opened the test speak decisively against the filter."""
         return self.against_filter > DECISIVE
+
+    @property
+    def is_refuted(self) -> bool:
+        """Whether these windows speak decisively for the filter."""
+        return self.filter_deviance < -DECISIVE
 
     def with_steps(self, steps: tuple[float, ...]) -> "SequentialTest":
         """Return the test with the steps of converters that windows have shown since."""
@@ -135,10 +147,15 @@ class SequentialTest:
         The evidence against the filter is a cumulative sum (E. S. Page, Biometrika 41, 1954) with decisive evidence as
         its reference value. It falls in windows that give less, so that it is forgotten if it does not go on.
         """
-        last = self.last
+        last, limits = self.last, (-MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         more = (filtered.chi_square - last.chi_square) / residual_variance_factor([last.chi_square], last.count)
-        total = self.against_filter + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
-        return replace(self, against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)))
+        total = self.against_filter + np.clip(more - DECISIVE, *limits)
+        deviance = self.filter_deviance + np.clip(more, *limits)
+        return replace(
+            self,
+            against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)),
+            filter_deviance=float(np.clip(deviance, -MAX_TOTAL_DEVIANCE, MAX_TOTAL_DEVIANCE)),
+        )
 
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
@@ -215,11 +232,13 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     tracked = [item for item, _ in kept]
     if test.windows >= PRUNED_AFTER:
         tracked = prune(tracked, [deviance for _, deviance in kept])
+    filter_deviance = test.filter_deviance - min(item.deviance for item in tracked)
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     if test.windows > MAX_OPEN_WINDOWS:
         hypotheses = without_duplicates(hypotheses, interchangeable(hypotheses))
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     followed = replace(test, hypotheses=_screened(hypotheses, steps), leading=leading, last=last)
+    followed = replace(followed, filter_deviance=filter_deviance)
     return replace(followed, clear=0 if followed.has_equal_types else test.clear + 1)
 
 
@@ -295,9 +314,11 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     known = {item.hypothesis.name for item in test.hypotheses}
     added = [item for item in fresh.hypotheses if item.hypothesis.name not in known]
     lead = min(gain, MAX_WINDOW_EVIDENCE)
-    hypotheses = _sorted([*(item.worse_by(lead, lead) for item in test.hypotheses), *added])
+    together = [*(item.worse_by(lead, lead) for item in test.hypotheses), *added]
+    filter_deviance = test.filter_deviance + lead - min(item.deviance for item in together)
+    hypotheses = _sorted(together)[: 2 * MAX_HYPOTHESES]
     leading = test.leading if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
-    return replace(test, hypotheses=hypotheses[: 2 * MAX_HYPOTHESES], leading=leading)
+    return replace(test, hypotheses=hypotheses, leading=leading, filter_deviance=filter_deviance)
 
 
 def _sorted(tracked: list[TrackedHypothesis]) -> tuple[TrackedHypothesis, ...]:
