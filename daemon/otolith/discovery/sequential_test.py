@@ -39,7 +39,7 @@ MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is
 MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
 MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
 MAX_TOTAL_DEVIANCE = 60.0  # in -2 log evidence: a hypothesis can return when things change
-CLEAR_WINDOWS = 2  # after which one type must explain the windows best before a class counts as resolved
+CLEAR_WINDOWS = 2  # after which one cause must explain the windows best before a class counts as resolved
 PRUNED_AFTER = 3  # windows of a test after which a hypothesis must differ from the null hypothesis
 DIVERGED = 1e12  # χ² of a twin that explains nothing
 
@@ -72,7 +72,7 @@ class SequentialTest:
     last: FitSummary = FitSummary()
     """Of the last window."""
     clear: int = CLEAR_WINDOWS
-    """Consecutive windows after which one type of hypotheses explained all windows best."""
+    """Consecutive windows after which one cause explained all windows best."""
     quiet: int = 0
     """Consecutive windows, up to the last, that the filter expected, and that did not confirm the test."""
     against_filter: float = -MAX_WINDOW_EVIDENCE
@@ -99,14 +99,15 @@ class SequentialTest:
         return probabilities(self.hypotheses, self.groups)
 
     @property
-    def has_equal_types(self) -> bool:
-        """Whether hypotheses of several types explain the windows equally."""
-        return len({self.hypotheses[group[0]].type for group in self.groups}) > 1
+    def has_equal_causes(self) -> bool:
+        """Whether hypotheses of several types, or several sets of moved parameters, explain the windows equally."""
+        types = [self.hypotheses[group[0]].type for group in self.groups]
+        return len(set(types)) > 1 or types.count(FaultType.PARAMETER) > 1
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether hypotheses of several types explain the windows equally, or did so one window before."""
-        return self.clear < CLEAR_WINDOWS or self.has_equal_types
+        """Whether hypotheses of several causes explain the windows equally, or did so one window before."""
+        return self.clear < CLEAR_WINDOWS or self.has_equal_causes
 
     def probability(self, kind: FaultType) -> float:
         """Return the probability of all hypotheses of one type."""
@@ -239,7 +240,7 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     followed = replace(test, hypotheses=_screened(hypotheses, steps), leading=leading, last=last)
     followed = replace(followed, filter_deviance=filter_deviance)
-    return replace(followed, clear=0 if followed.has_equal_types else test.clear + 1)
+    return replace(followed, clear=0 if followed.has_equal_causes else test.clear + 1)
 
 
 def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
