@@ -18,7 +18,7 @@ from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.problem import Problem
 
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
-WRONG_WINDOW = 0.5  # probability that the only window of a test is itself wrong
+WRONG_WINDOW = 0.5  # probability that the window that opened a test is itself wrong
 
 
 def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
@@ -76,8 +76,8 @@ def mixture(
 ) -> Prior:
     """Return what is known of the free parameters of ``problem`` under all hypotheses, as one normal distribution.
 
-    ``shares`` are their probabilities if the window that opened the test is right; with probability ``wrong`` it is not,
-    and ``before`` holds, which is known without it.
+    ``shares`` are their probabilities if the window that opened the test is right. With probability ``wrong`` it is
+    not, and ``before`` holds, which is known without it.
     """
     priors = [*(item.known(problem) for item in hypotheses), before]
     weights = np.append((1.0 - wrong) * np.array(shares), wrong)

@@ -13,7 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS, WRONG_WINDOW, interchangeable, probabilities, without_duplicates
+from otolith.discovery.ambiguity import (
+    MAX_OPEN_WINDOWS,
+    WRONG_WINDOW,
+    interchangeable,
+    probabilities,
+    without_duplicates,
+)
 from otolith.discovery.hypotheses import (
     FaultType,
     FittedHypothesis,
