@@ -235,8 +235,7 @@ class HistoryTable(StrictModel):
 class EvidenceTable(StrictModel):
     """Bundles with the evidence of each event."""
 
-    max_megabytes: Annotated[int, Field(ge=0, le=1_000_000)] = 100
-    """Size of all of them; with 0 there are none."""
+    max_megabytes: Annotated[int, Field(ge=0, le=1_000_000)] = 100  # with 0 there are none
 
 
 class MachineFile(StrictModel):

@@ -36,7 +36,6 @@ from otolith.storage.evidence import (
     MAX_WAITING_BUNDLES,
     TWIN,
     EvidenceWriter,
-    WindowMemory,
     public_text,
     read_bundle,
 )
@@ -159,25 +158,26 @@ def test_evidence_after_a_restart_and_a_decision_is_reproduced(batch: list[Windo
 
 
 @pytest.mark.parametrize("count", [1, 16, 17, 33, 40])
-def test_the_last_windows_are_kept(batch: list[Window], count: int) -> None:
-    memory, state = WindowMemory(), fresh()
+def test_the_last_windows_are_kept(batch: list[Window], folder: Path, count: int) -> None:
+    kept, state = writer(folder), fresh()
     for index in range(count):
-        after = replace(state, learned=index)
-        memory.add(state, replace(batch[0], index=index), _report(), after)
+        after, report = replace(state, learned=index), _report() if index < count - 1 else _raised(_report())
+        kept.add(state, replace(batch[0], index=index), report, after)
         state = after
-    items = memory.bundle({}, ()).windows
-    assert [item.window.index for item in items] == list(range(count - len(items), count))
-    assert min(count, 16) <= len(items) <= 32
-    assert [item.state for item in items if item.window.index] == [None] * (len(items) - (count == len(items)))
-    assert memory.bundle({}, ()).state.learned == (0 if count == len(items) else count - len(items) - 1)
+    (bundle,) = kept._waiting
+    first = bundle.windows[0].window.index
+    assert [item.window.index for item in bundle.windows] == list(range(first, count))
+    assert min(count, 16) <= len(bundle.windows) <= 32
+    assert bundle.state.learned == max(first - 1, 0)
+    assert [item.window.index for item in bundle.windows if item.state is not None] == ([0] if first == 0 else [])
 
 
-def test_large_windows_are_fewer(batch: list[Window], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_windows_are_fewer(batch: list[Window], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evidence, "MAX_WINDOW_BYTES", 3 * batch[0].values.nbytes)
-    memory, state = WindowMemory(), fresh()
+    kept, state = writer(folder), fresh()
     for window in batch:
-        memory.add(state, window, _report(), state)
-    assert len(memory.bundle({}, ()).windows) <= 6
+        kept.add(state, window, _report(), state)
+    assert len((*kept._older, *kept._newer)) <= 6
 
 
 @cache

@@ -359,7 +359,7 @@ class CountersDocument(StrictModel):
     history_dropped: int = 0
     """Windows that the history did not take: its disk was full or too slow."""
     evidence_dropped: int = 0
-    """Changes of events without a bundle: the disk was full or too slow, or it would have been too large."""
+    """Changes of events of which no evidence could be kept."""
     commands_failed: int = 0
     """Events for which ``on_event`` failed."""
 

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,7 @@ log = logging.getLogger(__name__)
 VERSION = 1
 EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
 NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-\d{8}T\d{6}\.zip")
-LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")
-"""On whose versions the last bit of a report may depend, beside Python and the processor."""
+LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")  # on which the last bit of a report may depend
 PUBLIC_KEYS = {"driver": ("type", "name", *FINGERPRINT_KEYS), "machine": ("name", "site"), "zenoh": ()}
 """Keys of tables of a machine file that bundles have; others may be secrets."""
 # Thresholds: docs/reference/thresholds-storage.md has the origin of each.
@@ -68,7 +68,6 @@ class Bundle:
 
     version: int
     versions: Mapping[str, str]
-    """Of what computed the reports."""
     events: tuple[EventDocument, ...]
     state: AdaptationState
     """The state before the first window."""
@@ -77,20 +76,15 @@ class Bundle:
 
 def versions() -> dict[str, str]:
     """Return the versions of what computes here."""
-    names = [platform.machine()]
-    with contextlib.suppress(OSError):
+    processor = platform.machine()
+    with contextlib.suppress(OSError, IndexError):
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-        names += re.findall(r"^model name\s*: (.+)$", text, re.MULTILINE)[:1]
-    libraries = {name: version(name) for name in LIBRARIES}
-    return {"python": platform.python_version(), **libraries, "processor": ", ".join(names)}
+        processor = re.findall(r"^model name\s*: (.+)$", text, re.MULTILINE)[0]
+    return {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}, "processor": processor}
 
 
 def pack(bundle: Bundle, files: Mapping[str, str]) -> bytes:
-    """Return a bundle as an archive; ``files`` are the texts beside it, by name.
-
-    Raises:
-        ValueError: it would be larger than what is read.
-    """
+    """Return a bundle as an archive with ``files``, by name; raise ValueError if it is larger than what is read."""
     is_small = 2 * sum(_bytes(item.window) for item in bundle.windows) <= MAX_EVIDENCE_BYTES  # as text they take more
     text = encoded(bundle) if is_small else ""
     if not 0 < len(text) <= MAX_EVIDENCE_BYTES:
@@ -147,11 +141,7 @@ def printable(text: str) -> str:
 
 
 def files_of(machine: LoadedMachine) -> dict[str, str]:
-    """Return the texts of twin and machine file, as bundles have them.
-
-    Raises:
-        ConfigurationError: one of them cannot be read any more.
-    """
+    """Return the texts of twin and machine file, as bundles have them; raise ConfigurationError if one is missing."""
     table = machine.file.twin
     source = read(LIBRARY / f"{table.name}.toml" if table.file is None else machine.path.parent / table.file)
     return {TWIN: source.text, MACHINE: public_text(parse(read(machine.path)))}
@@ -162,43 +152,11 @@ def public_text(tables: Mapping[str, Any]) -> str:
     lines: list[str] = []
     for name, content in tables.items():
         for table in content if isinstance(content, list) else [content]:
-            keys = PUBLIC_KEYS.get(name, tuple(table))
-            own = {"file": TWIN} if name == "twin" else {key: table[key] for key in keys if key in table}
+            own = {"file": TWIN} if name == "twin" else table
             lines.append(f"[[{name}]]" if isinstance(content, list) else f"[{name}]")
-            lines += [f"{_toml(key)} = {_toml(item)}" for key, item in own.items()]
+            write = partial(json.dumps, default=str, separators=(", ", " = "))  # TOML is JSON but for its colons
+            lines += [f"{write(key)} = {write(own[key])}" for key in own if key in PUBLIC_KEYS.get(name, own)]
     return "\n".join([*lines, ""])
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"{{ {', '.join(f'{_toml(key)} = {_toml(item)}' for key, item in value.items())} }}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    if isinstance(value, str | bool):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return str(value)
-
-
-class WindowMemory:
-    """The last windows with the state before the first of them: ``MIN_WINDOWS`` at least, at most twice as many."""
-
-    def __init__(self) -> None:
-        self._older: tuple[EvidenceWindow, ...] = ()
-        self._newer: tuple[EvidenceWindow, ...] = ()
-        self._states: tuple[AdaptationState, ...] = ()  # before the first of the older and of the newer ones
-        self._after: AdaptationState | None = None
-
-    def add(self, before: AdaptationState, window: Window, report: Report, after: AdaptationState) -> None:
-        """Add a window, its report and the states before and after it; older windows are dropped."""
-        size = sum(_bytes(item.window) for item in self._newer)
-        if not self._states or len(self._newer) >= MIN_WINDOWS or size >= MAX_WINDOW_BYTES:
-            self._older, self._newer, self._states = self._newer, (), (*self._states[-1:], before)
-        state = None if before is self._after else before
-        self._newer, self._after = (*self._newer, EvidenceWindow(state, window, report.document.to_json())), after
-
-    def bundle(self, versions: Mapping[str, str], events: tuple[EventDocument, ...]) -> Bundle:
-        """Return the windows, in their order, as the evidence of ``events``."""
-        return Bundle(VERSION, versions, events, self._states[0], (*self._older, *self._newer))
 
 
 class EvidenceWriter(WriterThread):
@@ -209,21 +167,28 @@ class EvidenceWriter(WriterThread):
         self.folder = state_directory() / "evidence"
         super().__init__("evidence", WRITE_RETRY, f"{self.folder}: no evidence of events is kept")
         self.files, self.max_bytes = files_of(machine), machine.file.evidence.max_megabytes * 1_000_000
-        self.dropped = 0
-        """Changes of events without a bundle."""
-        names = machine.file.machine
-        self._key, self._versions, self._memory = f"{names.site}.{names.name}", versions(), WindowMemory()
+        self.dropped = 0  # changes of events without a bundle
+        self._key, self._versions = f"{machine.file.machine.site}.{machine.file.machine.name}", versions()
+        self._older: tuple[EvidenceWindow, ...] = ()
+        self._newer: tuple[EvidenceWindow, ...] = ()
+        self._states: tuple[AdaptationState, ...] = ()  # before the first of the older and of the newer windows
+        self._after: AdaptationState | None = None
         self._waiting: deque[Bundle] = deque()
 
     def add(self, before: AdaptationState, window: Window, report: Report, after: AdaptationState) -> None:
-        """Keep a finished window, and request a bundle if it changed an event."""
+        """Keep the last finished windows with reports and states; request a bundle if this one changed an event."""
         if not self.max_bytes:
             return
-        self._memory.add(before, window, report, after)
+        size = sum(_bytes(item.window) for item in self._newer)
+        if not self._states or len(self._newer) >= MIN_WINDOWS or size >= MAX_WINDOW_BYTES:
+            self._older, self._newer, self._states = self._newer, (), (*self._states[-1:], before)
+        state = None if before is self._after else before
+        self._newer, self._after = (*self._newer, EvidenceWindow(state, window, report.document.to_json())), after
         if events := tuple(announcements(report.document)):
             is_full = len(self._waiting) >= MAX_WAITING_BUNDLES
             self.dropped += is_full
-            self._waiting += [] if is_full else [self._memory.bundle(self._versions, events)]
+            bundle = Bundle(VERSION, self._versions, events, self._states[0], (*self._older, *self._newer))
+            self._waiting += [] if is_full else [bundle]
             self._wakeup.set()
 
     def write(self) -> None:
@@ -233,7 +198,7 @@ class EvidenceWriter(WriterThread):
             names = ", ".join(event.id for event in bundle.events)
             try:
                 data = pack(bundle, self.files)
-                path = self._path(bundle, len(data))
+                path = self._path(bundle.windows[-1].window.end, len(data))
             except (TypeError, ValueError) as error:
                 self.dropped += 1
                 log.warning("%s: no evidence of %s: %s", self.folder, names, error)
@@ -242,12 +207,8 @@ class EvidenceWriter(WriterThread):
                 log.info("evidence of %s: %s", names, path)
             self._waiting.popleft()
 
-    def _path(self, bundle: Bundle, size: int) -> Path:
-        """Delete the oldest bundles for one of ``size`` bytes, and return its path; its number is above all others.
-
-        Raises:
-            ValueError: it is larger than what all may take.
-        """
+    def _path(self, end: float, size: int) -> Path:
+        """Return the path of a bundle after deleting the oldest ones for it; raise ValueError if it is too large."""
         if size > self.max_bytes:
             raise ValueError(f"it takes {size} bytes, more than all may take")
         named = ((NAME.fullmatch(path.name), path) for path in self.folder.glob("*.zip"))
@@ -257,5 +218,4 @@ class EvidenceWriter(WriterThread):
             _, oldest = own.pop(0)
             total -= oldest.stat().st_size
             oldest.unlink()
-        stamp = datetime.fromtimestamp(bundle.windows[-1].window.end, UTC).strftime(STAMP)
-        return self.folder / f"{self._key}-{number:06d}-{stamp}.zip"
+        return self.folder / f"{self._key}-{number:06d}-{datetime.fromtimestamp(end, UTC).strftime(STAMP)}.zip"

@@ -22,8 +22,7 @@ from otolith.estimation.problem import Problem
 from otolith.twin.augmentation import augmented_model
 from otolith.twin.definition import Definition
 
-REFERENCE, AUGMENTED, BITS = "=", "augmented", "bits"
-"""Keys of an object that was written before, of a twin, and of numbers of NumPy."""
+REFERENCE, AUGMENTED, BITS = "=", "augmented", "bits"  # keys of an object that occurred before, a twin, and an array
 
 
 def encoded(value: Any) -> str:
@@ -102,8 +101,8 @@ class Decoder:
             return len(value.noise) == len(twin.outputs) and all(len(a) in (0, len(b)) for a, b in sizes)
         if isinstance(value, Window):
             shape, error = (value.grid.records, len(twin.signals)), value.bridge_error
-            arrays = () if error is None else (error.noise_ratio, error.variance, error.held_variance)
-            is_whole = all(array.shape == shape for array in (value.values, value.missing, *arrays))
+            inputs = () if error is None else (error.noise_ratio, error.variance, error.held_variance)
+            is_whole = all(array.shape == shape for array in (value.values, value.missing, *inputs))
             return is_whole and value.signals == twin.signals and value.grid.steps.shape == shape[:1] != (0,)
         return True
 

@@ -125,11 +125,7 @@ class StateStore:
         Raises:
             ConfigurationError: the file is unreadable or damaged.
         """
-        learned = _read(self.components_path, LearnedState, VERSION)
-        if learned is None:
-            return ()
-        if reason := self._other_origin(learned):
-            log.warning("%s: not used: %s", self.components_path, reason)
+        if (learned := self._learned()) is None:
             return ()
         try:
             check_components(learned.components, self._twin)
@@ -138,15 +134,16 @@ class StateStore:
         return learned.components
 
     def histories(self) -> dict[str, History]:
-        """Return the saved histories of parameters of this machine; none if they are of another twin or other signals.
+        """Return the saved histories of parameters of this machine; none as, and raises as :meth:`components`."""
+        learned = self._learned()
+        return {} if learned is None else dict(learned.health.histories)
 
-        Raises:
-            ConfigurationError: the file is unreadable or damaged.
-        """
+    def _learned(self) -> LearnedState | None:
         learned = _read(self.components_path, LearnedState, VERSION)
-        if learned is None or self._other_origin(learned):
-            return {}
-        return dict(learned.health.histories)
+        if learned is not None and (reason := self._other_origin(learned)):
+            log.warning("%s: not used: %s", self.components_path, reason)
+            return None
+        return learned
 
     def _other_origin(self, learned: LearnedState) -> str:
         """Return why ``learned`` is about something else; empty if it is not."""
@@ -348,12 +345,10 @@ def _write(path: Path, model: StrictModel, temporary: str) -> None:
 
 
 def replace_file(path: Path, data: bytes, temporary: str) -> None:
-    """Replace a file, all or nothing, also if the computer loses power meanwhile; ``temporary`` is a name beside it.
+    """Replace a file, all or nothing, also if the computer loses power meanwhile; raise ServiceError if that fails.
 
-    All names are relative to the open folder: its owner could replace a path while root writes there.
-
-    Raises:
-        ServiceError: the file cannot be written.
+    ``temporary`` is a name beside it. All names are relative to the open folder: its owner could replace a path while
+    root writes there.
     """
     try:
         with opened_folder(path.parent) as folder:

@@ -12,8 +12,8 @@ from otolith.cli.common import FILE, local_time, progress_line
 if TYPE_CHECKING:
     from otolith.storage.evidence import Bundle
 
+# What values raise that have the right types, but that no state of the core has.
 FORGED = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
-"""What values of the right types raise that no state of the core has."""
 
 
 @click.command()
@@ -40,12 +40,11 @@ def reproduce(bundle: Path, as_json: bool) -> int:
         click.echo(printable(line), err=as_json)
 
     read = read_bundle(bundle)
-    first, last, count = read.windows[0].window, read.windows[-1].window, len(read.windows)
-    span = f"from {local_time(first.start)} to {local_time(last.end)}"
-    echo(f"{read.state.machine} at {read.state.site}, {counted(count, 'window')} {span}")
+    state, count, span = read.state, len(read.windows), (read.windows[0].window.start, read.windows[-1].window.end)
+    echo(f"{state.machine} at {state.site}, {counted(count, 'window')} from {' to '.join(map(local_time, span))}")
     for event in read.events:
         echo(f"{event.change}: {event_text(event, local_time)}")
-    echo(f"seed {read.state.problem.seed}, " + ", ".join(f"{name} {number}" for name, number in read.versions.items()))
+    echo(f"seed {state.problem.seed}, " + ", ".join(f"{name} {number}" for name, number in read.versions.items()))
     with progress_line("reproducing") as show:
         difference = _first_difference(read, show, click.echo if as_json else lambda _: None)
     others = [f"{name} {here}" for name, here in versions().items() if read.versions.get(name) != here]
@@ -63,10 +62,9 @@ def _first_difference(bundle: "Bundle", show: Callable[[str], None], put: Callab
     state = bundle.state
     with kernel_cache.observed(lambda step: show(f"compiling {step.kernel}")):
         for item in bundle.windows:
-            place, state = f"window {item.window.index}", item.state or state
-            show(place)
+            show(place := f"window {item.window.index}")
             try:
-                state, report = adapt(state, item.window)
+                state, report = adapt(item.state or state, item.window)
                 put(text := report.document.to_json())
                 if text != item.report:
                     return f"{place}: {_difference(json.loads(item.report), json.loads(text))}"
