@@ -59,6 +59,8 @@ class Decoder:
         origin, arguments = typing.get_origin(kind), typing.get_args(kind)
         if origin in (typing.Union, types.UnionType):
             return self.decode(next((each for each in arguments if each is type(content)), arguments[0]), content)
+        if origin is typing.Literal:
+            return _required(content in arguments, content, kind)
         if origin is np.ndarray:
             return _array(content, typing.get_args(arguments[1])[0])
         if origin is not None:
