@@ -6,11 +6,11 @@ import types
 import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
-from pydantic.fields import FieldInfo
 
 from otolith_drivers.errors import ConfigurationError, nearest
 
@@ -65,12 +65,12 @@ class StrictModel(BaseModel):
     @classmethod
     def _of_the_written_types(cls, table: object) -> object:
         """Refuse what pydantic converts (a boolean for a number, a number for a boolean), and zero bytes."""
-        fields = {field.alias or name: field for name, field in cls.model_fields.items()}
+        kinds = _written_kinds(cls)
         for key, value in table.items() if isinstance(table, dict) else ():
             if isinstance(value, str) and "\0" in value:
                 raise _ValueFaultError(key, f"{value!r} contains a zero byte")
-            if key in fields and isinstance(value, bool | int | float):
-                _check_number(key, value, fields[key])
+            if key in kinds and isinstance(value, bool | int | float):
+                _check_number(key, value, kinds[key])
         return table
 
 
@@ -82,10 +82,17 @@ class _ValueFaultError(ValueError):
         self.key = key
 
 
-def _check_number(key: str, value: float, field: FieldInfo) -> None:
-    if any(isinstance(one, BeforeValidator) for one in field.metadata):
-        return  # it has a check of its own
-    kinds = {kind if isinstance(kind, type) else type(kind) for kind in _kinds(field.annotation)}
+@cache
+def _written_kinds(model: type[BaseModel]) -> dict[str, set[type]]:
+    """Return the types of each key of a table; without keys that have a check of their own."""
+    return {
+        field.alias or name: {kind if isinstance(kind, type) else type(kind) for kind in _kinds(field.annotation)}
+        for name, field in model.model_fields.items()
+        if not any(isinstance(one, BeforeValidator) for one in field.metadata)
+    }
+
+
+def _check_number(key: str, value: float, kinds: set[type]) -> None:
     if isinstance(value, bool) and kinds & {int, float} and bool not in kinds:
         raise _ValueFaultError(key, f"{str(value).lower()} is a boolean: write a number")
     if not isinstance(value, bool) and bool in kinds and not kinds & {int, float}:

@@ -3,7 +3,7 @@
 (J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., section 10.3; bounds by the active set.)
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -33,11 +33,11 @@ class FitResult:
 
     guess: Array
     """(guess,)."""
-    chi_square: float
-    jacobian: Array
-    """(residuals, guess) derivatives of the residuals."""
     residuals: Array
     """(residuals,)."""
+    jacobian: Array
+    """(residuals, guess) derivatives of the residuals."""
+    chi_square: float
     evaluations: int
     converged: bool
     first: tuple[Array, Array, Array]
@@ -46,37 +46,39 @@ class FitResult:
 
 def gauss_newton(objective: LeastSquares, start: Array, max_steps: int = MAX_STEPS) -> FitResult:
     """Return the minimum of χ² reached from ``start`` (guess,), or ``start`` itself where no step improves it."""
-    low, high = objective.low, objective.high
-    guess = np.minimum(np.maximum(start, low), high)
+    guess = np.minimum(np.maximum(start, objective.low), objective.high)
     residuals, jacobian = objective.linearise(guess)
     first = (guess, residuals, jacobian)
-    chi_square, damping, evaluations, converged = float(residuals @ residuals), FIRST_DAMPING, 1, False
+    return continued(objective, FitResult(*first, float(residuals @ residuals), 1, False, first), max_steps)
+
+
+def continued(objective: LeastSquares, reached: FitResult, max_steps: int) -> FitResult:
+    """Return the result after up to ``max_steps`` more steps, with the damping of a new start."""
+    damping, evaluations, converged = FIRST_DAMPING, reached.evaluations, False
     for _ in range(max_steps):
-        step = _bounded_step(residuals, jacobian, guess, objective, damping)
-        trial = np.minimum(np.maximum(guess + step, low), high)
-        linear = residuals + jacobian @ (trial - guess)
-        if _is_negligible(chi_square, float(linear @ linear)):
-            truncated = (step != 0.0) & ((trial <= low) | (trial >= high))
+        step = _bounded_step(objective, reached, damping)
+        trial = np.minimum(np.maximum(reached.guess + step, objective.low), objective.high)
+        linear = reached.residuals + reached.jacobian @ (trial - reached.guess)
+        if _is_negligible(reached.chi_square, float(linear @ linear)):
+            truncated = (step != 0.0) & ((trial <= objective.low) | (trial >= objective.high))
             converged = not truncated.any()
             if converged or damping > MAX_DAMPING:
                 break
             damping = _increased(damping)  # a long step that a bound truncates may lead uphill
             continue
-        new_residuals, new_jacobian = objective.linearise(trial)
+        residuals, jacobian = objective.linearise(trial)
         evaluations += 1
-        new = float(new_residuals @ new_residuals)
-        if new < chi_square:
-            converged = _is_negligible(chi_square, new)
-            guess, residuals, jacobian, chi_square = trial, new_residuals, new_jacobian, new
+        chi_square = float(residuals @ residuals)
+        if chi_square < reached.chi_square:
+            converged = _is_negligible(reached.chi_square, chi_square)
+            reached = replace(reached, guess=trial, residuals=residuals, jacobian=jacobian, chi_square=chi_square)
             damping = max(damping / 10.0, MIN_DAMPING)
-            if converged:
-                break
         else:
-            converged = float(np.abs(new - chi_square)) <= MIN_IMPROVEMENT
+            converged = chi_square - reached.chi_square <= MIN_IMPROVEMENT
             damping = _increased(damping)
-            if converged or damping > MAX_DAMPING:
-                break
-    return FitResult(guess, chi_square, jacobian, residuals, evaluations, converged, first)
+        if converged or damping > MAX_DAMPING:
+            break
+    return replace(reached, evaluations=evaluations, converged=converged)
 
 
 def _is_negligible(before: float, after: float) -> bool:
@@ -87,12 +89,13 @@ def _increased(damping: float) -> float:
     return max(100.0 * damping, FIRST_DAMPING)
 
 
-def _bounded_step(residuals: Array, jacobian: Array, guess: Array, objective: LeastSquares, damping: float) -> Array:
+def _bounded_step(objective: LeastSquares, reached: FitResult, damping: float) -> Array:
     """Return the damped step within the bounds.
 
     Entries at a bound that the gradient pushes outward stay there. Entries that the step would carry beyond a bound go
     to the bound, and the others are solved for again.
     """
+    guess, residuals, jacobian = reached.guess, reached.residuals, reached.jacobian
     gradient = jacobian.T @ residuals
     free = ~(((guess <= objective.low) & (gradient > 0.0)) | ((guess >= objective.high) & (gradient < 0.0)))
     step = np.zeros(len(guess))

@@ -62,7 +62,10 @@ class Objective:
     """
 
     def __init__(self, problem: Problem, window: Window, start: Array, initial: Array | None = None) -> None:
-        """Build the predictor around ``start`` (free,) and ``initial`` (states,), by default the first record."""
+        """Build the predictor around ``start`` (free,) and ``initial`` (states,).
+
+        States that are NaN, by default all, start at the first record.
+        """
         twin = problem.twin
         self.kernel = kernel_of(twin)
         self.measured = np.column_stack([window.column(output.name) for output in twin.outputs])
@@ -90,7 +93,9 @@ class Objective:
         self._base = twin.base or twin
         self._excitation = Excitation(input_matrix(twin, window), window.grid)
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
-        self.set_predictor(start, self._first if initial is None else initial)
+        self.initial = self._first if initial is None else np.where(np.isnan(initial), self._first, initial)
+        """(states,) around which the predictor was built."""
+        self.set_predictor(start, self.initial)
 
     def set_predictor(self, parameters: Array, initial: Array) -> None:
         """Compute sub-steps, gain and whitening around ``parameters`` (free,) and ``initial`` (states,)."""
@@ -264,7 +269,9 @@ def rounding_variance(values: Array, noise: float, known_step: float) -> float:
     """
     if len(values) == 0:
         return 0.0
-    step = adc_step(values) or (known_step if len(np.unique(values)) < MIN_ADC_LEVELS else 0.0)
+    step = adc_step(values)
+    if not step and known_step and len(np.unique(values)) < MIN_ADC_LEVELS:
+        step = known_step
     alike = 1.0 if step <= WHITE_ROUNDING * noise else len(values) / _runs(values)
     return step**2 / 12.0 * alike
 

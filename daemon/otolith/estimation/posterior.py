@@ -173,23 +173,19 @@ class Posterior:
 
     def remap_parameters(self, problem: Problem) -> "Posterior":
         """Return what is known for another choice of free parameters; new ones have the initial prior."""
-        fresh = Posterior.initial(problem).belief
-        mean, covariance = imm_filter.moment_match(self.belief)
-        order = {free.label: index for index, free in enumerate(self.problem.free)}  # slots may have changed places
-        both = [(order[free.label], index) for index, free in enumerate(problem.free) if free.label in order]
-        old, new = (np.array(part, dtype=np.int64) for part in (zip(*both, strict=True) if both else ((), ())))
-        level = np.full(len(problem.free), FIRST_LEVEL)
-        level[new] = self.belief.level[0][old]
-        ratio = self.problem.scale[old] / problem.scale[new]
-        ratio = np.concatenate([ratio, ratio])
-        old, new = (
-            np.concatenate([part, part + count]) for part, count in ((old, len(order)), (new, len(problem.free)))
-        )
-        new_mean, new_covariance = imm_filter.moment_match(fresh)
-        new_mean[new] = mean[old] * ratio
-        new_covariance[new, :] = new_covariance[:, new] = 0.0
-        new_covariance[np.ix_(new, new)] = covariance[np.ix_(old, old)] * np.outer(ratio, ratio)
-        modes = imm_filter.equal_modes(level, new_mean, new_covariance, self.belief.end, self.belief.variance_ratio)
+        labels, count = [free.label for free in self.problem.free], len(problem.free)
+        kept = [at for at, free in enumerate(problem.free) if free.label in labels]
+        before = [labels.index(problem.free[at].label) for at in kept]  # slots may have changed places
+        level = np.full(count, FIRST_LEVEL)
+        level[kept] = self.belief.level[0][before]
+        kept, before = [*kept, *(count + at for at in kept)], [*before, *(len(labels) + at for at in before)]  # trends
+        ratio = _size(self.problem)[before] / _size(problem)[kept]
+        old_mean, old_covariance = imm_filter.moment_match(self.belief)
+        mean, covariance = imm_filter.moment_match(Posterior.initial(problem).belief)
+        mean[kept] = old_mean[before] * ratio
+        covariance[kept, :] = covariance[:, kept] = 0.0
+        covariance[np.ix_(kept, kept)] = old_covariance[np.ix_(before, before)] * np.outer(ratio, ratio)
+        modes = imm_filter.equal_modes(level, mean, covariance, self.belief.end, self.belief.variance_ratio)
         return replace(self, problem=problem, belief=modes)
 
     def without_slot(self, slot: int) -> "Posterior":

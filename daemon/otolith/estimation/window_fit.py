@@ -12,7 +12,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior
 from otolith.estimation.augmented import amplitude_indices
-from otolith.estimation.gauss_newton import MAX_STEPS, FitResult, gauss_newton
+from otolith.estimation.gauss_newton import MAX_STEPS, FitResult, continued, gauss_newton
 from otolith.estimation.information import (
     MIN_SINGULAR,
     AccuracyTarget,
@@ -94,9 +94,7 @@ class Fit:
         """Return the fit after further steps, unless it has converged."""
         if self.result.converged:
             return self
-        result = gauss_newton(self.map_objective, self.result.guess, max_steps)
-        evaluations = self.result.evaluations + result.evaluations
-        return replace(self, result=replace(result, evaluations=evaluations, first=self.result.first))
+        return replace(self, result=continued(self.map_objective, self.result, max_steps))
 
     def advance(self) -> PhaseAdvance:
         """Return the advance of the components' phases to the next window."""
@@ -122,11 +120,10 @@ def fit(  # noqa: PLR0913 - the two parts of a start
         window = shifted(problem.base_model, window, dict(problem.delays))
     initial = None
     if state:
-        outputs = {output.name for output in problem.base_model.outputs}
-        initial = Objective(problem, window, start[: len(problem.free)]).guess(start[: len(problem.free)])
-        initial = initial[len(problem.free) :].copy()
-        for index, (own, value) in enumerate(zip(problem.base_model.states, state, strict=True)):
-            initial[index] = initial[index] if own.name in outputs else value
+        measured = {output.name for output in problem.base_model.outputs}
+        reached = dict(zip((own.name for own in problem.base_model.states), state, strict=True))
+        names = (own.name for own in problem.twin.states)
+        initial = np.array([np.nan if name in measured else reached.get(name, np.nan) for name in names])
     return _fit(problem, window, prior, start, max_steps, initial=initial)
 
 
@@ -137,18 +134,17 @@ def _fit(  # noqa: PLR0913 - the two parts of a start
     start = np.clip(start[: len(problem.free)], *problem.bounds)
     objective = Objective(problem, window, start, initial)
     map_objective = MapObjective(objective, problem, prior)
-    initial = objective.guess(start)[len(start) :] if initial is None else initial
     if problem.components:
-        start = _with_bounded_amplitudes(problem, objective, start, initial)
-    result = gauss_newton(map_objective, map_objective.guess(start, initial), max_steps)
+        start = _with_bounded_amplitudes(problem, objective, start)
+    result = gauss_newton(map_objective, map_objective.guess(start, objective.initial), max_steps)
     return Fit(problem, prior, window, objective, map_objective, result)
 
 
-def _with_bounded_amplitudes(problem: Problem, objective: Objective, start: Array, initial: Array) -> Array:
+def _with_bounded_amplitudes(problem: Problem, objective: Objective, start: Array) -> Array:
     """Return ``start`` (free,) with smaller amplitudes if the twin diverges at those of the linear approximation."""
     start, amplitudes = start.copy(), amplitude_indices(problem)
     for _ in range(MAX_HALVINGS):
-        if objective.cost(np.concatenate([start, initial])[None])[0] < PENALTY:
+        if objective.cost(np.concatenate([start, objective.initial])[None])[0] < PENALTY:
             break
         start[amplitudes] *= 0.5
     return start

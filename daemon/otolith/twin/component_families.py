@@ -108,6 +108,10 @@ class ComponentFamily:
     phases: tuple[float, ...] = (0.0,)
     """Phases (rad) of the basis functions; two for a free phase, since both amplitudes enter linearly."""
 
+    def __hash__(self) -> int:
+        """Of the name alone, as each candidate form is looked up by its family."""
+        return hash(self.name)
+
 
 def _largest(x: SourceRange) -> float:
     return max(x.largest, MIN_MAGNITUDE)
