@@ -18,7 +18,7 @@ from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.problem import Problem
 
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
-WRONG_WINDOW = 0.5  # probability that the only window of a test is itself wrong
+WRONG_WINDOW = 0.5  # probability that the window that opened a test is itself wrong
 
 
 def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
