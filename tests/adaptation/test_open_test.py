@@ -61,3 +61,15 @@ def test_a_step_that_few_windows_excite_is_not_forgotten(scenario: MotorScenario
     step = Step(kind="step", parameter="J", start="10.7 s", amount="0.000234 kg*m^2")
     cut = [window for window, _ in windows(scenario.model_copy(update={"faults": (step,)}), 20)]
     assert_held(cut, ("R_a", "L_a", "J", "D"), "J", 1.2 * TRUTH["J"], EXCITED)
+
+
+def test_a_delay_from_the_first_window_on_is_not_forgotten(scenario: MotorScenario, windows: Cut) -> None:
+    """The current is one record late. At constant speed no window shows it, and only later ones show the inertia."""
+    cut = [window for window, _ in windows(scenario.model_copy(update={"faults": (), "seed": 3}), 13)]
+    before = cut[0].values[0, 2]
+    for at, window in enumerate(cut):
+        values = window.values.copy()
+        values[:, 2] = [before, *window.values[:-1, 2]]
+        before = window.values[-1, 2]
+        cut[at] = replace(window, values=values)
+    assert_held(cut, ("R_a", "L_a", "J", "D"), "J", TRUTH["J"], EXCITED)
