@@ -142,13 +142,16 @@ def test_noise_levels_of_the_guide_are_identified(folder: Path, machine: str, lo
 
 
 @needs_data
-def test_the_delay_and_its_noise_are_those_of_the_guide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (delay, level) = re.findall(r"a delay of `speed` of (\d+) ms, and a process noise of (\d+)", GUIDE)[0]
+def test_the_swing_of_the_guide_is_named_and_is_no_delay(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ((key, period),) = re.findall(r"`structure: (\S+)`, again every ([\d.]+) s", GUIDE)
+    (delay,) = re.findall(r"a delay of `speed` of (\d+) ms would explain as much", GUIDE)
     text = printed(folder, "noise rotor-rig.toml healthy_104.csv", monkeypatch)
-    (noise,) = re.findall(r'^speed = "([\d.]+) 1/s\^0\.5"', text, re.MULTILINE)
-    assert float(noise) == pytest.approx(float(level), rel=FIGURE)
-    (measured,) = re.findall(r'^speed = \{ delay = "([\d.]+) ms" \}', text, re.MULTILINE)
-    assert float(measured) == pytest.approx(float(delay), rel=FIGURE)
+    ((named, measured),) = re.findall(r"^# structure: (\S+): .* again every ([\d.]+) s$", text, re.MULTILINE)
+    assert named == key
+    assert float(measured) == pytest.approx(float(period), rel=FIGURE)
+    assert "{ delay" not in text
+    (refused,) = re.findall(r"^# speed: a delay of ([\d.]+) ms would explain as much", text, re.MULTILINE)
+    assert float(refused) == pytest.approx(float(delay), rel=FIGURE)
     assert "no delay is significant" in printed(folder, "noise servo-kp400.toml sin_time_square_kp400.csv", monkeypatch)
 
 

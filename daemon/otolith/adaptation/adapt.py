@@ -92,8 +92,9 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
     is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
-    alone = np.array([(parameter.value, parameter.sd) for parameter in estimated.parameters])
-    shifts = state.shifts.after(predicted.shifts(*alone.T))
+    alone = estimated.parameters
+    values, sd = np.array([own.value for own in alone]), np.array([own.sd for own in alone])
+    shifts = state.shifts.after(predicted.shifts(values, sd, estimated.fit.window.grid.length))
     moved = shifts.moved
     is_calm = is_expected and not screening.is_positive
     test = None if state.test is None else continue_test(state.test, predicted, screening).with_filter(estimated.fit)

@@ -5,7 +5,7 @@ become significantly more likely. The smallest delay is zero. ``docs/explanation
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,7 @@ UNOBSERVABLE = "its delay cannot be identified: it does not move, or no output d
 NO_DELAY = "no delay is significant; up to about {:.2g} ms could not be detected"
 AT_LIMIT = "at the largest delay that was searched"
 NO_WINDOW = "no window can be used: no delay was identified"
+STRUCTURE = "a delay of {:.4g} ms would explain as much as the structure that the twin lacks, so it is not identified"
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +132,17 @@ def identify_delays_and_noise(
             break
         noise = identify_noise(problem, delays.applied(problem, windows), progress)
     return delays, noise
+
+
+def without_delays(delays: IdentifiedDelays, declared: Mapping[str, float]) -> IdentifiedDelays:
+    """Return the ``declared`` delays, with a remark on those that were identified where the twin lacks a structure."""
+    kept = (
+        replace(own, value=declared.get(own.name, 0.0), sd=None, remark=STRUCTURE.format(1e3 * own.value))
+        if own.is_late
+        else own
+        for own in delays.signals
+    )
+    return IdentifiedDelays(tuple(kept), delays.windows)
 
 
 class _Search:

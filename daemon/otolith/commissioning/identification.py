@@ -96,6 +96,8 @@ class IdentifiedNoise:
     remarks: tuple[str, ...]
     """About windows that were not used."""
     consistency: Consistency = Consistency()
+    before_inflation: tuple[float, ...] = ()
+    """Levels of outputs and states before inflation; empty if nothing was identified."""
     log_likelihood: float | None = None
     """Restricted, before inflation, up to a constant; None if nothing was identified."""
     windows: int = 0
@@ -116,7 +118,7 @@ def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progre
     """
     likelihood = Likelihood(problem)
     guess = _initial_guess(likelihood, windows, progress)
-    twin = problem.twin
+    twin = problem.base_model
     if not guess.fits:
         sensors, process = problem.noise, problem.process_noise or (0.0,) * len(twin.states)
         outputs = (NoiseLevel(output.name, level) for output, level in zip(twin.outputs, sensors, strict=True))
@@ -129,6 +131,7 @@ def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progre
         states=tuple(_state_levels(twin, guess, best, levels, consistency.degrees)),
         remarks=guess.remarks,
         consistency=consistency,
+        before_inflation=tuple(best.levels.tolist()),
         log_likelihood=-0.5 * best.deviance,
         windows=len(guess.fits),
         evaluations=likelihood.evaluations,
@@ -153,7 +156,7 @@ class _InitialGuess:
 def _initial_guess(likelihood: Likelihood, windows: Sequence[Window], progress: Progress) -> _InitialGuess:
     """Windows at rest are used only if all are; then process noise is not free."""
     problem, remarks = likelihood.problem, []
-    usable = [window for window in windows if _is_usable(problem, window)]
+    usable = usable_windows(problem, windows)
     levels = _initial_levels(problem, usable)
     shown, process = levels.signal_noise > 0.0, levels.process
     fits = [fit for fit in _first_fits(likelihood, levels.values, usable, progress) if fit.cost < MAX_COST]
@@ -202,7 +205,7 @@ def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Prog
     added = not process.any()
     if added:
         small = SMALL_PROCESS_SHARE * np.nan_to_num(guess.process)
-        process[outputs:] = np.where(observable_states(likelihood.problem.twin), small, 0.0)
+        process[outputs:] = np.where(observable_states(likelihood.problem.base_model), small, 0.0)
     progress(f"reduced chi-square of the windows: {before.reduced:.3g}")
     factor, after = inflate_process_noise(likelihood, lambda factor: sensors + factor * process, best.fits)
     if not after.degrees or not after.passed:
@@ -239,7 +242,7 @@ def _state_levels(
 
 def with_initial_noise(problem: Problem, windows: Sequence[Window]) -> Problem:
     """The problem with the sensor noise that the signals show, and process noise that is just observable beside it."""
-    usable = [window for window in windows if _is_usable(problem, window)]
+    usable = usable_windows(problem, windows)
     return with_levels(problem, _initial_levels(problem, usable).values) if usable else problem
 
 
@@ -261,16 +264,21 @@ class _InitialLevels:
 
 
 def _initial_levels(problem: Problem, usable: Sequence[Window]) -> _InitialLevels:
-    signal_noise = np.array([sample_noise(output.name, usable) for output in problem.twin.outputs])
+    signal_noise = np.array([sample_noise(output.name, usable) for output in problem.base_model.outputs])
     sensors = np.where(signal_noise > 0.0, signal_noise, problem.noise)
-    process = np.full(len(problem.twin.states), np.nan)
+    process = np.full(len(problem.base_model.states), np.nan)
     if usable:
         process = _observable_process_noise(problem, sensors, _most_excited(problem, usable, sensors))
     return _InitialLevels(signal_noise, sensors, process)
 
 
+def usable_windows(problem: Problem, windows: Sequence[Window]) -> list[Window]:
+    """Return the windows that are well sampled and complete."""
+    return [window for window in windows if _is_usable(problem, window)]
+
+
 def _is_usable(problem: Problem, window: Window) -> bool:
-    samples = max(int((~window.missing_in(output.name)).sum()) for output in problem.twin.outputs)
+    samples = max(int((~window.missing_in(output.name)).sum()) for output in problem.base_model.outputs)
     sampled = window.quality.verdict is Verdict.GOOD and samples >= MIN_RECORDS
     return sampled and bool((np.isfinite(window.values) | window.missing).all())
 
@@ -308,7 +316,7 @@ def _differences(output: str, window: Window) -> Array:
 
 def _observable_process_noise(problem: Problem, sensors: Array, window: Window) -> Array:
     """(states,) process noise that doubles the variance of innovations due to ``sensors``; NaN where none does."""
-    states = problem.twin.states
+    states = problem.base_model.states
     without = np.concatenate([sensors, np.zeros(len(states))])
     threshold = _log_variance(problem, without, window) + OBSERVABLE
 
@@ -335,7 +343,7 @@ def _log_variance(problem: Problem, levels: Array, window: Window) -> float:
 
 def _most_excited(problem: Problem, windows: Sequence[Window], sensors: Array) -> Window:
     """The window in which the outputs move the most, in units of their noise."""
-    names = [output.name for output in problem.twin.outputs]
+    names = [output.name for output in problem.base_model.outputs]
 
     def movement(window: Window) -> float:
         signals = (window.column(name)[~window.missing_in(name)] for name in names)

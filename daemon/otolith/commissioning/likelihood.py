@@ -138,7 +138,7 @@ class Likelihood:
 
 def with_levels(problem: Problem, levels: Array) -> Problem:
     """The problem with noise ``levels`` (outputs + states,), in innovation form."""
-    count = len(problem.twin.outputs)
+    count = len(problem.base_model.outputs)
     return replace(problem, noise=tuple(levels[:count]), process_noise=tuple(levels[count:]), open_loop=False)
 
 

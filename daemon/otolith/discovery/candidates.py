@@ -49,7 +49,7 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     problem = response.problem
     forms = allowed_forms(problem, response.x)
     competing = CompetingForms.among(problem, forms)
-    guesses = _best_guesses(response, forms, competing)
+    guesses = best_guesses(response, forms, competing)
     if not guesses:
         return []
     best = guesses[0].score
@@ -64,7 +64,7 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     ]
 
 
-def _best_guesses(response: LinearResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[ScoredGuess]:
+def best_guesses(response: LinearResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[ScoredGuess]:
     """Return each form with its best inner parameter, the best form first; only those of leading forms are refined."""
     spectral = [form for form in forms if len(form.model.phases) > 1]
     others = [form for form in forms if len(form.model.phases) == 1]

@@ -82,6 +82,7 @@ class LinearResponse:
     def __init__(self, fitted: Fit) -> None:
         """Linearise where ``fitted`` started."""
         self.problem, self.window, self.objective = fitted.problem, fitted.window, fitted.objective
+        self.count = self.objective.count
         self._guess, residuals, jacobian = fitted.result.first
         self._project(residuals, jacobian, len(residuals) - len(fitted.prior.mean))
         self._linearise_slots()

@@ -187,7 +187,7 @@ class ScoredGuesses:
     def of(cls, response: LinearResponse, guesses: list[Guess], competing: CompetingForms) -> "ScoredGuesses":
         """Score ``guesses`` by the linear response."""
         statistics = response.score(guesses)
-        count = response.objective.count
+        count = response.count
         parameters = np.array([_parameter_count(form) for form, _ in guesses], dtype=np.float64)
         counts = np.array([competing.of(form) for form, _ in guesses])
         variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)

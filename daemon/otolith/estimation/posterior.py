@@ -127,16 +127,17 @@ class Posterior:
         """Whether the normalised innovation squared of a window is within what healthy windows reach."""
         return self.nis(evidence) <= imm_filter.nis_limit(2.0 * len(self.problem.free))
 
-    def shifts(self, values: Array, sd: Array) -> Array:
-        """Return by how many standard deviations a window alone differs from the prediction (free,).
+    def shifts(self, values: Array, sd: Array, length: float) -> Array:
+        """Return by how many standard deviations a window of ``length`` (s) alone differs from the prediction (free,).
 
-        ``values`` and ``sd`` (free,) are the estimates of that window. While nothing happens a shift is a standard
-        normal deviate, or less. Values of components do not count.
+        ``values`` and ``sd`` (free,) are its estimates, without trends, so that they hold in its middle. While nothing
+        happens a shift is a standard normal deviate, or less. Values of components do not count.
         """
         free, prior = len(self.problem.free), self.prior()
+        middle = prior.mean[:free] - 0.5 * length * prior.mean[free:]
         variance = self.belief.variance_ratio * sd**2 + np.diag(prior.covariance)[:free]
         counted = np.isfinite(variance) & [not parameter.name.startswith("_") for parameter in self.problem.free]
-        return np.where(counted, (values - prior.mean[:free]) / np.sqrt(np.where(counted, variance, 1.0)), 0.0)
+        return np.where(counted, (values - middle) / np.sqrt(np.where(counted, variance, 1.0)), 0.0)
 
     def update(self, evidence: Evidence, phase: PhaseAdvance) -> "Posterior":
         """Return the posterior after a window, of which this is the prediction."""

@@ -53,9 +53,9 @@ class SourceRange:
 
     @classmethod
     def of(cls, x: Array) -> "SourceRange":
-        """Return the range of ``x`` (records,)."""
-        step = float(np.abs(np.diff(x)).max(initial=0.0))
-        return cls(float(x.min()), float(x.max()), float(np.abs(x).min()), step)
+        """Return the range of ``x`` (records,); NaN separates windows."""
+        step = float(np.nan_to_num(np.abs(np.diff(x))).max(initial=0.0))
+        return cls(float(np.nanmin(x)), float(np.nanmax(x)), float(np.nanmin(np.abs(x))), step)
 
     @property
     def width(self) -> float:

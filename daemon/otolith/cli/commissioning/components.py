@@ -14,6 +14,7 @@ from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, 
 
 if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
+    from otolith.commissioning.structure import Structure
     from otolith.machine import LoadedMachine
     from otolith.storage.state_store import StateStore
 
@@ -215,15 +216,19 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
 def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windows: int, *, approve_all: bool) -> None:
     from otolith.cli.commissioning.baseline import keep_baseline
-    from otolith.cli.commissioning.noise import identified_noise, noise_lines
+    from otolith.cli.commissioning.noise import identified_record, noise_lines
     from otolith_drivers.errors import OtolithError
 
     state = _replayed(machine, data)
-    _, identified = identified_noise(machine, data, windows)
-    if not state.adopted:  # the file's noise levels may have hidden a component, so search again with these
-        state = _replayed(replace(machine, problem=identified.applied(machine.problem)), data)
+    record, is_pooled = identified_record(machine, data, windows), not state.adopted
+    identified = record.noise_beside(machine) if is_pooled and record.offered else record.noise
+    if is_pooled:  # the file's noise levels may have hidden a component, and no window alone shows what all show
+        components = tuple(_record_of(item) for item in record.offered)
+        state = _replayed(replace(machine, problem=identified.applied(machine.problem)), data, components)
     click.echo("\n".join(noise_lines(machine, identified)))
-    if state.adopted:
+    if is_pooled and record.offered:
+        click.echo("# this process noise is right with the components below: if you approve them, put it into the file")
+    elif state.adopted:
         click.echo("# this process noise contains the components below: keep that of the file if you approve them")
     else:
         click.echo("# put these tables into the machine file in place of its own", err=True)
@@ -234,12 +239,34 @@ def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windo
         click.echo(str(error), err=True)
 
 
-def _replayed(machine: "LoadedMachine", data: Path) -> "AdaptationState":
-    """The state after all windows of the data; findings and warnings are printed to standard error."""
+def _record_of(structure: "Structure") -> "ComponentRecord":
+    """Return what a state is given of a structure, so that it is in the twin from the first window on."""
+    from otolith.adaptation.state import ComponentRecord
+    from otolith.discovery.adopted import AdoptedComponent
+    from otolith.estimation.posterior import UNKNOWN_PHASE_SD
+
+    component = structure.component
+    values, deviations = [component.amplitude], [structure.sd]
+    if component.model.inner is not None:
+        values, deviations = [*values, component.inner], [*deviations, structure.inner_sd]
+    if component.periodic:
+        values, deviations = [*values, component.phase], [*deviations, UNKNOWN_PHASE_SD]
+    return ComponentRecord(AdoptedComponent(component, component.origin), tuple(values), tuple(deviations))
+
+
+def _replayed(
+    machine: "LoadedMachine", data: Path, components: "tuple[ComponentRecord, ...]" = ()
+) -> "AdaptationState":
+    """The state after all windows of the data, with ``components`` in the twin from the first window on.
+
+    Findings and warnings are printed to standard error.
+    """
+    from otolith.adaptation.state import restore_components
     from otolith.runtime.replay import Replay, open_recorded
 
     with open_recorded(machine, data) as recorded:
         run = Replay(machine, recorded)
+        run.state = restore_components(run.state, components)
         for report in run.reports():
             for finding in report.document.findings:
                 click.echo(f"window {report.document.window.index}: {finding.text}", err=True)

@@ -1,7 +1,8 @@
 """``otolith noise``: noise levels and delays from recorded data of a healthy machine, as lines of its machine file."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from otolith.acquisition.window import Window
     from otolith.commissioning.delays import IdentifiedDelays
     from otolith.commissioning.identification import IdentifiedNoise, NoiseLevel
+    from otolith.commissioning.structure import Structure
     from otolith.machine import LoadedMachine
 
 
@@ -35,31 +37,69 @@ def noise(file: Path, data: Path, windows: int, as_json: bool) -> None:
     from otolith.machine import load_machine
 
     machine = load_machine(file, with_driver=False)
-    delays, identified = identified_noise(machine, data, windows)
+    record = identified_record(machine, data, windows)
     if as_json:
-        click.echo(json.dumps(_document(machine, delays, identified), indent=2, ensure_ascii=False))
+        click.echo(json.dumps(_document(machine, record), indent=2, ensure_ascii=False))
     else:
-        click.echo("\n".join([*noise_lines(machine, identified), "", *delay_lines(machine, delays)]))
+        lines = [*noise_lines(machine, record.noise), *structure_lines(machine, record.structure), ""]
+        click.echo("\n".join([*lines, *delay_lines(machine, record.delays)]))
 
 
-def identified_noise(machine: "LoadedMachine", data: Path, count: int) -> tuple["IdentifiedDelays", "IdentifiedNoise"]:
-    """Delays, and noise levels without them, from at most ``count`` windows of the data.
+@dataclass(frozen=True, slots=True)
+class HealthyRecord:
+    """What was identified from a record of the healthy machine."""
+
+    delays: "IdentifiedDelays"
+    noise: "IdentifiedNoise"
+    structure: "Sequence[Structure]"
+    """Components that all windows show and the twin lacks."""
+    windows: "Sequence[Window]"
+    """Without the delays."""
+
+    @property
+    def offered(self) -> "list[Structure]":
+        """The structure that can be in the twin from the first window on: its phase is the same in all of them."""
+        return [item for item in self.structure if not item.is_restarted]
+
+    def noise_beside(self, machine: "LoadedMachine") -> "IdentifiedNoise":
+        """The noise levels with the structure in the twin."""
+        from otolith.commissioning.identification import identify_noise
+        from otolith.estimation.augmented import augment
+
+        with progress_line("noise beside the structure") as show:
+            wider = augment(machine.problem, [item.component for item in self.offered])
+            return identify_noise(wider, self.windows, progress=show)
+
+
+def identified_record(machine: "LoadedMachine", data: Path, count: int) -> HealthyRecord:
+    """Delays, noise levels without them, and what the twin lacks, from at most ``count`` windows of the data.
 
     Raises:
         ConfigurationError: no window can be used.
     """
-    from otolith.commissioning.delays import identify_delays_and_noise
+    from otolith.commissioning.delays import identify_delays_and_noise, without_delays
+    from otolith.commissioning.identification import identify_noise
+    from otolith.commissioning.structure import remaining_structure
     from otolith_drivers.errors import ConfigurationError
 
     with progress_line("reading") as show:
         declared = {name: table.delay for name, table in machine.signal_tables.items()}
         chosen = _good_windows(machine, data, count)
         delays, identified = identify_delays_and_noise(machine.problem, chosen, declared, progress=show)
+        problem, punctual = machine.problem, delays.applied(machine.problem, chosen)
+        structure = remaining_structure(problem, identified, punctual, show)
+        record = HealthyRecord(delays, identified, structure, punctual)
+        if structure and any(signal.is_late for signal in delays.signals):
+            # What the twin lacks has looked like a delay if it is still there with the delay.
+            without = identify_noise(problem, chosen, show)
+            beside = remaining_structure(problem, without, chosen, show)
+            if {item.component.key for item in beside} & {item.component.key for item in structure}:
+                record = HealthyRecord(without_delays(delays, declared), without, beside, chosen)
     if machine.problem.open_loop:
         click.echo(f"{machine.path}: open_loop is true, so the process noise will not be used", err=True)
     if not identified.windows:
         raise ConfigurationError(f"{data}: {'; '.join(identified.remarks)}")
-    return delays, identified
+    return record
 
 
 def _good_windows(machine: "LoadedMachine", data: Path, count: int) -> list["Window"]:
@@ -115,6 +155,33 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
     yield from (f"# {remark}" for remark in identified.remarks)
 
 
+def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") -> Iterator[str]:
+    """What all windows show and the twin lacks, as comments."""
+    from otolith.estimation.augmented import equation
+    from otolith.health.text import half_width_text
+
+    for item in structure:
+        component = item.component
+        values = (component.amplitude, component.inner, component.phase)
+        text = equation(machine.twin, component, values[: 2 if item.is_restarted else 3])
+        again = f", again every {_repeat(machine, item)}" if component.periodic else ""
+        yield f"# structure: {component.key}: {text} (amplitude ± {half_width_text(item.sd)}){again}"
+    if structure:
+        yield "# the twin lacks it in all windows alike, and the process noise above contains it"
+    if any(not item.is_restarted for item in structure):
+        yield "# otolith commission asks whether it belongs to the healthy machine, and identifies the noise beside it"
+
+
+def _repeat(machine: "LoadedMachine", item: "Structure") -> str:
+    """The period of a periodic component in the unit of its source."""
+    from math import pi
+
+    from otolith.estimation.augmented import source_of
+
+    unit = source_of(machine.twin, item.component.source).unit
+    return f"{2.0 * pi / item.component.inner:.4g} {unit}"
+
+
 def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterator[str]:
     """The keys ``delay`` of the table ``[signals]``, with uncertainties and remarks as comments.
 
@@ -146,14 +213,15 @@ def _aligned(rows: list[tuple[str, str]]) -> list[str]:
     return [f"{line:{width}}  # {comment}" if comment else line for line, comment in rows]
 
 
-def _document(machine: "LoadedMachine", delays: "IdentifiedDelays", identified: "IdentifiedNoise") -> dict[str, Any]:
+def _document(machine: "LoadedMachine", record: HealthyRecord) -> dict[str, Any]:
     from dataclasses import asdict
 
     units = machine.twin.units()
-    document = asdict(identified)
+    document = asdict(record.noise)
     for level in document["outputs"]:
         level["unit"] = units[level["name"]]
     for level in document["states"]:
         level["unit"] = f"({units[level['name']]})/s^0.5"
-    document["delays"] = [asdict(delay) | {"unit": "s"} for delay in delays.signals]
+    document["structure"] = [asdict(item) | {"key": item.component.key} for item in record.structure]
+    document["delays"] = [asdict(delay) | {"unit": "s"} for delay in record.delays.signals]
     return document

@@ -1,0 +1,246 @@
+"""Structure in the innovations of a healthy record: components that the twin lacks in all of its windows.
+
+Process noise can be made so large that the windows fit, whatever the twin lacks. So the innovations at the likeliest
+levels are searched for structure before any level is enlarged. The windows are pooled: all have the same parameters and
+the same component, so that much weaker components show than in one window, and nothing that comes in a single window
+does. The amplitudes of the windows must agree, which an accident of coloured noise does not.
+``docs/explanation/noise-identification.md`` has the equations.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Window
+from otolith.commissioning.consistency import sqrt_information
+from otolith.commissioning.identification import IdentifiedNoise, usable_windows
+from otolith.commissioning.likelihood import Fits, FittedWindow, Likelihood, Progress, with_levels
+from otolith.discovery.candidate_forms import CandidateForm
+from otolith.discovery.candidates import best_guesses
+from otolith.discovery.linear_response import BasisFunctions, Guess, LinearResponse, ScoreStatistics, basis_functions
+from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuess, allowed_forms
+from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import orthonormal_basis
+from otolith.estimation.objective import EXPLAINED
+from otolith.estimation.problem import Component, Problem
+from otolith.estimation.window_fit import Fit, fit
+from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
+from otolith.twin.component_families import SourceKind
+
+# Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
+MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree
+SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance
+CHANCE_DEVIATE = 3.0  # standard deviations of χ² of the phases of further windows, which count as chance
+UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
+MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
+MIN_SHARE = 0.5  # of the best score: a candidate with less only imitates the best
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """A component that all windows show."""
+
+    component: Component
+    sd: float
+    """Standard deviation of its amplitude, from the scatter between windows."""
+    inner_sd: float
+    """Standard deviation of its inner parameter."""
+    evidence: float
+    """-2 log evidence of all windows against a twin without it."""
+    is_restarted: bool
+    """Whether its phase is another in each window: a sine of time, or of an angle that begins at zero there."""
+
+
+class PooledResponse(LinearResponse):
+    """The linear response of several windows with the same parameters; each has its own initial state."""
+
+    def __init__(self, fits: Sequence[Fit]) -> None:
+        """``fits`` are linearised at the same parameters."""
+        self.parts = [LinearResponse(fitted) for fitted in fits]
+        first = self.parts[0]
+        self.problem, self.window, self.objective = first.problem, first.window, first.objective
+        self.x = np.hstack([part.x for part in self.parts])
+        self.count = sum(part.count for part in self.parts)
+        self.ends = np.cumsum([fitted.objective.measured.size for fitted in fits])
+        """(windows,) rows of the residual at which the windows end."""
+        free, rows = len(first.problem.free), int(self.ends[-1])
+        states = [fitted.result.first[2][: -len(fitted.prior.mean), 2 * free :] for fitted in fits]
+        residuals = [fitted.result.first[1][: -len(fitted.prior.mean)] for fitted in fits]
+        shared = [fitted.result.first[2][: -len(fitted.prior.mean), :free] for fitted in fits]
+        own = [orthonormal_basis(slopes) for slopes in states]
+        self._basis = np.zeros((rows, sum(basis.shape[1] for basis in own)))
+        column = 0
+        for end, basis in zip(self.ends, own, strict=True):
+            self._basis[end - len(basis) : end, column : column + basis.shape[1]] = basis
+            column += basis.shape[1]
+        self._remainder = np.concatenate(residuals)
+        self._remainder = self._remainder - self._basis @ (self._basis.T @ self._remainder)
+        self.explain(np.vstack(shared))
+
+    def explain(self, columns: Array) -> None:
+        """Project out what ``columns`` (residuals, columns) explain."""
+        columns = columns - self._basis @ (self._basis.T @ columns)
+        further = orthonormal_basis(columns)
+        self._basis = np.hstack([self._basis, further])
+        self._remainder = self._remainder - further @ (further.T @ self._remainder)
+        self.chi_square = float(self._remainder @ self._remainder)
+
+    def by_window(self, columns: Array) -> Array:
+        """Return ``columns`` (residuals, columns) as (residuals, windows * columns), each of one window alone."""
+        apart = np.zeros((len(columns), len(self.parts), columns.shape[1]))
+        for index, rows in enumerate(self.slices):
+            apart[rows, index] = columns[rows]
+        return apart.reshape(len(columns), -1)
+
+    @property
+    def slices(self) -> list[slice]:
+        """The rows of each window."""
+        return [slice(start, end) for start, end in zip([0, *self.ends[:-1].tolist()], self.ends.tolist(), strict=True)]
+
+    def responses(self, curves: BasisFunctions) -> Array:
+        """Return the responses (residuals, curves) of the whitened innovations."""
+        return np.vstack([part.responses(curves) for part in self.parts])
+
+    def estimated_gains(self, source: int, frequencies: Array) -> Array:
+        """Return about by how much χ² falls (sites, frequencies), with a phase for each window."""
+        return np.asarray(sum(part.estimated_gains(source, frequencies) for part in self.parts))
+
+    def score(self, guesses: list[Guess]) -> ScoreStatistics:
+        """Return the score statistics; a sine whose phase is another in each window costs more values."""
+        pooled = super().score(guesses)
+        restarted = [at for at, (form, _) in enumerate(guesses) if self.is_restarted(form)]
+        if restarted:
+            own = [part.score([guesses[at] for at in restarted]) for part in self.parts]
+            values = 2.0 * (len(own) - 1)
+            chance = values + CHANCE_DEVIATE * np.sqrt(2.0 * values)
+            pooled.gain[restarted] = np.maximum(sum(part.gain for part in own) - chance, 0.0)
+            squares = np.mean([(part.amplitudes**2).sum(axis=1) for part in own], axis=0)
+            pooled.amplitudes[restarted] = np.column_stack([np.sqrt(squares), np.zeros(len(restarted))])
+        return pooled
+
+    def is_restarted(self, form: CandidateForm) -> bool:
+        """Whether the form is a sine of time or of an angle that begins at zero in each window."""
+        source = sources(self.problem.base_model)[form.source]
+        return len(form.model.phases) > 1 and source.symbol.startswith("_")
+
+    def with_cycles(self, form: CandidateForm) -> CandidateForm:
+        """Return the form; a restarted one has several cycles in each window, as less is any slow curve."""
+        if not self.is_restarted(form):
+            return form
+        low, high = form.bounds
+        shortest = min(float(np.ptp(part.x[form.source])) for part in self.parts)
+        return replace(form, bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, np.finfo(float).tiny)), high))
+
+    def amplitudes_of_windows(self, guess: Guess, amplitudes: Array) -> tuple[Array, Array]:
+        """Return the amplitude (windows,) that each window gives, in the pooled phase, and the information on it."""
+        columns = self.responses(basis_functions([guess]))
+        columns = columns - self._basis @ (self._basis.T @ columns)
+        rows = self.slices
+        if self.is_restarted(guess[0]):
+            solved = [np.linalg.lstsq(columns[own], self._remainder[own], rcond=None)[0] for own in rows]
+            return np.linalg.norm(solved, axis=1), np.array([(columns[own] ** 2).sum() / 2.0 for own in rows])
+        along = columns @ (amplitudes[: columns.shape[1]] / np.linalg.norm(amplitudes))
+        information = np.array([along[own] @ along[own] for own in rows])
+        products = np.array([along[own] @ self._remainder[own] for own in rows])
+        return products / np.maximum(information, np.finfo(float).tiny), information
+
+
+def remaining_structure(
+    problem: Problem, noise: IdentifiedNoise, windows: Sequence[Window], progress: Progress = lambda _: None
+) -> list[Structure]:
+    """Return the components that ``windows`` show together, the strongest first; none if there are few windows.
+
+    ``noise`` has been identified from these windows.
+    """
+    if noise.windows < MIN_WINDOWS or problem.components:
+        return []
+    likelihood, levels = Likelihood(problem), np.array(noise.before_inflation)
+    fits: list[FittedWindow] = []
+    for window in usable_windows(problem, windows):
+        progress(f"structure of window {len(fits) + 1}")
+        starts = [problem.nominal, *(one.guess[: len(problem.free)] for one in fits[-1:])]
+        fits.append(likelihood.fit(levels, window, starts))
+    fits = [one for one in fits if one.cost <= EXPLAINED]
+    if len(fits) < MIN_WINDOWS:
+        return []
+    problem = with_levels(problem, levels)
+    progress("structure of all windows")
+    pooled = PooledResponse(_at_common_parameters(problem, fits, likelihood.width))
+    separated = np.hstack([np.pad(part.x, ((0, 0), (0, 1)), constant_values=np.nan) for part in pooled.parts])
+    alike = (form for form in allowed_forms(problem, separated) if _is_alike(problem, form))
+    allowed = [form for form in map(pooled.with_cycles, alike) if form.bounds[0] <= form.bounds[1]]
+    structures: list[Structure] = []
+    while len(structures) < MAX_COMPONENTS:
+        guesses = best_guesses(pooled, allowed, CompetingForms.among(problem, allowed))
+        best = max((guess.score for guess in guesses), default=0.0)
+        likely = (guess for guess in guesses if guess.score > max(DECISIVE, MIN_SHARE * best) and guess.is_readable)
+        structure = next(filter(None, (_structure(pooled, guess) for guess in likely)), None)
+        if structure is None:
+            break
+        structures.append(structure[0])
+        allowed = [form for form in allowed if _may_follow(structure[1], form)]
+    return structures
+
+
+def _may_follow(form: CandidateForm, other: CandidateForm) -> bool:
+    """Whether ``other`` may be a structure beside that of ``form``.
+
+    Levels that contain a sine are too large for anything smooth: what is left of that is the work of a controller.
+    """
+    is_same = (form.site, form.model, form.source) == (other.site, other.model, other.source)
+    return not is_same and (len(form.model.phases) == 1 or len(other.model.phases) > 1)
+
+
+def _at_common_parameters(problem: Problem, fits: Fits, width: Array) -> list[Fit]:
+    """Return the windows, linearised at their weighted mean parameters and each at its own initial state."""
+    free, prior = len(problem.free), initial_prior(problem)
+    centre = np.median([one.guess[:free] for one in fits], axis=0)
+    roots = [sqrt_information(one, width) for one in fits]
+    deviations = [root @ ((one.guess[:free] - centre) / width[:free]) for root, one in zip(roots, fits, strict=True)]
+    step = np.linalg.lstsq(np.vstack(roots), np.concatenate(deviations), rcond=None)[0] * width[:free]
+    start = np.concatenate([np.clip(centre + step, *problem.bounds), np.zeros(free)])
+    return [fit(problem, one.window, prior, start, 0, state=tuple(one.guess[free:].tolist())) for one in fits]
+
+
+def _is_alike(problem: Problem, form: CandidateForm) -> bool:
+    """Whether windows at different times show the same component: no error of a sensor, and no trend.
+
+    Under a controller the inputs follow every disturbance, so that what depends on an input is no structure.
+    """
+    twin, source = problem.base_model, sources(problem.base_model)[form.source]
+    is_trend = source.kind is SourceKind.TIME and len(form.model.phases) == 1
+    is_input = source.name in {driven.name for driven in twin.inputs}
+    return form.site < len(twin.sites) and not is_trend and not is_input
+
+
+def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, CandidateForm] | None:
+    """Return the structure of a guess, which is then projected out, or None if the windows do not agree on it."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - only noise identification needs SciPy
+
+    form = guess.form
+    values, information = pooled.amplitudes_of_windows((form, guess.inner), guess.amplitudes)
+    shares = information / information.sum()
+    mean = float(shares @ values)
+    sd = float(np.sqrt((shares**2 * (values - mean) ** 2).sum()))
+    effective = 1.0 / float((shares**2).sum())
+    if effective <= 2.0 or abs(mean) < sd * float(stdtrit(effective - 1.0, 1.0 - SIGNIFICANCE)):
+        return None
+    columns = pooled.responses(basis_functions([(form, guess.inner)]))
+    pooled.explain(pooled.by_window(columns) if pooled.is_restarted(form) else columns)
+    first, second = guess.amplitudes
+    periodic = len(form.model.phases) > 1
+    twin = pooled.problem.base_model
+    component = Component(
+        sites(twin)[form.site].name,
+        form.model.name,
+        sources(twin)[form.source].name,
+        float(np.hypot(first, second)) if periodic else float(first),
+        guess.inner,
+        float(np.arctan2(second, first)) if periodic else 0.0,
+        *form.bounds,
+        origin=pooled.window.start,
+    )
+    span = float(np.ptp(pooled.parts[0].x[form.source] if pooled.is_restarted(form) else pooled.x[form.source]))
+    inner_sd = np.sqrt(12.0 / max(guess.score, 1.0)) / span if periodic else UNCERTAIN_SHAPE * guess.inner
+    return Structure(component, sd, float(inner_sd), guess.score, pooled.is_restarted(form)), form
