@@ -113,14 +113,18 @@ def process_model(elapsed: float) -> tuple[Array, Array]:
 
 
 def predict(posterior: ImmPosterior, end: float) -> ImmPosterior:
-    """Return the prediction at ``end`` (Unix s); a clock that was set back changes nothing."""
+    """Return the prediction at ``end`` (Unix s).
+
+    If the clock was set back, the time since is unknown, and counts as the difference.
+    """
     if not np.isfinite(posterior.end):
         return replace(posterior, end=end)
-    if end <= posterior.end:
+    elapsed = abs(end - posterior.end)
+    if elapsed == 0.0:
         return posterior
     posterior = _mix(posterior)
     free = posterior.mean.shape[1] // 2
-    transition, noise = process_model(min(end - posterior.end, MAX_GAP))
+    transition, noise = process_model(min(elapsed, MAX_GAP))
     move = _block_diagonal(transition, np.ones(free))
     process_noise = _block_diagonal(noise, TREND_NOISE[posterior.level] ** 2)
     covariance = move @ posterior.covariance @ move.T + process_noise
