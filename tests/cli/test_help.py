@@ -1,5 +1,6 @@
 """Help of every command: at most 80 columns, with an example; docs/reference/commands.md has every option."""
 
+import os
 import re
 import subprocess
 import sys
@@ -75,3 +76,14 @@ def test_a_full_disk_gives_one_line_with_place_and_remedy() -> None:
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
     assert "standard output: No space left on device: free space on its disk" in line
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["twin", "show", "dc_motor"]])
+def test_a_reader_that_closes_the_output_is_no_error(arguments: list[str]) -> None:
+    """Click writes the help, rich the tables."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as closed:
+        command = [sys.executable, "-m", "otolith", *arguments]
+        result = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")

@@ -67,10 +67,12 @@ def _machine_name(_: click.Context, __: click.Parameter, name: str) -> str:
 
 @contextmanager
 def _output_may_close() -> Iterator[None]:
-    """Exit code 0 where the reader of standard output has closed it, as ``head`` does; click would exit with 1."""
+    """Exit code 0 where the reader of standard output has closed it, as ``head`` does; click and rich exit with 1."""
     try:
         yield
-    except BrokenPipeError as error:
+    except (BrokenPipeError, SystemExit) as error:
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still buffered
         raise click.exceptions.Exit(0) from error
 
