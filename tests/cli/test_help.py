@@ -87,3 +87,11 @@ def test_a_reader_that_closes_the_output_is_no_error(arguments: list[str]) -> No
         command = [sys.executable, "-m", "otolith", *arguments]
         result = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True, check=False)
     assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_the_page_of_a_twin_calls_a_parameter_known_or_estimated() -> None:
+    """As the messages of ``otolith check`` do, and the documentation of a twin."""
+    page = CliRunner().invoke(cli, ["twin", "show", "dc_motor"]).output
+    assert re.search(r"R_a .* estimated ", page)
+    assert re.search(r"K_e .* known ", page)
+    assert "instrumented" not in page

@@ -95,6 +95,7 @@ def _print(definition: "Definition") -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from otolith.twin.definition import Role
     from otolith.twin.identifiability import structural_identifiability
     from otolith.twin.symbolic import unicode_page
 
@@ -110,7 +111,8 @@ def _print(definition: "Definition") -> None:
         row = structure[parameter.name]
         estimable = "yes" if row.identifiable else f"no: {row.reason}"
         bounds = f"{parameter.low:g} to {parameter.high:g}"
-        table.add_row(parameter.name, f"{parameter.nominal:g}", bounds, parameter.unit, parameter.role, estimable,
+        role = "estimated" if parameter.role is Role.ESTIMATED else "known"
+        table.add_row(parameter.name, f"{parameter.nominal:g}", bounds, parameter.unit, role, estimable,
                       parameter.meaning)  # fmt: skip
     console.print(table)
     signals = Table("signal", "", "unit", "meaning")
