@@ -83,7 +83,7 @@ def test_imm_interval_grows_without_windows() -> None:
 
 
 def test_a_clock_that_is_set_back_counts_as_the_difference() -> None:
-    """Without process noise until the clock has caught up, a parameter that drifts would seem to contradict the twin."""
+    """Without process noise until the clock has caught up, a parameter that drifts would contradict the twin."""
     posterior = update(predict(Posterior.initial(PROBLEM), 1e9), evidence(6.0, 0.0, 0.01, np.random.default_rng(3)))
     earlier, later = (predict(posterior, 1e9 + pause) for pause in (-3600.0, 3600.0))
     assert earlier.prior().covariance == pytest.approx(later.prior().covariance)
