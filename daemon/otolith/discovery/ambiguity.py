@@ -15,9 +15,11 @@ from otolith.acquisition.window import Array
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.screening import DECISIVE
 from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
 
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
+MIN_WEIGHT = 0.05  # of a hypothesis whose own interval the published one contains
 WRONG_WINDOW = 0.5  # probability that the window that opened a test is itself wrong
 
 
@@ -84,5 +86,9 @@ def mixture(
     means = np.array([prior.mean for prior in priors])
     mean: Array = weights @ means
     offsets = means - mean
-    covariances = np.array([prior.covariance for prior in priors]) + offsets[:, :, None] * offsets[:, None, :]
-    return Prior(mean, np.einsum("h,hij->ij", weights, covariances))
+    own = np.array([prior.covariance for prior in priors])
+    covariance = np.einsum("h,hij->ij", weights, own + offsets[:, :, None] * offsets[:, None, :])
+    sd = np.sqrt(np.diag(covariance))
+    reach = np.abs(offsets) / QUANTILE + np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    wider = np.maximum(reach[weights >= MIN_WEIGHT].max(axis=0, initial=0.0) / np.where(sd > 0.0, sd, 1.0), 1.0)
+    return Prior(mean, covariance * np.outer(wider, wider))
