@@ -33,7 +33,7 @@ from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import MAX_COEFFICIENT, read_twin
 from otolith_drivers.base import Driver, Sampling, sampling_of
 from otolith_drivers.config_files import Context, expect, parse, read, validate
-from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.units import Quantity, limit_values
 from otolith_drivers.user_dirs import state_directory
 
@@ -429,12 +429,13 @@ def _window(table: WindowTable, context: Context) -> WindowOptions:
 def _length_problem(seconds: float, period: float) -> str:
     """Return why a window of ``seconds`` has no grid of ``period`` (s), with lengths that have one; empty if it has."""
     count = round(seconds / period)
+    given = f"{seconds:.9g} s at {period:g} s give {counted(count, 'record')}"
     if seconds < MIN_WINDOW_RECORDS * period * (1.0 - MAX_GRID_ERROR):
         least = f"write at least {MIN_WINDOW_RECORDS * period:.9g} s, or shorten sample_period"
-        return f"{seconds:.9g} s at {period:g} s give {count} records: a window needs {MIN_WINDOW_RECORDS}: {least}"
+        return f"{given}: a window needs {MIN_WINDOW_RECORDS}: {least}"
     if count > MAX_WINDOW_RECORDS:
         most = f"write at most {MAX_WINDOW_RECORDS * period:.9g} s, or lengthen sample_period"
-        return f"{seconds:.9g} s at {period:g} s give {count} records: more than {MAX_WINDOW_RECORDS}: {most}"
+        return f"{given}: more than {MAX_WINDOW_RECORDS}: {most}"
     if abs(count * period - seconds) <= MAX_GRID_ERROR * seconds:
         return ""
     below = math.floor(seconds / period)

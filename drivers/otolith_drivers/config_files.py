@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
-from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.errors import ConfigurationError, nearest, shown
 
 FILE_SIZE_LIMIT = 1 << 20  # bytes of a TOML file: engineering choice, 100 times the largest machine file
 
@@ -284,9 +284,9 @@ def _message(fault: dict[str, Any], location: Location, model: type[BaseModel]) 
     if fault["type"] == "value_error":
         return str(fault["ctx"]["error"])
     if fault["type"] in TOML_TYPES:
-        return f"{fault['input']!r}: must be {TOML_TYPES[fault['type']]}"
+        return f"{shown(fault['input'])}: must be {TOML_TYPES[fault['type']]}"
     message = re.sub(r"^Input", "the value", fault["msg"])
-    return f"{fault['input']!r}: {message}"
+    return f"{shown(fault['input'])}: {message}"
 
 
 def _keys_at(model: Any, location: Location) -> list[str]:

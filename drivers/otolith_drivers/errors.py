@@ -51,6 +51,12 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def shown(value: object) -> str:
+    """Return a value from outside as a message has it, shortened."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:60]}..."
+
+
 def some_names(names: Sequence[str]) -> str:
     """Return the first ``MAX_NAMES`` names, and how many more there are."""
     more = len(names) - MAX_NAMES

@@ -46,6 +46,7 @@ FAULTS = [
     ('name = "\\u0000"\n', "1: name: '\\x00' contains a zero byte"),
     ("name = 'x'\nfolder = 1\n", "2: folder: 1: must be a text, in quotes"),
     ("name = 'x'\nquantity = [1]\n", "2: quantity: [1]: the value should be a valid number"),
+    (f"name = 'x'\nquantity = {[1] * 999}\n", "1,...: the value should be a valid number"),
     ("name = 'x'\nname = 'y'\n", "not valid TOML: "),
     ("[inner]\nspeed = 1.0\n", ": name: missing: this key must be set"),
 ]

@@ -17,7 +17,7 @@ from otolith_drivers.common.periods import PeriodEstimator
 from otolith_drivers.common.reconnection import PassingFault
 from otolith_drivers.common.remote_clock import ArrivalClock, unix_time
 from otolith_drivers.common.scaled import Conversion, ScaledSource
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, shown
 from otolith_drivers.units import Quantity
 
 MAX_PAYLOAD = 1 << 16  # bytes of a message that is read
@@ -224,9 +224,3 @@ def at(content: Any, path: str | None) -> Any:
             known = f": it has {', '.join(map(str, list(value)[:8]))}" if isinstance(value, dict) and value else ""
             raise ValueError(f"a message without {path}{known}") from None
     return value
-
-
-def shown(written: object) -> str:
-    """Return a value of a message, shortened."""
-    text = repr(written)
-    return text if len(text) <= 60 else f"{text[:60]}..."
