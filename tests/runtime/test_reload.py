@@ -6,6 +6,9 @@ import pytest
 
 from otolith.machine import load_machine
 from otolith.runtime.reload import Reload, reloaded
+from otolith.runtime.service import Service
+from otolith_drivers.errors import ConfigurationError
+from tests.conftest import EXAMPLES
 
 TEXT = """[machine]
 name = "motor"
@@ -51,3 +54,16 @@ def test_all_else_needs_a_restart(tmp_path: Path, before: str, after: str, keys:
     assert (result.limits, result.recording, result.needs_restart) == (False, False, keys)
     assert result.machine.file.parameters["R_a"].value == "6.5 ohm"
     assert f"only a restart takes over {', '.join(keys)}" in result.text
+
+
+def test_a_file_that_vanishes_during_a_reload_does_not_end_the_daemon(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    service = Service(load_machine(EXAMPLES / "dc-motor-in-process.toml"))
+
+    def vanished(_: object) -> dict[str, str]:
+        raise ConfigurationError("dc-motor-in-process.toml: no such file")
+
+    monkeypatch.setattr("otolith.runtime.service.files_of", vanished)
+    service._reload()
+    assert "not reloaded, the daemon goes on as before: dc-motor-in-process.toml: no such file" in caplog.text

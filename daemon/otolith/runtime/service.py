@@ -186,15 +186,14 @@ class Service:
         self._is_reload_due = False
         try:
             change = reloaded(self._machine, load_machine(self._machine.path))
+            files = self._evidence.files if change.needs_restart else files_of(change.machine)
         except (OtolithError, OSError) as error:
             log.warning("not reloaded, the daemon goes on as before: %s", error)
             return
-        self._machine = change.machine
+        self._machine, self._evidence.files = change.machine, files
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
         if change.limits:
             self._supervisor.revise(lambda state: replace(state, plan=change.machine.plan))
-        if not change.needs_restart:
-            self._evidence.files = files_of(self._machine)
         if change.recording:
             self._recorder.reload(self._machine, time.monotonic(), RECORDER_FLUSH)
 
