@@ -173,6 +173,15 @@ def test_lost_data_of_the_time_are_counted_over_restarts(monkeypatch: pytest.Mon
     assert "6 samples lost" in text
 
 
+def test_each_loss_has_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = written(reports(1))
+    losses = dict.fromkeys(CountersDocument.model_fields, 7)
+    monkeypatch.setattr(HistoryReader, "counters", lambda *_: [{"hour": START, "run": START, **losses}])
+    lost = page(reader, now=START + 2.0).text.partition("Lost data")[2].partition("Made")[0]
+    assert lost.count("7 ") == len(losses)
+    assert not [name for name in losses if "_" in name and name in lost]
+
+
 HARMFUL = "<script>window.hit=1<"
 LONG = "a_parameter_with_a_name_that_is_longer_than_a_phone_is_wide"
 TEXT = "\"'><img src=x onerror='window.hit=1'>&lt;"
