@@ -440,6 +440,11 @@ list = [{ pass = "SECRET", x = 1.5 }]"""
     assert read["parameters"] == tomllib.loads(text)["parameters"]
 
 
+def test_any_letters_of_a_machine_file_are_kept() -> None:
+    tables = {"signals": {"i": {"topic": "M\u00fchle/\U0001f600", "field": 'a"b\\c\n'}}}
+    assert tomllib.loads(public_text(tables)) == tables
+
+
 def test_the_files_of_a_bundle_are_those_of_the_machine(bundles: list[Path], folder: Path) -> None:
     with zipfile.ZipFile(bundles[-1]) as archive:
         assert set(archive.namelist()) == {EVIDENCE, MACHINE, TWIN}

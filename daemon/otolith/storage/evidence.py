@@ -154,7 +154,8 @@ def public_text(tables: Mapping[str, Any]) -> str:
         for table in content if isinstance(content, list) else [content]:
             own = {"file": TWIN} if name == "twin" else table
             lines.append(f"[[{name}]]" if isinstance(content, list) else f"[{name}]")
-            write = partial(json.dumps, default=str, separators=(", ", " = "))  # TOML is JSON but for its colons
+            # TOML is JSON but for its colons, and has no pairs of escaped surrogates.
+            write = partial(json.dumps, default=str, ensure_ascii=False, separators=(", ", " = "))
             lines += [f"{write(key)} = {write(own[key])}" for key in own if key in PUBLIC_KEYS.get(name, own)]
     return "\n".join([*lines, ""])
 
