@@ -465,7 +465,6 @@ import sys
 from pathlib import Path
 from otolith.storage.history_retention import Bounds
 from otolith.storage.history_writer import HistoryWriter
-from tests.conftest import EXAMPLES
 from tests.storage.histories import START, documents
 writer = HistoryWriter(Path(sys.argv[1]), Bounds(20_000_000, 3650, 8760))
 numbers, note = writer.open(START)
