@@ -1,4 +1,4 @@
-"""A headless Chromium, driven over its DevTools protocol by a pipe: what a page shows, requests and complains about."""
+"""A headless Chromium, driven over its DevTools protocol by a pipe: what a page shows, requests and logs."""
 
 import base64
 import json
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-PATIENCE = 120.0  # s
+ANSWER_TIMEOUT = 120.0  # s
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-dev-shm-usage",
          "--remote-debugging-pipe")  # fmt: skip
 
@@ -28,8 +28,11 @@ class Browser:
     """One tab. ``events`` has what the browser has announced since the last page was opened."""
 
     def __init__(self, commands: int, replies: int) -> None:
-        self._commands, self._replies = commands, replies
-        self._number, self._rest, self._session = 0, b"", {}
+        self._commands = commands
+        self._replies = replies
+        self._number = 0  # of the last command
+        self._rest = b""  # of what was read, after the last whole message
+        self._session: dict[str, str] = {}
         self.events: list[dict[str, Any]] = []
         target = self._call("Target.createTarget", url="about:blank")["targetId"]
         attached = self._call("Target.attachToTarget", targetId=target, flatten=True)
@@ -64,8 +67,8 @@ class Browser:
         return [event["params"]["request"]["url"] for event in self.events
                 if event["method"] == "Network.requestWillBeSent"]  # fmt: skip
 
-    def complaints(self) -> list[str]:
-        """Return what is in the console: messages, errors and refused requests."""
+    def console(self) -> list[str]:
+        """Return what is in the console of the page: messages, errors and refused requests."""
         methods = {"Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded"}
         return [json.dumps(event["params"]) for event in self.events if event["method"] in methods]
 
@@ -81,8 +84,8 @@ class Browser:
 
     def _receive(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
-            if not select.select([self._replies], [], [], PATIENCE)[0]:
-                raise TimeoutError(f"no answer of the browser for {PATIENCE:g} s")
+            if not select.select([self._replies], [], [], ANSWER_TIMEOUT)[0]:
+                raise TimeoutError(f"no answer of the browser for {ANSWER_TIMEOUT:g} s")
             if not (data := os.read(self._replies, 1 << 20)):
                 raise RuntimeError("the browser has ended")
             self._rest += data
@@ -96,7 +99,8 @@ class Browser:
 @contextmanager
 def browser(path: str) -> Iterator[Browser]:
     """A browser that ends with the block; ``path`` as :func:`program` returns it."""
-    (theirs_in, commands), (replies, theirs_out) = os.pipe(), os.pipe()
+    theirs_in, commands = os.pipe()
+    replies, theirs_out = os.pipe()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         # The protocol takes commands from file 3 and writes replies to file 4.
         script = (

@@ -30,8 +30,11 @@ from otolith.health.text import event_text
 from otolith.machine import LoadedMachine
 from otolith_drivers.plant.dc_motor import SetPoint
 
-HOUR, LENGTH = 3600.0, 2.0  # s
-COPPER, RISE, WARM_UP = 0.00393, 40.0, 1200.0  # 1/K, K, s: a time constant of a small motor
+HOUR = 3600.0  # s
+LENGTH = 2.0  # s: of a window
+COPPER = 0.00393  # 1/K: temperature coefficient of the resistance
+RISE = 40.0  # K
+WARM_UP = 1200.0  # s: a time constant of a small motor
 GROWTH = 5.0  # exponent of a wear from its start to its end, as in the paper
 AMBIENT = 293.15  # K
 MAX_FALSE_PER_DAY = 0.5

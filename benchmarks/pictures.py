@@ -36,8 +36,9 @@ from otolith.storage.history_writer import HistoryWriter
 from otolith_drivers.base import Sampling
 
 START = 1_790_000_000.0  # Unix s of the first window
-COUNT, SEED = 60, 5
-SIZE = (1280, 720)
+COUNT = 60  # windows
+SEED = 5
+SIZE = (1280, 720)  # pixels
 COLOURS = 200  # of a PNG file
 MACHINE, SITE = "press-3", "hall-1"
 FAULTS: dict[str, dict[str, Any]] = {

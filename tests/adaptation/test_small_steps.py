@@ -1,5 +1,6 @@
 """A step of a few standard deviations of one window, of a shaft that turns unevenly under a speed controller."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -8,16 +9,22 @@ from benchmarks.changes.machines import ONE_MASS, twin_of
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import initial_state
+from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
 from otolith.discovery.decision import WindowDecision
 from otolith.estimation.imm_filter import CumulativeShifts
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument
 
 TWIN = twin_of(ONE_MASS)
-INERTIA, DAMPING, SPEED, GAIN = 0.12, 0.02, 30.0, 0.2  # kg*m^2, N*m*s/rad, rad/s, N*m*s/rad
-UNEVENNESS, NOISE = 0.1, 0.01  # rad/s/s^0.5, rad/s
-PERIOD, RECORDS, SUBSTEPS = 0.01, 200, 4
+INERTIA = 0.12  # kg*m^2
+DAMPING = 0.02  # N*m*s/rad
+SPEED = 30.0  # rad/s
+GAIN = 0.2  # N*m*s/rad
+UNEVENNESS = 0.1  # rad/s/s^0.5
+NOISE = 0.01  # rad/s
+PERIOD = 0.01  # s
+RECORDS = 200
+SUBSTEPS = 4
 BEFORE, AFTER, HEALTHY = 5, 8, 50  # windows
 SEEDS = 4
 FREE = tuple(TWIN.parameter(name) for name in ("J", "D"))
@@ -77,3 +84,15 @@ def test_a_wrong_window_alone_moves_nothing() -> None:
     assert once.moved == []
     assert once.after(np.array([0.5])).moved == []
     assert once.after(np.array([4.0])).moved == [0]
+
+
+def test_a_parameter_that_is_shifted_along_moves_with_the_other() -> None:
+    assert CumulativeShifts(np.array([[5.5, 2.6, 2.4], [0.0, 0.0, 0.0]])).moved == [0, 1]
+    assert CumulativeShifts(np.array([[4.9, 2.6, 2.4], [0.0, 0.0, 0.0]])).moved == []
+
+
+def test_a_reset_of_one_parameter_forgets_no_other() -> None:
+    sums = CumulativeShifts(np.array([[3.0, 12.0], [0.0, 0.0]]))
+    state = replace(initial_state("shaft", "bench", PROBLEM), shifts=sums)
+    assert state.shifts.moved == [0, 1]
+    assert apply_decisions(state, OperatorDecisions(resets={"D": 1.0})).shifts.moved == []

@@ -7,22 +7,34 @@ import pytest
 
 from otolith.acquisition.window import Window
 from otolith.commissioning.identification import identify_noise
-from otolith.commissioning.structure import Structure, remaining_structure
+from otolith.commissioning.likelihood import Likelihood, with_levels
+from otolith.commissioning.structure import PooledResponse, Structure, remaining_structure
+from otolith.discovery.screening import allowed_forms
+from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import fit
 from otolith.machine import find_twin
 
 TWIN = find_twin("servo_axis")
 TRUTH = {"M": 95.0, "F_v": 200.0, "F_c": 20.0, "offset": -3.0, "v_s": 0.002}
 FREE = tuple(parameter for parameter in TWIN.parameters if parameter.name in ("M", "F_v", "F_c", "offset"))
 PROBLEM = Problem(TWIN, (("v_s", TRUTH["v_s"]),), FREE, noise=(1e-6,))
-PITCH, AMPLITUDE = 5e-3, 5.0  # m, N: in each window the process noise hides it
-UNEVENNESS, NOISE, QUANTUM = 0.01, 1e-6, 5e-7  # m/s/s^0.5, m, m
-PERIOD, RECORDS, SUBSTEPS = 2e-3, 400, 4
+PITCH = 5e-3  # m
+AMPLITUDE = 5.0  # N: in each window the process noise hides it
+UNEVENNESS = 0.01  # m/s/s^0.5
+NOISE = 1e-6  # m
+QUANTUM = 5e-7  # m
+PERIOD = 2e-3  # s
+RECORDS = 400
+SUBSTEPS = 4
 
 
 @lru_cache
-def record(count: int, amplitude: float, seed: int) -> tuple[Window, ...]:
-    """Windows of an axis under a position controller that moves to and fro; its encoder has steps."""
+def record(count: int, amplitude: float, seed: int, frequency: float | None = None) -> tuple[Window, ...]:
+    """Windows of an axis under a position controller that moves to and fro; its encoder has steps.
+
+    A force is a sine of the position, or of time if it has a ``frequency`` (Hz).
+    """
     random, x, v, rows = np.random.default_rng(seed), 0.0, 0.0, []
     dt = PERIOD / SUBSTEPS
     for at in range(count * RECORDS):
@@ -30,9 +42,10 @@ def record(count: int, amplitude: float, seed: int) -> tuple[Window, ...]:
         target, speed = 0.08 * np.sin(1.9 * time), 0.152 * np.cos(1.9 * time)
         force = 4000.0 * (target - x) + 1200.0 * (speed - v) + 25.0 * np.tanh(speed / 0.002)
         rows.append((force, QUANTUM * np.rint((x + NOISE * random.standard_normal()) / QUANTUM)))
-        for _ in range(SUBSTEPS):
+        for substep in range(SUBSTEPS):
+            turns = x / PITCH if frequency is None else frequency * (time + substep * dt)
             friction = TRUTH["F_v"] * v + TRUTH["F_c"] * np.tanh(v / TRUTH["v_s"])
-            periodic = amplitude * np.sin(2.0 * np.pi * x / PITCH + 0.7)
+            periodic = amplitude * np.sin(2.0 * np.pi * turns + 0.7)
             v += dt * (force - friction - TRUTH["offset"] + periodic) / TRUTH["M"]
             x += dt * v
         v += UNEVENNESS * np.sqrt(PERIOD) * random.standard_normal()
@@ -42,8 +55,8 @@ def record(count: int, amplitude: float, seed: int) -> tuple[Window, ...]:
 
 
 @lru_cache
-def structure(count: int, amplitude: float, seed: int) -> list[Structure]:
-    windows = record(count, amplitude, seed)
+def structure(count: int, amplitude: float, seed: int, frequency: float | None = None) -> list[Structure]:
+    windows = record(count, amplitude, seed, frequency)
     return remaining_structure(PROBLEM, identify_noise(PROBLEM, windows), windows)
 
 
@@ -61,6 +74,32 @@ def test_a_force_that_depends_on_position_shows_in_all_windows_together(half: sl
 def test_a_healthy_axis_has_no_structure(seed: int) -> None:
     """Steps of the encoder, uneven motion and a controller make none."""
     assert structure(10, 0.0, seed) == []
+
+
+def test_a_force_that_depends_on_time_has_another_phase_in_each_window() -> None:
+    (shown,) = structure(10, 8.0, 1, frequency=8.3)
+    assert shown.component.key == "carriage/periodic/t"
+    assert shown.is_restarted
+    assert shown.component.inner / (2.0 * np.pi) == pytest.approx(8.3, rel=0.02)
+    assert shown.component.amplitude == pytest.approx(8.0, rel=0.2)
+
+
+def test_less_than_three_cycles_in_a_window_are_no_structure() -> None:
+    assert structure(10, 8.0, 1, frequency=2.0) == []
+
+
+def test_noise_seldom_gains_from_a_phase_in_each_window() -> None:
+    windows, likelihood = record(10, 0.0, 0), Likelihood(PROBLEM)
+    levels = np.array(identify_noise(PROBLEM, windows).before_inflation)
+    problem, truth = with_levels(PROBLEM, levels), np.array([TRUTH[parameter.name] for parameter in FREE])
+    prior, start = initial_prior(problem), np.concatenate([truth, np.zeros(len(FREE))])
+    states = [likelihood.fit(levels, window, [truth]).guess[len(FREE) :].tolist() for window in windows]
+    pairs = zip(windows, states, strict=True)
+    pooled = PooledResponse([fit(problem, window, prior, start, 0, state=tuple(state)) for window, state in pairs])
+    forms = [form for form in allowed_forms(problem, pooled.parts[0].x) if pooled.is_restarted(form)]
+    guesses = [(form, 2.0 * np.pi * hertz) for form in forms[:1] for hertz in range(5, 45)]
+    assert len(guesses) == 40
+    assert np.count_nonzero(pooled.score(guesses).gain) <= 1
 
 
 def test_few_windows_show_no_structure() -> None:

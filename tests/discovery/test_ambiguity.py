@@ -9,6 +9,7 @@ import pytest
 from otolith.discovery.ambiguity import interchangeable, mixture, probabilities, without_duplicates
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.estimation.augmented import augment
+from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Component
 from tests.discovery.test_sequential_test import BARE, PERIODIC, hypothesis
 
@@ -64,3 +65,12 @@ def test_the_mixture_holds_the_values_of_all_members(wrong: float) -> None:
     sd = float(np.sqrt(known.covariance[0, 0]))
     expected = (6.5, np.hypot(0.5, 0.01)) if wrong else (7.0, 0.01)
     assert (known.mean[0], sd) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(("share", "is_inside"), [(0.06, True), (0.04, False)])
+def test_the_interval_of_the_mixture_contains_those_of_probable_members(share: float, *, is_inside: bool) -> None:
+    near = stated(FaultType.PARAMETER, 0.0, 0.0, 1)
+    far = hypothesis(FaultType.PARAMETER, BARE, R_a=(8.0, 0.01))
+    known = mixture([near, far], [1.0 - share, share], BARE, near.posterior.prior(), wrong=0.0)
+    reach = QUANTILE * np.sqrt(known.covariance[0, 0])
+    assert (known.mean[0] + reach >= 8.0 + QUANTILE * 0.01 - 1e-9) == is_inside

@@ -106,6 +106,13 @@ def test_what_the_core_composes_is_translated_in_parts(english: str, german: str
     assert texts_in("en").translated(english) == english
 
 
+def test_a_very_long_text_stays_english() -> None:
+    """A device may write it, and made for it, a text of some thousand characters would take minutes."""
+    made = "5% of {} is missing, more than missing_limit (1%)"
+    assert GERMAN.translated(made.format("i" * 100)) != made.format("i" * 100)
+    assert GERMAN.translated(made.format("i" * 500)) == made.format("i" * 500)
+
+
 def reports(own_machine: OwnMachine, scenario: str, count: int) -> list[ReportDocument]:
     text = own_machine.machine.read_text(encoding="utf-8")
     own_machine.machine.write_text(text.replace("[machine]", '[machine]\nlanguage = "de"'), encoding="utf-8")

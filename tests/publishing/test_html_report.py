@@ -269,14 +269,14 @@ def tab() -> Iterator[Browser]:
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (360, 740)])
-def test_a_browser_complains_of_nothing_and_requests_nothing(
+def test_a_page_logs_and_requests_nothing_in_a_browser(
     simulated: dict[str, str], tab: Browser, tmp_path: Path, width: int, height: int
 ) -> None:
     for name, text in {**simulated, "harmful": shown_text(harmful()), "empty": shown_text(written([]))}.items():
         path = tmp_path / f"{name}.html"
         path.write_text(text, encoding="utf-8")
         tab.open(path, width, height, is_phone=width < 500)
-        assert tab.complaints() == []
+        assert tab.console() == []
         assert [address for address in tab.requested() if address != "data:,"] == [path.as_uri()]
         assert tab.value("window.hit") is None
         assert tab.value("innerWidth") == width  # a phone shows a page that is too wide as smaller

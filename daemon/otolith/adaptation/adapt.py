@@ -92,8 +92,8 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
     is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
-    alone = estimated.parameters
-    values, sd = np.array([own.value for own in alone]), np.array([own.sd for own in alone])
+    values = np.array([own.value for own in estimated.parameters])
+    sd = np.array([own.sd for own in estimated.parameters])
     shifts = state.shifts.after(predicted.shifts(values, sd, estimated.fit.window.grid.length))
     moved = shifts.moved
     is_calm = is_expected and not screening.is_positive
@@ -104,7 +104,10 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
         act = _update_filter_beside if is_calm and not moved and not test.is_confirmed else _apply_decision
         result = act(state, predicted, estimated, test)
     elif is_calm:
-        result = (_follow_shifts if moved else _update_filter)(state, predicted.reset_parameters(moved), estimated)
+        if moved:
+            result = _follow_shifts(state, predicted.reset_parameters(moved), estimated)
+        else:
+            result = _update_filter(state, predicted, estimated)
         return replace(result, shifts=shifts)
     else:
         state, test = replace(state, test=None), open_test(predicted, screening)
@@ -138,7 +141,7 @@ def _update_filter_beside(
     """Update the filter with a window that shows nothing of what opened the test.
 
     The window that opened it may have been wrong, so that the filter goes on. But windows of a machine at rest are no
-    evidence against its hypotheses: it is closed only when windows speak decisively for the filter. Until then the
+    evidence against its hypotheses: it is closed only when windows are decisive evidence for the filter. Until then the
     filter is one of the hypotheses.
     """
     result = _update_filter(state, predicted, estimated)

@@ -48,7 +48,7 @@ class AdaptationState:
     adopted: tuple[AdoptedComponent, ...] = ()
     """The components in the twin."""
     shifts: CumulativeShifts = field(default_factory=CumulativeShifts)
-    """How far windows that the filter expected have moved the parameters, all the same way."""
+    """By how much the estimates of windows differ from their predictions, all the same way."""
     noisier_since: float | None = None
     """Unix seconds from which on sensors are noisier than stated; None if they are not."""
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)
@@ -172,8 +172,14 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
     for index, parameter in enumerate(state.problem.free):
         if parameter.name == name:
             previous = {**state.previous, parameter.label: PreviousStatus()}
-            health, posterior = state.health.without_history(name), state.posterior.reset_parameters([index])
-            return replace(state, posterior=posterior, previous=previous, test=None, health=health)
+            return replace(
+                state,
+                posterior=state.posterior.reset_parameters([index]),
+                previous=previous,
+                test=None,
+                shifts=CumulativeShifts(),
+                health=state.health.without_history(name),
+            )
     for component in state.problem.components:
         if component.key == name:
             return without_component(state, component)

@@ -3,7 +3,7 @@
 Process noise can be made so large that the windows fit, whatever the twin lacks. So the innovations at the likeliest
 levels are searched for structure before any level is enlarged. The windows are pooled: all have the same parameters and
 the same component, so that much weaker components show than in one window, and nothing that comes in a single window
-does. The amplitudes of the windows must agree, which an accident of coloured noise does not.
+does. The amplitudes of the windows must agree, which those of coloured noise do only by chance.
 ``docs/explanation/noise-identification.md`` has the equations.
 """
 

@@ -132,12 +132,12 @@ class SequentialTest:
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether windows after the one that opened the test speak decisively against the filter."""
+        """Whether windows after the one that opened the test are decisive evidence against the filter."""
         return self.against_filter > DECISIVE
 
     @property
     def is_refuted(self) -> bool:
-        """Whether these windows speak decisively for the filter."""
+        """Whether these windows are decisive evidence for the filter."""
         return self.filter_deviance < -DECISIVE
 
     def with_steps(self, steps: tuple[float, ...]) -> "SequentialTest":
@@ -154,10 +154,10 @@ class SequentialTest:
         The evidence against the filter is a cumulative sum (E. S. Page, Biometrika 41, 1954) with decisive evidence as
         its reference value. It falls in windows that give less, so that it is forgotten if it does not go on.
         """
-        last, limits = self.last, (-MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
+        last = self.last
         more = (filtered.chi_square - last.chi_square) / residual_variance_factor([last.chi_square], last.count)
-        total = self.against_filter + np.clip(more - DECISIVE, *limits)
-        deviance = self.filter_deviance + np.clip(more, *limits)
+        total = self.against_filter + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
+        deviance = self.filter_deviance + np.clip(more, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         return replace(
             self,
             against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)),

@@ -163,7 +163,8 @@ class Posterior:
         belief, prior, size = self.belief, initial_prior(self.problem), _size(self.problem)
         for index in moved:
             for at in (index, index + len(self.problem.free)):
-                sd, value = float(np.sqrt(prior.covariance[at, at]) / size[at]), float(prior.mean[at] / size[at])
+                sd = float(np.sqrt(prior.covariance[at, at]) / size[at])
+                value = float(prior.mean[at] / size[at])
                 belief = imm_filter.reset_marginal(belief, at, sd, value)
         return replace(self, belief=belief)
 
@@ -178,7 +179,8 @@ class Posterior:
         before = [labels.index(problem.free[at].label) for at in kept]  # slots may have changed places
         level = np.full(count, FIRST_LEVEL)
         level[kept] = self.belief.level[0][before]
-        kept, before = [*kept, *(count + at for at in kept)], [*before, *(len(labels) + at for at in before)]  # trends
+        kept = [*kept, *(count + at for at in kept)]  # and their trends
+        before = [*before, *(len(labels) + at for at in before)]
         ratio = _size(self.problem)[before] / _size(problem)[kept]
         old_mean, old_covariance = imm_filter.moment_match(self.belief)
         mean, covariance = imm_filter.moment_match(Posterior.initial(problem).belief)

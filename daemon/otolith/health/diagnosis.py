@@ -40,8 +40,9 @@ class FindingKind(StrEnum):
     UNEXPLAINED = "unexplained"
     NO_DATA = "no data"
     NO_TEMPERATURE = "no temperature"
-    NO_SOURCE = "no source"
     """The temperature on which a parameter depends is not measured at present."""
+    NO_SOURCE = "no source"
+    """One of several sources is down or gave no sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +79,7 @@ class Rule(StrictModel):
     order: tuple[float, float] | None = None
     """Lowest and highest order."""
     condition: str = ""
-    """This one, cause and advice are from there."""
+    """Empty until :func:`worded`, as are cause and advice."""
     cause: str = ""
     advice: str = ""
     severity: Literal["WATCH", "ACT"] = "WATCH"

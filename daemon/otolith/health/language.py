@@ -13,7 +13,9 @@ from typing import Literal, get_args
 
 Language = Literal["en", "de"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
-ALTERNATIVES, PARTS = "; or ", "; "  # between the parts of a sentence
+ALTERNATIVES = "; or "  # between the parts of a sentence, as the next
+PARTS = "; "
+MAX_SENTENCE = 500  # characters: the time of a match grows with a high power of them, and a device may write the text
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +45,8 @@ class Texts:
         for joint, own in ((ALTERNATIVES, self.texts["alternatives"]), (PARTS, PARTS)):
             if joint in text:
                 return own.join(map(self.translated, text.split(joint)))
+        if len(text) > MAX_SENTENCE:
+            return text
         for pattern, translation in self.patterns:
             if match := pattern.fullmatch(text):
                 return translation.format(**{name: self.translated(part) for name, part in match.groupdict().items()})

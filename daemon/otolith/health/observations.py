@@ -114,18 +114,26 @@ def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator
 def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Level) -> Observation:
     """Return the observation of a finding; a parameter that has moved within the limits of the twin is none."""
     features = FindingFeatures(finding.kind, twin, finding.subject)
-    part, text = PARTS.get(finding.kind, MACHINE), finding.text
-    level, numbers, value = Level(severity(plan.rules, features)), None, finding.value
-    if value is not None:
+    part = PARTS.get(finding.kind, MACHINE)
+    level = Level(severity(plan.rules, features))
+    text = finding.text
+    numbers = None
+    if (value := finding.value) is not None:
         quantity = plan.known.get(finding.subject, MonitoredQuantity())
-        deviation, (passed, limit) = value.value - quantity.nominal, quantity.level(value.value, value.sd, before)
-        level, part = passed if quantity.limits else level, quantity.part
-        side, numbers = "below" if deviation < 0.0 else "above", _numbers(value.value, value.sd, value.unit, limit)
-        features = replace(features, side=side, manner="step")
-        interval = interval_text(value.value, value.sd, value.unit)
-        share = f" ({deviation / quantity.nominal:+.1%})" if quantity.nominal else ""
-        what, stated = plan.texts.translated(quantity.meaning), f"{quantity.nominal:.5g}"
-        text = plan.texts("moved", what=what, name=finding.subject, value=interval, change=share, stated=stated)
+        part = quantity.part
+        passed, limit = quantity.level(value.value, value.sd, before)
+        level = passed if quantity.limits else level
+        deviation = value.value - quantity.nominal
+        features = replace(features, side="below" if deviation < 0.0 else "above", manner="step")
+        numbers = _numbers(value.value, value.sd, value.unit, limit)
+        text = plan.texts(
+            "moved",
+            what=plan.texts.translated(quantity.meaning),
+            name=finding.subject,
+            value=interval_text(value.value, value.sd, value.unit),
+            change=f" ({deviation / quantity.nominal:+.1%})" if quantity.nominal else "",
+            stated=f"{quantity.nominal:.5g}",
+        )
     persistence = UNDECIDED if finding.kind in (FindingKind.CLASS, FindingKind.MOVED) else Persistence()
     return Observation(finding.id, part, level, features, text, finding.advice, finding.since, numbers, persistence)
 
