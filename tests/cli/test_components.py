@@ -21,6 +21,7 @@ from tests.cli.replays import MACHINE
 from tests.conftest import EXAMPLES
 
 KEY = "shaft/periodic/angle(omega)"
+STDOUT, STDERR = "standard output", "standard error"
 
 
 def torque(t: float, angle: float, *_: float) -> float:
@@ -43,9 +44,30 @@ def otolith(*arguments: str | Path, answer: str = "") -> Result:
     )
 
 
-def test_components_of_other_signals_are_not_restored(data: Path) -> None:
+@pytest.fixture(scope="module")
+def kept_files() -> dict[str, bytes]:
+    """What a commissioning wrote, once one has run, as it needs the state directory of a test."""
+    return {}
+
+
+@pytest.fixture
+def commissioned(data: Path, kept_files: dict[str, bytes]) -> tuple[str, str]:
+    """Standard output and error of a commissioning that this test's state directory has the files of."""
+    folder = store().components_path.parent
+    if not kept_files:
+        result = otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
+        assert result.exit_code == 0
+        kept_files.update({path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()})
+        kept_files.update({STDOUT: result.stdout.encode(), STDERR: result.stderr.encode()})
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in kept_files.keys() - {STDOUT, STDERR}:
+        (folder / name).write_bytes(kept_files[name])
+    return kept_files[STDOUT].decode(), kept_files[STDERR].decode()
+
+
+@pytest.mark.usefixtures("commissioned")
+def test_components_of_other_signals_are_not_restored() -> None:
     """Correcting a wrong unit must drop the components that it caused."""
-    assert otolith("commission", MACHINE, data, "--windows", "8", answer="y\n").exit_code == 0
     machine = load_machine(MACHINE, with_driver=False)
     names, folder = (machine.file.machine.site, machine.file.machine.name), store().components_path.parent
     records = store().components()
@@ -80,10 +102,10 @@ def store() -> StateStore:
     return StateStore(machine.file.machine.site, machine.file.machine.name, machine.twin)
 
 
-def test_commission_approve_reject_and_forget(data: Path) -> None:
-    asked = otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
-    assert "noise" in tomllib.loads(asked.stdout)  # only lines of a machine file go to standard output
-    assert f"found {KEY}: 0.0040" in asked.stderr or f"found {KEY}: 0.0039" in asked.stderr
+def test_commission_approve_reject_and_forget(commissioned: tuple[str, str]) -> None:
+    lines, asked = commissioned
+    assert "noise" in tomllib.loads(lines)  # only lines of a machine file go to standard output
+    assert f"found {KEY}: 0.0040" in asked or f"found {KEY}: 0.0039" in asked
     assert KEY in store().decisions().approved
 
     listed = otolith("components", "list", MACHINE)
@@ -168,8 +190,8 @@ def test_a_restricted_search_excludes_the_rest(tmp_path: Path) -> None:
     assert "winding/periodic/t" in excluded
 
 
-def test_reset_records_what_to_forget_and_keeps_decisions(data: Path) -> None:
-    otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
+@pytest.mark.usefixtures("commissioned")
+def test_reset_records_what_to_forget_and_keeps_decisions() -> None:
     shown = otolith("reset", MACHINE, "R_a", KEY, "--dry-run").stdout
     assert shown.splitlines() == ["R_a would be forgotten", f"{KEY} would be forgotten"]
     assert not store().decisions().resets
@@ -203,9 +225,9 @@ def test_reset_works_where_the_saved_state_is_damaged() -> None:
     assert store().decisions().resets.keys() == {"*"}
 
 
+@pytest.mark.usefixtures("commissioned")
 def test_commission_keeps_what_was_learned_before_beside(data: Path) -> None:
-    for _ in range(2):
-        result = otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
+    result = otolith("commission", MACHINE, data, "--windows", "8", answer="y\n")
     (kept,) = store().components_path.parent.glob("*.kept.json")
     assert f"what was learned before is kept as {kept}" in result.stderr
 
