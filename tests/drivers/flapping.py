@@ -28,6 +28,7 @@ PERIOD = 0.002  # s
 @contextmanager
 def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
     """The CAN driver, and a function that makes the socket of its bus invalid."""
+    reconnection.BACKOFF_FIRST = SHORT
     options = BusOptions(interface="udp_multicast", channel="239.74.163.8", port=free_port(socket.SOCK_DGRAM))
     opened: list[can.BusABC] = []  # at most one: the latest that has not been broken yet
 

@@ -23,7 +23,7 @@ flaps, process = int(sys.argv[2]), psutil.Process()
 measured = []
 
 def resources():
-    # Threads and sockets of the other end live on for a moment after a failure: the least of some moments is ours.
+    # Threads and sockets of the other end remain for a moment after a failure: the least of some moments is ours.
     gc.collect()
     threads, descriptors = [], []
     for _ in range(30):
