@@ -31,8 +31,7 @@ from otolith.machine import LoadedMachine
 from otolith.publishing.html_report import html_report
 from otolith.publishing.recorder import Recording
 from otolith.storage.history import SUFFIX, WINDOW, describe_machine
-from otolith.storage.history_retention import Bounds
-from otolith.storage.history_writer import HistoryWriter
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.base import Sampling
 
 START = 1_790_000_000.0  # Unix s of the first window

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sampling, SourceState, sampling_of
-from otolith_drivers.common.reconnection import ReconnectBackoff
-from otolith_drivers.common.threaded_driver import ThreadedDriver
+from otolith_drivers.common.reconnection import ReconnectBackoff, ThreadedDriver
 from otolith_drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.acquisition.playback import Playback
+from otolith.acquisition.playback import CONFIRMING_ROWS, Playback, SegmentFinder
 from otolith.acquisition.samples import SignalPlan
-from otolith.acquisition.segments import CONFIRMING_ROWS, SegmentFinder
 from otolith.acquisition.window import Array, Mask
 from otolith_drivers.replay.readers import Rows
 from tests.acquisition.series import ramp

@@ -11,9 +11,8 @@ from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.objective import Objective
-from otolith.estimation.problem import Problem, WindowOptions
+from otolith.estimation.problem import MAX_CHANGE, Problem, WindowOptions
 from otolith.estimation.window_fit import Search, estimate
-from otolith.estimation.window_length import MAX_CHANGE
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
 

@@ -16,8 +16,7 @@ from click.testing import CliRunner, Result
 from otolith.cli.main import cli
 from otolith.health.schema import EventChange
 from otolith.storage.history import HOUR, history_path
-from otolith.storage.history_retention import Bounds
-from otolith.storage.history_writer import HistoryWriter, Numbers
+from otolith.storage.history_writer import Bounds, HistoryWriter, Numbers
 from otolith_drivers.errors import ConfigurationError
 from tests.storage.histories import MACHINE, SITE, document, documents
 

@@ -14,8 +14,7 @@ from click.testing import CliRunner, Result
 
 from otolith.cli.main import cli
 from otolith.storage.history import history_path
-from otolith.storage.history_retention import Bounds
-from otolith.storage.history_writer import HistoryWriter
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.errors import ConfigurationError
 from tests.storage.histories import MACHINE, SITE, documents
 

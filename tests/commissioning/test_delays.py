@@ -13,7 +13,7 @@ from otolith.commissioning import delays as text
 from otolith.commissioning.delays import IdentifiedDelays, SignalDelay, identify_delays, identify_delays_and_noise
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
-from otolith.estimation.timing.shifted_window import shifted
+from otolith.estimation.timing import shifted
 from otolith.machine import find_twin, load_machine
 from otolith.runtime.replay import Replay, open_recorded
 

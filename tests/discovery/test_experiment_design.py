@@ -8,8 +8,7 @@ import pytest
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.estimation.problem import Problem, WindowOptions
-from otolith.estimation.window_length import WindowExcitation, next_records
+from otolith.estimation.problem import Problem, WindowExcitation, WindowOptions, next_records
 from otolith.health.schema import ReportDocument, Status
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of

@@ -15,7 +15,7 @@ SOURCES = {
     "commissioning": [DAEMON / "commissioning"],
     "discovery": [DAEMON / "discovery"],
     "drivers": [DRIVERS, DRIVERS / "common"],
-    "estimation": [DAEMON / "estimation", DAEMON / "estimation" / "timing"],
+    "estimation": [DAEMON / "estimation"],
     "health": [DAEMON / "health", DAEMON / "adaptation"],
     "modbus": [DRIVERS / "modbus"],
     "mqtt": [DRIVERS / "mqtt"],

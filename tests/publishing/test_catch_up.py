@@ -15,13 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith.publishing.catch_up import MAX_REPLIES, time_range
 from otolith.publishing.subscriber import MessageOrder, Subscriber
 from otolith.publishing.zenoh_config import Connection
-from otolith.publishing.zenoh_session import EVENT, REPORT, Publisher, Topic, session
+from otolith.publishing.zenoh_session import EVENT, MAX_REPLIES, REPORT, Publisher, Topic, session, time_range
 from otolith.storage.history import SUFFIX
-from otolith.storage.history_retention import Bounds
-from otolith.storage.history_writer import HistoryWriter
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from tests.conftest import free_port
 from tests.storage.histories import MACHINE, SITE, START, documents
 from tests.waiting import PATIENCE, wait_for
@@ -47,7 +45,7 @@ from pathlib import Path
 from otolith.machine_file import ZenohTable
 from otolith.publishing.zenoh_config import Access
 from otolith.publishing.zenoh_session import Publisher
-from otolith.storage.history_retention import Bounds
+from otolith.storage.history_writer import Bounds
 from otolith.storage.history_writer import HistoryWriter
 from tests.storage.histories import MACHINE, SITE, documents
 writer = HistoryWriter(Path(sys.argv[1]), Bounds(50_000_000, 3650, 24))

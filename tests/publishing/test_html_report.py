@@ -15,8 +15,7 @@ from otolith.health.limits import Level
 from otolith.health.schema import CountersDocument, EventChange, HealthDocument, PartDocument, ReportDocument, Status
 from otolith.publishing.html_report import MAX_ROWS, Axis, html_report
 from otolith.storage.history import DAY, HOUR, WINDOW, HistoryReader, history_path
-from otolith.storage.history_retention import Bounds
-from otolith.storage.history_writer import HistoryWriter
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from tests.storage.histories import MACHINE, SITE, START, document
 
 NOW = START + 400.0

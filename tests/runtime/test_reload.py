@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from otolith.machine import load_machine
-from otolith.runtime.reload import Reload, reloaded
-from otolith.runtime.service import Service
+from otolith.runtime.service import Reload, Service, reloaded
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 

@@ -29,8 +29,7 @@ from otolith.storage.history import (
     create,
     describe_machine,
 )
-from otolith.storage.history_retention import AGES, Bounds
-from otolith.storage.history_writer import KEPT, MAX_WAITING, HistoryWriter, Numbers
+from otolith.storage.history_writer import AGES, KEPT, MAX_WAITING, Bounds, HistoryWriter, Numbers
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.storage.histories import MACHINE, SITE, START, document, documents
@@ -463,7 +462,7 @@ def test_a_clock_that_leaps_ahead_deletes_nothing_for_a_day(opened: Callable[...
 WRITES_FOR_EVER = """
 import sys
 from pathlib import Path
-from otolith.storage.history_retention import Bounds
+from otolith.storage.history_writer import Bounds
 from otolith.storage.history_writer import HistoryWriter
 from tests.storage.histories import START, documents
 writer = HistoryWriter(Path(sys.argv[1]), Bounds(20_000_000, 3650, 8760))

@@ -1,8 +1,10 @@
-"""What the commands share: arguments, the signal to stop, logging, a line of progress, and folders."""
+"""What the commands share: arguments, options of readers, the signal to stop, logging, progress, and folders."""
 
+import functools
 import logging
 import os
 import queue
+import re
 import signal
 import sys
 import time
@@ -10,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import click
 
@@ -118,3 +121,35 @@ def shipped_directory(name: str) -> Path:
     """The folder ``config`` or ``systemd``: in an installed package, or beside the sources of a checkout."""
     installed = Path(__file__).parents[1] / name
     return installed if installed.is_dir() else Path(__file__).parents[3] / name
+
+
+def endpoints(_: click.Context, option: click.Parameter, written: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what ``--connect`` or ``--listen`` gives; raise BadParameter for a text that is no endpoint."""
+    for endpoint in written:
+        is_local = option.name == "listen" and endpoint == "local"
+        if not (is_local or re.fullmatch(r"[a-z-]+/\S+", endpoint)):
+            raise click.BadParameter(f"{endpoint!r} is no endpoint: write it like tcp/127.0.0.1:7447")
+    return written
+
+
+def reader_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of a reader; the command receives ``connect`` and ``credentials``."""
+
+    @functools.wraps(command)
+    def wrapped(
+        ca: Path | None, certificate: Path | None, key: Path | None, login: Path | None, **options: Any
+    ) -> object:
+        from otolith.publishing.zenoh_config import Credentials
+
+        return command(credentials=Credentials(ca, certificate, key, login), **options)
+
+    for option in (
+        click.option("--login", type=FILE, envvar="OTOLITH_LOGIN", help="File with a line name:password."),
+        click.option("--key", type=FILE, envvar="OTOLITH_KEY", help="Private key of the certificate."),
+        click.option("--certificate", type=FILE, envvar="OTOLITH_CERTIFICATE", help="Own certificate."),
+        click.option("--ca", type=FILE, envvar="OTOLITH_CA", help="Certificate of the site's CA, for tls/ endpoints."),
+        click.option("--connect", multiple=True, callback=endpoints, metavar="ENDPOINT", envvar="OTOLITH_CONNECT",
+                     help="Where daemons publish; may be repeated.  [default: their sockets on this computer]"),
+    ):  # fmt: skip
+        wrapped = option(wrapped)
+    return wrapped

@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from otolith import __version__
-from otolith.cli.commissioning.baseline import baseline
-from otolith.cli.commissioning.components import commission, components, reset
+from otolith.cli.commissioning.components import baseline, commission, components, reset
 from otolith.cli.commissioning.noise import noise
 from otolith.cli.commissioning.probe import probe
 from otolith.cli.commissioning.twin import twin
@@ -24,16 +24,16 @@ from otolith.cli.common import (
     INTERRUPTED,
     MACHINE_FILE,
     StopSignal,
+    endpoints,
     log_to_stderr,
     new_file,
+    progress_line,
+    reader_options,
     shipped_directory,
 )
-from otolith.cli.operation.compile import compile_command
-from otolith.cli.operation.connection import endpoints, reader_options
-from otolith.cli.operation.history import history
+from otolith.cli.operation.history import history, report
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
-from otolith.cli.operation.report import report
 from otolith.cli.operation.reproduce import reproduce
 from otolith.cli.operation.view import view
 
@@ -227,6 +227,45 @@ def watch(connect: tuple[str, ...], credentials: "Credentials", machine: str, as
     return stop.code()
 
 
+@cli.command("compile")
+@MACHINE_FILE
+def compile_command(file: Path) -> None:
+    """Compile the twin of the machine in FILE before it is needed.
+
+    The kernels go into the cache of this user. 'otolith run' compiles what is missing there, during which it reports
+    nothing; so does 'otolith install' for the service.
+
+    \b
+    Example:
+      otolith compile config/dc-motor.toml
+    """
+    from otolith import kernel_cache
+    from otolith.adaptation.state import initial_state
+    from otolith.machine import load_machine
+    from otolith.runtime.worker import warm_up
+    from otolith_drivers.errors import ServiceError, counted
+    from otolith_drivers.user_dirs import cache_directory
+
+    machine, begun = load_machine(file, with_driver=False), time.monotonic()
+    folder, count = cache_directory("kernels"), 0
+    with progress_line(f"compiling {machine.twin.name}") as show:
+
+        def observe(step: kernel_cache.CompileStep) -> None:
+            nonlocal count
+            count += step.compiled
+            show(f"compiling {step.kernel}, {counted(count, 'kernel')} done in {time.monotonic() - begun:.0f} s")
+
+        identity = machine.file.machine
+        with kernel_cache.observed(observe):
+            failure = warm_up(initial_state(identity.name, identity.site, machine.problem, machine.plan))
+    if failure:
+        raise ServiceError(f"{file}: twin {machine.twin.name!r} cannot be compiled or run: {failure}")
+    if count:
+        click.echo(f"compiled {counted(count, 'kernel')} in {time.monotonic() - begun:.0f} s: {folder}")
+    else:
+        click.echo(f"all kernels are there: {folder}")
+
+
 @cli.command()
 @click.argument("scenario", type=FILE)
 @click.option("--as", "transports", type=click.Choice(TRANSPORTS), multiple=True, default=("can",),
@@ -294,7 +333,6 @@ def demo(duration: float, machine: Path | None, scenario: Path | None, as_json: 
 COMMANDS: tuple[click.Command, ...] = (
     baseline,
     commission,
-    compile_command,
     components,
     history,
     install,

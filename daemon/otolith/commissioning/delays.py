@@ -14,8 +14,7 @@ from otolith.commissioning.identification import IdentifiedNoise, identify_noise
 from otolith.commissioning.likelihood import FittedWindow, Likelihood, Progress
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
-from otolith.estimation.timing.delay_response import delay_response, delayable
-from otolith.estimation.timing.shifted_window import largest_delay, same_measurements, shifted, trial_delays
+from otolith.estimation.timing import delay_response, delayable, largest_delay, same_measurements, shifted, trial_delays
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 SEARCHED_WINDOWS = 8  # windows with the most information, in which delays are tried

@@ -19,7 +19,7 @@ from otolith.estimation.augmented import amplitude_indices, augment, equation, i
 from otolith.estimation.information import QUANTILE, orthonormal_basis
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
-from otolith.estimation.timing.delay_response import delay_response, delayable
+from otolith.estimation.timing import delay_response, delayable
 from otolith.estimation.window_fit import Fit
 
 MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges

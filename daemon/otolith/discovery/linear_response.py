@@ -16,7 +16,7 @@ from otolith.acquisition.window import Array, Mask
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.estimation.information import orthonormal_basis
 from otolith.estimation.objective import input_matrix
-from otolith.estimation.timing.delay_response import delay_response
+from otolith.estimation.timing import delay_response
 from otolith.estimation.window_fit import Fit
 from otolith.twin.augmentation import augmented_model, sources
 from otolith.twin.component_families import family_code

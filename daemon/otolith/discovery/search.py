@@ -40,8 +40,7 @@ from otolith.estimation.arrival_cost import Prior, extend_prior, forget_paramete
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
-from otolith.estimation.timing.delay_response import delayable
-from otolith.estimation.timing.shifted_window import largest_delay, trial_delays
+from otolith.estimation.timing import delayable, largest_delay, trial_delays
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.augmentation import MAX_COMPONENTS
 

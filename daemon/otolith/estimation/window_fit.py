@@ -28,7 +28,7 @@ from otolith.estimation.objective import EXPLAINED, PENALTY, Objective
 from otolith.estimation.particle_swarm import SwarmResult, search_parameters, spread_starts
 from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
 from otolith.estimation.problem import Problem
-from otolith.estimation.timing.shifted_window import shifted
+from otolith.estimation.timing import shifted
 
 AT_BOUND = 1e-4  # share of the width of the bounds
 REFINED_PARTICLES = 4  # best particles of the swarm that Gauss-Newton starts from

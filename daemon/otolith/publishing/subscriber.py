@@ -9,9 +9,8 @@ from typing import Self
 
 import zenoh
 
-from otolith.publishing.catch_up import MAX_REPLIES
 from otolith.publishing.zenoh_config import Connection, local_sockets, reader_settings
-from otolith.publishing.zenoh_session import ALIVE, REPORT, Topic, close_session, session
+from otolith.publishing.zenoh_session import ALIVE, MAX_REPLIES, REPORT, Topic, close_session, session
 from otolith_drivers.errors import ServiceError
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.

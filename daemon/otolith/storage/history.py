@@ -2,7 +2,7 @@
 
 A value of each parameter and window is kept, and merged into its minute, hour and day at once, so that nothing has to
 be summarised later. Times are Unix seconds. The writer is :mod:`otolith.storage.history_writer`, retention is
-:mod:`otolith.storage.history_retention`; any number of processes may read meanwhile.
+:mod:`otolith.storage.history_writer`; any number of processes may read meanwhile.
 """
 
 import contextlib

@@ -23,8 +23,7 @@ from otolith_drivers.canbus.bus import (
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.canbus.options import FrameOptions
 from otolith_drivers.canbus.signals import CanSource
-from otolith_drivers.common.reconnection import Reconnection
-from otolith_drivers.common.threaded_driver import ThreadedDriver
+from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver
 from otolith_drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)

@@ -1,14 +1,18 @@
-"""A connection that is opened again after each fault: its state, pauses between attempts, causes, passing faults."""
+"""A driver's thread, and connections that are opened again: their state, pauses, causes and passing faults."""
 
 import logging
 import math
 import os
 import random
 import ssl
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
 FAULT_SHOWN = 10.0  # s after which a passing fault is no longer a warning
+CLOSE_TIMEOUT = 0.9  # s for the thread to end
 
 
 class ReconnectBackoff:
@@ -82,3 +86,22 @@ def cause_of(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno and error.errno > 0:
         return os.strerror(error.errno)
     return (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
+
+
+class ThreadedDriver:
+    """Base of a driver whose thread runs until ``_stop`` is set."""
+
+    def __init__(self) -> None:
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def _start(self, name: str, run: Callable[..., None], *arguments: Any) -> None:
+        """Call ``run`` with the arguments in a thread of this name."""
+        self._thread = threading.Thread(target=run, args=arguments, name=name, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """See :meth:`otolith_drivers.base.Driver.close`."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(CLOSE_TIMEOUT)

@@ -11,8 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
-from otolith_drivers.common.reconnection import Reconnection
-from otolith_drivers.common.threaded_driver import ThreadedDriver
+from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver
 from otolith_drivers.modbus.client import ReadOnlyClient
 from otolith_drivers.modbus.options import BIT_TABLES, ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.plausibility import OrderMonitor, StalenessMonitor

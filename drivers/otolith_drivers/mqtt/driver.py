@@ -15,8 +15,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
 from otolith_drivers.common.credentials import certificate, certificate_and_key, password
-from otolith_drivers.common.reconnection import Reconnection, cause_of
-from otolith_drivers.common.threaded_driver import ThreadedDriver
+from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver, cause_of
 from otolith_drivers.errors import ConfigurationError, counted
 from otolith_drivers.mqtt.topics import Messages, MqttOptions, MqttSource
 

@@ -14,10 +14,9 @@ from typing import Any
 from asyncua import Client, ua
 
 from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
-from otolith_drivers.common.reconnection import Reconnection
+from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver
 from otolith_drivers.common.remote_clock import unix_time
 from otolith_drivers.common.scaled import Conversion
-from otolith_drivers.common.threaded_driver import ThreadedDriver
 from otolith_drivers.errors import counted
 from otolith_drivers.opcua.connection import (
     OpcUaCredentials,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
-from otolith_drivers.common.threaded_driver import ThreadedDriver
+from otolith_drivers.common.reconnection import ThreadedDriver
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, nearest
 from otolith_drivers.plant.faults import IN_PROCESS

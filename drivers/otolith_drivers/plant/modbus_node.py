@@ -29,8 +29,7 @@ from otolith_drivers.errors import DeviceError
 from otolith_drivers.plant.faults import BusEffect
 from otolith_drivers.plant.pseudo_terminal import LineTransport, SerialLine
 from otolith_drivers.plant.realtime import Node, NodeSummary, ScheduledSample
-from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
-from otolith_drivers.plant.scenario import Scenario
+from otolith_drivers.plant.scenario import NodeModbusOptions, RegisterMap, Scenario
 
 READ_FUNCTIONS = frozenset({3, 4})  # holding and input registers: the functions that are answered
 UNDECODABLE = 0  # function code under which requests are counted that cannot be decoded

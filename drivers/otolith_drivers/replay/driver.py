@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import ConfigDict
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
-from otolith_drivers.common.threaded_driver import ThreadedDriver
+from otolith_drivers.common.reconnection import ThreadedDriver
 from otolith_drivers.config_files import StrictModel, validated
 from otolith_drivers.errors import ConfigurationError, DeviceError, OtolithError
 from otolith_drivers.replay.readers import Array, Reader, Rows, format_of, holds_frames

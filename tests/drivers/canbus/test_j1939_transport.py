@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from otolith_drivers.canbus.j1939_transport import (
+from otolith_drivers.canbus.j1939 import (
     ABORT,
     BAM,
     CTS,

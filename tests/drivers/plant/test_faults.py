@@ -34,8 +34,7 @@ from otolith_drivers.plant.faults import (
     WordOrder,
 )
 from otolith_drivers.plant.realtime import NODES, NodeSummary, ScheduledSample, in_real_time, refuse_unfit
-from otolith_drivers.plant.register_map import NodeModbusOptions, RegisterMap
-from otolith_drivers.plant.scenario import load_scenario, simulate
+from otolith_drivers.plant.scenario import NodeModbusOptions, RegisterMap, load_scenario, simulate
 from tests.conftest import EXAMPLES
 
 PERIOD = 0.01

@@ -1,5 +1,6 @@
 """``otolith probe``: what is on a bus, and lines for the machine file."""
 
+import asyncio
 import contextlib
 import json
 import re
@@ -10,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from otolith.cli.commissioning.probe_opcua import opcua
 from otolith.cli.common import AS_JSON, FILE, StopSignal, progress_line
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from otolith_drivers.canbus.probe import Picture
     from otolith_drivers.modbus.probe import Answer
     from otolith_drivers.modbus.probe_numbers import Place
+    from otolith_drivers.opcua.connection import OpcuaOptions, Variable
 
 NOTHING_THERE = 1  # exit code
 MAX_REGISTERS = 1000  # in one call
@@ -27,6 +28,7 @@ MODBUS_PORT = 502
 DEVICES = (1, 247)  # device numbers that the Modbus specification allows
 RECEIVE_TIMEOUT = 0.1  # s; how late a stop is noticed
 REFRESH = 4.0  # Hz of the live table
+SHOWN_VALUE = 40  # characters of a value of OPC UA
 Span = tuple[int, int]
 
 
@@ -65,9 +67,6 @@ def probe() -> None:
       otolith probe modbus /dev/ttyUSB0 --baudrate 9600 --parity N --scan
       otolith probe opcua opc.tcp://192.168.0.10:4840
     """
-
-
-probe.add_command(opcua)
 
 
 @probe.command()
@@ -335,3 +334,77 @@ def _hints(options: "BusOptions", picture: "Picture") -> Iterator[str]:
         yield "- another bit rate: --bitrate 250000, 500000 or 1000000"
     yield "- termination: 60 ohm between CAN-H and CAN-L while everything is switched off"
     yield "- does any node send? A CANopen drive only sends heartbeats until a master starts it"
+
+
+@probe.command()
+@click.argument("endpoint", metavar="ENDPOINT")
+@click.option("--security", type=click.Choice(["none", "Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss"]),
+              default="none")  # fmt: skip
+@click.option("--mode", type=click.Choice(["sign", "sign and encrypt"]), default="sign and encrypt")
+@click.option("--certificate", type=FILE, help="Of this client; the server must trust it.")
+@click.option("--key", type=FILE, help="The private key of the certificate.")
+@click.option("--server-certificate", type=FILE, help="The only one that is accepted from the server.")
+@click.option("--user", help="With --password-file.")
+@click.option("--password-file", type=FILE, help="A file whose first line is the password.")
+@click.option("--timeout", type=click.FloatRange(0.1, 60.0), default=4.0, metavar="SECONDS", help="For each answer.")
+@click.option("--most", type=click.IntRange(1, 10_000), default=500, help="Variables that are shown.")
+@AS_JSON
+def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) -> int:
+    """List the variables of an OPC UA server with value, type and unit.
+
+    The lines can be copied into [signals]. Nothing is written to the server.
+
+    \b
+    Examples:
+      otolith probe opcua opc.tcp://192.168.0.10:4840
+      otolith probe opcua opc.tcp://plc:4840 --user otolith --password-file pw
+    """
+    from otolith.cli.commissioning.probe_view import stdout_console
+    from otolith_drivers.config_files import validated
+    from otolith_drivers.registry import find
+
+    find("opcua")  # names the extra that is missing
+    from otolith_drivers.opcua.connection import OpcuaOptions
+
+    given = {name: value for name, value in keys.items() if value is not None}
+    options = validated({"endpoint": endpoint, "timeout": f"{timeout} s"} | given, OpcuaOptions, ())
+    with progress_line(f"reading {endpoint}"):
+        variables = asyncio.run(_browse(options, most))
+    if as_json:
+        click.echo(json.dumps({"variables": [_opcua_document(one) for one in variables]}, ensure_ascii=False))
+    else:
+        console = stdout_console()
+        for variable in variables:
+            console.print(_opcua_line(variable), markup=False, soft_wrap=True)
+        console.print(f"{len(variables)} variables" if variables else "no variables beside those of OPC UA itself")
+    return 0 if variables else NOTHING_THERE
+
+
+async def _browse(options: "OpcuaOptions", most: int) -> "list[Variable]":
+    """Return the variables of the server; raise DeviceError if it cannot be read."""
+    from otolith_drivers.errors import DeviceError
+    from otolith_drivers.opcua.connection import OpcUaCredentials, browse, connected, reason
+
+    credentials = OpcUaCredentials.load(options, Path())
+    try:
+        async with connected(options, credentials) as client:
+            return await browse(client, most)
+    except Exception as error:  # the library raises anything that a server makes it raise
+        raise DeviceError(f"OPC UA {options.endpoint}: {reason(error, options.timeout)}") from error
+
+
+def _opcua_document(variable: "Variable") -> dict[str, Any]:
+    value = variable.value if isinstance(variable.value, bool | int | float | str) else None
+    rest = {"type": variable.type, "unit": variable.unit, "status": variable.status}
+    return {"node": variable.node, "path": variable.path, "value": value} | rest
+
+
+def _opcua_line(variable: "Variable") -> str:
+    """Return a line for [signals], with the rest as a comment."""
+    name = "".join(sign if sign.isalnum() else "_" for sign in variable.path.rpartition("/")[2]) or "signal"
+    value = str(variable.value)
+    short = value if len(value) <= SHOWN_VALUE else f"{value[:SHOWN_VALUE]}..."
+    unit = variable.unit or "unit?"
+    status = "" if variable.status == "Good" else f", status {variable.status}"
+    node = json.dumps(variable.node, ensure_ascii=False)
+    return f"{name} = {{ node = {node} }}  # {variable.path}: {short} {unit}, {variable.type}{status}"

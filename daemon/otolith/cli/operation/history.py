@@ -1,4 +1,4 @@
-"""``otolith history``: what was estimated and announced, from the database of a machine."""
+"""``otolith history`` and ``report``: what was estimated and announced, from the database of a machine."""
 
 import csv
 import json
@@ -18,6 +18,7 @@ from otolith.cli.common import AS_JSON, FILE, local_time, new_file
 if TYPE_CHECKING:
     from otolith.health.schema import EventDocument
     from otolith.storage.history import HistoryReader, HistorySample
+
 
 SPANS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 INTERVALS = ("window", "minute", "hour", "day")
@@ -262,3 +263,48 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
         limits = (f"{low:.5g}", f"{high:.5g}") if has_range else ()
         table.add_row(name, f"{end.last:.5g}", half, unit, change, *limits, curve)
     return table
+
+
+@click.command()
+@click.argument("machine", metavar="FILE|MACHINE")
+@click.option("--since", default="7d", callback=age_or_date, metavar="AGE|DATE", help="Begin here, like 12h, 30d, 8w.")
+@click.option("--output", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True), callback=new_file,
+              metavar="FILE", help="Write this new file; '-' prints.  [default: MACHINE-TIME.html]")  # fmt: skip
+def report(machine: str, since: float, output: Path | None) -> None:
+    """Write what was estimated and announced as one HTML page.
+
+    FILE is the machine file, MACHINE the name in it. A daemon may run meanwhile.
+    The page needs no other file and no network: it can be mailed and printed.
+
+    \b
+    Examples:
+      otolith report press-3
+      otolith report my-machine.toml --since 30d
+      otolith report press-3 --since 2026-01-31 --output press-3.html
+      otolith report press-3 --since 1d --output - > /srv/www/press-3.html
+    """
+    from otolith.publishing.html_report import html_report
+    from otolith_drivers.errors import ConfigurationError
+
+    reader, now = reader_of(machine), time.time()
+    if since >= now:
+        raise click.BadParameter("lies in the future", param_hint="'--since'")
+    interval = interval_since(reader, since)
+    try:
+        page = html_report(reader, samples_since(reader, interval, since, ()), interval, since, now)
+    except ValueError as error:
+        raise ConfigurationError(f"{reader.path}: cannot be read: {error}") from error
+    content = page.encode(errors="backslashreplace")  # a text of a machine may have half a character
+    if output == Path("-"):
+        sys.stdout.buffer.write(content)
+        return
+    path = output or Path(f"{reader.machine}-{time.strftime('%FT%H%M%S', time.localtime(now))}.html")
+    with path.open("xb") as file:
+        try:
+            file.write(content)
+            file.flush()
+        except OSError as error:
+            path.unlink()
+            error.filename = str(path)
+            raise
+    click.echo(path)
