@@ -11,7 +11,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
 from otolith.discovery.decision import WindowDecision
-from otolith.estimation.imm_filter import CumulativeShifts
+from otolith.estimation.imm_filter import ParameterCusum
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument
 
@@ -80,19 +80,19 @@ def test_healthy_windows_shift_nothing() -> None:
 
 
 def test_a_wrong_window_alone_moves_nothing() -> None:
-    once = CumulativeShifts().after(np.array([50.0]))
+    once = ParameterCusum().after(np.array([50.0]))
     assert once.moved == []
     assert once.after(np.array([0.5])).moved == []
     assert once.after(np.array([4.0])).moved == [0]
 
 
 def test_a_parameter_that_is_shifted_along_moves_with_the_other() -> None:
-    assert CumulativeShifts(np.array([[5.5, 2.6, 2.4], [0.0, 0.0, 0.0]])).moved == [0, 1]
-    assert CumulativeShifts(np.array([[4.9, 2.6, 2.4], [0.0, 0.0, 0.0]])).moved == []
+    assert ParameterCusum(np.array([[5.5, 2.6, 2.4], [0.0, 0.0, 0.0]])).moved == [0, 1]
+    assert ParameterCusum(np.array([[4.9, 2.6, 2.4], [0.0, 0.0, 0.0]])).moved == []
 
 
 def test_a_reset_of_one_parameter_forgets_no_other() -> None:
-    sums = CumulativeShifts(np.array([[3.0, 12.0], [0.0, 0.0]]))
+    sums = ParameterCusum(np.array([[3.0, 12.0], [0.0, 0.0]]))
     state = replace(initial_state("shaft", "bench", PROBLEM), shifts=sums)
     assert state.shifts.moved == [0, 1]
     assert apply_decisions(state, OperatorDecisions(resets={"D": 1.0})).shifts.moved == []

@@ -30,7 +30,7 @@ from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, open_test
 from otolith.estimation.augmented import slot_of
 from otolith.estimation.data_checks import CheckedWindow, check_window
-from otolith.estimation.imm_filter import CumulativeShifts
+from otolith.estimation.imm_filter import ParameterCusum
 from otolith.estimation.information import QUANTILE, Identifiability, information
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
@@ -102,7 +102,7 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     if test is not None and test.best.type is FaultType.NOTHING and not is_expected:
         test = None  # the window shows something else than what opened the test
     if test is not None:
-        act = _update_filter_beside if is_calm and not moved and not test.is_confirmed else _apply_decision
+        act = _update_filter_beside if is_calm and not moved and not test.rejects_filter else _apply_decision
         result = act(state, predicted, estimated, test)
     elif is_calm:
         if moved:
@@ -146,7 +146,7 @@ def _update_filter_beside(
     filter is one of the hypotheses.
     """
     result = _update_filter(state, predicted, estimated)
-    if test.is_refuted or test.best.type is FaultType.NOTHING:
+    if test.accepts_filter or test.best.type is FaultType.NOTHING:
         return result
     return _with_mixture(replace(result, test=replace(test, quiet=test.quiet + 1)), state.problem)
 
@@ -222,7 +222,7 @@ def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:
     test = result.test
     if test is None or result.posterior.problem.free != problem.free:
         return result
-    wrong = test.filter_share if result.is_explained else max(test.filter_share, WRONG_WINDOW)
+    wrong = test.filter_probability if result.is_explained else max(test.filter_probability, WRONG_WINDOW)
     mixed = mixture(test.hypotheses, test.probabilities, problem, result.after, wrong)
     return replace(result, before=mixed, after=mixed, is_mixture=True)
 
@@ -250,10 +250,10 @@ def _next_state(
     )
 
 
-def _next_shifts(state: AdaptationState, result: WindowResult) -> CumulativeShifts:
+def _next_shifts(state: AdaptationState, result: WindowResult) -> ParameterCusum:
     """Return the cumulative shifts; a posterior that replaces the filter's contains what shifted the windows before."""
     if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
-        return CumulativeShifts()
+        return ParameterCusum()
     return state.shifts if result.shifts is None else result.shifts
 
 

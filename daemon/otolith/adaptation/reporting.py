@@ -16,7 +16,7 @@ from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.augmented import equation, indices, site_of, source_of
 from otolith.estimation.data_checks import FaultySensor
-from otolith.estimation.imm_filter import CumulativeShifts
+from otolith.estimation.imm_filter import ParameterCusum
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
@@ -89,7 +89,7 @@ class WindowResult:
     """Whether ``after`` is the mixture of the hypotheses of an open test."""
     searched: bool = False
     """Whether other hypotheses were compared."""
-    shifts: CumulativeShifts | None = None
+    shifts: ParameterCusum | None = None
     """With those of this window; None for a window that was not estimated from."""
 
     @classmethod

@@ -8,7 +8,7 @@ import numpy as np
 from otolith.discovery.adopted import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.augmented import augment, indices, slot_of, without
-from otolith.estimation.imm_filter import CumulativeShifts
+from otolith.estimation.imm_filter import ParameterCusum
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
 from otolith.health.baseline import Baseline, with_baselines
@@ -47,7 +47,7 @@ class AdaptationState:
     """Keys of components that the operator approved."""
     adopted: tuple[AdoptedComponent, ...] = ()
     """The components in the twin."""
-    shifts: CumulativeShifts = field(default_factory=CumulativeShifts)
+    shifts: ParameterCusum = field(default_factory=ParameterCusum)
     """By how much the estimates of windows differ from their predictions, all the same way."""
     noisier_since: float | None = None
     """Unix seconds from which on sensors are noisier than stated; None if they are not."""
@@ -177,7 +177,7 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
                 posterior=state.posterior.reset_parameters([index]),
                 previous=previous,
                 test=None,
-                shifts=CumulativeShifts(),
+                shifts=ParameterCusum(),
                 health=state.health.without_history(name),
             )
     for component in state.problem.components:

@@ -18,7 +18,14 @@ from otolith.commissioning.identification import IdentifiedNoise, usable_windows
 from otolith.commissioning.likelihood import Fits, FittedWindow, Likelihood, Progress, with_levels
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.discovery.candidates import best_guesses
-from otolith.discovery.linear_response import BasisFunctions, Guess, LinearResponse, ScoreStatistics, basis_functions
+from otolith.discovery.linear_response import (
+    BasisFunctions,
+    Guess,
+    LinearResponse,
+    ProjectedResponse,
+    ScoreStatistics,
+    basis_functions,
+)
 from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuess, allowed_forms
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.information import orthonormal_basis
@@ -52,7 +59,7 @@ class Structure:
     """Whether its phase is another in each window: a sine of time, or of an angle that begins at zero there."""
 
 
-class PooledResponse(LinearResponse):
+class PooledResponse(ProjectedResponse):
     """The linear response of several windows with the same parameters; each has its own initial state."""
 
     def __init__(self, fits: Sequence[Fit]) -> None:
@@ -99,7 +106,7 @@ class PooledResponse(LinearResponse):
         return [slice(start, end) for start, end in zip([0, *self.ends[:-1].tolist()], self.ends.tolist(), strict=True)]
 
     def responses(self, curves: BasisFunctions) -> Array:
-        """Return the responses (residuals, curves) of the whitened innovations."""
+        """See :meth:`ProjectedResponse.responses`."""
         return np.vstack([part.responses(curves) for part in self.parts])
 
     def estimated_gains(self, source: int, frequencies: Array) -> Array:

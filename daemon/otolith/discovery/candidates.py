@@ -10,7 +10,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange
-from otolith.discovery.linear_response import Guess, LinearResponse, basis_functions
+from otolith.discovery.linear_response import Guess, LinearResponse, ProjectedResponse, basis_functions
 from otolith.discovery.screening import (
     DECISIVE,
     CompetingForms,
@@ -64,7 +64,9 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     ]
 
 
-def best_guesses(response: LinearResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[ScoredGuess]:
+def best_guesses(
+    response: ProjectedResponse, forms: list[CandidateForm], competing: CompetingForms
+) -> list[ScoredGuess]:
     """Return each form with its best inner parameter, the best form first; only those of leading forms are refined."""
     spectral = [form for form in forms if len(form.model.phases) > 1]
     others = [form for form in forms if len(form.model.phases) == 1]
@@ -82,7 +84,9 @@ def best_guesses(response: LinearResponse, forms: list[CandidateForm], competing
     return sorted(best, key=lambda guess: -guess.score)
 
 
-def refine_inner_parameters(response: LinearResponse, starts: list[tuple[CandidateForm, list[float]]]) -> list[Guess]:
+def refine_inner_parameters(
+    response: ProjectedResponse, starts: list[tuple[CandidateForm, list[float]]]
+) -> list[Guess]:
     """Return each form with the inner parameter of largest gain around its ``starts``, which are points of its grid.
 
     Each round tries points on both sides of the best one so far, at shares of the distance to the next grid point, and
@@ -129,7 +133,7 @@ def _without_parameters(
     return [guess for guess, at in zip(guesses, first, strict=True) if competing.is_sensor(guess.form) or not same[at]]
 
 
-def _affordable(response: LinearResponse) -> int:
+def _affordable(response: ProjectedResponse) -> int:
     """Return how many candidates are fitted: fewer in large windows, so that a search ends before the next window."""
     share = MAX_CANDIDATES * AFFORDABLE_STEPS / max(response.objective.integrator_steps, 1)
     return int(np.clip(share, MIN_CANDIDATES, MAX_CANDIDATES))

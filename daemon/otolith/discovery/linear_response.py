@@ -6,16 +6,18 @@ explain, with all that is known of them, is projected out of residual and respon
 therefore gains over "parameters only". ``docs/explanation/discovery.md`` has the equations.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Mask
+from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.estimation.information import orthonormal_basis
-from otolith.estimation.objective import input_matrix
+from otolith.estimation.objective import Objective, input_matrix
+from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response
 from otolith.estimation.window_fit import Fit
 from otolith.twin.augmentation import augmented_model, sources
@@ -76,7 +78,76 @@ class ScoreStatistics:
     """(guesses, 2) of its curves; zero for a second curve that it does not have."""
 
 
-class LinearResponse:
+class ProjectedResponse(ABC):
+    """A residual and its responses to components, both without what parameters, trends and initial states explain."""
+
+    problem: Problem
+    window: Window
+    objective: Objective
+    """Of the window, or of the first of several."""
+    count: float
+    """Measured values of all outputs."""
+    x: Array
+    """(sources, records)."""
+    chi_square: float
+    """Of parameters only, with the prior."""
+    _remainder: Array
+    """(residuals,) what is left of the residual."""
+    _basis: Array
+    """(residuals, columns) orthonormal: what is projected out."""
+
+    @abstractmethod
+    def responses(self, curves: BasisFunctions) -> Array:
+        """Return the responses (residuals, curves) of the whitened innovations."""
+
+    @abstractmethod
+    def estimated_gains(self, source: int, frequencies: Array) -> Array:
+        """Return about by how much χ² falls (sites, frequencies) by a sine of a source at each site of the machine."""
+
+    def score(self, guesses: list[Guess]) -> ScoreStatistics:
+        """Return the score statistics of all guesses."""
+        block = max(MAX_BLOCK // max(2 * len(self._remainder), 1), 1)
+        parts = [self._score_block(guesses[first : first + block]) for first in range(0, len(guesses), block)]
+        if not parts:
+            return ScoreStatistics(np.zeros(0), np.zeros((0, 2)))
+        gain = np.concatenate([part.gain for part in parts])
+        return ScoreStatistics(gain, np.concatenate([part.amplitudes for part in parts]))
+
+    def _score_block(self, guesses: list[Guess]) -> ScoreStatistics:
+        counts = np.array([len(form.model.phases) for form, _ in guesses], dtype=np.int64)
+        first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+        pairs = np.column_stack([first, first + counts - 1])
+        return self.score_responses(self.responses(basis_functions(guesses)), pairs)
+
+    def score_responses(self, responses: Array, pairs: Array) -> ScoreStatistics:
+        """Return the statistics of ``responses`` (residuals, curves).
+
+        ``pairs`` (guesses, 2) holds the two curves of each guess, or its one curve twice. The amplitudes solve the
+        normal equations of one or two curves after projection.
+        """
+        with np.errstate(all="ignore"):
+            along = self._remainder @ responses
+            shared = self._basis.T @ responses
+            whole = np.einsum("rc,rc->c", responses, responses)
+            own = whole - np.einsum("bc,bc->c", shared, shared)
+            own = np.where(own > MIN_REMAINDER * whole, own, np.inf)
+            first, second = pairs.T
+            single = first == second
+            cross = np.zeros(len(pairs))
+            one, two = first[~single], second[~single]
+            cross[~single] = np.einsum("rg,rg->g", responses[:, one], responses[:, two])
+            cross[~single] -= np.einsum("bg,bg->g", shared[:, one], shared[:, two])
+            other = np.where(single, np.inf, own[second])
+            independence = 1.0 - cross**2 / (own[first] * other)
+            one = (along[first] - cross / other * along[second]) / (own[first] * independence)
+            two = np.where(single, 0.0, (along[second] - cross / own[first] * along[first]) / (other * independence))
+            gain = one * along[first] + two * along[second]
+        valid = np.isfinite(gain) & np.isfinite(one) & np.isfinite(two) & (independence > MIN_INDEPENDENCE)
+        amplitudes = np.where(valid[:, None], np.column_stack([one, two]), 0.0)
+        return ScoreStatistics(np.where(valid, gain, 0.0), amplitudes)
+
+
+class LinearResponse(ProjectedResponse):
     """Residual and responses of one window, around the start of a fit."""
 
     def __init__(self, fitted: Fit) -> None:
@@ -92,7 +163,6 @@ class LinearResponse:
         basis = orthonormal_basis(jacobian)
         remainder = residuals - basis @ (basis.T @ residuals)
         self.chi_square = float(remainder @ remainder)
-        """Of parameters only, with the prior."""
         self._remainder, self._basis = remainder[:window_rows], basis[:window_rows]
         self._prior_basis = basis[window_rows:]
 
@@ -107,7 +177,6 @@ class LinearResponse:
         excitation = replace(objective.excitation, inputs=input_matrix(slotted, self.window), gain=gain)
         linear = self._kernel.linearise(parameters, initial, excitation)
         self.x = self._sources([state.name for state in slotted.states], linear.trajectory, states)
-        """(sources, records)."""
         self._linear = _without_angles(linear, len(states))
 
     def _sources(self, state_names: list[str], trajectory: Array, initial: Array) -> Array:
@@ -133,21 +202,6 @@ class LinearResponse:
         """Return an input (records,); a constant where it varies by no more than its noise."""
         noise = np.median(self.objective.noise.inputs[:, index])
         return values if values.std() > MIN_INPUT_VARIATION * noise else np.full(len(values), values.mean())
-
-    def score(self, guesses: list[Guess]) -> ScoreStatistics:
-        """Return the score statistics of all guesses."""
-        block = max(MAX_BLOCK // max(2 * len(self._remainder), 1), 1)
-        parts = [self._score_block(guesses[first : first + block]) for first in range(0, len(guesses), block)]
-        if not parts:
-            return ScoreStatistics(np.zeros(0), np.zeros((0, 2)))
-        gain = np.concatenate([part.gain for part in parts])
-        return ScoreStatistics(gain, np.concatenate([part.amplitudes for part in parts]))
-
-    def _score_block(self, guesses: list[Guess]) -> ScoreStatistics:
-        counts = np.array([len(form.model.phases) for form, _ in guesses], dtype=np.int64)
-        first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
-        pairs = np.column_stack([first, first + counts - 1])
-        return self.score_responses(self.responses(basis_functions(guesses)), pairs)
 
     def estimated_gains(self, source: int, frequencies: Array) -> Array:
         """Return about by how much χ² falls (sites, frequencies) by a sine of a source at each site of the machine.
@@ -226,7 +280,7 @@ class LinearResponse:
         return dict(zip((parameter.name for parameter in self.problem.twin.parameters), values.tolist(), strict=True))
 
     def responses(self, curves: BasisFunctions) -> Array:
-        """Return the responses (residuals, curves) of the whitened innovations."""
+        """See :meth:`ProjectedResponse.responses`."""
         shapes = self._kernel.curves(curves.families, self.x, curves.sources, curves.inner, curves.phases)
         model, present = self.objective.innovation_model, self.objective.present
         return self._kernel.respond(self._linear, model, present, shapes.take(curves.shapes, axis=1), curves.sites)
@@ -240,33 +294,6 @@ class LinearResponse:
         slopes = objective.kernel.sensitivities(parameters, initial, objective.excitation, wanted).slopes
         columns = np.where(objective.present[..., None], slopes, 0.0)
         return np.asarray(np.matmul(objective.whitening, columns).reshape(-1, len(names)))
-
-    def score_responses(self, responses: Array, pairs: Array) -> ScoreStatistics:
-        """Return the statistics of ``responses`` (residuals, curves).
-
-        ``pairs`` (guesses, 2) holds the two curves of each guess, or its one curve twice. The amplitudes solve the
-        normal equations of one or two curves after projection.
-        """
-        with np.errstate(all="ignore"):
-            along = self._remainder @ responses
-            shared = self._basis.T @ responses
-            whole = np.einsum("rc,rc->c", responses, responses)
-            own = whole - np.einsum("bc,bc->c", shared, shared)
-            own = np.where(own > MIN_REMAINDER * whole, own, np.inf)
-            first, second = pairs.T
-            single = first == second
-            cross = np.zeros(len(pairs))
-            one, two = first[~single], second[~single]
-            cross[~single] = np.einsum("rg,rg->g", responses[:, one], responses[:, two])
-            cross[~single] -= np.einsum("bg,bg->g", shared[:, one], shared[:, two])
-            other = np.where(single, np.inf, own[second])
-            independence = 1.0 - cross**2 / (own[first] * other)
-            one = (along[first] - cross / other * along[second]) / (own[first] * independence)
-            two = np.where(single, 0.0, (along[second] - cross / own[first] * along[first]) / (other * independence))
-            gain = one * along[first] + two * along[second]
-        valid = np.isfinite(gain) & np.isfinite(one) & np.isfinite(two) & (independence > MIN_INDEPENDENCE)
-        amplitudes = np.where(valid[:, None], np.column_stack([one, two]), 0.0)
-        return ScoreStatistics(np.where(valid, gain, 0.0), amplitudes)
 
 
 def chi_square_of_parameters(fitted: Fit) -> float:

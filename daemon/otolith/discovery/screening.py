@@ -10,7 +10,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidate_forms import CandidateForm, candidate_table
-from otolith.discovery.linear_response import Guess, LinearResponse
+from otolith.discovery.linear_response import Guess, LinearResponse, ProjectedResponse
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
@@ -161,7 +161,7 @@ def _beside_friction(
     return replace(form, bounds=(low, high)) if low <= high else None
 
 
-def grid_guesses(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
+def grid_guesses(response: ProjectedResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
     """Return all forms with all inner parameters of their grids, which the sites of a machine share."""
     grids: dict[tuple[str, int], list[float]] = {}
     guesses = []
@@ -184,7 +184,7 @@ class ScoredGuesses:
     """(guesses,) gains in -2 log evidence over parameters only."""
 
     @classmethod
-    def of(cls, response: LinearResponse, guesses: list[Guess], competing: CompetingForms) -> "ScoredGuesses":
+    def of(cls, response: ProjectedResponse, guesses: list[Guess], competing: CompetingForms) -> "ScoredGuesses":
         """Score ``guesses`` by the linear response."""
         statistics = response.score(guesses)
         count = response.count
@@ -297,7 +297,7 @@ def screen_fit(fitted: Fit) -> ScreeningResult:
     return ScreeningResult(gain, fitted, response)
 
 
-def promising_lines(response: LinearResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[Guess]:
+def promising_lines(response: ProjectedResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[Guess]:
     """Return the spectral lines whose estimated gain is not far below what a search requires, those of largest gain.
 
     A line that gains enough is left out with probability 4e-6 (:meth:`LinearResponse.estimated_gains`).
@@ -310,7 +310,7 @@ def promising_lines(response: LinearResponse, forms: list[CandidateForm], compet
     return [guess for _, guess in lines[:MAX_LINES]]
 
 
-def highest_lines(response: LinearResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
+def highest_lines(response: ProjectedResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
     """Return the PEAKS_OF_SPECTRUM highest peaks of the spectrum of each form, by estimated gain."""
     guesses: list[Guess] = []
     for form, grid, gains in _spectra(response, forms, fineness):
@@ -322,7 +322,7 @@ def highest_lines(response: LinearResponse, forms: list[CandidateForm], fineness
 
 
 def _spectra(
-    response: LinearResponse, forms: list[CandidateForm], fineness: float
+    response: ProjectedResponse, forms: list[CandidateForm], fineness: float
 ) -> Iterator[tuple[CandidateForm, Array, Array]]:
     """Yield each of the periodic ``forms`` with its frequencies (lines,) and the estimated gains there (lines,)."""
     for source in dict.fromkeys(form.source for form in forms):

@@ -81,11 +81,11 @@ class SequentialTest:
     """Consecutive windows after which one cause explained all windows best."""
     quiet: int = 0
     """Consecutive windows, up to the last, that the filter expected, and that did not confirm the test."""
-    against_filter: float = -MAX_WINDOW_EVIDENCE
-    """Evidence against the filter, in -2 log likelihood, of the windows after the one that opened the test; without
-    that one, they alone must pay for the complexity of a hypothesis."""
+    cusum_against_filter: float = -MAX_WINDOW_EVIDENCE
+    """Cumulative sum of the evidence against the filter, in -2 log likelihood, of the windows after the one that opened
+    the test: they alone must pay for the complexity of a hypothesis. See :meth:`with_filter`."""
     filter_deviance: float = 0.0
-    """-2 log likelihood of these windows under the filter, relative to the best hypothesis."""
+    """-2 log likelihood of the same windows under the filter, relative to the best hypothesis; nothing is forgotten."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
 
@@ -126,18 +126,18 @@ class SequentialTest:
         return null <= DECISIVE
 
     @property
-    def filter_share(self) -> float:
+    def filter_probability(self) -> float:
         """Probability that the window that opened the test was itself wrong, so that the filter's posterior holds."""
         return float(WRONG_WINDOW / (WRONG_WINDOW + (1.0 - WRONG_WINDOW) * np.exp(0.5 * self.filter_deviance)))
 
     @property
-    def is_confirmed(self) -> bool:
+    def rejects_filter(self) -> bool:
         """Whether windows after the one that opened the test are decisive evidence against the filter."""
-        return self.against_filter > DECISIVE
+        return self.cusum_against_filter > DECISIVE
 
     @property
-    def is_refuted(self) -> bool:
-        """Whether these windows are decisive evidence for the filter."""
+    def accepts_filter(self) -> bool:
+        """Whether windows after the one that opened the test are decisive evidence for the filter."""
         return self.filter_deviance < -DECISIVE
 
     def with_steps(self, steps: tuple[float, ...]) -> "SequentialTest":
@@ -156,11 +156,11 @@ class SequentialTest:
         """
         last = self.last
         more = (filtered.chi_square - last.chi_square) / residual_variance_factor([last.chi_square], last.count)
-        total = self.against_filter + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
+        total = self.cusum_against_filter + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         deviance = self.filter_deviance + np.clip(more, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         return replace(
             self,
-            against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)),
+            cusum_against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)),
             filter_deviance=float(np.clip(deviance, -MAX_TOTAL_DEVIANCE, MAX_TOTAL_DEVIANCE)),
         )
 

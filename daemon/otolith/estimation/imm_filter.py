@@ -162,8 +162,8 @@ def nis(prediction: ImmPosterior, evidence: Evidence) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CumulativeShifts:
-    """Cumulative sums of the shifts of parameters, upwards and downwards (E. S. Page, Biometrika 41, 1954).
+class ParameterCusum:
+    """CUSUM test of the innovations of parameters, upwards and downwards (E. S. Page, Biometrika 41, 1954).
 
     They show a change that no single window shows. The innovation test of one window misses a step of a few standard
     deviations, and the filter would follow it slowly, with an interval that excludes both values.
@@ -172,11 +172,11 @@ class CumulativeShifts:
     sums: Array | None = None
     """(2, free); None if nothing is summed."""
 
-    def after(self, shifts: Array) -> "CumulativeShifts":
+    def after(self, shifts: Array) -> "ParameterCusum":
         """Return the sums after a window of these ``shifts`` (free,), in standard deviations."""
         both = np.clip([shifts, -shifts], None, LARGEST_SHIFT)
         before = self.sums if self.sums is not None and self.sums.shape == both.shape else np.zeros(both.shape)
-        return CumulativeShifts(np.maximum(before + both - SHIFT_REFERENCE, 0.0))
+        return ParameterCusum(np.maximum(before + both - SHIFT_REFERENCE, 0.0))
 
     @property
     def moved(self) -> list[int]:

@@ -4,14 +4,15 @@ import logging
 import sqlite3
 import threading
 import time
+from abc import ABC, abstractmethod
 
 log = logging.getLogger(__name__)
 
 WRITE_RETRY = 30.0  # s from an error to the next try; docs/reference/thresholds-storage.md has its origin
 
 
-class WriterThread:
-    """Calls :meth:`write` when something is to be written, and once per interval; a subclass defines it."""
+class WriterThread(ABC):
+    """Calls :meth:`write` when something is to be written, and once per interval."""
 
     def __init__(self, name: str, interval: float, loss: str) -> None:
         """``interval`` in s; ``loss`` names for the log what an error keeps from being written."""
@@ -33,11 +34,11 @@ class WriterThread:
             if self._thread.is_alive():
                 log.warning("%s: writing took over %.1f s: check the disk", self._loss, seconds)
 
+    @abstractmethod
     def write(self) -> None:
         """Write what is waiting; after an exception the next call comes ``WRITE_RETRY`` later, or from :meth:`stop`."""
-        raise NotImplementedError
 
-    def read(self) -> None:
+    def read(self) -> None:  # noqa: B027 - what has nothing to read does nothing
         """Read what other processes have written; called as often as :meth:`write`, and after its errors as well."""
 
     def fail(self, error: Exception) -> None:
