@@ -100,17 +100,24 @@ class Objective:
     def set_predictor(self, parameters: Array, initial: Array) -> None:
         """Compute sub-steps, gain and whitening around ``parameters`` (free,) and ``initial`` (states,)."""
         full = self.parameters(parameters[None])[0]
-        allowed = TRUNCATION * self.noise.outputs
         uncorrected = replace(self._excitation, gain=None, substeps=1)
         while True:
             model = self._innovation_model(full, initial, uncorrected)
             corrected = replace(uncorrected, gain=model.gain)
-            substeps = self.kernel.substeps(full, initial, corrected, allowed, self._max_substeps)
+            substeps = self._substeps(full, initial, corrected)
             if substeps <= uncorrected.substeps:  # otherwise the gain comes from too coarse an integrator
                 break
             uncorrected = replace(uncorrected, substeps=substeps)
         self.innovation_model = model
         self._excitation = corrected
+
+    def is_resolved(self, parameters: Array, initial: Array) -> bool:
+        """Whether the sub-steps of the predictor suffice at ``parameters`` (free,) and ``initial`` (states,)."""
+        needed = self._substeps(self.parameters(parameters[None])[0], initial, self._excitation)
+        return needed <= self._excitation.substeps
+
+    def _substeps(self, full: Array, initial: Array, excitation: Excitation) -> int:
+        return self.kernel.substeps(full, initial, excitation, TRUNCATION * self.noise.outputs, self._max_substeps)
 
     def _innovation_model(self, parameters: Array, initial: Array, excitation: Excitation) -> InnovationModel:
         """Return gain and whitening of the base model: components hardly change the prediction error covariance."""
