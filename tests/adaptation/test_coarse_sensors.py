@@ -9,7 +9,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.objective import WHITE_ROUNDING, adc_step, rounding_variance
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument
@@ -113,3 +113,18 @@ def test_faulty_values_show_no_step(scenario: MotorScenario, windows: Cut, size:
     state, report = adapt(initial_state("motor", "bench", problem_of(FREE[0])), replace(window, values=values))
     assert report.document.decision is not WindowDecision.LEARNED
     assert state.posterior.problem.steps == ()
+
+
+@pytest.mark.parametrize("levels", [(-1e11, 0.0, 1e11), (-1e11, 1e11), (-100.0, 0.0, 100.0)])
+def test_wrong_readings_are_no_levels_of_a_converter(
+    scenario: MotorScenario, windows: Cut, levels: tuple[float, ...]
+) -> None:
+    state = initial_state("motor", "bench", problem_of(("R_a", "D")))
+    *before, (last, _) = windows(scenario.model_copy(update={"faults": ()}), 3)
+    for window, _ in before:
+        state, _ = adapt(state, window)
+    values = last.values.copy()
+    values[:, SPEED] = np.random.default_rng(1).choice(levels, len(values))
+    state, report = adapt(state, replace(last, values=values))
+    assert report.document.decision not in ACCEPTED
+    assert state.problem.steps == ()

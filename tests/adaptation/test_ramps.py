@@ -4,10 +4,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from benchmarks.changes.machines import TWO_MASS
+from benchmarks.changes.observe import Case, coverage, observe
+from benchmarks.changes.plants import HEALTHY, Change
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
+from otolith.discovery.decision import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -50,3 +54,11 @@ def test_a_parameter_on_a_ramp_is_followed(
             assert abs(value.value - truth) < SDS * value.sd, window.index
             is_followed = name == "R_a" and window.index >= FOLLOWED_FROM
             assert not is_followed or value.value == pytest.approx(truth, rel=0.01)
+
+
+def test_a_drift_from_before_the_first_window_is_covered_and_no_step() -> None:
+    """As of a bearing that warms up when the daemon starts."""
+    case = Case("drift", TWO_MASS, HEALTHY, before=Change(ramps={"D_l": 1e-3}), healthy=12, changed=0)
+    reports = [window for run in observe(case, range(3), 1) for window in run]
+    assert all(window.decision in (WindowDecision.LEARNED, WindowDecision.SUSPECTED) for window in reports)
+    assert coverage([window.parameters["D_l"] for window in reports]).reaches(0.9)

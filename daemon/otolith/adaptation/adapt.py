@@ -165,6 +165,8 @@ def _follow_shifts(state: AdaptationState, predicted: Posterior, estimated: Wind
     """Return the result of a window that, with those before, shows a change; ``predicted`` forgets what has moved."""
     again = estimate_window(predicted, estimated.fit.window)
     result = _update_filter(state, predicted, again)
+    if result.decision is WindowDecision.FADED:
+        return result
     return replace(result, decision=WindowDecision.STEPPED, before=result.after)
 
 

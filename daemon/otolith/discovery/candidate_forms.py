@@ -25,6 +25,7 @@ from otolith_drivers.units import to_base
 SENSOR_FAMILIES = frozenset({"constant", "linear"})  # the errors of a sensor: an offset and a gain
 BALANCE_MARGIN = 2.0  # times the terms of the site's equation: parameters and inputs may be off
 FRICTION_SPEEDS = np.geomspace(0.02, 1.0, 12)  # of the largest speed: where friction is compared with the twin's own
+TRIALS = 3  # random values of all quantities at which it is tested whether a parameter is a factor
 PROBE = 1e-3  # in the unit of a site: difference that gives its coefficient; components enter linearly
 
 
@@ -74,6 +75,27 @@ def _equations(base: Definition) -> tuple[list[tuple[str, ast.expr]], dict[str, 
         ordered += [(name, pending.pop(name)) for name in ready]
     ordered += [(left, parse(text)) for left, text in base.equations if left.startswith("der(")]
     return ordered, {name: to_base(unit)[0] for name, unit in base.units().items()}
+
+
+@lru_cache(maxsize=64)
+def scales_a_sum(base: Definition, site: int) -> bool:
+    """Whether a site scales a quantity as a whole, of which each parameter of the twin scales a part only.
+
+    A constant there and a step of a parameter are different causes, even where the other parts happen to be zero.
+    """
+    if site >= len(base.sites) or base.sites[site].mode != "multiplicative":
+        return False
+    ordered, _ = _equations(base)
+
+    def quantity(doubled: str = "") -> Array:
+        random = np.random.default_rng(0)
+        values = {name: [random.uniform(0.5, 1.5, TRIALS) * (1.0 + (name == doubled))] for name in base.units()}
+        for name, tree in ordered:
+            values[name] = terms(tree, values)
+        return np.asarray(sum(values[base.sites[site].into]))
+
+    with np.errstate(all="ignore"):
+        return not any(np.allclose(quantity(each.name), 2.0 * quantity()) for each in base.parameters)
 
 
 def rate_terms(base: Definition, columns: Mapping[str, Array], site: int = 0, entering: float = 0.0) -> list[Array]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange
+from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange, scales_a_sum
 from otolith.discovery.linear_response import Guess, LinearResponse, ProjectedResponse, basis_functions
 from otolith.discovery.screening import (
     DECISIVE,
@@ -125,12 +125,17 @@ def _around(form: CandidateForm, x: Array, inner: Array, scale: float) -> list[f
 def _without_parameters(
     response: LinearResponse, guesses: list[ScoredGuess], competing: CompetingForms
 ) -> list[ScoredGuess]:
-    """Return the guesses that no parameter would produce as well; errors of sensors stay."""
+    """Return the guesses that no parameter would produce as well; errors of sensors stay, and causes of their own."""
+    twin = response.problem.base_model
     curves = [len(guess.form.model.phases) for guess in guesses]
     amplitudes = np.concatenate([guess.amplitudes[:count] for guess, count in zip(guesses, curves, strict=True)])
     same = response.is_parameter(basis_functions((guess.form, guess.inner) for guess in guesses), amplitudes)
     first = np.cumsum([0, *curves[:-1]]).tolist()
-    return [guess for guess, at in zip(guesses, first, strict=True) if competing.is_sensor(guess.form) or not same[at]]
+    return [
+        guess
+        for guess, at in zip(guesses, first, strict=True)
+        if competing.is_sensor(guess.form) or scales_a_sum(twin, guess.form.site) or not same[at]
+    ]
 
 
 def _affordable(response: ProjectedResponse) -> int:

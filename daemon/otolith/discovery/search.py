@@ -68,7 +68,11 @@ def fit_hypotheses(proposals: Iterable[Proposal], window: Window, far_worse: flo
             replace(item, fit=item.fit.continued(STEPS_OF_ROUND)) if item.chi_square <= limit else item
             for item in fitted
         ]
-    return fitted
+    limit = FAR_WORSE * min(map(_chi_square, fitted), default=0.0)
+    return [
+        replace(item, fit=item.fit.resolved(ROUNDS * STEPS_OF_ROUND)) if item.chi_square <= limit else item
+        for item in fitted
+    ]
 
 
 def explained_again(fitted: FittedHypothesis, item: Proposal, window: Window, before: Posterior) -> FittedHypothesis:
@@ -143,7 +147,26 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
         fitted += [] if best is None else [best, *_sub_structures(best, fitted)]
     if screening.always_lacking or _convincing(fitted) is None:
         fitted += _always_lacking(fitted[0])
-    return fitted
+    return _without_local_minima(fitted)
+
+
+def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
+    """Return the hypotheses; those of moved parameters also fitted from the values of the best, where they are better.
+
+    A component may lead the parameters out of a local minimum. It needs evidence against the parameters alone there.
+    """
+    best = min(fitted, key=_chi_square)
+    if best.type is FaultType.PARAMETER or best.fit.cost > EXPLAINED:
+        return fitted
+    values = {free.label: value for free, value in zip(best.problem.free, best.fit.parameters, strict=True)}
+    stuck = [item for item in fitted if item.type is FaultType.PARAMETER and item.fit.cost > EXPLAINED]
+    proposals = []
+    for item in stuck:
+        own = zip(item.problem.free, item.fit.parameters, strict=True)
+        start = np.array([values.get(free.label, value) for free, value in own])
+        proposals.append(Proposal(item.hypothesis, item.problem, item.fit.prior, start))
+    freed = {id(old): new for old, new in zip(stuck, fit_hypotheses(proposals, fitted[0].fit.window), strict=True)}
+    return [min(item, freed.get(id(item), item), key=_chi_square) for item in fitted]
 
 
 def late_signals(null: FittedHypothesis, response: LinearResponse) -> list[FittedHypothesis]:

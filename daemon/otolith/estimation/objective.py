@@ -26,6 +26,9 @@ PENALTY = 1e30  # cost of a guess whose prediction is not finite
 MAX_SUBSTEPS_WITH_COMPONENTS = 8  # no number of sub-steps makes the step of dry friction smooth
 ADC_TOLERANCE = 0.01  # share of a step: how far level differences may be from whole multiples of it
 WHITE_ROUNDING = 2.0  # standard deviations of the noise: rounding to steps up to this size is white noise
+MAX_ADC_STEP = (
+    1000.0  # standard deviations of the noise: what differs by more are wrong values, no levels of a converter
+)
 MIN_ADC_LEVELS = 4  # levels in a window that show the step of a converter
 
 
@@ -100,17 +103,24 @@ class Objective:
     def set_predictor(self, parameters: Array, initial: Array) -> None:
         """Compute sub-steps, gain and whitening around ``parameters`` (free,) and ``initial`` (states,)."""
         full = self.parameters(parameters[None])[0]
-        allowed = TRUNCATION * self.noise.outputs
         uncorrected = replace(self._excitation, gain=None, substeps=1)
         while True:
             model = self._innovation_model(full, initial, uncorrected)
             corrected = replace(uncorrected, gain=model.gain)
-            substeps = self.kernel.substeps(full, initial, corrected, allowed, self._max_substeps)
+            substeps = self._substeps(full, initial, corrected)
             if substeps <= uncorrected.substeps:  # otherwise the gain comes from too coarse an integrator
                 break
             uncorrected = replace(uncorrected, substeps=substeps)
         self.innovation_model = model
         self._excitation = corrected
+
+    def is_resolved(self, parameters: Array, initial: Array) -> bool:
+        """Whether the sub-steps of the predictor suffice at ``parameters`` (free,) and ``initial`` (states,)."""
+        needed = self._substeps(self.parameters(parameters[None])[0], initial, self._excitation)
+        return needed <= self._excitation.substeps
+
+    def _substeps(self, full: Array, initial: Array, excitation: Excitation) -> int:
+        return self.kernel.substeps(full, initial, excitation, TRUNCATION * self.noise.outputs, self._max_substeps)
 
     def _innovation_model(self, parameters: Array, initial: Array, excitation: Excitation) -> InnovationModel:
         """Return gain and whitening of the base model: components hardly change the prediction error covariance."""
@@ -269,7 +279,7 @@ def rounding_variance(values: Array, noise: float, known_step: float) -> float:
     """
     if len(values) == 0:
         return 0.0
-    step = adc_step(values)
+    step = _plausible_step(values, noise)
     if not step and known_step and len(np.unique(values)) < MIN_ADC_LEVELS:
         step = known_step
     alike = 1.0 if step <= WHITE_ROUNDING * noise else len(values) / _runs(values)
@@ -282,13 +292,20 @@ def converter_steps(problem: Problem, window: Window) -> tuple[float, ...]:
     A step replaces the one before if it is smaller by more than rounding.
     """
     outputs = [output.name for output in problem.base_model.outputs]
-    shown = [adc_step(window.column(name)[~window.missing_in(name)]) for name in outputs]
+    values = (window.column(name)[~window.missing_in(name)] for name in outputs)
+    shown = list(map(_plausible_step, values, problem.noise))
     before = problem.steps or (0.0,) * len(outputs)
     steps = tuple(
         new if new and (not old or new < old * (1.0 - ADC_TOLERANCE)) else old
         for old, new in zip(before, shown, strict=True)
     )
     return steps if any(steps) else ()
+
+
+def _plausible_step(values: Array, noise: float) -> float:
+    """Return the step of the converter behind ``values`` (n,); 0 if they show none, or one that no converter has."""
+    step = adc_step(values)
+    return step if step <= MAX_ADC_STEP * noise else 0.0
 
 
 def adc_step(values: Array) -> float:

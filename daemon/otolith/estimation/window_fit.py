@@ -96,6 +96,17 @@ class Fit:
             return self
         return replace(self, result=continued(self.map_objective, self.result, max_steps))
 
+    def resolved(self, max_steps: int) -> "Fit":
+        """Return the fit; if the integrator needs smaller steps at its end, after ``max_steps`` more of those at most.
+
+        Otherwise the error of the integrator would pass for evidence: as where dry friction changes its sign.
+        """
+        free = len(self.problem.free)
+        initial = self.result.guess[2 * free :]
+        if self.objective.is_resolved(self.parameters, initial):
+            return self
+        return _fit(self.problem, self.window, self.prior, self.parameters, max_steps, initial=initial)
+
     def advance(self) -> PhaseAdvance:
         """Return the advance of the components' phases to the next window."""
         last_state = self.objective.predict_with_trends(self.result.guess)[1]

@@ -17,7 +17,13 @@ from otolith.acquisition.window import Array
 from otolith.adaptation.state import AdaptationState, ComponentRecord, cleared, component_records, restore_components
 from otolith.estimation.arrival_cost import MAX_TREND
 from otolith.estimation.augmented import augment, indices
-from otolith.estimation.imm_filter import HIGHEST_LEVEL, MAX_VARIANCE_RATIO, ImmPosterior, moment_match
+from otolith.estimation.imm_filter import (
+    HIGHEST_LEVEL,
+    MAX_VARIANCE_RATIO,
+    CumulativeShifts,
+    ImmPosterior,
+    moment_match,
+)
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import UNLIMITED, Problem
 from otolith.health.events import HealthState
@@ -59,6 +65,8 @@ class FilterRecord(StrictModel):
     """Of the outputs; empty unless it was accepted as larger than the machine file states."""
     steps: tuple[float, ...] = ()
     """See :attr:`otolith.estimation.problem.Problem.steps`."""
+    shifts: tuple[tuple[float, ...], ...] = ()
+    """See :attr:`CumulativeShifts.sums`; empty for none."""
     previous: tuple[PreviousStatus, ...]
     records: int
     learned: int
@@ -154,9 +162,16 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
         phase=state.posterior.phase,
         noise=problem.noise if problem.stated_noise else (),
         steps=problem.steps,
+        shifts=_sums(state, len(labels)),
         previous=tuple(state.previous.get(label, PreviousStatus()) for label in labels),
         **{name: getattr(state, name) for name in SCALARS},
     )
+
+
+def _sums(state: AdaptationState, free: int) -> tuple[tuple[float, ...], ...]:
+    """Return the cumulative shifts; those of other parameters than the present ones count no more."""
+    sums = state.shifts.sums
+    return () if sums is None or sums.shape[1] != free else tuple(map(tuple, sums.tolist()))
 
 
 def restored(document: LearnedState, state: AdaptationState, now: float) -> AdaptationState:
@@ -195,6 +210,7 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         state,
         **kept,
         posterior=posterior,
+        shifts=_shifts(record),
         previous=dict(zip(record.labels, record.previous, strict=True)),
         adopted=adopted,
         resets=document.resets,
@@ -274,6 +290,15 @@ def _posterior(record: FilterRecord, problem: Problem) -> Posterior:
         states = len(problem.base_model.states)
         _require(len(phase.by) == len(problem.components) and len(phase.last_state) in (0, states), "phase: wrong size")
     return Posterior(problem, belief, phase)
+
+
+def _shifts(record: FilterRecord) -> CumulativeShifts:
+    """Return the cumulative shifts of a record, checked."""
+    if not record.shifts:
+        return CumulativeShifts()
+    sums = np.array(record.shifts)
+    _require(sums.shape == (2, len(record.labels)) and float(sums.min()) >= 0.0, "shifts: not plausible")
+    return CumulativeShifts(sums)
 
 
 def _check_covariance(covariance: Array) -> None:

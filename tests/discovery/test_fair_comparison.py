@@ -1,0 +1,69 @@
+"""Hypotheses are compared at their best fits: neither a local minimum nor the integrator's error is evidence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from benchmarks.changes import classes
+from benchmarks.changes.machines import ONE_MASS, TWO_MASS
+from benchmarks.changes.observe import Case, observe, recordings
+from benchmarks.changes.plants import Change
+
+from otolith.adaptation.adapt import adapt
+from otolith.adaptation.state import initial_state
+from otolith.discovery.candidate_forms import scales_a_sum
+from otolith.discovery.candidates import Candidate
+from otolith.discovery.decision import WindowDecision
+from otolith.discovery.hypotheses import FaultHypothesis, FaultType, Proposal, with_candidate
+from otolith.discovery.search import fit_hypotheses
+from otolith.estimation.arrival_cost import Prior, forget_parameter
+from otolith.estimation.problem import Component
+from otolith.machine import find_twin
+
+
+@pytest.mark.parametrize("run", [pytest.param(0, marks=pytest.mark.full), 2])
+def test_a_stiffness_that_moved_far_is_no_periodic_torque(run: int) -> None:
+    """The resonance moves by several half waves in a window, so that a fit from the old stiffness ends elsewhere."""
+    change = Change(parameters={"k_s": 0.8 * TWO_MASS.parameters["k_s"]})
+    case = Case("k_s", TWO_MASS, change, healthy=12, changed=12)
+    state, decisions = initial_state("two masses", "bench", case.problem), []
+    for window in next(recordings(case, case.problem, [run], 1))[8:14]:
+        state, report = adapt(state, window)
+        decisions.append(report.document.decision)
+    assert decisions == [*[WindowDecision.LEARNED] * 4, WindowDecision.SUSPECTED, WindowDecision.STEPPED]
+
+
+@pytest.mark.parametrize("number", [17, 20])
+def test_the_error_of_the_integrator_is_no_evidence(number: int) -> None:
+    """Speed crosses zero where dry friction needs short steps; a fit that starts beside it must not keep long ones."""
+    (trial,) = (own for own in classes.trials(12, 12) if own.case.name == "J / gain of omega: J -20 %")
+    problem = trial.case.problem
+    window = next(recordings(trial.case, problem, [2], 1))[number]
+    truth = ONE_MASS.parameters
+    prior = Prior(np.array([truth["J"], truth["T_c"], 0.0, 0.0]), np.diag([2e-5, 5e-4, 1e-5, 1e-4]) ** 2)
+    gain = Component("sensor of omega", "linear", "omega", 0.25)
+    moved = FaultHypothesis(FaultType.PARAMETER, "J", 1)
+    proposals = [
+        Proposal(moved, problem, forget_parameter(prior, problem, 0), prior.mean),
+        with_candidate(problem, prior, Candidate(gain, 1.0, True)),
+    ]
+    parameter, sensor = (fitted.chi_square for fitted in fit_hypotheses(proposals, window))
+    assert parameter == pytest.approx(sensor, abs=1.0)
+
+
+def test_a_site_that_scales_a_sum_is_a_cause_beside_its_parts() -> None:
+    pump = find_twin("pump")
+    head = [site.name for site in pump.sites].index("head")
+    assert scales_a_sum(pump, head)
+    rest = tuple(own for own in pump.definitions if own[0] != "dp")
+    for expression in ("h_0*omega^2", "h_0*(omega^2 - h_2*Q*abs(Q))"):  # the parameter is a factor of all
+        assert not scales_a_sum(replace(pump, definitions=(("dp", expression, ""), *rest)), head)
+    assert not any(scales_a_sum(pump, site) for site in range(len(pump.sites) + 3) if site != head)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("truth", ["h_0 -12 %", "head -12 %"])
+def test_a_step_of_the_head_curve_and_a_loss_of_head_are_a_class_without_the_other_part(truth: str) -> None:
+    (trial,) = (own for own in classes.trials(5, 5) if own.case.name == f"h_0 / constant head: {truth}")
+    outcomes = [classes.judge(trial, run) for run in observe(trial.case, [0, 1], 1)]
+    assert all(outcome.right for outcome in outcomes), outcomes
