@@ -110,6 +110,21 @@ def test_a_cubic_leaves_no_noise_at_any_times(missing: float, rows: float) -> No
     assert levels_of_noise[1] == pytest.approx(0.01, rel=0.1)
 
 
+@pytest.mark.parametrize("rows", [0.0, 0.3])
+def test_a_coarse_signal_that_mostly_rests_is_as_noisy_as_where_it_moves(rows: float) -> None:
+    """At irregular times five equal values differ by rounding; that is not the noise of the sensor."""
+    random, step = np.random.default_rng(22), 0.1
+    times = PERIOD * np.arange(RECORDS)
+    motions = [3.0 * times, np.maximum(0.3 - times, 0.0), 0.0 * times, 0.0 * times]  # most of them at rest
+    windows = []
+    for index, motion in enumerate(motions):
+        coarse = 0.7 + step * np.rint(motion / step)
+        whole = Window.whole(index, 0.0, PERIOD, TWIN.signals, np.tile(coarse[:, None], (1, 4)))
+        windows.append(thinned(random, whole, 0.0, rows))
+    assert 0.1 * step < sample_noise("omega", windows) < step
+    assert sample_noise("omega", windows[2:]) == 0.0
+
+
 @pytest.mark.parametrize(("missing", "rows"), [(0.5, 0.0), (0.0, 0.3)])
 def test_noise_at_irregular_records(missing: float, rows: float) -> None:
     """Rows may be dropped only if no input changes in between, so the voltage is constant."""
