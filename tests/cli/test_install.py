@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -66,16 +67,29 @@ def test_a_file_that_another_machine_names_is_not_replaced_silently(file: Path, 
     assert "warning" not in installed(other, root)
 
 
-def test_the_shipped_unit_is_hardened(file: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("driver", "limit"),
+    [
+        ('type = "can"\nchannel = "can0"', 1.0),
+        ('type = "modbus"\nhost = "192.168.0.10"', 1.0),
+        ('type = "modbus"\nserial = "/dev/ttyUSB0"', 0.7),
+        ('type = "plant"\nscenario = "plant.toml"', 0.6),
+        ('type = "modbus"\nhost = "drive.plant.local"', 1.2),  # its address is not known: none is denied
+    ],
+)
+def test_the_shipped_unit_is_hardened(file: Path, tmp_path: Path, driver: str, limit: float) -> None:
     """Exposure by systemd's own measure, with the drop-in of the machine."""
     if shutil.which("systemd-analyze") is None:
         pytest.skip("no systemd-analyze here")
     installed(file, tmp_path)
+    folder = tmp_path / "etc/systemd/system/otolith@press-3.service.d"
+    text = drop_in("press-3", [tomllib.loads(driver)], ("local",), ())
+    (folder / "machine.conf").write_text(text, encoding="utf-8")
     command = ["systemd-analyze", "security", "--offline=yes", f"--root={tmp_path}", "otolith@press-3.service"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     exposure = re.search(r"exposure level for \S+: ([\d.]+)", done.stdout)
     assert exposure is not None, done.stderr
-    assert float(exposure[1]) <= 1.6
+    assert float(exposure[1]) <= limit
 
 
 def test_a_wrong_machine_file_installs_nothing(file: Path, tmp_path: Path) -> None:
@@ -114,8 +128,35 @@ def test_the_drop_in_allows_what_the_file_names() -> None:
     assert [line for line in drive.splitlines() if "IPAddressAllow" in line] == [
         "IPAddressAllow=localhost", "IPAddressAllow=fd00::1", "IPAddressAllow=192.168.0.10"]  # fmt: skip
     assert "IPAddressAllow=multicast" in drop_in("press", [{"type": "can"}], LOOPBACK, ())
+    assert "multicast" not in drop_in("press", [{"type": "can", "channel": "can0"}], LOOPBACK, ())
     adapter = drop_in("press", [{"type": "can", "interface": "slcan", "channel": "/dev/ttyACM0@115200"}], LOOPBACK, ())
     assert "DeviceAllow=/dev/ttyACM0 rw" in adapter
+
+
+@pytest.mark.parametrize(
+    ("driver", "listen", "sockets"),
+    [
+        ({"type": "plant"}, ("local",), "AF_UNIX"),
+        ({"type": "modbus", "serial": "/dev/ttyUSB0"}, ("local",), "AF_UNIX"),
+        ({"type": "can", "interface": "slcan", "channel": "/dev/ttyACM0"}, ("local",), "AF_UNIX"),
+        ({"type": "can", "channel": "can0"}, ("local",), "AF_UNIX AF_CAN"),
+        ({"type": "can"}, ("local",), "AF_UNIX AF_CAN AF_INET AF_INET6"),  # without vcan0 it is UDP multicast
+        ({"type": "can", "channel": "can0"}, LOOPBACK, "AF_UNIX AF_CAN AF_INET AF_INET6"),
+        ({"type": "modbus", "host": "192.168.0.10"}, ("local",), "AF_UNIX AF_INET AF_INET6"),
+        ({"type": "opcua", "endpoint": "opc.tcp://10.0.0.7:4840"}, ("local",), "AF_UNIX AF_INET AF_INET6"),
+        ({"type": "can", "interface": "pcan"}, ("local",), None),  # whatever its library needs
+        ({"type": "of-our-own"}, ("local",), None),
+    ],
+)
+def test_the_service_may_open_the_sockets_that_it_needs(
+    driver: dict[str, str], listen: tuple[str, ...], sockets: str | None
+) -> None:
+    lines = drop_in("press", [driver], listen, ()).splitlines()
+    expected = [] if sockets is None else ["RestrictAddressFamilies=", f"RestrictAddressFamilies={sockets}"]
+    assert [line for line in lines if line.startswith("RestrictAddressFamilies")] == expected
+    assert ("PrivateNetwork=yes" in lines) == (sockets == "AF_UNIX")
+    with_command = drop_in("press", [driver], listen, (), has_command=True)
+    assert "PrivateNetwork" not in with_command  # it may send a mail
 
 
 @pytest.mark.parametrize(

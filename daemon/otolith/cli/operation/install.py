@@ -25,6 +25,8 @@ PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
 USER, ETC = "otolith", Path("etc/otolith")
 # Drivers whose addresses are in the keys 'host', 'endpoint' and 'channel'.
 KNOWN_DRIVERS = {"can", "modbus", "mqtt", "opcua", "plant", "replay"}
+# Interfaces of python-can that need a bus of the kernel, multicast, or the serial port that the channel names.
+KNOWN_BUSES = {"socketcan", "udp_multicast", "slcan", "serial", "robotell"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +89,8 @@ def _files(file: Path) -> Iterator[InstalledFile]:
     yield InstalledFile(etc / "systemd/system" / UNIT, (shipped / UNIT).read_bytes())
     yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
     zenoh = machine.file.zenoh
-    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect)
+    has_command = bool(machine.file.machine.on_event)
+    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, has_command=has_command)
     yield InstalledFile(etc / f"systemd/system/otolith@{file.stem}.service.d/machine.conf", text.encode())
     yield InstalledFile(ETC / file.name, file.read_bytes())
     for name in named_files(file):
@@ -122,8 +125,18 @@ def _strings(value: Any) -> Iterator[str]:
             yield from _strings(item)
 
 
-def drop_in(name: str, drivers: Sequence[Mapping[str, Any]], listen: Sequence[str], connect: Sequence[str]) -> str:
-    """Return the drop-in of the unit: the devices and addresses that the machine file names, and no others."""
+def drop_in(
+    name: str,
+    drivers: Sequence[Mapping[str, Any]],
+    listen: Sequence[str],
+    connect: Sequence[str],
+    *,
+    has_command: bool = False,
+) -> str:
+    """Return the drop-in of the unit: devices, addresses and kinds of sockets that the machine file needs, no others.
+
+    ``has_command``: the daemon runs a command for each event, which may use the network of this computer.
+    """
     from otolith.machine_file import address_of, host_of
 
     lines = [f"# Made by 'otolith install' from /etc/otolith/{name}.toml.", "[Service]"]
@@ -135,17 +148,36 @@ def drop_in(name: str, drivers: Sequence[Mapping[str, Any]], listen: Sequence[st
     hosts = [host for endpoint in connect if (host := host_of(endpoint))]
     hosts += [host for driver in drivers for host in _hosts_of(driver)]
     unknown = [host for host in hosts if not address_of(host) and host != "localhost"]
-    published = [host for endpoint in listen if (host := host_of(endpoint)) and host != "localhost"]
-    unknown += [host for host in published if (address := address_of(host)) is None or not address.is_loopback]
-    unknown += [f"driver {driver.get('type')!r}" for driver in drivers if driver.get("type") not in KNOWN_DRIVERS]
-    if unknown:
+    published = [host for endpoint in listen if (host := host_of(endpoint))]
+    public = [host for host in published if host != "localhost"]
+    unknown += [host for host in public if (address := address_of(host)) is None or not address.is_loopback]
+    buses = [bus for driver in drivers if driver.get("type") == "can" for bus in _can_buses(driver)]
+    foreign = [f"driver {driver.get('type')!r}" for driver in drivers if driver.get("type") not in KNOWN_DRIVERS]
+    foreign += [f"CAN interface {bus!r}" for bus in buses if bus not in KNOWN_BUSES]
+    if not foreign:
+        sockets = ["AF_UNIX"] + (["AF_CAN"] if "socketcan" in buses else [])
+        if hosts or published or has_command or "udp_multicast" in buses:
+            sockets += ["AF_INET", "AF_INET6"]
+        lines += ["RestrictAddressFamilies=", f"RestrictAddressFamilies={' '.join(sockets)}"]
+        lines += ["PrivateNetwork=yes"] if sockets == ["AF_UNIX"] else []
+    if unknown := [*unknown, *foreign]:
         comment = (
             f"# No IPAddressDeny: the addresses that {', '.join(dict.fromkeys(unknown))} stands for are not known."
         )
         return "\n".join([*lines, comment, ""])
-    multicast = ["multicast"] if any(driver.get("type") == "can" for driver in drivers) else []
+    multicast = ["multicast"] if "udp_multicast" in buses else []
     allowed = dict.fromkeys(["localhost", *multicast, *(host for host in hosts if address_of(host))])
     return "\n".join([*lines, "IPAddressDeny=any", *(f"IPAddressAllow={host}" for host in allowed), ""])
+
+
+def _can_buses(driver: Mapping[str, Any]) -> Sequence[str]:
+    """Return the interfaces of python-can that a table ``[driver]`` may use."""
+    from otolith_drivers.canbus.bus import DEFAULT_CHANNEL
+
+    interface, channel = str(driver.get("interface", "auto")), str(driver.get("channel", DEFAULT_CHANNEL))
+    if interface != "auto":
+        return (interface,)
+    return ("socketcan", "udp_multicast") if channel.startswith("vcan") else ("socketcan",)
 
 
 def _hosts_of(driver: Mapping[str, Any]) -> Iterator[str]:
