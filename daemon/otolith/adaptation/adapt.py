@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.reporting import OPEN, WindowResult, make_report
+from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
 from otolith.adaptation.state import AdaptationState, with_posterior
 from otolith.adaptation.unbridged_gap import unbridged_gap
 from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
@@ -250,10 +250,13 @@ def _next_state(
 
 
 def _next_shifts(state: AdaptationState, result: WindowResult) -> CumulativeShifts:
-    """Return the cumulative shifts; a posterior that replaces the filter's contains what shifted the windows before."""
+    """Return the cumulative shifts; a posterior that replaces the filter's contains what shifted the windows before.
+
+    The error of a sensor shifts no parameter.
+    """
     if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
         return CumulativeShifts()
-    return state.shifts if result.shifts is None else result.shifts
+    return state.shifts if result.shifts is None or result.decision in DATA_FAULTS else result.shifts
 
 
 def _next_records(state: AdaptationState, result: WindowResult) -> int:
