@@ -96,7 +96,7 @@ class LoadedMachine:
     @property
     def title(self) -> str:
         """Name and site of the machine, for people."""
-        return f"{self.file.machine.name} at {self.file.machine.site}"
+        return f"{self.file.machine.name}, {self.file.machine.site}"
 
     @property
     def observed(self) -> tuple[str, ...]:

@@ -11,7 +11,9 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
 from otolith.discovery.decision import WindowDecision
+from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.imm_filter import ParameterCusum
+from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ReportDocument
 
@@ -96,3 +98,17 @@ def test_a_reset_of_one_parameter_forgets_no_other() -> None:
     state = replace(initial_state("shaft", "bench", PROBLEM), shifts=sums)
     assert state.shifts.moved == [0, 1]
     assert apply_decisions(state, OperatorDecisions(resets={"D": 1.0})).shifts.moved == []
+
+
+def test_the_lag_behind_a_drift_is_no_shift() -> None:
+    """A drift that accelerates is ahead of its prediction in each window: it has not moved at once."""
+    scale, rate = PROBLEM.scale, 0.01  # 1/s
+    trend = np.array([0.0, rate * DAMPING])
+    covariance = np.diag(np.concatenate([1e-4 * scale, 1e-6 * scale]) ** 2)
+    mean = np.concatenate([[INERTIA, DAMPING], trend])
+    drifting = Posterior.initial(PROBLEM).set_prior(Prior(mean, covariance))
+    resting = Posterior.initial(PROBLEM).set_prior(Prior(np.concatenate([mean[:2], [0.0, 0.0]]), covariance))
+    values, sd = np.array([INERTIA, DAMPING * 1.005]), 1e-4 * scale
+    assert drifting.shifts(values + trend * -1.0, sd, 2.0).tolist()[1] == 0.0
+    assert resting.shifts(values, sd, 2.0)[1] > 1.0
+    assert drifting.shifts(values * [1.0, 1.2], sd, 2.0)[1] > 1.0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis, is_usable, prune
+from otolith.discovery.sequential_test import FitSummary, SequentialTest, join
 from otolith.estimation.arrival_cost import Evidence, Prior
 from otolith.estimation.augmented import augment
 from otolith.estimation.posterior import PhaseAdvance, Posterior
@@ -61,3 +62,17 @@ def test_evidence_of_a_diverging_twin_is_not_used(sharpness: float) -> None:
     changed = FaultHypothesis(FaultType.PARAMETER, "R_a")
     assert is_usable(changed, predicted, evidence(1.0))
     assert not is_usable(changed, predicted, evidence(sharpness))
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_what_opened_a_test_has_ended_where_the_filter_alone_explains_a_window(ended: bool) -> None:
+    """Otherwise new hypotheses would compete with the filter as it was while the fault lasted."""
+    null, moved = hypothesis(FaultType.NOTHING, BARE), hypothesis(FaultType.PARAMETER, BARE)
+    wrong = hypothesis(FaultType.SENSOR, augment(BARE, [PERIODIC]))
+    wrong = replace(wrong, cost=5.0)
+    old = SequentialTest(BARE, (wrong, null.worse_by(60.0, 60.0)), 0.0, windows=15, last=FitSummary(9000.0, 0.0, 400.0))
+    others = (null, moved.worse_by(5.0, 0.0)) if ended else (moved, null.worse_by(15.0, 15.0))
+    fresh = SequentialTest(BARE, others, 30.0, last=FitSummary(400.0, 0.0, 400.0))
+    joined = join(old, fresh)
+    assert joined.best.type is (FaultType.NOTHING if ended else FaultType.PARAMETER)
+    assert (joined is fresh) == ended

@@ -1,25 +1,37 @@
 """The texts: every language has the same texts, and what people read is in the language of the machine."""
 
+import io
 import re
+import tempfile
 import tomllib
+from collections.abc import Iterable, Iterator
+from functools import cache
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
+from otolith.storage.history_retention import Bounds
+from rich.console import Console
 
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
+from otolith.cli.operation.live_table import LiveTable
 from otolith.health import language as module
 from otolith.health.language import LANGUAGES, Language, texts_in
 from otolith.health.limits import MACHINE, Level
 from otolith.health.observations import BUS, SENSORS
-from otolith.health.schema import ReportDocument
-from otolith.health.text import event_text, headline
-from otolith.machine import find_twin, library_twins, load_machine, load_rules
+from otolith.health.schema import CountersDocument, ReportDocument
+from otolith.health.text import announcements, event_text, headline
+from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine, load_rules
+from otolith.publishing.html_report import html_report
+from otolith.publishing.recording_layout import blueprint, operator_text, report_text
+from otolith.storage.history import SUFFIX, WINDOW, describe_machine
+from otolith.storage.history_writer import HistoryWriter
+from otolith_drivers.base import Sampling
 from otolith_drivers.plant.scenario import load_scenario, simulate
-from tests.conftest import EXAMPLES, SIGNALS, OwnMachine
+from tests.conftest import EXAMPLES, SIGNALS
 
 GERMAN = texts_in("de")
 OTHERS = [language for language in LANGUAGES if language != "en"]
@@ -56,6 +68,7 @@ def test_what_the_library_and_the_states_name_is_translated(language: Language) 
     words = {MACHINE, BUS, SENSORS} | {str(level) for level in Level} - {"OK"}
     for twin in twins:
         words |= {parameter.meaning for parameter in twin.parameters} | {site.meaning for site in twin.sites}
+        words |= {row.meaning for rows in (twin.inputs, twin.outputs, twin.states) for row in rows} | {twin.title}
         words |= {parameter.part for parameter in twin.parameters} | {site.part for site in twin.sites}
     assert words - set(texts_in(language).phrases) - {""} == set()
 
@@ -113,10 +126,18 @@ def test_a_very_long_text_stays_english() -> None:
     assert GERMAN.translated(made.format("i" * 500)) == made.format("i" * 500)
 
 
-def reports(own_machine: OwnMachine, scenario: str, count: int) -> list[ReportDocument]:
-    text = own_machine.machine.read_text(encoding="utf-8")
-    own_machine.machine.write_text(text.replace("[machine]", '[machine]\nlanguage = "de"'), encoding="utf-8")
-    machine = load_machine(own_machine.machine, with_driver=False)
+@cache
+def german_motor() -> LoadedMachine:
+    text = (EXAMPLES / "dc-motor.toml").read_text(encoding="utf-8")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "machine.toml"
+        path.write_text(text.replace("[machine]", '[machine]\nlanguage = "de"'), encoding="utf-8")
+        return load_machine(path, with_driver=False)
+
+
+@cache
+def reports(scenario: str, count: int) -> list[ReportDocument]:
+    machine = german_motor()
     state, documents = initial_state("m", "s", machine.problem, machine.plan), []
     ticks = simulate(load_scenario(EXAMPLES / "scenarios" / f"{scenario}.toml"))
     for index in range(count):
@@ -126,8 +147,8 @@ def reports(own_machine: OwnMachine, scenario: str, count: int) -> list[ReportDo
     return documents
 
 
-def test_a_german_machine_has_german_events_and_states(own_machine: OwnMachine) -> None:
-    last = reports(own_machine, "demo", 45)[-1]
+def test_a_german_machine_has_german_events_and_states() -> None:
+    last = reports("demo", 45)[-1]
     assert last.health is not None
     assert headline(last.health).startswith("HANDELN seit t = ")
     events = {event.part: event for event in last.events}
@@ -140,10 +161,72 @@ def test_a_german_machine_has_german_events_and_states(own_machine: OwnMachine) 
     assert last.health.parts["shaft"].state is Level.ACT  # what programs read is the same in all languages
 
 
-def test_a_german_machine_has_german_sensor_faults(own_machine: OwnMachine) -> None:
-    last = reports(own_machine, "sensor-frozen", 22)[-1]
+def test_a_german_machine_has_german_sensor_faults() -> None:
+    last = reports("sensor-frozen", 22)[-1]
     (event,) = last.events
     assert (event.condition_id, event.condition) == ("sensor", "ein Sensor misst falsch")
     assert event.text.startswith("omega steht seit ")
     assert " the " not in event_text(event)
     assert last.parameters["R_a"].reason.startswith("aus dem Zeitfenster wird nichts geschätzt: omega steht seit ")
+
+
+def words(text: str) -> set[str]:
+    return set(re.findall(r"[^\W\d_]{2,}", text))
+
+
+def english_words() -> set[str]:
+    """Words of the English texts, and of what the core composes, that are no German ones and no names of the twin."""
+    english, twin = texts_in("en"), find_twin("dc_motor")
+    texts = [*english.texts.values(), *(text for own in english.rules.values() for text in own.values())]
+    german = [*GERMAN.texts.values(), *(text for own in GERMAN.rules.values() for text in own.values())]
+    names = [
+        *twin.signals,
+        *(row.name for row in twin.parameters),
+        "dc_motor angle sin machine signals checks frozen spikes stale",
+    ]
+    sources = ["An Interpretable Digital Twin for Self-Aware Industrial Machines (2023), section", "Rotor balancing"]
+    composed = [re.sub(r"{\w+}", "", text) for text in GERMAN.phrases]
+    common = "the of and is with from to for not has no at by it its that be are was were if or this than other"
+    known = words(" ".join([*german, *GERMAN.phrases.values(), *names, *sources]))
+    return words(" ".join([*(re.sub(r"{\w+}", "", text) for text in texts), *composed, common])) - known
+
+
+def names_in(view: object) -> Iterator[str]:
+    """Yield what is above the views of a layout."""
+    yield str(getattr(view, "name", None) or "")
+    children = getattr(view, "contents", ())
+    for child in children if isinstance(children, Iterable) and not isinstance(children, str) else ():
+        yield from names_in(child)
+
+
+def shown(documents: list[ReportDocument], folder: Path) -> dict[str, str]:
+    """What people read of these reports: a page, the live table, and the texts of events and of a recording."""
+    machine, last = german_motor(), documents[-1]
+    writer = HistoryWriter(folder / f"m{SUFFIX}", Bounds(20_000_000, 3650, 24))
+    numbers, _ = writer.open(documents[0].window.start)
+    writer.description = describe_machine(machine.twin, machine.plan)
+    counters = CountersDocument(received=9, lost=1, bad=1, windows_bad=1, worker_restarts=1, history_dropped=1)
+    for document in documents:
+        writer.add(numbers.number(document.model_copy(update={"counters": counters})))
+    writer.stop(0.0)
+    writer.write()
+    now = last.window.end
+    page = html_report(writer.reader, writer.reader.samples(WINDOW, 0.0), "window", 0.0, now)
+    table, output = LiveTable(lambda: ""), io.StringIO()
+    for document in documents:
+        table.add(document.model_copy(update={"counters": counters}).to_json())
+    Console(file=output, width=250).print(table)
+    events = "\n".join(event_text(event) for document in documents for event in announcements(document))
+    titles = re.findall(r'title="[^"]*"', page)
+    body = re.sub(r"<style.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL)
+    layout = list(names_in(blueprint(machine.recorded(Sampling.TRUE)).root_container))
+    assert "Ereignisse" in layout
+    recording = f"{operator_text(last)} {report_text(last)} {layout}"
+    return {"page": f"{body} {titles}", "table": output.getvalue(), "events": events, "recording": recording}
+
+
+@pytest.mark.parametrize(("scenario", "count"), [("demo", 45), ("sensor-frozen", 22), ("demo", 1)])
+def test_no_english_word_is_left_in_what_a_german_operator_reads(scenario: str, count: int, tmp_path: Path) -> None:
+    english = english_words()
+    left = {name: words(text) & english for name, text in shown(reports(scenario, count), tmp_path).items()}
+    assert not any(left.values()), left

@@ -8,12 +8,13 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
+from otolith.discovery.decision import WindowDecision
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, ReportDocument
 from otolith.health.text import announcements
 from otolith.machine import load_machine
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.plant.faults import Step
+from otolith_drivers.plant.faults import Gain, Step
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES, SIGNALS
 
@@ -69,6 +70,15 @@ def test_a_frozen_sensor_of_the_motor_is_one_event() -> None:
     (event,) = [event for document in documents for event in announcements(document)]
     assert (event.part, event.state, event.condition) == ("sensors", Level.ACT, "a sensor is wrong")
     assert event.text.startswith("omega is frozen at ")
+
+
+def test_a_sensor_that_works_again_leaves_no_other_event() -> None:
+    keys = {"kind": "gain", "signal": "ArmatureCurrent", "factor": "1.1", "start": "20 s", "until": "40 s"}
+    fault = Gain.model_validate(keys)
+    documents = reports(motor("demo").model_copy(update={"faults": (fault,)}), 26)
+    announced = [(event.part, event.change) for document in documents for event in announcements(document)]
+    assert announced == [("sensors", EventChange.RAISED), ("sensors", EventChange.CLEARED)]
+    assert WindowDecision.STEPPED not in {document.decision for document in documents}
 
 
 def test_a_weaker_magnet_is_an_event_although_the_machine_file_gives_it_as_known() -> None:

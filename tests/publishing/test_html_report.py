@@ -11,6 +11,7 @@ import pytest
 from benchmarks.browser import Browser, browser, program
 
 from benchmarks import pictures
+from otolith.health.language import texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import CountersDocument, EventChange, HealthDocument, PartDocument, ReportDocument, Status
 from otolith.publishing.html_report import MAX_ROWS, Axis, html_report
@@ -213,7 +214,7 @@ def test_texts_of_the_machine_are_harmless() -> None:
 
 @pytest.mark.parametrize("span", [0.5, 7.0, 100.0, 3600.0, 5e4, 7.0 * DAY, 40.0 * DAY, 3.0 * YEAR, 9.0 * YEAR])
 def test_marks_of_time_are_few_and_at_round_times(span: float) -> None:
-    marks = Axis(START, START + span, START + 1.2 * span).ticks()
+    marks = Axis(START, START + span, START + 1.2 * span).ticks(texts_in("en"))
     assert len(marks) <= 5
     assert span < 2.0 or len(marks) >= 2
     assert all(0.0 <= place <= 100.0 for place, _ in marks)

@@ -1,15 +1,16 @@
 """The operator's tab of a recording: in words, as lanes, with limits. Each file has it from its first window on."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from otolith.health.limits import Level
+from otolith.health.limits import Level, Limit, MonitoredQuantity
 from otolith.health.schema import Report, ReportDocument
 from otolith.machine import load_machine
 from otolith.publishing.recorder import Recording
-from otolith.publishing.recording_layout import operator_text
+from otolith.publishing.recording_layout import near_values, operator_text
 from otolith_drivers.base import Sampling
 from tests.conftest import EXAMPLES
 from tests.publishing.test_events import documents
@@ -24,10 +25,10 @@ def test_the_text_has_state_what_since_when_how_sure_and_what_to_do() -> None:
     text = operator_text(at(Level.ACT))
     assert text.startswith("# ACT\nsince ")
     for part in (
-        "**ACT: winding: short circuit between turns of the winding**, since",
+        "## ACT: winding: short circuit between turns of the winding\nsince",
         "R\\_a is 5.8 ohm",
         "% probability)",
-        "**plan a replacement of the winding",
+        "**What to do: plan a replacement of the winding",
     ):
         assert part in text
     assert operator_text(documents()[0]).startswith("# OK\nsince ")
@@ -38,7 +39,7 @@ def test_text_of_a_machine_is_no_markdown() -> None:
     event = document.events[0].model_copy(update={"text": "0.005 N*m, [now] 5 N*m | <b>", "advice": "`a`"})
     text = operator_text(document.model_copy(update={"events": (event,)}))
     assert r"0.005 N\*m, \[now\] 5 N\*m \| \<b\>" in text
-    assert r"**\`a\`**" in text
+    assert r"\`a\`**" in text
 
 
 @pytest.fixture
@@ -71,7 +72,16 @@ def test_events_are_on_change_only(recorded: tuple[Path, Path]) -> None:
     assert [text[0].partition(":")[0] for text in rows(recorded[1], "/events", "TextLog:text")[1]] == ["cleared"]
 
 
-def test_each_parameter_has_nominal_value_and_limits_all_the_time(recorded: tuple[Path, Path]) -> None:
+def test_each_parameter_has_nominal_value_and_near_limits_all_the_time(recorded: tuple[Path, Path]) -> None:
     times, values = rows(recorded[0], "/limits/R_a")
     assert len(times) == 14
-    assert np.unique(values, axis=0) == pytest.approx(np.array([[6.5, 6.37, 8.125, 6.175, 9.425]]))
+    near, far = [0, 1, 3], [2, 4]
+    assert np.unique(np.array(values)[:, near], axis=0) == pytest.approx(np.array([[6.5, 6.37, 6.175]]))
+    assert np.isnan(np.array(values)[:, far]).all()
+
+
+def test_a_far_limit_is_shown_to_a_value_near_it() -> None:
+    limits = tuple(Limit(Level.WATCH, value, value < 6.5) for value in (6.37, 8.125))
+    quantity = MonitoredQuantity(nominal=6.5, limits=limits)
+    assert near_values(quantity, 6.5) == pytest.approx([6.5, 6.37, math.nan], nan_ok=True)
+    assert near_values(quantity, 7.4) == pytest.approx([6.5, 6.37, 8.125])

@@ -63,7 +63,7 @@ def test_nothing_is_lost_between_files_and_each_is_complete(tmp_path: Path, sour
     assert np.array_equal(np.concatenate([omega(path) for path in files]), measured)
     for path in files:
         assert len(RrdReader(path).blueprints()) == 1
-        assert [entry.recording_id for entry in RrdReader(path).recordings()] == ["motor_at_site"]
+        assert [entry.recording_id for entry in RrdReader(path).recordings()] == ["motor_site"]
 
 
 def test_a_file_of_the_largest_size_is_followed_by_another(tmp_path: Path, source: RecordedMachine) -> None:

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from otolith.adaptation.state import EVERYTHING, AdaptationState, OperatorDecisions, apply_decisions, component_records
-from otolith.estimation.imm_filter import CumulativeShifts
+from otolith.estimation.imm_filter import ParameterCusum
 from otolith.health.events import HealthState
 from otolith.health.schema import EventChange, ForecastDocument, ReportDocument, Status
 from otolith.storage.state_store import MAX_KEPT, MAX_STATE_BYTES, StateStore
@@ -126,10 +126,10 @@ def test_an_open_event_goes_on_after_a_restart(tmp_path: Path) -> None:
 def test_what_shifted_the_last_windows_survives_a_restart(tmp_path: Path) -> None:
     state = healthy()
     sums = np.tile([[3.0], [0.5]], len(state.problem.free))
-    shifted = replace(state, shifts=CumulativeShifts(sums))
+    shifted = replace(state, shifts=ParameterCusum(sums))
     assert restarted(shifted, tmp_path).shifts.sums == pytest.approx(sums)
     with pytest.raises(OtolithError, match="shifts: not plausible"):
-        store_in(tmp_path).save(replace(state, shifts=CumulativeShifts(-sums)))
+        store_in(tmp_path).save(replace(state, shifts=ParameterCusum(-sums)))
 
 
 def test_histories_survive_a_restart_and_forecasts_are_computed_again(tmp_path: Path) -> None:

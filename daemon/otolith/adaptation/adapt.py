@@ -12,7 +12,7 @@ import numpy as np
 
 from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.reporting import OPEN, WindowResult, make_report
+from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
 from otolith.adaptation.state import AdaptationState, with_posterior
 from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
 from otolith.discovery.ambiguity import WRONG_WINDOW, mixture
@@ -253,10 +253,13 @@ def _next_state(
 
 
 def _next_shifts(state: AdaptationState, result: WindowResult) -> ParameterCusum:
-    """Return the cumulative shifts; a posterior that replaces the filter's contains what shifted the windows before."""
+    """Return the cumulative shifts; a posterior that replaces the filter's contains what shifted the windows before.
+
+    The error of a sensor shifts no parameter.
+    """
     if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
         return ParameterCusum()
-    return state.shifts if result.shifts is None else result.shifts
+    return state.shifts if result.shifts is None or result.decision in DATA_FAULTS else result.shifts
 
 
 def _next_records(state: AdaptationState, result: WindowResult) -> int:

@@ -309,13 +309,18 @@ def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[HypothesisS
 
 
 def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
-    """Return the test with the hypotheses of a new search in its last window, if that explains it decisively better."""
+    """Return the test with the hypotheses of a new search in its last window, if that explains it decisively better.
+
+    If the filter alone explains the window, but not the leading hypothesis, what opened the test has ended.
+    """
     old, new = test.last, fresh.last
     gain = (
         (old.chi_square - new.chi_square) / residual_variance_factor([new.chi_square], old.count)
         + old.penalty
         - new.penalty
     )
+    if fresh.best.type is FaultType.NOTHING and fresh.best.cost <= EXPLAINED < test.best.cost:
+        return fresh
     if gain <= DECISIVE:
         return test
     known = {item.hypothesis.name for item in test.hypotheses}

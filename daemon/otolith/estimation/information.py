@@ -155,5 +155,6 @@ def classify(
         partners = f"it can be traded with {names[partner]} (correlation {correlations[partner]:.3f})"
         return Identifiability.TRADED, partners
     bound = "; its best value lies at its bound" if target.at_bound else ""
-    weak = f"the window determines it to ±{reach:.3g} {target.unit} only: too little excitation"
+    asked = f"±{target.half_width:.3g} {target.unit} is required"
+    weak = f"the window determines it to ±{reach:.3g} {target.unit} only, {asked}: too little excitation"
     return Identifiability.WEAK, weak + bound

@@ -15,6 +15,7 @@ from otolith.estimation import imm_filter
 from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
 from otolith.estimation.augmented import indices, source_of, without
 from otolith.estimation.imm_filter import FIRST_LEVEL, ImmPosterior
+from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import converter_steps
 from otolith.estimation.problem import Problem
 
@@ -131,13 +132,18 @@ class Posterior:
         """Return by how many standard deviations a window of ``length`` (s) alone differs from the prediction (free,).
 
         ``values`` and ``sd`` (free,) are its estimates, without trends, so that they hold in its middle. While nothing
-        happens a shift is a standard normal deviate, or less. Values of components do not count.
+        happens a shift is a standard normal deviate, or less. Values of components do not count, nor does less than a
+        parameter drifts in the window: the filter lags behind a drift that accelerates, and follows it.
         """
-        free, prior = len(self.problem.free), self.prior()
-        middle = prior.mean[:free] - 0.5 * length * prior.mean[free:]
-        variance = self.belief.variance_ratio * sd**2 + np.diag(prior.covariance)[:free]
-        counted = np.isfinite(variance) & [not parameter.name.startswith("_") for parameter in self.problem.free]
-        return np.where(counted, (values - middle) / np.sqrt(np.where(counted, variance, 1.0)), 0.0)
+        prior = self.prior()
+        before, trend = np.split(prior.mean, 2)
+        variance_before, variance_of_trend = np.split(np.diag(prior.covariance), 2)
+        difference = values - (before - 0.5 * length * trend)
+        drift = length * np.maximum(np.abs(trend) - QUANTILE * np.sqrt(variance_of_trend), 0.0)
+        variance = self.belief.variance_ratio * sd**2 + variance_before
+        counted = np.isfinite(variance) & (np.abs(difference) > drift)
+        counted &= [not parameter.name.startswith("_") for parameter in self.problem.free]
+        return np.where(counted, difference / np.sqrt(np.where(counted, variance, 1.0)), 0.0)
 
     def update(self, evidence: Evidence, phase: PhaseAdvance) -> "Posterior":
         """Return the posterior after a window, of which this is the prediction."""

@@ -143,7 +143,10 @@ def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
         name: item.model_copy(update={"reason": say(item.reason), "advice": item.advice and say(item.advice)})
         for name, item in report.parameters.items()
     }
-    components = [item.model_copy(update={"meaning": say(item.meaning)}) for item in report.components]
+    components = [
+        item.model_copy(update={key: say(getattr(item, key)) for key in ("meaning", "conditions", "domain")})
+        for item in report.components
+    ]
     window = report.window.model_copy(update={"quality": quality, "absent": absent})
     changed = {"findings": tuple(findings), "parameters": parameters, "components": tuple(components)}
     return report.model_copy(update={**changed, "window": window})
@@ -252,37 +255,42 @@ def _states(
     events: Sequence[EventDocument],
     determined: Collection[str],
 ) -> HealthDocument:
-    """Return the states of parts and machine; ``events`` begin with the most severe."""
+    """Return the states of parts and machine; ``events`` begin with the most severe.
+
+    ``determined`` are the parameters that once were.
+    """
     worst = {event.part: event for event in reversed(events)}
     silent = next((event for event in events if event.state is Level.NO_DATA and event.part == BUS), None)
     parts: dict[str, PartDocument] = {}
     for part in dict.fromkeys((*plan.parts, SENSORS, BUS, *worst)):
-        event, missing = worst.get(part, silent), _undetermined(plan, part, report, determined)
+        event = worst.get(part, silent)
+        missing = () if event else _undetermined(plan, part, report)
+        key = "no_longer" if any(name in determined for name in missing) else "not_yet"
+        why = plan.texts(key, names=", ".join(missing)) if missing else ""
         state = event.state if event else Level.NO_DATA if missing else Level.OK
-        since, reason = (event.since, event.condition) if event else (report.window.start, missing)
-        parts[part] = _kept(before.parts.get(part) if before else None, state, since, reason)
+        since, reason = (event.since, event.condition) if event else (report.window.start, why)
+        parts[part] = _kept(before.parts.get(part) if before else None, state, since, reason, missing)
     levels = [item.state for item in parts.values() if item.state.rank > Level.NO_DATA.rank]
     is_known = any(parts[part].state is not Level.NO_DATA for part in plan.parts) or not plan.parts
     state = max(levels, key=lambda level: level.rank, default=Level.OK if is_known and not silent else Level.NO_DATA)
     same = [item for item in parts.values() if item.state is state]
     reason = "; ".join(dict.fromkeys(item.reason for item in same if item.reason))
     since = min(item.since for item in same) if levels else report.window.start
-    whole = _kept(before, state, since, reason)
-    return HealthDocument(state=state, since=whole.since, reason=reason, parts=parts, language=plan.language)
+    unknown = tuple(name for item in same for name in item.undetermined)
+    whole = _kept(before, state, since, reason, unknown)
+    return HealthDocument(**dict(whole), parts=parts, language=plan.language)
 
 
-def _kept(before: PartDocument | None, state: Level, since: float, reason: str) -> PartDocument:
+def _kept(
+    before: PartDocument | None, state: Level, since: float, reason: str, undetermined: tuple[str, ...]
+) -> PartDocument:
     """Return a state, since the report before or earlier if that has the same one."""
     since = before.since if before is not None and before.state is state else since
-    return PartDocument(state=state, since=since, reason=reason)
+    return PartDocument(state=state, since=since, reason=reason, undetermined=undetermined)
 
 
-def _undetermined(plan: MonitoringPlan, part: str, report: ReportDocument, determined: Collection[str]) -> str:
-    """Return why nothing is known of a part of the twin; empty if something is.
-
-    ``determined`` are the parameters that once were.
-    """
+def _undetermined(plan: MonitoringPlan, part: str, report: ReportDocument) -> tuple[str, ...]:
+    """Return the parameters of a part of the twin if the value of none is known."""
     own = [name for name, quantity in plan.parameters.items() if quantity.part == part] or list(report.parameters)
     known = any(report.parameters[name].value is not None for name in own if name in report.parameters)
-    key = "no_longer" if any(name in determined for name in own) else "not_yet"
-    return "" if known or part not in plan.parts else plan.texts(key, names=", ".join(own))
+    return () if known or part not in plan.parts else tuple(own)

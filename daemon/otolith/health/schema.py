@@ -164,6 +164,8 @@ class PartDocument(StrictModel):
     since: float
     """Unix seconds."""
     reason: str = ""
+    undetermined: tuple[str, ...] = ()
+    """The parameters because of which it is at NO DATA, although there are data."""
 
 
 class HealthDocument(PartDocument):

@@ -12,11 +12,13 @@ from otolith.health.schema import (
     FindingDocument,
     HealthDocument,
     ParameterDocument,
+    PartDocument,
     ReportDocument,
     Status,
 )
 
 UNKNOWN = "unknown"
+UNKNOWN_STATE = "UNKNOWN"
 UNITS_OF_TIME = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 """Length in s and name, the longest first; a duration is given in the longest of which it has at least two."""
 
@@ -120,12 +122,17 @@ def announcements(document: ReportDocument) -> list[EventDocument]:
     return [event for event in document.events if event.change is not None]
 
 
+def state_word(part: PartDocument) -> str:
+    """The state of a part: there may be data without a parameter that they determine."""
+    return UNKNOWN_STATE if part.undetermined else part.state
+
+
 def headline(health: HealthDocument, when: Callable[[float], str] = time_text) -> str:
     """State of the machine, since when, and which parts are in it and why."""
     texts, parts = texts_in(health.language), health.parts.items()
     reasons = {name: part.reason for name, part in parts if part.state is health.state and part.reason}
     why = "; ".join(f"{texts.translated(name)}: {reason}" for name, reason in reasons.items())
-    state = f"{texts.translated(health.state)} {texts('since', time=when(health.since))}"
+    state = f"{texts.translated(state_word(health))} {texts('since', time=when(health.since))}"
     return state + (f": {why}" if why else "")
 
 

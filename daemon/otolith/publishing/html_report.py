@@ -17,6 +17,7 @@ from jinja2 import Environment, StrictUndefined
 
 from otolith import __version__
 from otolith.health import text
+from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample
@@ -58,12 +59,12 @@ class Axis:
         first, last = (self.x(min(max(at, self.begin), self.end)) for at in (begin, end))
         return first, round(last - first, 2)
 
-    def ticks(self) -> list[tuple[float, str]]:
+    def ticks(self, texts: Texts) -> list[tuple[float, str]]:
         """Return position and text of the marks of time, at round local times."""
         span = self.end - self.begin
         step = next((step for step in STEPS if span / step < MAX_TICKS), STEPS[-1])
-        form = "%H:%M:%S" if step < 60 else "%H:%M" if span < DAY else "%a %H:%M" if step < DAY else "%d %b"
-        form = "%b %Y" if step > 30 * DAY else form
+        form = "%H:%M:%S" if step < 60 else "%H:%M" if span < DAY else texts("day_and_time" if step < DAY else "day")
+        form = texts("month") if step > 30 * DAY else form
         zone = time.localtime(self.begin).tm_gmtoff
         first = math.ceil((self.begin + zone) / step) * step - zone
         times = (first + index * step for index in range(MAX_TICKS + 1))
@@ -126,10 +127,12 @@ def html_report(
     curves.sort(key=lambda row: not urgent & {f"limit/{row.name}", f"component/{row.name.rpartition('/')[0]}"})
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= vars(text) | {"when": lambda at: time.strftime("%F %T", time.localtime(at))}
+    say = texts_in(latest.health.language if latest and latest.health else "en")
+    own = {"when": lambda at: time.strftime("%F %T", time.localtime(at)), "words": say.translated}
+    environment.filters |= vars(text) | own
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     return template.render(
-        machine=reader.machine, site=reader.site, latest=latest, is_silent=is_silent, silence=silence, now=now,
+        say=say, machine=reader.machine, site=reader.site, latest=latest, is_silent=is_silent, silence=silence, now=now,
         description=description, interval=interval, version=__version__, axis=axis, levels=Level, max_rows=MAX_ROWS,
         zone=time.strftime("%Z", time.localtime(now)), lanes=list(_lanes(axis, latest, states)), curves=curves,
         gaps=[(*axis.span(*gap), *gap) for gap in gaps if axis.begin < gap[1] > gap[0]], events=events,

@@ -34,6 +34,7 @@ from otolith.publishing.recording_layout import (
     TWIN,
     blueprint,
     limit_lines,
+    near_values,
     operator_text,
     report_text,
 )
@@ -136,7 +137,7 @@ class Recording:
         self._stream.set_log_time_enabled(False)
         self._layout = tempfile.TemporaryDirectory(prefix="otolith-")
         self._rows: defaultdict[str, list[tuple[Times, Any]]] = defaultdict(list)
-        self._limits: dict[str, tuple[float, ...]] = {}
+        self._limits: dict[str, MonitoredQuantity] = {}
         self._states: dict[str, str] = {}
         self._styled: set[str] = set()
         self._latest: ReportDocument | None = None
@@ -176,10 +177,8 @@ class Recording:
         for parameter in source.parameters:
             names = [*INTERVAL, f"{parameter.name} [{parameter.unit}]"]  # the last is drawn on top
             self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, TWIN])
-            lines = limit_lines(
-                source.plan.parameters.get(parameter.name, MonitoredQuantity(nominal=parameter.nominal))
-            )
-            self._limits[parameter.name] = tuple(value for _, value, _ in lines)
+            quantity = source.plan.parameters.get(parameter.name, MonitoredQuantity(nominal=parameter.nominal))
+            self._limits[parameter.name], lines = quantity, limit_lines(quantity, source.plan.texts)
             self._style(f"limits/{parameter.name}", [name for name, _, _ in lines], [colour for _, _, colour in lines])
         self._style("windows", ["is good", "start [s]", "end [s]", "records"], None)
 
@@ -244,7 +243,9 @@ class Recording:
         for name, parameter in document.parameters.items():
             if parameter.value is not None and parameter.low is not None and parameter.high is not None:
                 self._add_row(f"parameters/{name}", end, parameter.low, parameter.high, parameter.value)
-            self._add_row(f"limits/{name}", end, *self._limits.get(name, (parameter.nominal,)))
+            quantity = self._limits.get(name, MonitoredQuantity(nominal=parameter.nominal))
+            value = quantity.nominal if parameter.value is None else parameter.value
+            self._add_row(f"limits/{name}", end, *near_values(quantity, value))
         for component in document.components:
             amplitude = component.values["amplitude"]
             # '/' and brackets have a meaning in the path of an entity.

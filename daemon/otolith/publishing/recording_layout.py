@@ -1,18 +1,21 @@
 """What the viewer shows of a recording: a tab for the operator, one for the engineer, and their texts."""
 
+import math
 import re
 
 import rerun as rr
 import rerun.blueprint as rrb
 
 from otolith.acquisition.quality import time_text
-from otolith.health.language import texts_in
+from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level, MonitoredQuantity
 from otolith.health.schema import EventDocument, ReportDocument
-from otolith.health.text import event_text, headline, probability_text, value_text
+from otolith.health.text import event_text, headline, probability_text, state_word, value_text
 from otolith.machine import RecordedMachine
 
 TIMELINE = "time"
+NEAR_LIMITS = 3.0  # times the distance of the nearest limit from the nominal value, up to which others are shown
+NEAR_VALUES = 2.0  # times the distance of the value from the nominal value, the same
 MEASURED, TWIN, LIMIT = [90, 160, 255], [255, 140, 0], [150, 150, 150]  # colours, RGB
 STATES = {
     Level.OK: [46, 125, 50],
@@ -22,22 +25,34 @@ STATES = {
 }
 
 
-def limit_lines(quantity: MonitoredQuantity) -> list[tuple[str, float, list[int]]]:
+def limit_lines(quantity: MonitoredQuantity, texts: Texts) -> list[tuple[str, float, list[int]]]:
     """Return name, value and colour of the lines beside a parameter: its nominal value and its limits."""
-    lines = [(f"nominal {quantity.nominal:.4g}", quantity.nominal, LIMIT)]
-    return lines + [(f"{row.level} {row.value:.4g}", row.value, STATES[row.level]) for row in quantity.limits]
+    rows = [("nominal", quantity.nominal, LIMIT)]
+    rows += [(str(row.level), row.value, STATES[row.level]) for row in quantity.limits]
+    return [(f"{texts.translated(name)} {value:.4g}", value, colour) for name, value, colour in rows]
+
+
+def near_values(quantity: MonitoredQuantity, value: float) -> list[float]:
+    """Return nominal value and limits of a parameter at ``value``; not a number for each that is too far to be shown.
+
+    A limit far beyond the others would make the curve flat.
+    """
+    nominal, limits = quantity.nominal, [row.value for row in quantity.limits]
+    nearest = min((abs(limit - nominal) for limit in limits), default=0.0)
+    reach = max(NEAR_LIMITS * nearest, NEAR_VALUES * abs(value - nominal))
+    return [nominal, *(limit if abs(limit - nominal) <= reach else math.nan for limit in limits)]
 
 
 def operator_text(document: ReportDocument) -> str:
     """Return in Markdown the state, what is the matter, since when, how sure, and what to do."""
     health = document.health
     if health is None:
-        return f"# {document.machine}\n\nno state yet"
+        return f"# {document.machine}"
     texts = texts_in(health.language)
-    lines = [f"# {texts.translated(health.state)}\n{texts('since', time=time_text(health.since))}"]
+    lines = [f"# {texts.translated(state_word(health))}\n{texts('since', time=time_text(health.since))}"]
     lines += [_paragraph(event) for event in document.events if event.end is None]
-    if health.reason and len(lines) == 1:
-        lines.append(_plain(health.reason))
+    if len(lines) == 1:
+        lines.append(_plain(health.reason or texts("all_well")))
     return "\n\n".join(lines)
 
 
@@ -46,9 +61,9 @@ def _paragraph(event: EventDocument) -> str:
     say = texts_in(event.language)
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
     what = _plain(f"{say.translated(event.state)}: {say.translated(event.part)}: {event.condition}")
-    what = f"**{what}**, {say('since', time=time_text(event.since))}"
-    advice = f"**{_plain(event.advice)}**" if event.advice else ""
-    return "  \n".join(filter(None, [what, _plain(f"{event.text}{sure}"), advice]))
+    what = f"## {what}\n{say('since', time=time_text(event.since))}"
+    advice = f"**{say('what_to_do')}: {_plain(event.advice)}**" if event.advice else ""
+    return "  \n".join(filter(None, [what, advice, _plain(f"{event.text}{sure}")]))
 
 
 def _plain(text: str) -> str:
@@ -58,16 +73,20 @@ def _plain(text: str) -> str:
 
 def report_text(document: ReportDocument) -> str:
     """Return the report as tables in Markdown."""
-    rows = [f"# {document.machine} at {document.site}", ""]
+    texts = texts_in("en" if document.health is None else document.health.language)
+    rows = [f"# {document.machine}, {document.site}", ""]
     rows += [] if document.health is None else [headline(document.health), ""]
-    rows += ["| parameter | value | status |", "|---|---|---|"]
+    say, columns = texts.translated, "| {} | {} | {} |\n|---|---|---|"
+    rows += [columns.format(say("parameter"), say("value"), say("status"))]
     rows += [
-        f"| {name} | {value_text(parameter)} | {parameter.status} {parameter.reason} |"
+        f"| {name} | {say(value_text(parameter))} | {say(parameter.status)} {parameter.reason} |"
         for name, parameter in document.parameters.items()
     ]
     if document.components:
-        rows += ["", "| component | equation | status |", "|---|---|---|"]
-        rows += [f"| {row.meaning} | {row.equation} | {row.status} {row.approval} |" for row in document.components]
+        rows += ["", columns.format(say("component"), say("equation"), say("status"))]
+        rows += [
+            f"| {row.meaning} | {row.equation} | {say(row.status)} {say(row.approval)} |" for row in document.components
+        ]
     rows += [f"\n{event_text(event)}" for event in document.events if event.end is None]
     return "\n".join(rows)
 
@@ -88,42 +107,48 @@ def _operator(source: RecordedMachine) -> rrb.Container:
         link="Independent",
         view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite()),
     )
+    texts = source.plan.texts
+    say = texts.translated
     estimates = [
         rrb.TimeSeriesView(
             contents=[f"/parameters/{row.name}", f"/limits/{row.name}"],
-            name=f"{row.meaning} {row.name} [{row.unit}] with 95 % interval, nominal value and limits",
+            name=f"{row.name} [{row.unit}]: {say(row.meaning)}",
             axis_x=whole,
             plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
         )
         for row in source.parameters
     ]
     estimates.append(
-        rrb.TimeSeriesView(origin="/components", name="what the twin lacked: amplitudes", axis_x=whole),
+        rrb.TimeSeriesView(origin="/components", name=texts("components"), axis_x=whole),
     )
     columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     return rrb.Vertical(
         rrb.Horizontal(
-            rrb.TextDocumentView(origin="/operator", name=f"{source.title}: what matters now"),
-            rrb.StateTimelineView(origin="/state", name="state over time", time_view=whole),
+            rrb.TextDocumentView(origin="/operator", name=source.title),
+            rrb.StateTimelineView(origin="/state", name=texts("state_over_time"), time_view=whole),
             column_shares=[1, 1],
         ),
         rrb.Grid(*estimates),
-        rrb.TextLogView(origin="/events", name="events, on change only", columns=columns),
-        row_shares=[5, 4, 2],
-        name="state",
+        rrb.TextLogView(origin="/events", name=texts("events"), columns=columns),
+        row_shares=[6, 4, 2],
+        name=texts("state"),
     )
 
 
 def _engineer(source: RecordedMachine) -> rrb.Container:
     """Curves of signals and twin, residuals, the report and the log."""
-    series, twin = rrb.TimeSeriesView, source.twin
+    series, twin, texts = rrb.TimeSeriesView, source.twin, source.plan.texts
+    say = texts.translated
     outputs = [
-        series(origin=f"/signals/{row.name}", name=f"{row.meaning} [{row.unit}]: measured and twin")
+        series(origin=f"/signals/{row.name}", name=f"{say(row.meaning)} [{row.unit}]: {texts('measured_and_twin')}")
         for row in twin.outputs
     ]
-    inputs = [series(origin=f"/signals/{row.name}", name=f"{row.meaning} [{row.unit}]") for row in twin.inputs]
-    residual = series(origin="/residual", name="root mean square of the residuals in units of the noise")
-    texts = rrb.TextDocumentView(origin="/report", name="report"), rrb.TextLogView(origin="/log", name="log")
+    inputs = [series(origin=f"/signals/{row.name}", name=f"{say(row.meaning)} [{row.unit}]") for row in twin.inputs]
+    residual = series(origin="/residual", name=texts("residuals"))
+    words = (
+        rrb.TextDocumentView(origin="/report", name=texts("report")),
+        rrb.TextLogView(origin="/log", name=texts("log")),
+    )
     return rrb.Horizontal(
-        rrb.Vertical(*outputs, *inputs, residual), rrb.Vertical(*texts), column_shares=[3, 2], name="curves"
+        rrb.Vertical(*outputs, *inputs, residual), rrb.Vertical(*words), column_shares=[3, 2], name=texts("curves")
     )

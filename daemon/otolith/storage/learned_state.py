@@ -20,8 +20,8 @@ from otolith.estimation.augmented import augment, indices
 from otolith.estimation.imm_filter import (
     HIGHEST_LEVEL,
     MAX_VARIANCE_RATIO,
-    CumulativeShifts,
     ImmPosterior,
+    ParameterCusum,
     moment_match,
 )
 from otolith.estimation.posterior import PhaseAdvance, Posterior
@@ -66,7 +66,7 @@ class FilterRecord(StrictModel):
     steps: tuple[float, ...] = ()
     """See :attr:`otolith.estimation.problem.Problem.steps`."""
     shifts: tuple[tuple[float, ...], ...] = ()
-    """See :attr:`CumulativeShifts.sums`; empty for none."""
+    """See :attr:`ParameterCusum.sums`; empty for none."""
     previous: tuple[PreviousStatus, ...]
     records: int
     learned: int
@@ -292,13 +292,13 @@ def _posterior(record: FilterRecord, problem: Problem) -> Posterior:
     return Posterior(problem, belief, phase)
 
 
-def _shifts(record: FilterRecord) -> CumulativeShifts:
+def _shifts(record: FilterRecord) -> ParameterCusum:
     """Return the cumulative shifts of a record, checked."""
     if not record.shifts:
-        return CumulativeShifts()
+        return ParameterCusum()
     sums = np.array(record.shifts)
     _require(sums.shape == (2, len(record.labels)) and float(sums.min()) >= 0.0, "shifts: not plausible")
-    return CumulativeShifts(sums)
+    return ParameterCusum(sums)
 
 
 def _check_covariance(covariance: Array) -> None:

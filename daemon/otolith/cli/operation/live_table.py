@@ -14,10 +14,10 @@ from rich.text import Text
 from otolith.acquisition.window import Verdict
 from otolith.cli.common import local_time
 from otolith.health.diagnosis import FindingKind
-from otolith.health.language import texts_in
+from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
-from otolith.health.text import event_text, forecast_text, headline, interval_text, value_cells
+from otolith.health.text import event_text, forecast_text, headline, interval_text, state_word, value_cells
 
 HISTORY = 200  # windows that the curve of a parameter can show
 OTHER_COLUMNS = 72  # characters that the table needs beside the curve
@@ -48,15 +48,16 @@ class _Machine:
     def draw(self, state: str, width: int, *, in_short: bool) -> list[RenderableType]:
         """Return its lines and tables; ``in_short`` without components, messages and counters."""
         document, silence = self.document, time.monotonic() - self.received
+        texts = texts_of(document)
         parts: list[RenderableType] = []
         if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
-            parts.append(Text(f"no report for {silence:.0f} s: {state}", style="bold red"))
-        table = _parameters(document.parameters, self.histories, width)
+            parts.append(Text(f"{texts('no_report_for', seconds=f'{silence:.0f}')}: {state}", style="bold red"))
+        table = _parameters(document.parameters, self.histories, width, texts)
         if in_short:
             return [title(document), *parts, *state_lines(document), table, Text()]
-        parts += [*state_lines(document), *_title_lines(document), table]
-        parts += [_components(document, width)] if document.components else []
-        return [*parts, *_messages(document), *_counters(document)]
+        parts += [*state_lines(document), *_title_lines(document, texts), table]
+        parts += [_components(document, width, texts)] if document.components else []
+        return [*parts, *_messages(document, texts), *_counters(document, texts)]
 
 
 class LiveTable:
@@ -104,9 +105,14 @@ class LiveTable:
         return Group(*parts) if parts else Text(state, style="dim")
 
 
+def texts_of(document: ReportDocument) -> Texts:
+    """The texts in the language of a report."""
+    return texts_in("en" if document.health is None else document.health.language)
+
+
 def title(document: ReportDocument, rest: str = "") -> Text:
     """The machine of a report, its site, twin and model."""
-    text = f" at {document.site}, twin {document.twin} ({document.model}){rest}"
+    text = f" ({document.site}): {document.twin} ({document.model}){rest}"
     return Text.assemble((document.machine, "bold"), text)
 
 
@@ -123,13 +129,13 @@ def state_lines(document: ReportDocument) -> list[Text]:
     parts = Text()
     say = texts_in(health.language).translated
     for name, part in health.parts.items():
-        parts.append(f"{say(name)} ").append(say(part.state), style=LEVEL_STYLES[part.state]).append("  ")
+        parts.append(f"{say(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
     current = [event for event in document.events if event.end is None]
     events = [Text(event_text(event, local_time), style=event_style(event)) for event in current]
     return [Text(headline(health, local_time), style=LEVEL_STYLES[health.state]), parts, *events]
 
 
-def parameter_table(*columns: str, width: int) -> Table:
+def parameter_table(*columns: str, width: int, texts: Texts | None = None) -> Table:
     """A table of parameters: the columns of :func:`value_cells`, then ``columns``; status counts are numbers.
 
     In a narrow terminal words are folded first, as a truncated number would be a wrong one.
@@ -138,7 +144,8 @@ def parameter_table(*columns: str, width: int) -> Table:
     for column in (*VALUE_COLUMNS, *columns):
         right, whole = column in RIGHT or column in set(Status), column in (*RIGHT, "history")
         overflow: OverflowMethod = "ellipsis" if whole else "fold"
-        table.add_column(column, justify="right" if right else "left", no_wrap=whole, overflow=overflow)
+        heading = texts.translated(column) if texts else column
+        table.add_column(heading, justify="right" if right else "left", no_wrap=whole, overflow=overflow)
     return table
 
 
@@ -147,79 +154,80 @@ def _table(width: int) -> Table:
     return Table(box=box.HEAVY_HEAD if has_lines else None, pad_edge=has_lines, collapse_padding=not has_lines)
 
 
-def _title_lines(document: ReportDocument) -> list[Text]:
+def _title_lines(document: ReportDocument, texts: Texts) -> list[Text]:
     window, quality = document.window, document.window.quality
-    line = Text(f"window {window.index} ")
-    line.append(quality.verdict, style="green" if quality.verdict is Verdict.GOOD else "red")
-    line.append(f", {window.records} records, {quality.missing:.1%} missing, jitter {quality.jitter_s * 1e3:.1f} ms")
+    line = Text(f"{texts('window')} {window.index} ")
+    line.append(texts.translated(quality.verdict), style="green" if quality.verdict is Verdict.GOOD else "red")
+    numbers = {"missing": f"{quality.missing:.1%}", "jitter": f"{quality.jitter_s * 1e3:.1f}"}
+    line.append(f", {texts('sampling', records=window.records, **numbers)}")
     if document.fit is not None and document.cost.seconds is not None:
         line.append(f", {document.cost.seconds * 1e3:.0f} ms")
     return [title(document), line]
 
 
 def _parameters(
-    parameters: Mapping[str, ParameterDocument], histories: Mapping[str, deque[float]], width: int
+    parameters: Mapping[str, ParameterDocument], histories: Mapping[str, deque[float]], width: int, texts: Texts
 ) -> Table:
     length = width - OTHER_COLUMNS
     curve = ("history",) if length > len("history") else ()  # below, numbers need the room
-    table = parameter_table("status", *curve, width=width)
+    table = parameter_table("status", *curve, width=width, texts=texts)
     for name, parameter in parameters.items():
-        status = Text(parameter.status, style=STYLES[parameter.status])
+        status = Text(texts.translated(parameter.status), style=STYLES[parameter.status])
         cells = [sparkline(tuple(histories.get(name, ()))[-length:]) for _ in curve]
-        table.add_row(name, *value_cells(parameter), status, *cells)
+        table.add_row(name, *map(texts.translated, value_cells(parameter)), status, *cells)
     return table
 
 
-def _components(document: ReportDocument, width: int) -> Table:
-    table = _table(width)
-    for column in ("component", "equation", "amplitude ± 95 %", "since", "status"):
-        table.add_column(column, overflow="fold")  # a truncated equation would be a wrong one
+def _components(document: ReportDocument, width: int, texts: Texts) -> Table:
+    table, say = _table(width), texts.translated
+    for column in ("component", "equation", "amplitude", "since", "status"):
+        table.add_column(say(column), overflow="fold")  # a truncated equation would be a wrong one
     for component in document.components:
         amplitude = component.values["amplitude"]
         text = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
-        status = f"{component.status}, {component.approval}"
+        status = f"{say(component.status)}, {say(component.approval)}"
         table.add_row(component.meaning, component.equation, text, local_time(component.onset), status)
     return table
 
 
-def _messages(document: ReportDocument) -> list[Text]:
+def _messages(document: ReportDocument, texts: Texts) -> list[Text]:
     """Reasons, advice, open tests, and how well the twin explains the window."""
     bad = document.window.quality.reasons
-    lines = [Text(f"bad window: {reason}", style="red") for reason in bad]
+    lines = [Text(f"{texts('bad_window')}: {reason}", style="red") for reason in bad]
     for name, parameter in document.parameters.items():
-        language = "en" if document.health is None else document.health.language
-        if expected := forecast_text(parameter, document.window.end, language):
+        if expected := forecast_text(parameter, document.window.end, texts.language):
             lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
         if parameter.reason and not bad:
             lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
         if parameter.advice:
             lines.append(Text(f"{name}: {parameter.advice}", style="cyan"))
     for finding in (finding for finding in document.findings if finding.kind is FindingKind.OPEN):
-        lines.append(Text(f"not yet decided: {finding.text}", style="magenta"))
+        lines.append(Text(f"{texts('open_test')}: {finding.text}", style="magenta"))
         if finding.advice:
             lines.append(Text(f"  {finding.advice}", style="cyan"))
     if document.fit is not None:
         errors = ", ".join(f"{name} {value:.3g}" for name, value in document.fit.rmse_estimated.items())
-        explained = "explained up to the noise" if document.fit.explained else "larger than the noise"
-        lines.append(Text(f"residual (RMSE): {errors}: {explained}"))
+        explained = texts("explained" if document.fit.explained else "unexplained")
+        lines.append(Text(f"{texts('residual', errors=errors)}: {explained}"))
     return lines
 
 
-def _counters(document: ReportDocument) -> list[Text]:
-    lines = _driver(document.driver) if document.driver is not None else []
+def _counters(document: ReportDocument, texts: Texts) -> list[Text]:
+    lines = _driver(document.driver, texts("source")) if document.driver is not None else []
     if (counters := document.counters) is not None:
-        windows = f"windows: {counters.windows}, bad {counters.windows_bad}, missed {counters.windows_missed}"
-        restarts = f"worker restarts {counters.worker_restarts}, bus reconnects {counters.reconnects}"
-        samples = f"samples: {counters.received}, lost {counters.lost}, bad {counters.bad}"
-        lines += [Text(samples, style="dim"), Text(f"{windows}; {restarts}", style="dim")]
+        samples = texts("samples_counted", received=counters.received, lost=counters.lost, bad=counters.bad)
+        restarts = {"restarts": counters.worker_restarts, "reconnects": counters.reconnects}
+        bad, missed = counters.windows_bad, counters.windows_missed
+        windows = texts("windows_counted", windows=counters.windows, bad=bad, missed=missed, **restarts)
+        lines += [Text(samples, style="dim"), Text(windows, style="dim")]
     return lines
 
 
-def _driver(driver: DriverDocument) -> list[Text]:
-    lines = [Text(f"driver: {warning}", style="yellow") for warning in driver.warnings]
+def _driver(driver: DriverDocument, word: str) -> list[Text]:
+    lines = [Text(f"{word}: {warning}", style="yellow") for warning in driver.warnings]
     if not driver.up:
-        return [*lines, Text(f"driver: {driver.reason}", style="bold red")]
-    return [*lines, Text(f"driver: {driver.plan}", style="dim")] if driver.plan else lines
+        return [*lines, Text(f"{word}: {driver.reason}", style="bold red")]
+    return [*lines, Text(f"{word}: {driver.plan}", style="dim")] if driver.plan else lines
 
 
 def sparkline(values: tuple[float, ...]) -> str:
