@@ -182,7 +182,7 @@ def test_values_come_signed_and_encrypted(secure: int, folder: Path) -> None:
 
 
 def test_a_certificate_of_another_host_is_a_warning(secure: int, folder: Path) -> None:
-    keys = {"server_certificate": None, "endpoint": f"opc.tcp://localhost:{secure}/motor"}
+    keys: dict[str, Any] = {"server_certificate": None, "endpoint": f"opc.tcp://localhost:{secure}/motor"}
     with opened(secure, folder, **keys_of(folder, **keys)) as (driver, _):
         wait_for(lambda: driver.link().up)
         assert "the server's certificate is of 127.0.0.1 instead of localhost" in driver.link().warnings[0]
