@@ -2,11 +2,12 @@
 
 import logging
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sampling, SourceState, sampling_of
-from otolith_drivers.common.reconnection import ReconnectBackoff, ThreadedDriver
+from otolith_drivers.common.reconnection import CLOSE_TIMEOUT, ReconnectBackoff, ThreadedDriver
 from otolith_drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
@@ -62,6 +63,8 @@ class SeveralSources(ThreadedDriver):
             self._faults[source.name] = str(error) if is_known else f"{type(error).__name__}: {error}"
         else:
             self._faults.pop(source.name, None)
+            if self._stop.is_set():  # it was closed while it opened
+                source.driver.close()
 
     def _open_the_rest(self, deliver: Deliver) -> None:
         backoff, logged = ReconnectBackoff(), dict[str, str]()
@@ -78,12 +81,14 @@ class SeveralSources(ThreadedDriver):
 
     def close(self) -> None:
         """See :meth:`otolith_drivers.base.Driver.close`; all drivers close at the same time."""
-        super().close()
-        threads = [threading.Thread(target=source.driver.close, name="close") for source in self._sources]
+        self._stop.set()
+        closing = [super().close, *(source.driver.close for source in self._sources)]
+        threads = [threading.Thread(target=close, name="close", daemon=True) for close in closing]
         for thread in threads:
             thread.start()
+        deadline = time.monotonic() + CLOSE_TIMEOUT
         for thread in threads:
-            thread.join()
+            thread.join(max(0.0, deadline - time.monotonic()))
 
     def counters(self) -> Counters:
         """Return the sums over all drivers."""

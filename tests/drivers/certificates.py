@@ -10,8 +10,11 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 
-def certificate(folder: Path, name: str) -> tuple[Path, Path]:
-    """Write a certificate (DER) of 127.0.0.1 and of ``urn:NAME``, and its key (PEM); return their paths."""
+def certificate(folder: Path, name: str, *, until: timedelta = timedelta(days=1)) -> tuple[Path, Path]:
+    """Write a certificate (DER) of 127.0.0.1 and of ``urn:NAME``, and its key (PEM); return their paths.
+
+    It is valid ``until`` so long from now.
+    """
     key = rsa.generate_private_key(65537, 2048)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     names = [x509.UniformResourceIdentifier(f"urn:{name}"), x509.IPAddress(ip_address("127.0.0.1"))]
@@ -21,7 +24,7 @@ def certificate(folder: Path, name: str) -> tuple[Path, Path]:
     made = (
         x509.CertificateBuilder(subject, subject, key.public_key(), x509.random_serial_number())
         .not_valid_before(now - timedelta(days=1))
-        .not_valid_after(now + timedelta(days=1))
+        .not_valid_after(now + until)
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=False)
         .add_extension(usage, critical=True)

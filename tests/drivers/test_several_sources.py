@@ -1,5 +1,7 @@
 """Several drivers as one: the contract of every driver, and what one source that is down changes."""
 
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -67,6 +69,30 @@ def test_one_source_down_is_a_warning_and_both_down_is_a_lost_connection() -> No
     link = both(DOWN, DOWN)[0].link()
     assert not link.up
     assert link.reason == "source 'drive' is down: connection refused; source 'encoder' is down: connection refused"
+
+
+@pytest.mark.timed
+def test_sources_that_hang_while_they_open_or_close_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    sources, (one, two) = both(UP, DOWN, fault="no such interface")
+    opening, held = threading.Event(), threading.Event()
+
+    def hang_in_open(_: Deliver) -> None:
+        opening.set()
+        held.wait(PATIENCE)
+
+    def hang_in_close() -> None:
+        held.wait(PATIENCE)
+
+    sources.open(lambda _: None)
+    monkeypatch.setattr(two, "open", hang_in_open)
+    monkeypatch.setattr(one, "close", hang_in_close)
+    assert opening.wait(PATIENCE)
+    begun = time.monotonic()
+    sources.close()
+    took = time.monotonic() - begun
+    held.set()
+    wait_for(lambda: two.calls[-2:] == ["close", "close"])  # at once, and again when it is open
+    assert took < within(1.0)
 
 
 def test_counters_are_summed_and_kept_for_each_source() -> None:

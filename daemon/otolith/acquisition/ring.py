@@ -46,7 +46,10 @@ class Ring:
         self._times[slot] = time
         self._values[slot] = value
         self._count += 1
-        self._note_order(time < self._newest, time)
+        if time < self._newest:
+            self._unordered_until = self._count
+        else:
+            self._newest = time
 
     def extend(self, times: Array, values: Array) -> None:
         """Add many samples (s, value) at once, with the same result as :meth:`append` for each."""
@@ -59,13 +62,9 @@ class Ring:
             self._times[slots % capacity] = times[part]
             self._values[slots % capacity] = values[part]
             self._count += len(slots)
-            back = bool((times[part] < np.maximum.accumulate(np.maximum(times[part], self._newest))).any())
-            self._note_order(back, float(times[part].max()))
-
-    def _note_order(self, stepped_back: bool, newest: float) -> None:
-        if stepped_back:
-            self._unordered_until = self._count
-        self._newest = max(self._newest, newest)
+            if (times[part] < np.maximum.accumulate(np.maximum(times[part], self._newest))).any():
+                self._unordered_until = self._count
+            self._newest = max(self._newest, float(times[part].max()))
 
     def around(self, start: float, end: float, read_until: float) -> tuple[Array, Array]:
         """Return times (s) and values with ``start <= time < end``, sorted by time, and the last finite one before.
@@ -116,13 +115,13 @@ class Rings:
     def deliver(self, samples: Sequence[Sample]) -> None:
         """Take the samples of a driver; called from the driver's thread."""
         with self._lock:
-            for sample in samples:
-                ring = self._rings.get(sample.signal)
+            for signal, time, value in samples:
+                ring = self._rings.get(signal)
                 if ring is None:
                     self._unknown += 1
                 else:
-                    ring.append(sample.time, sample.value)
-                    self._received += math.isfinite(sample.value)
+                    ring.append(time, value)
+                    self._received += math.isfinite(value)
 
     def deliver_columns(self, columns: Mapping[str, tuple[Array, Array]]) -> None:
         """Take many samples at once: times (s) and values of each signal, in the order of their arrival."""

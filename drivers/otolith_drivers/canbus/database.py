@@ -34,6 +34,7 @@ LENGTHS = re.compile(
     r"\b(?:un)?signed\s+|<(?:[\w-]*LENGTH|START-POSITION)>\s*)(\d+)",
     re.MULTILINE,
 )
+SYM_PLACES = re.compile(r"^\s*(?:Mux|Var|Sig)\s*=[^/\n]*?\s(\d+)\s*(?:,\s*(\d+)|-|/|$)", re.MULTILINE)
 MULTIPLEXERS = re.compile(r"\bSG_MUL_VAL_\s[^;]*;")
 RANGES = re.compile(r"\b(\d+)\s*-\s*(\d+)\s*[,;]")
 IDENTIFIERS = re.compile(r"^\s*ID\s*=\s*([0-9A-Fa-f]+)h\s*-\s*([0-9A-Fa-f]+)h", re.MULTILINE)
@@ -146,7 +147,8 @@ def _excess(text: str) -> str:
         return "it contains zero bytes"
     if text.lstrip().startswith("<") and re.search(r"<!(?:DOCTYPE|ENTITY)", text):
         return "it defines XML entities, which no database needs"
-    if any(len(match[1]) > 5 or int(match[1]) > 8 * MAX_MESSAGE_LENGTH for match in LENGTHS.finditer(text)):
+    numbers = {*LENGTHS.findall(text), *(number for pair in SYM_PLACES.findall(text) for number in pair if number)}
+    if any(len(number) > 5 or int(number) > 8 * MAX_MESSAGE_LENGTH for number in numbers):
         return f"it has a length or a start beyond {MAX_MESSAGE_LENGTH} bytes"
     if any(_is_long(match, 10) for line in MULTIPLEXERS.findall(text) for match in RANGES.finditer(line)):
         return f"it has a multiplexer of more than {MAX_RANGE} values"
@@ -222,6 +224,8 @@ def _why_unusable(message: Message) -> str:
     """What the formats allow to be absent although the decoder needs it; empty if nothing is."""
     if not isinstance(message.name, str) or not isinstance(message.frame_id, int) or message.frame_id < 0:
         return "it has no name or no arbitration ID"
+    if message.length < 0:
+        return f"it has {message.length} bytes"
     if any(not isinstance(signal.name, str) or signal.start < 0 for signal in message.signals):
         return "one of its signals has no name or no place"
     return ""
@@ -247,18 +251,29 @@ def _multiplexed_places(text: str) -> set[tuple[int, int, int]]:
 
 
 def _multiplexer_faults(message: Message, multiplexed: set[tuple[int, int, int]]) -> list[DatabaseFault]:
-    """Multiplexed signals whose multiplexer is not in ``message``, such as one whose name is cut short."""
-    names = {signal.name for signal in message.signals}
+    """Multiplexed signals whose multiplexer, or one that this depends on, is not in ``message``, or is cut short."""
+    signals = {signal.name: signal for signal in message.signals}
+
+    def missing(signal: CanSignal) -> str:
+        """Return the multiplexer that is missing; empty if none is."""
+        for _ in signals:
+            name = signal.multiplexer_signal
+            if name is None:
+                place = (message.frame_id, signal.start, signal.length)
+                return "a signal without a name" if place in multiplexed else ""
+            if name not in signals:
+                return name or "a signal without a name"
+            signal = signals[name]
+        return ""  # they depend on each other in a circle
+
     return [
         DatabaseFault(
-            f"{message.name}.{signal.name} is multiplexed by {signal.multiplexer_signal or 'a signal without a name'}, "
-            "which the message does not have",
+            f"{message.name}.{signal.name} is multiplexed by {name}, which the message does not have",
             message.name,
             signal.name,
         )
         for signal in message.signals
-        if signal.multiplexer_signal not in names
-        and (signal.multiplexer_signal is not None or (message.frame_id, signal.start, signal.length) in multiplexed)
+        if (name := missing(signal))
     ]
 
 

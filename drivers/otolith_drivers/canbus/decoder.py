@@ -51,6 +51,7 @@ NO_SAMPLES: list[Sample] = []
 EXTENDED = 1 << 29  # added to an extended arbitration ID, so that it differs from the same standard one
 MIN_WAIT, WAIT_PERIODS = 3.0, 10.0  # s; periods: when a message is reported that has not come once
 GROUP_WAIT_PERIODS = 100.0  # periods of the message: the same for the signals of one multiplexer value
+MAX_CYCLE_TIME = 86_400_000  # ms; a longer one in a database is no cycle time
 MAX_WARNINGS = 20  # lines about the files; more of them do not help
 
 Condition = tuple[tuple[RawReader, frozenset[int]], ...]
@@ -99,7 +100,7 @@ class MessageReader:
         self._lost = 0
         self._counter, self._checksum, self._declared_period = rules.counter, rules.checksum, rules.period
         self._length = max(rules.length, *(message.length for message in messages))
-        self._database_period = max((message.cycle_time or 0) * 1e-3 for message in messages)
+        self._database_period = max(min(message.cycle_time or 0, MAX_CYCLE_TIME) * 1e-3 for message in messages)
         self._rows: list[Row] = []
         self._groups: dict[tuple[object, ...], _MultiplexedGroup] = {}
         self._rejections: defaultdict[str, PassingFault] = defaultdict(PassingFault)

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 
 MAX_DRIFT = 2e-4  # s per s between two clocks, beyond the 1e-4 of two quartz oscillators
 BLOCK = 10.0  # s; the fastest message of the last one or two of these gives the offset of a clock that is not asked
+SET_BACK = 2.0  # s; for which a clock that is not asked must be behind to count as one that was set back
 
 
 def unix_time(moment: datetime) -> float:
@@ -68,24 +69,34 @@ class ArrivalClock:
     def __init__(self) -> None:
         self._begun, self._least, self._previous = -math.inf, math.inf, math.inf
         self._ahead = math.nan
+        self._late_since, self._late = math.inf, math.inf
 
     def arrival(self, stamp: float, received: float, most: float) -> bool:
         """Take a message of the remote time ``stamp`` (s) that came at the local time ``received`` (s).
 
         Return False, and do not use it, if it is more than ``most`` s ahead of all others and the message before it was
-        not ahead by as much: one wrong time would make all that follow old.
+        not ahead by as much: one wrong time would make all that follow old. If all messages of ``SET_BACK`` s are
+        behind the others by more than ``most``, only they count: the clock was set back, or the others were wrong.
         """
         if received - self._begun >= BLOCK:
-            fresh = received - self._begun < 2.0 * BLOCK
-            self._begun, self._previous = received, self._least if fresh else math.inf
-            self._least = math.inf
+            self._begin(received, self._least if received - self._begun < 2.0 * BLOCK else math.inf)
         offset = received - stamp
         known, before = self.offset, self._ahead
         self._ahead = offset
         if math.isfinite(known) and known - offset > most and not abs(offset - before) <= most:
             return False
         self._least = min(self._least, offset)
+        if offset - known <= most:
+            self._late_since, self._late = math.inf, math.inf
+            return True
+        self._late_since, self._late = min(self._late_since, received), min(self._late, offset)
+        if received - self._late_since > SET_BACK:
+            self._begin(received, self._late)
         return True
+
+    def _begin(self, now: float, previous: float) -> None:
+        """Begin a block at ``now`` (s), which follows one whose least offset was ``previous`` (s)."""
+        self._begun, self._least, self._previous = now, math.inf, previous
 
     @property
     def offset(self) -> float:

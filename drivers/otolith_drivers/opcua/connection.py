@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 from urllib.parse import urlsplit
@@ -31,7 +32,7 @@ MODES = {"sign": ua.MessageSecurityMode.Sign, "sign and encrypt": ua.MessageSecu
 REFUSALS = {
     "certificate": (
         "BadCertificateUntrusted", "BadSecurityChecksFailed", "BadCertificateInvalid", "BadCertificateUriInvalid",
-        "BadCertificateTimeInvalid", "BadCertificateUseNotAllowed", "BadCertificateChainIncomplete",
+        "BadCertificateUseNotAllowed", "BadCertificateChainIncomplete",
     ),
     "user": ("BadIdentityTokenRejected", "BadIdentityTokenInvalid", "BadUserAccessDenied"),
 }  # fmt: skip
@@ -124,21 +125,23 @@ class RefusedError(Exception):
 
 
 @asynccontextmanager
-async def connected(options: OpcuaOptions, credentials: OpcUaCredentials) -> AsyncIterator[Client]:
-    """Yield a client with a session, and end both.
+async def connected(options: OpcuaOptions, credentials: OpcUaCredentials) -> AsyncIterator[tuple[Client, list[str]]]:
+    """Yield a client with a session and what is wrong with the server's certificate, a line each; end both.
 
     Raises:
         RefusedError: the server refuses the certificate, the user or the security policy, or its certificate is wrong.
     """
-    client = Client(options.endpoint, timeout=options.timeout)
+    client, warnings = Client(options.endpoint, timeout=options.timeout), list[str]()
     if options.user is not None:
         client.set_user(options.user)
         client.set_password(credentials.password)
     try:
         if credentials.certificate is not None:
-            await _secure(client, options, credentials)
+            presented = await _secure(client, options, credentials)
+            host = str(urlsplit(options.endpoint).hostname) if credentials.server is None else None
+            warnings = certificate_warnings(presented, host, datetime.now(UTC))
         await client.connect()
-        yield client
+        yield client, warnings
     except ua.UaError as error:
         raise RefusedError(_cause(error, options)) from error
     finally:
@@ -158,8 +161,8 @@ async def _end(client: Client) -> None:
         await client.disconnect()
 
 
-async def _secure(client: Client, options: OpcuaOptions, credentials: OpcUaCredentials) -> None:
-    """Set the security policy with the certificate that the server presents.
+async def _secure(client: Client, options: OpcuaOptions, credentials: OpcUaCredentials) -> x509.Certificate:
+    """Set the security policy with the certificate that the server presents, and return that.
 
     Raises:
         RefusedError: the server has not the policy, or not the certificate that the machine file names.
@@ -189,11 +192,31 @@ async def _secure(client: Client, options: OpcuaOptions, credentials: OpcUaCrede
         client.application_uri = (*names.get_values_for_type(x509.UniformResourceIdentifier), client.application_uri)[0]
     client.security_policy = policy(presented, own, credentials.key, MODES[options.mode])
     client.uaclient.set_security(client.security_policy)
+    return presented
+
+
+def certificate_warnings(presented: x509.Certificate, host: str | None, now: datetime) -> list[str]:
+    """Return what is wrong with a server's certificate at ``now``, a line each; ``host`` is None if any may have it.
+
+    Both are warnings: a plant goes on when a certificate expires, and many controllers have one of another name.
+    """
+    begin, end = presented.not_valid_before_utc, presented.not_valid_after_utc
+    lines = []
+    if not begin <= now <= end:
+        lines.append(f"the server's certificate is valid from {begin:%Y-%m-%d} to {end:%Y-%m-%d} only: renew it")
+    with suppress(x509.ExtensionNotFound):
+        names = presented.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        hosts = [*names.get_values_for_type(x509.DNSName), *map(str, names.get_values_for_type(x509.IPAddress))]
+        if host is not None and hosts and host.lower() not in map(str.lower, hosts):
+            lines.append(f"the server's certificate is of {', '.join(hosts)} instead of {host}: set server_certificate")
+    return lines
 
 
 def _cause(error: ua.UaError, options: OpcuaOptions) -> str:
     """Return why the server refuses, and what to do."""
     name = type(error).__name__
+    if name == "BadCertificateTimeInvalid":
+        return f"the server takes the certificate {options.certificate} as expired: renew it, or set the server's clock"
     if name in REFUSALS["certificate"]:
         return f"the server refuses the certificate {options.certificate} ({name}): let the server trust it"
     if name in REFUSALS["user"]:

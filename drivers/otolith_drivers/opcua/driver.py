@@ -70,7 +70,8 @@ class OpcuaSubscriber(ThreadedDriver):
         self._connection = Reconnection(f"OPC UA {options.endpoint}", log)
         self._latest = -math.inf  # s; time of the latest message
         self._slow = ""  # what the server grants less than was asked
-        self._ended = ""  # why the server has ended the subscription
+        self._ended = ""  # why the subscription has ended
+        self._certificate_warnings: list[str] = []
         self._ahead = math.nan  # s; the server's clock minus this computer's
         self._interval = options.interval  # s between two messages
         self._clocks_due = 0.0  # s; when they are compared again
@@ -97,7 +98,7 @@ class OpcuaSubscriber(ThreadedDriver):
     def link(self) -> Link:
         """See :meth:`otolith_drivers.base.Driver.link`."""
         readings, connection, now = self._readings, self._connection, time.monotonic()
-        lines = [line for node in readings.signals for line in node.warnings(now)]
+        lines = self._certificate_warnings + [line for node in readings.signals for line in node.warnings(now)]
         if readings.server_stamped:
             lines.append(f"{readings.server_stamped} values without a source time stamp have that of the server")
         plan = ""
@@ -136,7 +137,8 @@ class OpcuaSubscriber(ThreadedDriver):
 
     async def _session(self, deliver: Deliver) -> None:
         """Subscribe and take values until the connection fails, which raises."""
-        async with connected(self._options, self._credentials) as client:
+        async with connected(self._options, self._credentials) as (client, self._certificate_warnings):
+            client.connection_lost_callback = self._note_loss
             for _ in range(FIRST_EXCHANGES):
                 await self._compare_clocks(client)
             await self._look_up(client)
@@ -151,6 +153,10 @@ class OpcuaSubscriber(ThreadedDriver):
                     raise ConnectionError(f"no message of the subscription for {now - self._latest:.1f} s")
                 if now >= self._clocks_due:
                     await self._compare_clocks(client)
+
+    async def _note_loss(self, error: Exception) -> None:
+        """Take the cause from the library, which after this presents a lost connection as an ended subscription."""
+        self._ended = "the server does not answer" if isinstance(error, TimeoutError) else "the connection was closed"
 
     async def _compare_clocks(self, client: Client) -> None:
         await exchange(client, self._readings.clock)
@@ -238,7 +244,7 @@ class OpcuaSubscriber(ThreadedDriver):
         values: list[tuple[int, Any]] = []
         for part in message.NotificationData or ():
             if isinstance(part, ua.StatusChangeNotification):
-                self._ended = f"the server has ended the subscription: {part.Status.name}"
+                self._ended = self._ended or f"the server has ended the subscription: {part.Status.name}"
             elif isinstance(part, ua.DataChangeNotification):
                 values += [(item.ClientHandle, item.Value) for item in part.MonitoredItems]
         if not readings.clock.arrival(unix_time(message.PublishTime), now):  # the server's clock was set

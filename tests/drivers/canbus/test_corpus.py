@@ -25,7 +25,7 @@ from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.drivers.can_frames import decoder, frame
 
-SUFFIXES = {".dbc", ".kcd", ".sym", ".eds", ".dcf"}
+SUFFIXES = {".dbc", ".kcd", ".sym", ".arxml", ".eds", ".dcf"}
 FRAMES = 12  # of each message
 
 

@@ -89,6 +89,8 @@ def test_excessive_numbers_are_refused_before_parsing(tmp_path: Path, text: str,
             '<NetworkDefinition><Bus name="b"><Message id="1" name="m" length="99999999"/></Bus></NetworkDefinition>',
         ),
         ("bomb.sym", 'FormatVersion=6.0\nTitle="x"\n\n{SEND}\n\n[M]\nID=000h-1FFFFFFFh\nLen=8\n'),
+        ("bomb.sym", 'FormatVersion=6.0\nTitle="x"\n\n{SEND}\n\n[M]\nID=100h\nLen=8\nMux=X 0,2147483648 002Ah\n'),
+        ("bomb.sym", 'FormatVersion=6.0\nTitle="x"\n\n{SEND}\n\n[M]\nID=100h\nLen=8\nVar=X unsigned 2147483648,8\n'),
     ],
 )
 def test_memory_bombs_in_other_formats_are_refused(tmp_path: Path, name: str, text: str) -> None:

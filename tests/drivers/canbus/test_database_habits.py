@@ -18,6 +18,7 @@ CUT = dbc(
     NESTED,
     after="SG_MUL_VAL_ 258 InnerMultiplexer VeryLongNameOfTheOuterMul 0-0;\n\nSG_MUL_VAL_ 258 Volts InnerMult 1-1;",
 )
+OUTER_CUT = CUT.replace("InnerMult 1-1", "InnerMultiplexer 1-1")
 VOLTS, PLAIN = {"U": ("V", {"signal": "Volts"})}, {"U": ("V", {"signal": "Plain"})}
 
 
@@ -25,10 +26,11 @@ VOLTS, PLAIN = {"U": ("V", {"signal": "Volts"})}, {"U": ("V", {"signal": "Plain"
     "text",
     [
         CUT,
+        OUTER_CUT,
         dbc(NESTED),  # two multiplexers, and nothing that assigns the signals to them
         dbc(NESTED.replace("m0M", "m0").replace("Multiplexer M ", "Multiplexer ")),
     ],
-    ids=["name cut short", "not assigned", "no multiplexer"],
+    ids=["name cut short", "outer name cut short", "not assigned", "no multiplexer"],
 )
 def test_signal_without_its_multiplexer_is_an_error_only_if_requested(tmp_path: Path, text: str) -> None:
     """It would otherwise be read from frames that do not contain it."""
@@ -37,6 +39,17 @@ def test_signal_without_its_multiplexer_is_an_error_only_if_requested(tmp_path: 
     frame_decoder = decoder(tmp_path, PLAIN, text)
     assert any("Mux.Volts is multiplexed by" in line for line in frame_decoder.describe())
     assert values(frame_decoder.decode(frame(258, bytes([0, 1, 2, 3, 0, 0, 0, 0])), 0.0)) == {"U": 3.0}
+
+
+def test_a_cycle_time_that_is_none_does_no_harm(tmp_path: Path) -> None:
+    cycle = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 10;\nBA_DEF_DEF_ "GenMsgCycleTime" 0;\nBA_ "GenMsgCycleTime" BO_ 258 '
+    frame_decoder = decoder(tmp_path, PLAIN, dbc(NESTED, after=f"{cycle}{'9' * 400};"))
+    assert values(frame_decoder.decode(frame(258, bytes([0, 1, 2, 3, 0, 0, 0, 0])), 0.0)) == {"U": 3.0}
+
+
+def test_a_message_of_a_negative_length_does_not_affect_others(tmp_path: Path) -> None:
+    frame_decoder = decoder(tmp_path, PLAIN, dbc(NESTED, 'BO_ 400 Other: -1 Drive\n SG_ A : 0|8@1+ (1,0) [0|0] "V" X'))
+    assert any("message Other cannot be used: it has -1 bytes" in line for line in frame_decoder.describe())
 
 
 @pytest.mark.parametrize("length", [0, 12])

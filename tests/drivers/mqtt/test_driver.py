@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -102,21 +103,24 @@ def _send_until(port: int, enough: Callable[[], bool]) -> None:
 
 # paho-mqtt leaves the socket of a handshake that fails to the garbage collector.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_wrong_authority_is_named_and_the_right_one_accepted(tmp_path: Path) -> None:
+def test_a_wrong_authority_and_an_expired_certificate_are_named_and_the_right_one_accepted(tmp_path: Path) -> None:
     from cryptography import x509  # noqa: PLC0415 - only here
     from cryptography.hazmat.primitives.serialization import Encoding  # noqa: PLC0415
 
     port, pems = free_port(socket.SOCK_STREAM), {}
-    for name in ("broker", "stranger"):
-        der, _ = certificate(tmp_path, name)
+    for name, valid in (("broker", 1), ("stranger", 1), ("expired", -1)):
+        der, _ = certificate(tmp_path, name, until=timedelta(hours=valid))
         pems[name] = tmp_path / f"{name}.crt"
         pems[name].write_bytes(x509.load_der_x509_certificate(der.read_bytes()).public_bytes(Encoding.PEM))
     setup = setup_of(tmp_path, omega=SPEED)
     with mqtt_broker(port, tmp_path, tls=(pems["broker"], tmp_path / "broker.pem")):
         with opened(port, setup, tls=True, ca=pems["stranger"].name) as (driver, _):
-            wait_for(lambda: "certificate is refused" in driver.link().reason)
+            wait_for(lambda: "is ca right, and host its name?" in driver.link().reason)
         with opened(port, setup, tls=True, ca=pems["broker"].name) as (driver, _):
             wait_for(lambda: driver.link().up)
+    with mqtt_broker(port, tmp_path, tls=(pems["expired"], tmp_path / "expired.pem")):  # noqa: SIM117 - as above
+        with opened(port, setup, tls=True, ca=pems["expired"].name) as (driver, _):
+            wait_for(lambda: "has expired: renew it" in driver.link().reason)
 
 
 def test_a_server_that_is_no_broker_and_files_that_are_none_are_named(tmp_path: Path) -> None:
@@ -183,6 +187,33 @@ def test_a_clock_that_is_set_ahead_costs_one_message() -> None:
         for now in np.arange(5.0, 9.0, 0.01).tolist()
     ]
     assert taken.count(False) == read.bad == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "shift", "settled"),
+    [(range(100, 102), 30.0, 310), (range(100, 130), 30.0, 340), (range(100, 1000), -30.0, 310)],
+    ids=["two wrong times", "thirty wrong times", "set back"],
+)
+def test_equal_wrong_times_and_a_clock_that_is_set_back_cost_two_seconds(
+    wrong: range, shift: float, settled: int
+) -> None:
+    read = messages(time="t", time_format="s")
+    for index in range(1000):
+        now = 5.0 + 0.01 * index
+        stamp = now + (shift if index in wrong else 0.0)
+        samples = read.take("motor", document(60.0, stamp), now, retained=False)
+        if index >= settled:
+            assert [sample.time for sample in samples] == pytest.approx([now], abs=1e-6)
+    assert 150 <= read.bad <= 210
+
+
+def test_messages_that_were_held_up_for_a_second_do_not_move_the_clock() -> None:
+    read = messages(time="t", time_format="s")
+    for index in range(1000):
+        stamp = 5.0 + 0.01 * index
+        now = max(stamp, 8.0) if stamp > 7.0 else stamp  # the broker hangs for a second, and sends all at once
+        samples = read.take("motor", document(60.0, stamp), now, retained=False)
+        assert [sample.time for sample in samples] == pytest.approx([stamp], abs=1e-6)
 
 
 def test_senders_with_two_clocks_do_not_move_each_other() -> None:

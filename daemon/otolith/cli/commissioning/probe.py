@@ -387,7 +387,7 @@ async def _browse(options: "OpcuaOptions", most: int) -> "list[Variable]":
 
     credentials = OpcUaCredentials.load(options, Path())
     try:
-        async with connected(options, credentials) as client:
+        async with connected(options, credentials) as (client, _):
             return await browse(client, most)
     except Exception as error:  # the library raises anything that a server makes it raise
         raise DeviceError(f"OPC UA {options.endpoint}: {reason(error, options.timeout)}") from error
