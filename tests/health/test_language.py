@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from otolith.storage.history_retention import Bounds
 from rich.console import Console
 
 from otolith.acquisition.window import Window
@@ -28,7 +27,7 @@ from otolith.machine import LoadedMachine, find_twin, library_twins, load_machin
 from otolith.publishing.html_report import html_report
 from otolith.publishing.recording_layout import blueprint, operator_text, report_text
 from otolith.storage.history import SUFFIX, WINDOW, describe_machine
-from otolith.storage.history_writer import HistoryWriter
+from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.base import Sampling
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES, SIGNALS
