@@ -81,7 +81,7 @@ def reports(windows: list[Window], free: tuple[str, ...]) -> list[ReportDocument
 
 @pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.__name__)
 @pytest.mark.parametrize("free", [("R_a",), ("R_a", "D"), ("R_a", "L_a", "J", "D")], ids=len)
-@pytest.mark.parametrize("at", [0, 1, 5])
+@pytest.mark.parametrize("at", [0, pytest.param(1, marks=pytest.mark.full), 5])
 def test_a_wrong_window_is_given_up(
     wrong: Callable[[Array], Array], free: tuple[str, ...], at: int, scenario: MotorScenario, windows: Cut
 ) -> None:

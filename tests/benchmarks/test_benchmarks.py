@@ -74,7 +74,7 @@ def test_every_benchmark_of_make_bench_is_tested() -> None:
 @pytest.mark.parametrize("name", TIMINGS)
 def test_a_timing_benchmark_runs(name: str) -> None:
     skip_without(TIMINGS[name])
-    run(name)
+    run(name, "--quick")
 
 
 @pytest.mark.parametrize("name", COMPARED)

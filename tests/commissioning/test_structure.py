@@ -1,15 +1,18 @@
 """What a twin lacks in all windows of a healthy record: an axis whose force depends on its position."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
 
 from otolith.acquisition.window import Window
+from otolith.commissioning import structure as module
 from otolith.commissioning.identification import identify_noise
 from otolith.commissioning.likelihood import Likelihood, with_levels
 from otolith.commissioning.structure import PooledResponse, Structure, remaining_structure
-from otolith.discovery.screening import allowed_forms
+from otolith.discovery.candidates import best_guesses
+from otolith.discovery.screening import ScoredGuess, allowed_forms
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import fit
@@ -88,18 +91,45 @@ def test_less_than_three_cycles_in_a_window_are_no_structure() -> None:
     assert structure(10, 8.0, 1, frequency=2.0) == []
 
 
-def test_noise_seldom_gains_from_a_phase_in_each_window() -> None:
+@lru_cache
+def pooled_healthy() -> PooledResponse:
     windows, likelihood = record(10, 0.0, 0), Likelihood(PROBLEM)
     levels = np.array(identify_noise(PROBLEM, windows).before_inflation)
     problem, truth = with_levels(PROBLEM, levels), np.array([TRUTH[parameter.name] for parameter in FREE])
     prior, start = initial_prior(problem), np.concatenate([truth, np.zeros(len(FREE))])
     states = [likelihood.fit(levels, window, [truth]).guess[len(FREE) :].tolist() for window in windows]
     pairs = zip(windows, states, strict=True)
-    pooled = PooledResponse([fit(problem, window, prior, start, 0, state=tuple(state)) for window, state in pairs])
-    forms = [form for form in allowed_forms(problem, pooled.parts[0].x) if pooled.is_restarted(form)]
+    return PooledResponse([fit(problem, window, prior, start, 0, state=tuple(state)) for window, state in pairs])
+
+
+def test_noise_seldom_gains_from_a_phase_in_each_window() -> None:
+    pooled = pooled_healthy()
+    forms = [form for form in allowed_forms(pooled.problem, pooled.parts[0].x) if pooled.is_restarted(form)]
     guesses = [(form, 2.0 * np.pi * hertz) for form in forms[:1] for hertz in range(5, 45)]
     assert len(guesses) == 40
     assert np.count_nonzero(pooled.score(guesses).gain) <= 1
+
+
+def test_a_candidate_with_less_than_half_of_the_best_score_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It imitates the best: windows that do not agree on the best may agree on it."""
+    scores = (100.0, 60.0, 40.0)
+    tried: list[float] = []
+    monkeypatch.setattr(
+        module, "best_guesses", lambda *given: [replace(best_guesses(*given)[0], score=score) for score in scores]
+    )
+    monkeypatch.setattr(module, "_structure", lambda _, guess: tried.append(guess.score))
+    windows = record(20, AMPLITUDE, 1)[:10]
+    assert remaining_structure(PROBLEM, identify_noise(PROBLEM, windows), windows) == []
+    assert tried == [100.0, 60.0]
+
+
+def test_an_exponent_is_uncertain_by_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
+    pooled = pooled_healthy()
+    form = next(form for form in allowed_forms(pooled.problem, pooled.x) if form.model.name == "power")
+    monkeypatch.setattr(PooledResponse, "amplitudes_of_windows", lambda *_: (np.full(10, 5.0), np.ones(10)))
+    shown = module._structure(pooled, ScoredGuess(form, 2.0, np.array([5.0, 0.0]), 50.0))
+    assert shown is not None
+    assert shown[0].inner_sd == pytest.approx(0.2)
 
 
 def test_few_windows_show_no_structure() -> None:

@@ -282,11 +282,11 @@ VALUES: st.SearchStrategy[object] = (
 FACTORS = st.sampled_from([-1.0, 0.0, 1e-30, 0.5, 2.0, 1e3, 1e30])
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
-def test_whatever_a_file_contains_the_next_report_is_finite_and_nothing_raises(
-    tmp_path: Path, data: st.DataObject
-) -> None:
+SHORT = settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+LONG = settings(SHORT, max_examples=300)
+
+
+def check_changed(tmp_path: Path, data: st.DataObject) -> None:
     shutil.rmtree(tmp_path)
     store, document = saved(tmp_path)
     for _ in range(data.draw(st.integers(1, 3))):
@@ -303,6 +303,21 @@ def test_whatever_a_file_contains_the_next_report_is_finite_and_nothing_raises(
     (window,) = windows(simulate_motor("sweep", 2.0, Faults(), seed=11), START + 30.0)
     _, reports = run(state, [window])
     assert not any(word in reports[0].to_json() for word in ("NaN", "Infinity"))
+
+
+@SHORT
+@given(st.data())
+def test_whatever_a_file_contains_the_next_report_is_finite_and_nothing_raises(
+    tmp_path: Path, data: st.DataObject
+) -> None:
+    check_changed(tmp_path, data)
+
+
+@pytest.mark.full
+@LONG
+@given(st.data())
+def test_whatever_many_files_contain_the_next_report_is_finite(tmp_path: Path, data: st.DataObject) -> None:
+    check_changed(tmp_path, data)
 
 
 def test_a_change_of_the_machine_file_keeps_the_components_alone(tmp_path: Path) -> None:

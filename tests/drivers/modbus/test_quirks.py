@@ -27,7 +27,7 @@ from tests.waiting import PATIENCE, wait_for
 
 DOCS = Path(__file__).parents[3] / "docs" / "modbus.md"
 PERIOD = 0.05
-STARTING, ROUNDS = 5, 60
+STARTING, ROUNDS = 5, 40
 WORDS = floats(24.0, 1.5)
 EVERY = 20
 """One answer in so many is wrong, where not all are."""
