@@ -12,7 +12,7 @@ PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constra
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
-	@echo "make test    run the tests, long ones shortened: six minutes on two cores"
+	@echo "make test    run the tests, long ones shortened: ten minutes on two cores"
 	@echo "make test-full"
 	@echo "             the long tests, and those that time something, one at a time: fifteen minutes"
 	@echo "make system-test"
