@@ -6,9 +6,9 @@ import _signal  # type: ignore[import-not-found]  # mypy has no stub for the C m
 
 _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
-import errno  # noqa: E402
-import os  # noqa: E402
-import sys  # noqa: E402
+import errno  # noqa: E402 - after the line above
+import os  # noqa: E402 - as above
+import sys  # noqa: E402 - as above
 
 # The matrices are small, so threads of the linear algebra cost more than they save. Set before NumPy is loaded.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):

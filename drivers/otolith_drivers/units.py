@@ -116,7 +116,7 @@ def unit(text: str) -> "pint.Unit":
     name = written or FACTOR_NAME.sub(_renamed, short)
     try:
         parsed = _registry().Unit(name)
-    except Exception as error:
+    except Exception as error:  # pint raises errors of many types for a text that is no unit
         raise UnitNameError(f"{text!r} is not a unit (examples: ohm, N*m*s/rad, rad/s, ms)") from error
     if odd := ODD_PREFIX.search(str(parsed)):
         raise UnitNameError(f"{text!r} would be {odd[0]}: write another prefix, or the name of the unit in full")

@@ -288,7 +288,7 @@ def read_eds(path: Path, node: int, warnings: list[str]) -> "ObjectDictionary":
         lines += [f"[{name}]", *(f"{key}={value}" for key, value in values.items()), ""]
     try:
         dictionary: ObjectDictionary = eds.import_eds(io.StringIO("\n".join(lines)), node)  # type: ignore[no-untyped-call]  # the library has no types
-    except Exception as error:
+    except Exception as error:  # the library raises anything for a damaged sheet
         cause = " ".join(str(error).split())[:200] or type(error).__name__
         raise ConfigurationError(f"{path}: not an electronic data sheet: {cause}", EDS_KEY) from error
     return dictionary

@@ -116,7 +116,7 @@ class ModbusPoller(ThreadedDriver):
                 self._wait()
                 if not self._stop.is_set():
                     connected = self._round(deliver)
-            except Exception as error:
+            except Exception as error:  # nothing that a device answers may end the thread
                 if self._stop.is_set():  # the connection was closed by the driver
                     break
                 if not isinstance(error, ConnectionLostError):

@@ -112,7 +112,7 @@ class PlantDriver(ThreadedDriver):
             summaries = {IN_PROCESS: NodeSummary.of(self._scenario.faults)}
             for _, scheduled in in_real_time(self._scenario, summaries, self._stop.is_set):
                 self._take(scheduled, deliver)
-        except Exception as error:
+        except Exception as error:  # the thread ends: the link names the cause
             self._link = Link(up=False, reason=f"{type(error).__name__}: {error}")
             log.exception("the simulated machine stopped with an error")
 

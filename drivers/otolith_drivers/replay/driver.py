@@ -168,7 +168,7 @@ class ReplayDriver(ThreadedDriver):
             self._down_reason = "closed" if self._stop.is_set() else "the recording has ended"
         except OtolithError as error:
             self._down_reason = str(error)
-        except Exception as error:
+        except Exception as error:  # the thread ends: the link names the cause
             self._down_reason = f"{type(error).__name__}: {error}"
             log.exception("the replay stopped with an error")
 
