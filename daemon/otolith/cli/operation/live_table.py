@@ -144,8 +144,8 @@ def parameter_table(*columns: str, width: int, texts: Texts | None = None) -> Ta
     for column in (*VALUE_COLUMNS, *columns):
         right, whole = column in RIGHT or column in set(Status), column in (*RIGHT, "history")
         overflow: OverflowMethod = "ellipsis" if whole else "fold"
-        heading = texts.translated(column) if texts else column
-        table.add_column(heading, justify="right" if right else "left", no_wrap=whole, overflow=overflow)
+        title = texts.translated(column) if texts else column
+        table.add_column(title, justify="right" if right else "left", no_wrap=whole, overflow=overflow)
     return table
 
 
