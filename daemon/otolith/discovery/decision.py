@@ -13,7 +13,7 @@ MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accept
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability
 COMPONENT_WINDOWS, COMPONENT_PROBABILITY = 3, 0.95  # the same for a component
 TIMING_WINDOWS = 2  # windows that must agree on a late signal
-DATA_FAULT_PROBABILITY = 0.5  # of a faulty sensor or a late signal, if no other type explains the windows as well
+DATA_FAULT_PROBABILITY = 0.8  # of a faulty sensor or a late signal, if no other type explains the windows as well
 YOUNG_WINDOWS = 3  # learned windows that do not outweigh more windows that agree with each other
 AMBIGUOUS_WINDOWS = 3  # windows that several causes explain equally
 

@@ -120,7 +120,10 @@ def _parameter_values(problem: Problem, mean: Array) -> tuple[Array, list[int]]:
 
 
 def _interval_after(problem: Problem, known: Prior, situation: Situation, move: Move) -> Array:
-    """Return the half-width (free,) of each 95 % interval after ``move``; the initial state is estimated as well."""
+    """Return the half-width (free,) of each 95 % interval after ``move``.
+
+    The initial state is estimated as well; trends are not, and what is unknown of them widens the intervals.
+    """
     twin, kernel, free = problem.twin, kernel_of(problem.twin), len(problem.free)
     parameters, columns = _parameter_values(problem, known.mean)
     grid = _grid(situation, len(move.inputs))
@@ -139,7 +142,8 @@ def _interval_after(problem: Problem, known: Prior, situation: Situation, move: 
     total = information + prior
     size = np.sqrt(np.maximum(np.diag(total), REGULARISATION))
     covariance = np.linalg.pinv(total / np.outer(size, size), hermitian=True) / np.outer(size, size)
-    reach: Array = QUANTILE * np.sqrt(np.maximum(np.diag(covariance)[:free], 0.0))
+    drift = 0.5 * grid.length * np.sqrt(np.diag(known.covariance)[free:])  # from the middle of the window to its end
+    reach: Array = QUANTILE * np.sqrt(np.maximum(np.diag(covariance)[:free], 0.0) + drift**2)
     return np.minimum(reach, QUANTILE * deviations)
 
 

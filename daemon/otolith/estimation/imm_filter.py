@@ -22,6 +22,7 @@ from otolith.estimation.arrival_cost import Evidence
 TREND_NOISE = np.array([1e-7, 1e-6, 1e-5, 1e-4])  # 1/s^1.5: process noise of a trend, relative to the parameter
 HIGHEST_LEVEL = len(TREND_NOISE) - 1
 FIRST_LEVEL = HIGHEST_LEVEL  # before the first window: a parameter may already be drifting
+ADDED_LEVEL = 2  # of a parameter that a hypothesis adds
 MAX_LEVELS_BELOW = 1  # levels of a parameter below the highest of its mode: either of two correlated ones may drift
 STAY_PROBABILITY = 0.97  # that the same mode holds in the next window
 CALMER_FACTOR = 1.5  # how much more probable a calmer mode must be to become the centre

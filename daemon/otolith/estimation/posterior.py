@@ -14,7 +14,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.estimation import imm_filter
 from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
 from otolith.estimation.augmented import indices, source_of, without
-from otolith.estimation.imm_filter import FIRST_LEVEL, ImmPosterior
+from otolith.estimation.imm_filter import ADDED_LEVEL, ImmPosterior
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import converter_steps
 from otolith.estimation.problem import Problem
@@ -183,7 +183,7 @@ class Posterior:
         labels, count = [free.label for free in self.problem.free], len(problem.free)
         kept = [at for at, free in enumerate(problem.free) if free.label in labels]
         before = [labels.index(problem.free[at].label) for at in kept]  # slots may have changed places
-        level = np.full(count, FIRST_LEVEL)
+        level = np.full(count, ADDED_LEVEL)
         level[kept] = self.belief.level[0][before]
         kept = [*kept, *(count + at for at in kept)]  # and their trends
         before = [*before, *(len(labels) + at for at in before)]
