@@ -1,16 +1,16 @@
-"""Cramér-Rao bound of the samples that a window has: the smallest standard deviation of an unbiased estimate.
+"""Cramér-Rao bound of the samples that a window has, and the error of the estimate that reaches it.
 
 The Fisher information comes from numerical derivatives of the exact plant by the free parameters and by the state at
 the start of the window, which is a nuisance without a prior. Inputs that the samples do not fix are Gaussian nuisances
 as well: noise of the load torque, the load torque as a random walk between its samples, and the time of a voltage
 change whose row is missing. Their effect on the outputs is a dense covariance beside the noise of the sensors.
 
-A slow load torque is a straight line between its samples. The bound uses this, though the samples do not show it:
-``cases.WIDER_SPREAD`` lists the parameters of which no estimate can therefore reach it.
+The efficient estimate is the linear one at the truth. Its error in a window comes from the same noise as that of the
+twin's estimate, so both share what chance does to their coverage.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -24,15 +24,23 @@ KNOWN_LOAD = 1e-9  # N·m: standard deviation of a sample without noise
 UNKNOWN_LEVEL = 1.0  # N·m: standard deviation of the load torque before its samples
 
 
-def lower_bounds(recording: Recording, start: float, end: float, free: Sequence[str]) -> Array:
-    """Return the bound of the standard deviation of each free parameter from the samples in [start, end) s: (free,).
+@dataclass(frozen=True, slots=True)
+class EfficientEstimate:
+    """What the samples of a window allow; arrays are (free,)."""
 
-    It is infinite where they do not determine the parameters.
-    """
-    times = _times_of(recording, start, end)
+    bound: Array
+    """Smallest standard deviation of an unbiased estimate; infinite where the samples do not determine it."""
+    error: Array
+    """Error of the estimate that reaches it, in this window; NaN without."""
+
+
+def efficient_estimate(recording: Recording, start: float, end: float, free: Sequence[str]) -> EfficientEstimate:
+    """Return the bound of each free parameter from the samples in [start, end) s, and what reaches it."""
+    nothing = EfficientEstimate(np.full(len(free), np.inf), np.full(len(free), np.nan))
+    times, values = _samples_of(recording, start, end)
     count = sum(map(len, times))
     if count < len(free) + 2:
-        return np.full(len(free), np.inf)
+        return nothing
     union = np.unique(np.concatenate(times))
     state = simulate(recording.motor, recording.initial, 0.0, recording.inputs, np.array([start]))[0]
 
@@ -50,39 +58,42 @@ def lower_bounds(recording: Recording, start: float, end: float, free: Sequence[
     columns += [outputs(recording.motor, state + unit, recording.inputs) - truth for unit in np.eye(2)]
     jacobian = np.column_stack(columns)
     sensors = np.concatenate([np.full(len(own), NOISE[name]) for name, own in zip(OUTPUTS, times, strict=True)])
-    late = [outputs(recording.motor, state, inputs) - truth for inputs in _late_changes(recording, start, end)]
-    covariance = _load_covariance(recording, times, start, end) + sum(np.outer(effect, effect) for effect in late)
-    fisher = _fisher(jacobian, sensors, covariance)
+    load_covariance, load_error = _load(recording, times, start, end)
+    unexpected = np.concatenate(values) - truth + load_error
+    covariance: Array = np.diag(sensors**2) + load_covariance
+    for possible in _possible_inputs(recording, start, end):
+        effects = np.array([outputs(recording.motor, state, inputs) for inputs in possible]) - truth
+        unexpected -= effects.mean(axis=0)
+        covariance = covariance + np.cov(effects, rowvar=False, bias=True)
+    weighted = cho_solve(cho_factor(covariance), jacobian)
+    fisher = jacobian.T @ weighted
     scale = np.sqrt(np.diag(fisher))
     if not (scale > 0.0).all() or np.linalg.cond(fisher / np.outer(scale, scale)) > 1e12:
-        return np.full(len(free), np.inf)
-    values = np.array([getattr(recording.motor, name) for name in free])
-    return np.asarray(np.sqrt(np.diag(np.linalg.inv(fisher)))[: len(free)] * values)
+        return nothing
+    inverse = np.linalg.inv(fisher)
+    nominal = np.array([getattr(recording.motor, name) for name in free])
+    error = inverse @ (weighted.T @ unexpected)
+    return EfficientEstimate(np.sqrt(np.diag(inverse))[: len(free)] * nominal, error[: len(free)] * nominal)
 
 
-def _fisher(jacobian: Array, sensors: Array, covariance: Array | float) -> Array:
-    """Return the information of outputs with independent noise ``sensors`` (outputs,) beside ``covariance``."""
-    if np.ndim(covariance) == 0:
-        whitened = jacobian / sensors[:, None]
-        return np.asarray(whitened.T @ whitened)
-    return np.asarray(jacobian.T @ cho_solve(cho_factor(np.diag(sensors**2) + covariance), jacobian))
-
-
-def _times_of(recording: Recording, start: float, end: float) -> list[Array]:
-    """Return the true times of the fresh samples of each output whose stated times are in [start, end)."""
+def _samples_of(recording: Recording, start: float, end: float) -> tuple[list[Array], list[Array]]:
+    """Return true times and values of the fresh samples of each output whose stated times are in [start, end)."""
     samples = [recording.samples[name] for name in OUTPUTS]
-    parts = [own.times[own.fresh & (own.stated >= start) & (own.stated < end)] for own in samples]
-    return [part[part >= start] for part in parts]
+    inside = [own.fresh & (own.stated >= start) & (own.stated < end) & (own.times >= start) for own in samples]
+    pairs = list(zip(samples, inside, strict=True))
+    return [own.times[part] for own, part in pairs], [own.values[part] for own, part in pairs]
 
 
-def _load_covariance(recording: Recording, times: Sequence[Array], start: float, end: float) -> Array | float:
-    """Return the covariance of the outputs from what the samples leave open of the load torque."""
+def _load(recording: Recording, times: Sequence[Array], start: float, end: float) -> tuple[Array, Array]:
+    """Return covariance and true value of what the load torque adds to the outputs beyond what its samples show."""
     if not recording.load_noise and not recording.walk:
-        return 0.0
-    knots = recording.inputs.load_times
+        count = sum(map(len, times))
+        return np.zeros((count, count)), np.zeros(count)
+    knots, loads = recording.inputs.load_times, recording.inputs.loads
     near = (knots >= start - 0.1) & (knots <= end + 0.1)
     effect = load_effect(recording.motor, knots[near], times, start)
-    return np.asarray(effect @ _knot_covariance(recording, knots[near]) @ effect.T)
+    mean, covariance = _knots(recording, knots[near])
+    return effect @ covariance @ effect.T, effect @ (loads[near] - mean)
 
 
 def load_effect(motor: Motor, knots: Array, times: Sequence[Array], start: float) -> Array:
@@ -105,8 +116,8 @@ def load_effect(motor: Motor, knots: Array, times: Sequence[Array], start: float
     return np.asarray(effect + levels * shares)
 
 
-def _knot_covariance(recording: Recording, knots: Array) -> Array:
-    """Return the covariance of the load torque at ``knots``, given its samples; samples are at knots."""
+def _knots(recording: Recording, knots: Array) -> tuple[Array, Array]:
+    """Return mean and covariance of the load torque at ``knots``, given its samples; samples are at knots."""
     sample = recording.samples["T_load"]
     seen: Mask = np.isin(knots, sample.times)
     precision = np.zeros((len(knots), len(knots)))
@@ -114,19 +125,21 @@ def _knot_covariance(recording: Recording, knots: Array) -> Array:
     for index, length in enumerate(np.diff(knots)):
         weight = 1.0 / (WALK**2 * length)
         precision[index : index + 2, index : index + 2] += weight * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    precision[seen, seen] += max(recording.load_noise, KNOWN_LOAD) ** -2
-    return np.asarray(np.linalg.inv(precision))
+    own = max(recording.load_noise, KNOWN_LOAD) ** -2
+    precision[seen, seen] += own
+    covariance = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+    return covariance[:, seen] @ (own * sample.values[np.isin(sample.times, knots)]), covariance
 
 
-def _late_changes(recording: Recording, start: float, end: float) -> list[Inputs]:
-    """Return the inputs with each voltage change of unknown time later by one standard deviation of it."""
-    inputs = recording.inputs
-    times, uncertainty = inputs.voltage_times, recording.change_sd
-    changed = []
-    for index in np.flatnonzero((uncertainty > 0.0) & (times > start) & (times < end)):
-        later = times.copy()
-        later[index] += uncertainty[index]
-        if index + 1 < len(times):  # the order of the changes stays
-            later[index] = min(later[index], times[index + 1] - 1e-6)
-        changed.append(replace(inputs, voltage_times=later))
-    return changed
+def _possible_inputs(recording: Recording, start: float, end: float) -> Iterator[list[Inputs]]:
+    """Yield for each voltage change of unknown time the inputs with it at each time at which it can have been."""
+    times = recording.inputs.voltage_times
+    for index, choices in enumerate(recording.possible_changes):
+        if len(choices) < 2 or choices[-1] <= start or choices[0] >= end:
+            continue
+        low = times[index - 1] if index else -np.inf  # the order of the changes stays
+        high = times[index + 1] if index + 1 < len(times) else np.inf
+        moved = [times.copy() for _ in choices]
+        for own, choice in zip(moved, np.clip(choices, low, high), strict=True):
+            own[index] = choice
+        yield [replace(recording.inputs, voltage_times=own) for own in moved]

@@ -1,36 +1,13 @@
-"""The scenarios: ways to record the motor, and by how much their errors may exceed the bound."""
+"""The scenarios: ways to record the motor."""
 
 from dataclasses import replace
 
-import numpy as np
-
-from benchmarks.sampling.measure import FREE
 from benchmarks.sampling.schedules import Schedule, Timing
-from otolith.acquisition.window import Array
 
 DENSE, STALE = Timing(0.01), Timing(renewed_every=5)
 SLOWS = (0.01, 0.02, 0.05, 0.1)  # s
 SHARES = (0.3, 0.5, 0.8)  # missing
 JITTERS = (0.1, 0.3, 0.5)  # of the period
-
-MAX_SPREAD = 1.1  # of errors over the bound
-WIDER_SPREAD = {
-    "load every 50 ms, commands on change": {"R_a": 1.15},
-    "inputs every 50 ms": {"R_a": 1.15},
-    "polled every 21 ms, 30 % missing": {"J": 1.15},
-}
-"""Limits of the parameters whose bound is too low for any estimator.
-
-The load of the simulated machine is a straight line between its samples, 50 ms apart or with readings that are missing.
-The bound uses this, but the samples do not show it: a smooth curve through them is as probable. The measured errors are
-1.12 and 1.14 times the bound of R_a, and 1.12 times that of J; those of the other parameters stay within the limit of
-the other scenarios.
-"""
-
-
-def max_spread(case: str) -> Array:
-    """Return how many times the bound the errors of each free parameter may be."""
-    return np.array([WIDER_SPREAD.get(case, {}).get(name, MAX_SPREAD) for name in FREE])
 
 
 def _cases() -> dict[str, Schedule]:

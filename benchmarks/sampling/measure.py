@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.sampling.bound import lower_bounds
+from benchmarks.sampling.bound import efficient_estimate
 from benchmarks.sampling.plant import Motor
 from benchmarks.sampling.schedules import NOISE, Recording, Schedule, record
 from otolith.acquisition.window import Array, Mask
@@ -23,6 +23,7 @@ FREE = ("R_a", "D", "J")
 WINDOW = 2.0  # s
 WINDOWS_PER_RECORDING = 10
 DETERMINED_WITHIN = 0.1  # of the nominal value: half-width of the interval that is asked for
+LEVEL = 0.95  # of the intervals
 SPREAD = 0.15  # share by which each constant of a recorded motor may differ from that of the machine file
 FILE_NAME = "recording.csv"
 
@@ -35,6 +36,8 @@ class WindowOutcome:
     truth: Array
     bound: Array
     """Cramér-Rao bound of the standard deviations; infinite without."""
+    efficient_error: Array
+    """Error of the estimate that reaches the bound."""
     raw: Array
     """Estimates of this window alone."""
     raw_sd: Array
@@ -98,10 +101,11 @@ def measure(schedule: Schedule, windows: int, seed: int, folder: Path) -> Iterat
 
 def outcome(recording: Recording, document: ReportDocument, shift: float = 0.0) -> WindowOutcome:
     """Compare a report with the truth; ``shift`` is the time of the table minus that of the recording, s."""
-    bound = lower_bounds(recording, document.window.start - shift, document.window.end - shift, FREE)
+    efficient = efficient_estimate(recording, document.window.start - shift, document.window.end - shift, FREE)
     parameters = [document.parameters[name] for name in FREE]
     columns = [_column(parameters, key) for key in ("raw", "raw_sd", "low", "high")]
-    return WindowOutcome(document, np.array([getattr(recording.motor, name) for name in FREE]), bound, *columns)
+    truth = np.array([getattr(recording.motor, name) for name in FREE])
+    return WindowOutcome(document, truth, efficient.bound, efficient.error, *columns)
 
 
 def _column(parameters: Sequence[ParameterDocument], key: str) -> Array:
@@ -127,9 +131,13 @@ class Summary:
     """Share of those that are estimated; NaN without any."""
     raw_coverage: Array
     """Share of the 95 % intervals of single windows that hold the truth."""
+    efficient_coverage: Array
+    """The same of the efficient estimates of these windows: by how much it differs from 95 % is chance."""
     published_coverage: Array
     spread: Array
     """Root mean square error of single windows over their bounds."""
+    efficient_spread: Array
+    """The same of the efficient estimates of these windows: by how much it differs from 1 is chance."""
     bias: Array
     """Mean error of single windows over their bounds."""
     bound: Array
@@ -137,15 +145,26 @@ class Summary:
     reasons: tuple[tuple[str, int], ...]
     """Most frequent decisions of windows that were not used, and why; N stands for a number."""
 
+    @property
+    def coverage(self) -> Array:
+        """Share of intervals of single windows that hold the truth, without what chance does to all estimates."""
+        return self.raw_coverage - self.efficient_coverage + LEVEL
+
+    @property
+    def error_ratio(self) -> Array:
+        """Root mean square error of single windows over that of the efficient estimates of these windows."""
+        return self.spread / self.efficient_spread
+
 
 def summarise(outcomes: Sequence[WindowOutcome]) -> Summary:
     """Return the figures of the windows of one scenario; every window with a raw estimate counts."""
     allowed = [outcome.is_estimated for outcome in outcomes if outcome.is_allowed]
-    truth, bound, raw, raw_sd, low, high = (
-        np.array([getattr(item, key) for item in outcomes])
-        for key in ("truth", "bound", "raw", "raw_sd", "low", "high")
+    keys = ("truth", "bound", "efficient_error", "raw", "raw_sd", "low", "high")
+    truth, bound, efficient, raw, raw_sd, low, high = (
+        np.array([getattr(item, key) for item in outcomes]) for key in keys
     )
-    pulls = (raw - truth) / bound
+    pulls, present = (raw - truth) / bound, np.isfinite(raw)
+    efficient = np.where(present, efficient / bound, np.nan)
     unused = [item.document for item in outcomes if item.document.decision not in ACCEPTED]
     texts = [f"{document.decision.value}: {'; '.join(document.window.quality.reasons)}" for document in unused]
     texts = [re.sub(r"\d[\d.]*", "N", text) for text in texts]
@@ -155,9 +174,11 @@ def summarise(outcomes: Sequence[WindowOutcome]) -> Summary:
         learned=learned,
         allowed=len(allowed),
         estimated=float(np.mean(allowed)) if allowed else float("nan"),
-        raw_coverage=_share(np.abs(raw - truth) <= QUANTILE * raw_sd, np.isfinite(raw)),
+        raw_coverage=_share(np.abs(raw - truth) <= QUANTILE * raw_sd, present),
+        efficient_coverage=_share(np.abs(efficient) <= QUANTILE, np.isfinite(efficient)),
         published_coverage=_share((low <= truth) & (truth <= high), np.isfinite(low)),
         spread=_mean(pulls**2) ** 0.5,
+        efficient_spread=_mean(efficient**2) ** 0.5,
         bias=_mean(pulls),
         bound=np.median(bound / truth, axis=0),
         reasons=tuple(Counter(texts).most_common(3)),

@@ -148,7 +148,7 @@ def voltages(kind: Voltage, times: Array, random: np.random.Generator) -> tuple[
 
 
 def loads(kind: Load, times: Array, random: np.random.Generator) -> Array:
-    """Return the load torque in N·m at ``times`` (s), between which it is linear."""
+    """Return the load torque in N·m at ``times`` (s), between which a walk is linear."""
     if kind == "slow":
         return 0.05 + 0.03 * np.sin(random.uniform(1.0, 6.0) * times + random.uniform(0.0, 2.0 * np.pi))
     steps = random.normal(size=len(times)) * WALK * np.sqrt(np.diff(times, prepend=times[0]))

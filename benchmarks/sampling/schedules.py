@@ -4,7 +4,7 @@ A sample has two times: when its value was true, and the time that the table sta
 only. Jitter moves both.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -16,6 +16,8 @@ from otolith.acquisition.window import Array, Mask
 OUTPUTS = ("i", "omega")
 NOISE = {"i": 0.005, "omega": 0.02, "T_load": 2e-4}  # A, rad/s, N·m: the sensors of config/dc-motor.toml
 MICROSECONDS = 6  # decimals of the times in a table
+CHOICES = 8  # times between two readings that stand for all
+KNOT_PERIOD = 0.002  # s between the times at which a smooth load torque is computed
 COMMAND_PERIOD = 0.01  # s between the times at which a command can change
 
 
@@ -44,7 +46,7 @@ class Schedule:
     """A way to record the motor. Without ``rows`` every signal has times of its own."""
 
     rows: Timing | None = None
-    """Times of rows that have all signals; the commands change at them, and the load is linear between them."""
+    """Times of rows that have all signals; the commands change at them, and a random walk of the load bends at them."""
     i: Timing = field(default_factory=Timing)
     omega: Timing = field(default_factory=Timing)
     voltage: Voltage = "levels"
@@ -85,8 +87,8 @@ class Recording:
     """N·m: standard deviation of the samples of the load torque."""
     walk: bool
     """Whether the load torque is a random walk; otherwise it is known between its samples."""
-    change_sd: Array
-    """(changes of the voltage,) s: standard deviation of the time of each, given the samples of the voltage."""
+    possible_changes: tuple[Array, ...]
+    """When each change of the voltage can have been, given the samples of the voltage: some equally likely times, s."""
     copies: int = 1
 
     def rows(self, *, shift: float = 0.0, first: float = -np.inf) -> list[list[str]]:
@@ -137,7 +139,10 @@ def record(schedule: Schedule, motor: Motor, length: float, random: np.random.Ge
     command_times = full if rows is not None else np.round(np.arange(0.0, length, COMMAND_PERIOD), MICROSECONDS)
     if schedule.polled:
         command_times = np.sort(random.uniform(0.0, length, int(length / COMMAND_PERIOD)))
-    inputs = Inputs(*voltages(schedule.voltage, command_times, random), full, loads(schedule.load, full, random))
+    knots = full
+    if schedule.load == "slow":
+        knots = np.union1d(full, np.round(np.arange(0.0, full[-1], KNOT_PERIOD), MICROSECONDS))
+    inputs = Inputs(*voltages(schedule.voltage, command_times, random), knots, loads(schedule.load, knots, random))
     timings = {name: getattr(schedule, name) for name in OUTPUTS}
     times = {name: _output_times(timings[name], full, kept, length, random, rows=rows is not None) for name in OUTPUTS}
     initial: Array = random.uniform([0.5, 3.0], [2.0, 15.0])
@@ -149,13 +154,12 @@ def record(schedule: Schedule, motor: Motor, length: float, random: np.random.Ge
         "T_load": _plain(full[kept], load_values),
         **_measure(motor, initial, inputs, times, timings, random),
     }
+    changes, walk = inputs.voltage_times, schedule.load == "walk"
     if schedule.commands_on_change:
-        changes = np.zeros(len(inputs.voltage_times))
-    elif schedule.polled:  # uniform between two readings
-        changes = np.full(len(inputs.voltage_times), np.diff(seen).mean() / np.sqrt(12.0))
+        choices = tuple(changes[:, None])
     else:
-        changes = _change_sd(inputs.voltage_times, full, seen)
-    return Recording(motor, initial, inputs, samples, noise, schedule.load == "walk", changes, schedule.copies)
+        choices = tuple(_possible_changes(changes, None if schedule.polled else full, seen))
+    return Recording(motor, initial, inputs, samples, noise, walk, choices, schedule.copies)
 
 
 def _kept(times: Array, missing: float, random: np.random.Generator) -> Mask:
@@ -199,13 +203,16 @@ def _plain(times: Array, values: Array) -> Samples:
     return Samples(times, values, times, np.ones(len(times), dtype=np.bool_))
 
 
-def _change_sd(changes: Array, possible: Array, seen: Array) -> Array:
-    """Return the standard deviation of the time of each change of the voltage, in s.
+def _possible_changes(changes: Array, possible: Array | None, seen: Array) -> Iterator[Array]:
+    """Yield when each change of the voltage can have been: at times of ``possible``, or at any time.
 
-    A change can be at each time of ``possible`` after the last time of ``seen`` before it, up to the next one.
+    A change comes after the last time of ``seen`` before it, up to the next one.
     """
-    after = np.minimum(np.searchsorted(seen, changes), len(seen) - 1)
-    low = np.searchsorted(possible, seen[np.maximum(after - 1, 0)], side="right")
-    high = np.searchsorted(possible, seen[after], side="right")
-    pairs = zip(low.tolist(), high.tolist(), strict=True)
-    return np.array([float(np.std(possible[first:last])) if last - first > 1 else 0.0 for first, last in pairs])
+    after = np.clip(np.searchsorted(seen, changes), 1, len(seen) - 1)
+    for time, first, last in zip(changes, seen[after - 1], seen[after], strict=True):
+        if not first < time <= last:
+            yield np.array([time])
+        elif possible is None:
+            yield first + (np.arange(CHOICES) + 0.5) / CHOICES * (last - first)
+        else:
+            yield possible[(possible > first) & (possible <= last)]

@@ -12,6 +12,7 @@ from otolith.acquisition.bridging import (
     LostIntervals,
     OtherSamples,
     bridge,
+    curve_variance,
     kind_of,
     line_variance,
     lost_samples,
@@ -157,6 +158,55 @@ def test_the_line_variance_follows_the_length_of_the_line() -> None:
     curvature = 0.5 / 8.0**4  # mean square of the second derivative of the sine
     for length in (2.0, 8.0):
         assert float(smooth(np.array([length]))[0]) == pytest.approx(curvature * length**4 / 64.0, rel=0.3)
+
+
+@pytest.mark.parametrize("missing", [0.3, 0.8])
+def test_the_variance_of_a_walk_is_right_between_samples_at_any_times(missing: float) -> None:
+    random, stated, true = np.random.default_rng(8), 0.0, 0.0
+    for _ in range(20):
+        times = np.flatnonzero(random.uniform(size=4000) >= missing).astype(float)
+        walk = np.cumsum(random.normal(size=len(times)) * np.sqrt(np.diff(times, prepend=-1.0)))
+        lengths = np.diff(times)
+        stated += float(line_variance(Series(times, walk), 0.0)(lengths) @ lengths**2)
+        true += float(lengths / 4.0 @ lengths**2)
+    assert stated == pytest.approx(true, rel=0.1)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 0.001])
+def test_a_smooth_quantity_is_bridged_by_a_curve(missing: float, noise: float) -> None:
+    """A line through a sine is wrong in one direction for half a period, like another moment of inertia of a motor."""
+    random, frequency = np.random.default_rng(9), 6.0
+    squares, stated, of_line = [], [], []
+    for phase in random.uniform(0.0, 2.0 * np.pi, 50):
+        times = 0.05 * np.flatnonzero(random.uniform(size=round(46 / (1.0 - missing))) >= missing).astype(float)
+        values = np.sin(frequency * times + phase) + noise * random.normal(size=len(times))
+        at = np.arange(times[0], times[-1], PERIOD)
+        own = interval_of(times)
+        lost = lost_samples(Series(times, values), InputKind.LINE, own, NO_OTHERS)
+        samples = InputSamples(Series(times, values), InputKind.LINE, noise, own, lost)
+        result, truth = bridge(samples, at, np.full(len(at), PERIOD)), np.sin(frequency * at + phase)
+        squares.append(np.mean((result.values - truth) ** 2))
+        stated.append(np.mean(result.error.variance))
+        of_line.append(np.mean((np.interp(at, times, values) - truth) ** 2))
+    assert np.mean(squares) < np.mean(of_line) / 10.0
+    assert np.mean(squares) < 4.0 * (np.mean(stated) + noise**2)
+
+
+def test_only_a_smooth_quantity_is_a_curve() -> None:
+    random, times = np.random.default_rng(10), 0.05 * np.arange(40.0)
+    rough: list[Array] = [
+        np.cumsum(random.normal(size=40)),
+        random.normal(size=40),
+        np.where(times > 1.02, 1.0, 0.0),
+        np.round(100.0 * np.sin(times)),
+        np.zeros(40),
+    ]
+    assert all(curve_variance(Series(times, values), 0.0) is None for values in rough)
+    smooth = curve_variance(Series(times, np.sin(6.0 * times)), 0.0)
+    assert smooth is not None
+    line = line_variance(Series(times, np.sin(6.0 * times)), 0.0)
+    assert float(smooth(np.array([0.05]))[0]) < float(line(np.array([0.05]))[0]) / 100.0
 
 
 @pytest.mark.parametrize("late", [5, 40])

@@ -88,7 +88,7 @@ def test_a_signal_that_becomes_late_leaves_the_estimates_as_they_are(tmp_path: P
     own = recording.samples[name]
     stated = own.stated + np.where(own.stated > since, 0.01, 0.0)
     changed = {**recording.samples, name: Samples(own.times, own.values, np.round(stated, 6), own.fresh)}
-    late = Recording(recording.motor, recording.initial, recording.inputs, changed, 0.0, False, recording.change_sd)
+    late = replace(recording, samples=changed)
     documents = reports(tmp_path, late)
     healthy = [document for document in documents if document.window.end <= since]
     assert all(document.decision is WindowDecision.LEARNED for document in healthy)

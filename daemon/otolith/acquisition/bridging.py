@@ -3,15 +3,16 @@
 A command (``zoh``) holds its value until the next sample. Where a sample of it was lost, it may have changed at any of
 the lost instants: the value moves from one end to the other with the probability that it has changed by then. A command
 that is polled may have changed at any time since the last reading, and moves in the same way. A measured
-quantity (``foh``) is a straight line between two samples. How far it may be from that line is taken from the window
-itself: a sample against the line through its neighbours, at two spacings, gives a power law of the spacing.
-``docs/explanation/sampling.md`` derives the variances.
+quantity (``foh``) is a straight line between two samples, or a smooth curve if its samples show that it is one. How far
+it may be from that is taken from the window itself: a sample against the line or curve through those around it, at two
+spacings, gives a power law of the spacing. ``docs/explanation/sampling.md`` derives the variances.
 """
 
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from otolith.acquisition.alignment import Indices
 from otolith.acquisition.samples import Interval, Series, SignalPlan
@@ -19,8 +20,12 @@ from otolith.acquisition.window import Array, BridgeError
 from otolith_drivers.base import Sampling
 
 LINE_NOISE = 1.5  # variance of a sample about the line through its neighbours, in variances of the noise of a sample
+CURVE_NOISE = 1.76  # the same about the cubic spline through the samples around it
+SMOOTHER = 1.5  # times the mean square about the spline, above which that about the line shows a smooth curve
+MIN_KNOTS = 5  # of a spline whose errors are measured
 NORMAL_SQUARE_MEDIAN = 0.455  # of the square of a standard normal deviate
-EXPONENTS = (1.0, 4.0)  # of the variance of a line, by its length: a random walk, and a smooth curve
+LINE_EXPONENTS = (1.0, 4.0)  # of the variance of a line, by its length: a random walk, and a smooth curve
+CURVE_EXPONENTS = (1.0, 8.0)  # of that of a spline: a random walk, and a curve with four derivatives
 MIN_STEP = 1e-9  # s; against division by the step between two equal times
 ROUNDING = 1e-6  # usual intervals: rounding of the times of lost instants
 
@@ -228,45 +233,89 @@ def _line(samples: InputSamples, times: Array, before: Indices, after: Indices) 
     inside = spread > ROUNDING
     if not inside.any():
         return values, _Error(none, none)
-    middle = line_variance(series, samples.noise)
-    return values, _Error(np.where(inside, middle(length) * spread, 0.0), 0.5 * length)
+    variance = line_variance(series, samples.noise)(length)
+    of_curve = curve_variance(series, samples.noise)
+    if of_curve is not None:
+        curved = inside & (of_curve(length) < variance)  # a long gap is too long for a curve first
+        values = np.where(curved, CubicSpline(series.times, series.values)(times), values)
+        variance = np.where(curved, of_curve(length), variance)
+    return values, _Error(np.where(inside, variance * spread, 0.0), 0.5 * length)
 
 
 @dataclass(frozen=True, slots=True)
-class LineVariance:
-    """Variance of a quantity in the middle of a line between two samples: ``at_two * (length / two)**exponent``."""
+class GapVariance:
+    """Variance of a quantity in the middle between two samples: ``at_two * (length / two)**exponent``."""
 
     at_two: float
     two: float
-    """Two usual intervals, s."""
+    """Two intervals, s."""
     exponent: float
 
     def __call__(self, length: Array) -> Array:
-        """Return the variance for lines of ``length`` s."""
+        """Return the variance for gaps of ``length`` s."""
         return np.asarray(self.at_two * (np.maximum(length, 0.0) / self.two) ** self.exponent)
 
 
-def line_variance(series: Series, noise: float) -> LineVariance:
+def line_variance(series: Series, noise: float) -> GapVariance:
     """Return the variance of a line through samples, from what the samples between show; ``noise`` is their own."""
-    short, long = (_about_line(series, reach, noise) for reach in (1, 2))
-    two = 2.0 * float(np.median(np.diff(series.times))) if len(series.times) > 1 else 1.0
-    if short <= 0.0:
-        return LineVariance(max(long, 0.0) / 2.0 ** EXPONENTS[0], two, EXPONENTS[0])
-    exponent = float(np.clip(np.log2(max(long, short) / short), *EXPONENTS))
-    return LineVariance(short, two, exponent)
+    if len(series.times) < 3:
+        return GapVariance(float(np.var(series.values)), 2.0 * float(np.ptp(series.times)) or 1.0, LINE_EXPONENTS[0])
+    squares = (_mean_square(_about_line(series, 1)), _mean_square(_about_line(series, 2)))
+    return _power_law(series, squares, LINE_NOISE * noise**2, LINE_EXPONENTS)
 
 
-def _about_line(series: Series, reach: int, noise: float) -> float:
-    """Return the variance of samples about the line through those ``reach`` before and after, without their noise."""
+def curve_variance(series: Series, noise: float) -> GapVariance | None:
+    """Return the variance of a cubic spline through samples; None if they do not show a smooth curve."""
+    if len(series.times) < 4 * MIN_KNOTS:
+        return None
+    short = _mean_square(_about_curve(series, 1))
+    if not short * SMOOTHER < _mean_square(_about_line(series, 1)) < np.inf:
+        return None
+    noise_square = CURVE_NOISE * noise**2
+    short = max(short, noise_square * (1.0 + np.sqrt(2.0 / len(series.times))))  # as far as noise lets it be known
+    return _power_law(series, (short, _mean_square(_about_curve(series, 2))), noise_square, CURVE_EXPONENTS)
+
+
+def _power_law(
+    series: Series, squares: tuple[float, float], noise: float, exponents: tuple[float, float]
+) -> GapVariance:
+    """Return the variance that explains the mean ``squares`` without ``noise``, at two and at four intervals."""
+    short, long = (max(square - noise, 0.0) if np.isfinite(square) else 0.0 for square in squares)
+    exponent = float(np.clip(np.log2(max(long, short) / short), *exponents)) if short > 0.0 else exponents[0]
+    length = series.times[2:] - series.times[:-2]
+    share = (series.times[1:-1] - series.times[:-2]) / length
+    two = float(np.mean(length**exponent * 4.0 * share * (1.0 - share)) ** (1.0 / exponent))
+    return GapVariance(short if short > 0.0 else long / 2.0**exponent, two, exponent)
+
+
+def _mean_square(errors: Array) -> float:
+    """Return the mean square of errors; infinite if it is beyond all numbers."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = float(np.mean(errors**2))
+    return square if np.isfinite(square) else np.inf
+
+
+def _about_line(series: Series, reach: int) -> Array:
+    """Return the samples minus the line through those ``reach`` before and after."""
     times, values = series.times, series.values
     if len(times) <= 2 * reach:
-        return float(np.var(values)) if len(values) > 1 else 0.0
+        return values - float(values.mean())
     left, middle, right = slice(None, -2 * reach), slice(reach, -reach), slice(2 * reach, None)
     share = (times[middle] - times[left]) / (times[right] - times[left])
     with np.errstate(over="ignore", invalid="ignore"):
-        error = values[middle] - (1.0 - share) * values[left] - share * values[right]
-        variance = float(np.mean(error**2)) - LINE_NOISE * noise**2
-    return max(variance, 0.0) if np.isfinite(variance) else 0.0
+        return np.asarray(values[middle] - (1.0 - share) * values[left] - share * values[right])
+
+
+def _about_curve(series: Series, reach: int) -> Array:
+    """Return the samples minus the spline through each ``2 * reach``-th one, in the middle between two of these."""
+    times, values, pitch = series.times, series.values, 2 * reach
+    errors = []
+    with np.errstate(over="ignore", invalid="ignore"):
+        for first in range(pitch):
+            knots = slice(first, None, pitch)
+            middles = slice(first + reach, -reach, pitch)
+            errors.append(values[middles] - CubicSpline(times[knots], values[knots])(times[middles]))
+    return np.asarray(np.concatenate(errors))
 
 
 def _outdated(samples: InputSamples, times: Array) -> _Error:

@@ -64,12 +64,16 @@ def phase_of_grid(times: Array, start: float, period: float) -> float | None:
     return phase * period if lies_on_grid(times, start + phase * period, period) else None
 
 
-def without_stale(series: Mapping[str, Series], plans: Mapping[str, SignalPlan]) -> dict[str, Series]:
-    """Return the samples without repeats of a register that was not renewed; a command repeats what it holds."""
+def without_stale(series: Mapping[str, Series], plans: Mapping[str, SignalPlan], start: float) -> dict[str, Series]:
+    """Return the samples without repeats of a register that was not renewed; a command repeats what it holds.
+
+    The first of those before ``start`` (s) may be a repeat as well, of a reading that is not among them.
+    """
     kept = dict(series)
     for name, samples in series.items():
         if plans[name].hold != "zoh" and Check.STALE in plans[name].checks:
             stale = stale_repeats(samples.values)
+            stale[:1] |= stale.any() and samples.times[0] < start
             kept[name] = Series(samples.times[~stale], samples.values[~stale]) if stale.any() else samples
     return kept
 
@@ -81,8 +85,8 @@ def make_records(series: Mapping[str, Series], plans: Mapping[str, SignalPlan], 
     before, a measured input also the one after.
     """
     start, period = span.start, span.period
-    fresh = without_stale(series, plans)
     early = EARLY * period
+    fresh = without_stale(series, plans, start - early)
     inside = {name: samples.within(start - early, span.end - early) for name, samples in fresh.items()}
     whole = (samples.within(start - early, span.end - early) for samples in series.values())
     stale = sum(len(samples.times) for samples in whole) - sum(len(samples.times) for samples in inside.values())
