@@ -146,5 +146,7 @@ def test_errors_name_the_way_out(services: Path, shown: Path, monkeypatch: pytes
     assert not shown.exists()
     program = Path(shown.parent / "bin" / "rerun")
     assert program.stat().st_mode & stat.S_IXUSR
+    program.write_text("#!/bin/sh\nexit 1\n", encoding="utf-8")  # its binary was removed
+    assert "is not installed" in str(run("--web").exception)
     program.unlink()
     assert "is not installed" in str(run("--web").exception)

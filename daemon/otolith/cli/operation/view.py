@@ -153,11 +153,12 @@ def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:
         remedy = "'otolith view --web' serves it to a browser, through a tunnel like 'ssh -L'"
         raise ServiceError(f"no display here: {remedy}; or copy {paths[0]} to a computer with one")
     program = Path(sysconfig.get_path("scripts")) / "rerun"
-    if not program.exists():
-        raise ServiceError(f"{program}: the Rerun viewer is not installed; copy {paths[0]} to a computer that has it")
     # Only 'rerun analytics disable' switches its analytics off, by a file; a folder of ours keeps the user's settings.
     environment = {**os.environ, "XDG_CONFIG_HOME": str(cache_directory("viewer"))}
-    subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)  # noqa: S603 - our viewer
+    command = [str(program), "analytics", "disable"]
+    # The program may be there without the viewer that it starts: docs/service.md shows how to do without.
+    if not program.exists() or subprocess.run(command, env=environment, capture_output=True, check=False).returncode:  # noqa: S603 - our viewer
+        raise ServiceError(f"{program}: the Rerun viewer is not installed; copy {paths[0]} to a computer that has it")
     with tempfile.TemporaryDirectory(prefix="otolith-view-") as folder:
         whole = list(_whole(program, paths, Path(folder)))
         target = ("--serve-web", "--web-viewer-port", "0") if web else ()
