@@ -254,7 +254,7 @@ print(sys.modules.get("pandas"))
 
 
 def test_the_recorder_does_without_pandas(tmp_path: Path) -> None:
-    """pyarrow would import it where it is installed, which costs 34 MB."""
+    """Where it is installed, pyarrow would import it, which costs 34 MB."""
     command = [sys.executable, "-c", RECORDS_NOTHING, str(MACHINE), str(tmp_path / "run.rrd")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == "None\n"

@@ -48,7 +48,7 @@ class Instance:
     def __init__(self, name: str) -> None:
         self.name, self.unit = name, f"otolith@{name}"
         self.file, self.state = Path(f"/etc/otolith/{name}.toml"), Path(f"/var/lib/otolith/{name}")
-        self.remembered = Path(f"/root/{name}.json")
+        self.remembered = Path.home() / f"{name}.json"
 
     def shown(self, name: str) -> str:
         """A property of the unit."""

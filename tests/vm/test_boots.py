@@ -6,7 +6,7 @@ from pathlib import Path
 from tests.vm.conftest import run
 from tests.vm.service import Before, Instance
 
-WHOLE = Path("/root/whole.rrd")
+WHOLE = Path.home() / "whole.rrd"
 
 
 def remembered(press: Instance) -> Before:

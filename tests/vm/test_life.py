@@ -102,7 +102,7 @@ def test_all_processes_take_at_most_300_mb(press: Instance) -> None:
 
 
 def test_what_was_learned_survives_an_upgrade(press: Instance) -> None:
-    before, source = press.before(), Path("/root/press")
+    before, source = press.before(), Path.home() / "press"
     source.mkdir()
     install_wheel(*map(str, SHARE.glob("*.whl")))
     press.install(simulated_machine(source))

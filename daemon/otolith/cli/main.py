@@ -34,6 +34,7 @@ from otolith.cli.common import (
 from otolith.cli.operation.history import history, report
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
+from otolith.cli.operation.licences import licences
 from otolith.cli.operation.reproduce import reproduce
 from otolith.cli.operation.view import view
 
@@ -337,6 +338,7 @@ COMMANDS: tuple[click.Command, ...] = (
     history,
     install,
     keys,
+    licences,
     noise,
     probe,
     report,
