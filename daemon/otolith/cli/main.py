@@ -34,7 +34,6 @@ from otolith.cli.common import (
 from otolith.cli.operation.history import history, report
 from otolith.cli.operation.install import install
 from otolith.cli.operation.keys import keys
-from otolith.cli.operation.licences import licences
 from otolith.cli.operation.reproduce import reproduce
 from otolith.cli.operation.view import view
 
@@ -338,7 +337,6 @@ COMMANDS: tuple[click.Command, ...] = (
     history,
     install,
     keys,
-    licences,
     noise,
     probe,
     report,

@@ -56,11 +56,8 @@ def main(connection: Any, state: AdaptationState) -> None:
 
     Each step of a kernel is sent as well, and :class:`Ready` once.
     """
-    is_new = False
 
     def report(step: kernel_cache.CompileStep) -> None:
-        nonlocal is_new
-        is_new = True
         with contextlib.suppress(OSError):  # the daemon has died, which the next result notices
             connection.send(step)
 
@@ -69,9 +66,7 @@ def main(connection: Any, state: AdaptationState) -> None:
         connection.send(Ready())
         while (task := connection.recv()) is not None:
             connection.send(perform(*task))
-            if is_new:
-                kernel_cache.release_compiler()
-                is_new = False
+            kernel_cache.release_compiler()
 
 
 def perform(state: AdaptationState, window: Window) -> WorkerResult:

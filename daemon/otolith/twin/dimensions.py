@@ -3,7 +3,6 @@
 import ast
 from collections.abc import Mapping
 from fractions import Fraction
-from functools import cache
 from typing import Any
 
 from otolith.twin.expressions import ExpressionError, constant
@@ -28,7 +27,6 @@ def dimension_of(unit_text: str) -> Dimension:
     return unit(unit_text).dimensionality
 
 
-@cache
 def dimensionless() -> Dimension:
     """The dimension of a plain number. A function, as pint takes 15 MB in each process that reads a unit."""
     return dimension_of("1")
