@@ -5,9 +5,11 @@ in it are executed. Two processes that need the same kernel at once compile it o
 Otolith or of its libraries are not used, and removed when the cache is full.
 """
 
+import ctypes
 import fcntl
 import hashlib
 import importlib.util
+import mmap
 import os
 import shutil
 import sys
@@ -136,3 +138,16 @@ def _remove_old(store: Path, keep: Path) -> None:
         if folder != keep:
             shutil.rmtree(folder, ignore_errors=True)
             (store / f"{folder.name}.lock").unlink(missing_ok=True)
+
+
+def release_compiler() -> None:
+    """Return memory to the system that loaded kernels do not need: LLVM's own code (50 MB), and what it has freed.
+
+    The code is only read, so that what a later compilation needs of it comes from the file again.
+    """
+    libc = ctypes.CDLL(None)
+    for line in Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines():
+        if " r-xp " in line and line.endswith("libllvmlite.so"):
+            begin, end = (int(text, 16) for text in line.partition(" ")[0].split("-"))
+            libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), mmap.MADV_DONTNEED)
+    libc.malloc_trim(0)

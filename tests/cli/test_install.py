@@ -155,7 +155,7 @@ def test_the_service_may_open_the_sockets_that_it_needs(
     expected = [] if sockets is None else ["RestrictAddressFamilies=", f"RestrictAddressFamilies={sockets}"]
     assert [line for line in lines if line.startswith("RestrictAddressFamilies")] == expected
     assert ("PrivateNetwork=yes" in lines) == (sockets == "AF_UNIX")
-    with_command = drop_in("press", [driver], listen, (), has_command=True)
+    with_command = drop_in("press", [driver], listen, (), command=True)
     assert "PrivateNetwork" not in with_command  # it may send a mail
 
 

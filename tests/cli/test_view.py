@@ -97,7 +97,7 @@ def test_the_newest_or_all_of_a_span_are_opened_in_order(services: Path, shown: 
     assert arguments_of(shown) == f"{BOUND} {paths[0]}"
     run("motor", "--since", "2h")
     assert arguments_of(shown) == f"{BOUND} {paths[1]} {paths[0]}"
-    run("motor", "--since", "1 day", "--web")
+    run("motor", "--since", "1d", "--web")
     assert arguments_of(shown) == f"{BOUND} --serve-web --web-viewer-port 0 " + " ".join(map(str, reversed(paths)))
     run(str(paths[3]))
     assert arguments_of(shown) == f"{BOUND} {paths[3]}"
@@ -134,8 +134,8 @@ def test_what_may_not_be_read_names_the_group(services: Path, monkeypatch: pytes
 
 
 def test_errors_name_the_way_out(services: Path, shown: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert "no recording of motor of the last 2h" in str(run("motor", "--since", "2h").exception)
-    assert "write it like 2h" in str(run("--since", "2 V").exception)
+    assert "no recording of motor since 20" in str(run("motor", "--since", "2h").exception)
+    assert "write an age like 12h" in str(run("--since", "2 V").exception)
     (tmp_path / "other.rrd").write_text("nothing", encoding="utf-8")
     assert "not a Rerun recording" in str(run(str(tmp_path / "other.rrd")).exception)
     path = made(services / "press-3" / "recordings", "hall.motor", 0.0)
@@ -146,5 +146,7 @@ def test_errors_name_the_way_out(services: Path, shown: Path, monkeypatch: pytes
     assert not shown.exists()
     program = Path(shown.parent / "bin" / "rerun")
     assert program.stat().st_mode & stat.S_IXUSR
+    program.write_text("#!/bin/sh\nexit 1\n", encoding="utf-8")  # its binary was removed
+    assert "is not installed" in str(run("--web").exception)
     program.unlink()
     assert "is not installed" in str(run("--web").exception)

@@ -234,3 +234,28 @@ def test_many_damaged_recordings_are_refused_or_read(
     tmp_path: Path, scenario: MotorScenario, changes: list[tuple[float, int]], end: float
 ) -> None:
     check_damaged(tmp_path, scenario, changes, end)
+
+
+RECORDS_NOTHING = """
+import sys
+from pathlib import Path
+from otolith.machine import load_machine
+from otolith.publishing import recorder
+from otolith_drivers.base import Sampling
+
+class Ended:
+    def recv(self):
+        return None
+
+machine = load_machine(Path(sys.argv[1]), with_driver=False)
+recorder.main(Ended(), Path(sys.argv[2]), machine.recorded(Sampling.TRUE))
+print(sys.modules.get("pandas"))
+"""
+
+
+def test_the_recorder_does_without_pandas(tmp_path: Path) -> None:
+    """Where it is installed, pyarrow would import it, which costs 34 MB."""
+    command = [sys.executable, "-c", RECORDS_NOTHING, str(MACHINE), str(tmp_path / "run.rrd")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "None\n"
+    assert (tmp_path / "run.rrd").stat().st_size > 0

@@ -109,3 +109,30 @@ def test_old_kernels_are_removed(cache: Path, monkeypatch: pytest.MonkeyPatch) -
         kernel_cache.load(f"number {index}", lambda: "")
         time.sleep(0.01)  # so that their times differ
     assert len([path for path in cache.iterdir() if path.is_dir()]) == 3
+
+
+RELEASED = """
+import re
+from pathlib import Path
+from numba import njit
+from otolith import kernel_cache
+
+def resident():
+    text = Path("/proc/self/smaps").read_text(encoding="utf-8")
+    found = re.findall(r" r-xp .*libllvmlite\\.so\\n(?:.+kB\\n)*?Rss: +(\\d+) kB", text)
+    return sum(map(int, found))
+
+add = njit(lambda a, b: a + b)
+assert add(1, 2) == 3
+before = resident()
+kernel_cache.release_compiler()
+print(before, resident())
+assert add(1.5, 2.0) == 3.5  # compiled again, for other types
+"""
+
+
+def test_the_compiler_returns_its_memory_and_goes_on_compiling() -> None:
+    done = subprocess.run([sys.executable, "-c", RELEASED], capture_output=True, text=True, check=True)
+    before, after = map(int, done.stdout.split())
+    assert before > 10_000  # kB
+    assert after < 0.1 * before

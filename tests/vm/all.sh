@@ -22,6 +22,14 @@ begun=$SECONDS code=0
 mkdir -p "$share"
 rm -f "$share"/*.whl
 "$python" -m pip --disable-pip-version-check wheel --quiet --no-deps --wheel-dir "$share" .
-SHARE=$share tests/vm/run.sh tests/vm/in_guest.sh -v -s tests/vm/test_can.py tests/vm/test_unit.py || code=1
+
+# The same disk through a first boot, a reboot, and a power cut.
+work=$(mktemp -d)
+trap 'rm -rf --one-file-system "$work"' EXIT
+export SHARE=$share DISK=$work/disk
+boot() { tests/vm/run.sh "$@" || code=1; }
+boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py tests/vm/test_life.py
+boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_reboot '&&' python -m tests.vm.cut_power
+boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_power_cut
 echo "system tests took $((SECONDS - begun)) s"
 exit $code

@@ -1,5 +1,5 @@
 #!/bin/bash
-# Builds the guest of the system tests, once: Debian 12 with systemd, can-utils and a venv of our dependencies.
+# Builds the guest of the system tests, once: Debian 12 with systemd, can-utils and a venv of our dependencies and pytest.
 # Prints where the image lies. It is made again when a dependency, the kernel or this script changes.
 set -euo pipefail
 umask 022
@@ -14,7 +14,9 @@ requirements=$("$python" - "$root/pyproject.toml" <<'PYTHON'
 import sys, tomllib
 with open(sys.argv[1], "rb") as file:
     project = tomllib.load(file)["project"]
-print("\n".join([*project["dependencies"], *project["optional-dependencies"]["dev"]]))
+extras = project["optional-dependencies"]
+tools = [text for text in extras["dev"] if text.startswith(("hypothesis", "psutil", "pytest>"))]
+print("\n".join([*project["dependencies"], *extras["mqtt"], *extras["opcua"], *tools]))
 PYTHON
 )
 key=$(cat "$here/image.sh" "$here"/guest/* "$root/constraints.txt" <(echo "$requirements $kernel") | sha256sum)

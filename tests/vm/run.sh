@@ -4,6 +4,7 @@
 #   tests/vm/run.sh COMMAND...        # like tests/vm/run.sh systemctl --failed
 #
 # The repository lies at /mnt/source, read-only, and is where COMMAND begins; $SHARE of the host at /mnt/share.
+# What the guest writes to its disk is kept in the file $DISK, if that is set, for the next boot.
 # Exit code: COMMAND's own; 124 not finished within $SECONDS_AT_MOST; 125 the guest failed.
 set -euo pipefail
 here=$(dirname "$(realpath "$0")")
@@ -34,10 +35,13 @@ printf '%s ' "$@" >"$share/command"
 
 # A session of its own, so that all of the guest ends with it. Its first terminal is our standard output.
 begun=$SECONDS
-setsid env "${settings[@]}" linux.uml "mem=${memory}M" "ubd0=$work/disk,$image" root=/dev/ubda rw \
+# The machine in the guest sends in real time: on a busy computer the guest goes first. The niceness of a session, in
+# which Linux groups processes, is that of its autogroup.
+setsid nice -n -10 env "${settings[@]}" linux.uml "mem=${memory}M" "ubd0=${DISK:-$work/disk},$image" root=/dev/ubda rw \
   con=null con0=null,fd:3 con1=null,fd:1 ssl=null console=tty0 "uml_dir=$work" "otolith.share=$share" \
   quiet systemd.show_status=0 </dev/null 3>"$work/console" 2>&3 &
 guest=$!
+{ sleep 0.5; echo -10 >"/proc/$guest/autogroup"; } 2>/dev/null || true
 while kill -0 "$guest" 2>/dev/null && [ $((SECONDS - begun)) -lt "$limit" ]; do sleep 0.2; done
 if [ -s "$share/rc" ]; then exit "$(cat "$share/rc")"; fi
 tail -n 40 "$work/console" >&2

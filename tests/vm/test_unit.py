@@ -9,65 +9,48 @@ import pytest
 
 from otolith.health.schema import Status
 from tests.vm.conftest import Machine, resistance, run
-
-SYSTEMD = Path(__file__).parents[2] / "systemd"
-UNIT = "otolith@bench"
-
-
-def shown(name: str) -> str:
-    """A property of the unit."""
-    return run("systemctl", "show", "--value", f"--property={name}", UNIT).strip()
+from tests.vm.service import Instance
 
 
 @pytest.fixture
-def installed(machine: Machine) -> Iterator[Machine]:
-    """As README.md says; /opt/otolith is there already. Kernels that are compiled are taken over."""
-    file = machine.file.with_name("bench.toml")
-    if file != machine.file:
-        shutil.copy(machine.file, file)
-    run("systemd-sysusers", str(SYSTEMD / "otolith.sysusers.conf"))
-    cache = Path("/var/cache/otolith/bench")
-    cache.parent.mkdir(exist_ok=True)
-    shutil.copytree(Path.home() / ".cache" / "otolith", cache)
-    run("chown", "--recursive", "otolith:otolith", str(cache))
-    run("/opt/otolith/bin/otolith", "install", str(file), seconds=600.0)
-    yield machine
-    run("systemctl", "disable", "--now", UNIT)
+def bench(machine: Machine) -> Iterator[Instance]:
+    bench = Instance("bench")
+    bench.install(Path(shutil.copy(machine.file, machine.file.with_name("bench.toml"))))
+    yield bench
+    run("systemctl", "disable", "--now", bench.unit)
 
 
-def failure() -> str:
-    return "" if shown("ActiveState") in {"active", "activating"} else run("journalctl", "--unit", UNIT, "--no-pager")
-
-
-def test_the_shipped_unit_serves_and_comes_back(installed: Machine) -> None:
-    installed.plant()
+def test_the_shipped_unit_serves_and_comes_back(machine: Machine, bench: Instance) -> None:
+    machine.plant()
     begun = time.monotonic()
-    run("systemctl", "enable", "--now", UNIT)  # returns when the daemon has said that it is ready
+    run("systemctl", "enable", "--now", bench.unit)  # returns when the daemon has said that it is ready
     print(f"ready after {time.monotonic() - begun:.1f} s")
-    assert (shown("ActiveState"), shown("SubState"), shown("Type")) == ("active", "running", "notify")
-    listener = installed.listener(failure)
+    assert (bench.shown("ActiveState"), bench.shown("SubState"), bench.shown("Type")) == ("active", "running", "notify")
+    listener = machine.listener(bench.failure)
     reports = listener.wait_for_good(3)
     assert resistance(reports).status is Status.ESTIMATED
-    assert "R_a" in shown("StatusText")
-    first = shown("MainPID")
+    assert "R_a" in bench.shown("StatusText")
+    first = bench.shown("MainPID")
     status = Path(f"/proc/{first}/status").read_text(encoding="ascii")
     user = run("id", "--user", "otolith").strip()
     assert f"\nUid:\t{user}\t{user}\t{user}\t{user}\n" in status
     assert "\nSeccomp:\t2\n" in status
+    sockets = run("ss", "--no-header", "--numeric", "--processes", "--listening", "--tcp", "--udp").splitlines()
+    assert [machine.endpoint.removeprefix("tcp/") in line for line in sockets if "otolith" in line] == [True]
 
     run("kill", "-KILL", first)
     begun = time.monotonic()
-    while shown("MainPID") in {"0", first}:
-        assert time.monotonic() < begun + 30.0, failure()
+    while bench.shown("MainPID") in {"0", first}:
+        assert time.monotonic() < begun + 30.0, bench.failure()
         time.sleep(0.1)
     index = reports[-1].window.index
     reports = listener.wait_for(lambda reports: reports[-1].window.index < index)
     listener.wait_for_good(2)
     print(f"good again {time.monotonic() - begun:.1f} s after it was killed")
-    assert shown("NRestarts") == "1"
+    assert bench.shown("NRestarts") == "1"
 
     begun = time.monotonic()
-    run("systemctl", "stop", UNIT)
+    run("systemctl", "stop", bench.unit)
     print(f"stopped in {time.monotonic() - begun:.1f} s")
-    assert (shown("ActiveState"), shown("Result")) == ("inactive", "success")
-    assert "Traceback" not in run("journalctl", "--unit", UNIT, "--no-pager")
+    assert (bench.shown("ActiveState"), bench.shown("Result")) == ("inactive", "success")
+    assert "Traceback" not in bench.log()

@@ -9,6 +9,7 @@ import json
 import logging
 import math
 import re
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -65,6 +66,7 @@ def main(connection: Any, path: Path, source: RecordedMachine, folder: Recording
     """
     if not has_room(path):
         return
+    sys.modules.setdefault("pandas", None)  # type: ignore[arg-type]  # pyarrow would import it: 34 MB for nothing
     recording = RotatedRecording(path, source, folder, time.time())
     try:
         while (report := connection.recv()) is not None and recording.has_room(time.time()):

@@ -8,14 +8,7 @@ from pathlib import Path
 from otolith.health.schema import Report
 from otolith.machine import LoadedMachine
 from otolith.runtime.process import ChildProcess
-from otolith.storage.recording_files import (
-    DAY,
-    GIGABYTE,
-    MEGABYTE,
-    RESUME_FACTOR,
-    RecordingBudget,
-    RecordingFolder,
-)
+from otolith.storage.recording_files import DAY, GIGABYTE, MEGABYTE, RESUME_FACTOR, RecordingBudget, RecordingFolder
 from otolith_drivers.errors import OtolithError
 from otolith_drivers.user_dirs import writable
 

@@ -66,6 +66,7 @@ def main(connection: Any, state: AdaptationState) -> None:
         connection.send(Ready())
         while (task := connection.recv()) is not None:
             connection.send(perform(*task))
+            kernel_cache.release_compiler()
 
 
 def perform(state: AdaptationState, window: Window) -> WorkerResult:

@@ -27,7 +27,9 @@ def dimension_of(unit_text: str) -> Dimension:
     return unit(unit_text).dimensionality
 
 
-NONE = dimension_of("1")
+def dimensionless() -> Dimension:
+    """The dimension of a plain number. A function, as pint takes 15 MB in each process that reads a unit."""
+    return dimension_of("1")
 
 
 def infer_dimension(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension:
@@ -38,9 +40,9 @@ def infer_dimension(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension
     """
     match tree:
         case ast.Constant(value=value):
-            return None if value == 0 else NONE
+            return None if value == 0 else dimensionless()
         case ast.Name(id=name):
-            return NONE if name == "pi" else known[name]
+            return dimensionless() if name == "pi" else known[name]
         case ast.UnaryOp(operand=operand):
             return infer_dimension(operand, known)
         case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
@@ -50,7 +52,7 @@ def infer_dimension(tree: ast.expr, known: Mapping[str, Dimension]) -> Dimension
             return None if first is None or second is None else _tidy(first * second)
         case ast.BinOp(left=left, op=ast.Div(), right=right):
             first, second = infer_dimension(left, known), infer_dimension(right, known)
-            return None if first is None else _tidy(first / (NONE if second is None else second))
+            return None if first is None else _tidy(first / (dimensionless() if second is None else second))
         case ast.BinOp(left=left, op=ast.Pow(), right=right):
             base = infer_dimension(left, known)
             return None if base is None else _tidy(base ** constant(right))
@@ -76,14 +78,14 @@ def _call(name: str, arguments: list[ast.expr], known: Mapping[str, Dimension]) 
         return _same(arguments, known, name)
     if name == "atan2":
         _same(arguments, known, name)
-        return NONE
+        return dimensionless()
     dimension = infer_dimension(arguments[0], known)
     if name == "sqrt":
         return None if dimension is None else _tidy(dimension**0.5)
-    if name != "sign" and dimension is not None and dimension != NONE:
+    if name != "sign" and dimension is not None and dimension != dimensionless():
         text = f"{name} takes a plain number, not {describe(dimension)}: {ast.unparse(arguments[0])}"
         raise ExpressionError(text, arguments[0].col_offset + 1)
-    return NONE
+    return dimensionless()
 
 
 def _same(parts: list[ast.expr], known: Mapping[str, Dimension], what: str) -> Dimension:
@@ -102,7 +104,7 @@ def _same(parts: list[ast.expr], known: Mapping[str, Dimension], what: str) -> D
 
 def describe(dimension: Dimension) -> str:
     """The dimension as a common unit such as "V" or "N*m", else in base units."""
-    if dimension is None or dimension == NONE:
+    if dimension is None or dimension == dimensionless():
         return "a plain number"
     for name in NAMED_UNITS:
         if dimension_of(name) == dimension:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, StateVariable
-from otolith.twin.dimensions import NONE, Dimension, describe, dimension_of, infer_dimension
+from otolith.twin.dimensions import Dimension, describe, dimension_of, dimensionless, infer_dimension
 from otolith.twin.expressions import ExpressionError, check_known, check_name, names_in, parse
 from otolith_drivers.config_files import Limits, Location, SourceFile, StrictModel, expect, validate
 from otolith_drivers.config_files import parse as parse_toml
@@ -406,14 +406,14 @@ class _EquationChecker:
             self._fault(at, text)
             return
         if site.mode == "multiplicative":
-            if site.through != "1" or dimension_of(site.unit) != NONE:
+            if site.through != "1" or dimension_of(site.unit) != dimensionless():
                 self._fault(at, 'a multiplicative component has no unit: write unit = "1", and no through')
             return
         tree = self._tree(at, site.through)
         if tree is None:
             return
         try:
-            entering = (infer_dimension(tree, self._known) or NONE) * dimension_of(site.unit)
+            entering = (infer_dimension(tree, self._known) or dimensionless()) * dimension_of(site.unit)
         except ExpressionError as error:
             self._fault(at, str(error))
             return

@@ -22,6 +22,8 @@ from otolith_drivers.errors import ConfigurationError, ServiceError
 
 UNIT, SYSUSERS = "otolith@.service", "otolith.sysusers.conf"
 PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
+Table = Mapping[str, Any]
+Texts = Sequence[str]
 USER, ETC = "otolith", Path("etc/otolith")
 # Drivers whose addresses are in the keys 'host', 'endpoint' and 'channel'.
 KNOWN_DRIVERS = {"can", "modbus", "mqtt", "opcua", "plant", "replay"}
@@ -89,8 +91,8 @@ def _files(file: Path) -> Iterator[InstalledFile]:
     yield InstalledFile(etc / "systemd/system" / UNIT, (shipped / UNIT).read_bytes())
     yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
     zenoh = machine.file.zenoh
-    has_command = bool(machine.file.machine.on_event)
-    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, has_command=has_command)
+    command = bool(machine.file.machine.on_event)
+    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, command=command)
     yield InstalledFile(etc / f"systemd/system/otolith@{file.stem}.service.d/machine.conf", text.encode())
     yield InstalledFile(ETC / file.name, file.read_bytes())
     for name in named_files(file):
@@ -125,17 +127,10 @@ def _strings(value: Any) -> Iterator[str]:
             yield from _strings(item)
 
 
-def drop_in(
-    name: str,
-    drivers: Sequence[Mapping[str, Any]],
-    listen: Sequence[str],
-    connect: Sequence[str],
-    *,
-    has_command: bool = False,
-) -> str:
+def drop_in(name: str, drivers: Sequence[Table], listen: Texts, connect: Texts, *, command: bool = False) -> str:
     """Return the drop-in of the unit: devices, addresses and kinds of sockets that the machine file needs, no others.
 
-    ``has_command``: the daemon runs a command for each event, which may use the network of this computer.
+    ``command``: the daemon runs one for each event, which may use the network of this computer.
     """
     from otolith.machine_file import address_of, host_of
 
@@ -147,40 +142,34 @@ def drop_in(
         lines += ["SupplementaryGroups=dialout"]
     hosts = [host for endpoint in connect if (host := host_of(endpoint))]
     hosts += [host for driver in drivers for host in _hosts_of(driver)]
-    unknown = [host for host in hosts if not address_of(host) and host != "localhost"]
     published = [host for endpoint in listen if (host := host_of(endpoint))]
-    public = [host for host in published if host != "localhost"]
-    unknown += [host for host in public if (address := address_of(host)) is None or not address.is_loopback]
     buses = [bus for driver in drivers if driver.get("type") == "can" for bus in _can_buses(driver)]
     foreign = [f"driver {driver.get('type')!r}" for driver in drivers if driver.get("type") not in KNOWN_DRIVERS]
     foreign += [f"CAN interface {bus!r}" for bus in buses if bus not in KNOWN_BUSES]
     if not foreign:
-        sockets = ["AF_UNIX"] + (["AF_CAN"] if "socketcan" in buses else [])
-        if hosts or published or has_command or "udp_multicast" in buses:
-            sockets += ["AF_INET", "AF_INET6"]
-        lines += ["RestrictAddressFamilies=", f"RestrictAddressFamilies={' '.join(sockets)}"]
-        lines += ["PrivateNetwork=yes"] if sockets == ["AF_UNIX"] else []
-    if unknown := [*unknown, *foreign]:
-        comment = (
-            f"# No IPAddressDeny: the addresses that {', '.join(dict.fromkeys(unknown))} stands for are not known."
-        )
-        return "\n".join([*lines, comment, ""])
+        needs_ip = hosts or published or command or "udp_multicast" in buses
+        sockets = (["AF_CAN"] if "socketcan" in buses else []) + (["AF_INET", "AF_INET6"] if needs_ip else [])
+        lines += ["RestrictAddressFamilies=", " ".join(["RestrictAddressFamilies=AF_UNIX", *sockets])]
+        lines += [] if sockets else ["PrivateNetwork=yes"]
+    local = {host: (address := address_of(host)) and address.is_loopback for host in hosts + published}
+    local["localhost"] = True
+    unknown = [host for host in hosts if local[host] is None] + [host for host in published if not local[host]]
+    if unknown or foreign:
+        names = ", ".join(dict.fromkeys([*unknown, *foreign]))
+        return "\n".join([*lines, f"# No IPAddressDeny: the addresses that {names} stands for are not known.", ""])
     multicast = ["multicast"] if "udp_multicast" in buses else []
-    allowed = dict.fromkeys(["localhost", *multicast, *(host for host in hosts if address_of(host))])
+    allowed = dict.fromkeys(["localhost", *multicast, *hosts])
     return "\n".join([*lines, "IPAddressDeny=any", *(f"IPAddressAllow={host}" for host in allowed), ""])
 
 
-def _can_buses(driver: Mapping[str, Any]) -> Sequence[str]:
+def _can_buses(driver: Table) -> Sequence[str]:
     """Return the interfaces of python-can that a table ``[driver]`` may use."""
-    from otolith_drivers.canbus.bus import DEFAULT_CHANNEL
-
-    interface, channel = str(driver.get("interface", "auto")), str(driver.get("channel", DEFAULT_CHANNEL))
-    if interface != "auto":
-        return (interface,)
-    return ("socketcan", "udp_multicast") if channel.startswith("vcan") else ("socketcan",)
+    is_virtual = str(driver.get("channel", "vcan")).startswith("vcan")
+    automatic = ("socketcan", "udp_multicast") if is_virtual else ("socketcan",)
+    return automatic if driver.get("interface", "auto") == "auto" else (str(driver["interface"]),)
 
 
-def _hosts_of(driver: Mapping[str, Any]) -> Iterator[str]:
+def _hosts_of(driver: Table) -> Iterator[str]:
     """Yield the computers that a table ``[driver]`` names."""
     if isinstance(host := driver.get("host"), str):
         yield host

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sysconfig
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import click
 
 from otolith.cli.common import local_time
+from otolith.cli.operation.history import age_or_date
 from otolith.storage.recording_files import MEGABYTE, RecordingFile, recording_file
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import cache_directory, state_directory
@@ -24,10 +24,11 @@ LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all 
 
 @click.command()
 @click.argument("recording", metavar="[MACHINE|FILE]", required=False)
-@click.option("--since", metavar="TIME", help='All recordings of the last TIME, as "2h" or "3 days".')
+@click.option("--since", callback=lambda *given: given[-1] and age_or_date(*given), metavar="AGE|DATE",
+              help="All recordings from here on, like 12h, 30d, 8w.")  # fmt: skip
 @click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
 @click.option("--web", is_flag=True, help="For a browser on this computer, instead of a window.")
-def view(recording: str | None, since: str | None, only_list: bool, web: bool) -> int:
+def view(recording: str | None, since: float | None, only_list: bool, web: bool) -> int:
     """Open the newest recording, or FILE, in the Rerun viewer.
 
     MACHINE is the name of the machine that it is of, with or without its site, or an instance of the service.
@@ -44,9 +45,8 @@ def view(recording: str | None, since: str | None, only_list: bool, web: bool) -
         if since or only_list:
             raise click.UsageError("--since and --list choose among the recordings of a machine, not of a file")
         return open_viewer([path], web=web)
-    seconds = _seconds(since)
     known = Recordings.search(recording or "")
-    files = [file for file in known.files if seconds is None or file.end >= time.time() - seconds]
+    files = [file for file in known.files if since is None or file.end >= since]
     if only_list:
         width = max((len(file.key) for file in files), default=0)
         click.echo("".join(f"{_row(file, width)}\n" for file in files), nl=False)
@@ -55,16 +55,7 @@ def view(recording: str | None, since: str | None, only_list: bool, web: bool) -
         return 0
     if not files:
         raise ConfigurationError(known.none_text(since))
-    return open_viewer([file.path for file in (files[:1] if seconds is None else reversed(files))], web=web)
-
-
-def _seconds(text: str | None) -> float | None:
-    from otolith_drivers.units import Quantity
-
-    try:
-        return None if text is None else Quantity("s", 0.0)(text)
-    except ValueError as error:
-        raise click.BadParameter(f"{error}; write it like 2h or '3 days'", param_hint="'--since'") from error
+    return open_viewer([file.path for file in (files[:1] if since is None else reversed(files))], web=web)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +86,10 @@ class Recordings:
         newest_first = sorted(files.values(), key=lambda file: file.end, reverse=True)
         return cls(machine, (own, SERVICES), tuple(newest_first), tuple(unreadable))
 
-    def none_text(self, since: str | None) -> str:
+    def none_text(self, since: float | None) -> str:
         """Return why there is nothing to open, and what to do."""
         of = f" of {self.machine}" if self.machine else ""
-        span = f" of the last {since}" if since else ""
+        span = f" since {local_time(since)}" if since else ""
         where = " and ".join(map(str, self.places))
         remedy = "'otolith run' makes one, or 'otolith replay --recording FILE.rrd'"
         return "; ".join([f"{where}: no recording{of}{span}", *(self.unreadable or (remedy,))])
@@ -153,11 +144,12 @@ def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:
         remedy = "'otolith view --web' serves it to a browser, through a tunnel like 'ssh -L'"
         raise ServiceError(f"no display here: {remedy}; or copy {paths[0]} to a computer with one")
     program = Path(sysconfig.get_path("scripts")) / "rerun"
-    if not program.exists():
-        raise ServiceError(f"{program}: the Rerun viewer is not installed; copy {paths[0]} to a computer that has it")
     # Only 'rerun analytics disable' switches its analytics off, by a file; a folder of ours keeps the user's settings.
     environment = {**os.environ, "XDG_CONFIG_HOME": str(cache_directory("viewer"))}
-    subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)  # noqa: S603 - our viewer
+    command = [str(program), "analytics", "disable"]
+    # The program may be there without the viewer that it starts: docs/service.md shows how to do without.
+    if not program.exists() or subprocess.run(command, env=environment, capture_output=True, check=False).returncode:  # noqa: S603 - our viewer
+        raise ServiceError(f"{program}: the Rerun viewer is not installed; copy {paths[0]} to a computer that has it")
     with tempfile.TemporaryDirectory(prefix="otolith-view-") as folder:
         whole = list(_whole(program, paths, Path(folder)))
         target = ("--serve-web", "--web-viewer-port", "0") if web else ()

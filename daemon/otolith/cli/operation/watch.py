@@ -21,12 +21,7 @@ PATIENCE = 5.0  # s without a report until the stream prints what it waits for
 
 
 def watch_reports(
-    connection: Connection,
-    machine: str,
-    *,
-    as_json: bool,
-    after: int | None,
-    stopped: Callable[[], bool],
+    connection: Connection, machine: str, *, as_json: bool, after: int | None, stopped: Callable[[], bool]
 ) -> None:
     """Show reports until ``stopped``; wait for a daemon that is not there yet.
 

@@ -1,0 +1,30 @@
+"""A service that was enabled goes on after a boot. Each test runs in a boot of its own, after test_life.py."""
+
+import json
+from pathlib import Path
+
+from tests.vm.conftest import run
+from tests.vm.service import Before, Instance
+
+WHOLE = Path.home() / "whole.rrd"
+
+
+def remembered(press: Instance) -> Before:
+    return Before(**json.loads(press.remembered.read_text(encoding="utf-8")))
+
+
+def test_after_a_reboot() -> None:
+    press = Instance("press")
+    press.check_continued(remembered(press))
+    press.remember(press.before())
+
+
+def test_after_a_power_cut() -> None:
+    press = Instance("press")
+    press.check_continued(remembered(press))
+    assert not list(press.state.rglob("*.kept.*"))
+    recordings = sorted(press.state.rglob("*.rrd"))
+    assert len(recordings) >= 2
+    for recording in recordings:  # what is whole of each can be opened
+        run("/opt/otolith/bin/rerun", "rrd", "optimize", "--continue-on-error", str(recording), "-o", str(WHOLE))
+        assert WHOLE.stat().st_size > 0

@@ -1,0 +1,116 @@
+"""What an installed service has learned survives the ways in which it may end. Runs in the guest, as root."""
+
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.publishing import attacker
+from tests.vm.conftest import PATIENCE, run
+from tests.vm.service import Instance, simulated_machine
+
+SHARE = Path("/mnt/share")
+STRANGER = "65533"  # a user of no group
+
+
+@pytest.fixture(scope="module")
+def press(tmp_path_factory: pytest.TempPathFactory) -> Instance:
+    """A service that has estimated, raised an event, and found a component that is approved."""
+    previous = [str(path) for path in SHARE.glob("previous/*.whl")]
+    if previous:
+        install_wheel(*previous)
+    press = Instance("press")
+    press.install(simulated_machine(tmp_path_factory.mktemp("press")))
+    run("systemctl", "enable", "--now", press.unit, seconds=300.0)
+    deadline = time.monotonic() + 400.0
+    while not ((report := press.wait_for_reports(1, seconds=300.0)[-1]).components and report.events):
+        assert time.monotonic() < deadline, report.to_json()
+        time.sleep(1.0)
+    print(f"a component after {report.window.index} windows")
+    component = report.components[0].id
+    press.otolith("components", "approve", str(press.file), component)
+    while press.reports()[-1].components[0].approval != "approved":
+        assert time.monotonic() < deadline
+        time.sleep(0.5)
+    return press
+
+
+def install_wheel(*wheels: str) -> None:
+    run("/opt/otolith/bin/pip", "--disable-pip-version-check", "install", "--quiet", "--no-index", "--no-deps",
+        "--force-reinstall", *wheels, seconds=300.0)  # fmt: skip
+
+
+def test_nobody_else_reads_or_publishes(press: Instance) -> None:
+    """A user of no group can open neither the socket nor the files, and nothing of the service listens elsewhere."""
+    (endpoint,) = Path("/run/otolith/press").glob("*.sock")
+    given = {"connect": f"unixsock-stream/{endpoint}", "uid": int(STRANGER)}
+    command = [sys.executable, attacker.__file__, json.dumps(given)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert (done.stdout, done.returncode) == ("refused\n", 0), done.stderr
+    (database,) = press.state.rglob("*.history.sqlite")
+    (recording, *_) = press.state.rglob("*.rrd")
+    for path in (endpoint, press.state, database, recording):
+        assert (
+            run("setpriv", "--reuid", STRANGER, "--regid", STRANGER, "--clear-groups", "test", "!", "-r", str(path))
+            == ""
+        )
+    network = ("nsenter", "--net", "--target", press.shown("MainPID"))
+    assert run(*network, "ss", "--no-header", "--all", "--tcp", "--udp", "--raw", "--packet") == ""
+    assert run(*network, "ip", "-brief", "link").split()[0] == "lo"
+
+
+def test_the_sandbox_is_tight(press: Instance) -> None:
+    shown = run("systemd-analyze", "security", "--no-pager", press.unit)
+    exposure = re.search(r"exposure level for \S+: ([\d.]+)", shown)
+    assert exposure is not None
+    print(f"exposure {exposure[1]}")
+    assert float(exposure[1]) <= 1.0
+
+
+def test_what_was_learned_survives_a_kill(press: Instance) -> None:
+    before, first = press.before(), press.shown("MainPID")
+    run("kill", "-KILL", first)
+    press.check_continued(before)
+    assert press.shown("MainPID") != first
+
+
+def test_what_was_learned_survives_a_restart_which_is_ready_in_3_s(press: Instance) -> None:
+    press.wait_for_reports(3, after=press.reports()[-1].sequence or 0)
+    before, begun = press.before(), time.monotonic()
+    run("systemctl", "stop", press.unit)
+    stopped = time.monotonic()
+    run("systemctl", "start", press.unit)  # returns when the daemon is ready
+    ready, wall = time.monotonic(), time.time()
+    print(f"stopped in {stopped - begun:.1f} s, ready after {ready - stopped:.1f} s")
+    first = press.check_continued(before)[0]
+    published = first.window.end + (first.cost.latency_s or 0.0)
+    print(f"the first report came {published - wall:.1f} s after it was ready")
+
+
+def test_all_processes_take_at_most_300_mb(press: Instance) -> None:
+    """With all kernels on disk, as after an installation: a daemon that has compiled takes 130 MB more."""
+    processes = Path(f"/sys/fs/cgroup{press.shown('ControlGroup')}/cgroup.procs").read_text(encoding="ascii").split()
+    rows = [Path(f"/proc/{process}/smaps_rollup").read_text(encoding="ascii") for process in processes]
+    taken = [int(re.findall(r"^Pss: +(\d+) kB$", text, re.MULTILINE)[0]) / 1024 for text in rows]
+    print(f"{sum(taken):.0f} MB: {taken}")
+    assert len(taken) == 4
+    assert sum(taken) <= 300.0
+
+
+def test_what_was_learned_survives_an_upgrade(press: Instance) -> None:
+    before, source = press.before(), Path.home() / "press"
+    source.mkdir()
+    install_wheel(*map(str, SHARE.glob("*.whl")))
+    press.install(simulated_machine(source))
+    run("systemctl", "restart", press.unit)
+    press.check_continued(before)
+
+
+def test_it_goes_on_until_the_computer_is_switched_off(press: Instance) -> None:
+    """The tests of the next boot go on from here."""
+    press.remember(press.before())
+    assert not press.failure()
