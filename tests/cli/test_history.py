@@ -18,6 +18,7 @@ from otolith.health.schema import EventChange
 from otolith.storage.history import HOUR, history_path
 from otolith.storage.history_writer import Bounds, HistoryWriter, Numbers
 from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.user_dirs import state_directory
 from tests.storage.histories import MACHINE, SITE, document, documents
 
 COUNT, LENGTH = 400, 30.0
@@ -102,6 +103,21 @@ def test_csv_json_and_parquet_have_the_same_values(written: HistoryWriter, tmp_p
     assert [event["change"] for event in document["events"]] == ["raised"] * 4
     assert document["findings"][0]["count"] == COUNT // 2
     assert document["counters"][-1]["windows"] == COUNT - 1
+
+
+def test_each_change_of_an_event_has_its_evidence(written: HistoryWriter) -> None:
+    ends = list(written.reader.event_ends(0.0).items())
+    folder = state_directory() / "evidence"
+    folder.mkdir(parents=True)
+    stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(ends[1][1]))
+    path = folder / f"{SITE}.{MACHINE}-000001-{stamp}.zip"
+    for name in (path.name, path.name.replace(MACHINE, "other"), path.name.replace(stamp, "20000101T000000")):
+        (folder / name).touch()
+    lines = run(MACHINE, "--events", width=400).stdout.splitlines()
+    changes = [number for number, line in enumerate(lines) if line.startswith("raised: ")]
+    assert [line for line in lines if "reproduce" in line] == [lines[changes[1] + 1]] == [f"  otolith reproduce {path}"]
+    assert json.loads(run(MACHINE, "--json").stdout)["evidence"] == {str(ends[1][0]): str(path)}
+    assert "reproduce" not in run(MACHINE).stdout
 
 
 def test_a_parquet_file_that_cannot_be_written_is_named(written: HistoryWriter, tmp_path: Path) -> None:

@@ -441,8 +441,8 @@ def test_a_trend_that_warming_may_explain_is_no_event_without_a_temperature(temp
     for at, document in enumerate(documents):
         window = document.window.model_copy(update={"observed": {"winding": 293.15}})
         documents[at] = document.model_copy(update={"window": window})
-    found = changes(assessed(documents, plan=replace(PLAN, parameters={"R_a": copper})))
-    assert len(found) == expected
+    announced = changes(assessed(documents, plan=replace(PLAN, parameters={"R_a": copper})))
+    assert len(announced) == expected
 
 
 def lost(index: int, *, others: bool = True) -> ReportDocument:

@@ -6,7 +6,7 @@ import socket
 import pytest
 from rich.console import Console
 
-from otolith.cli.operation.live_table import BARS, LEVEL_STYLES, LiveTable, event_style
+from otolith.cli.operation.live_table import BARS, LEVEL_STYLES, LiveTable, event_style, sparkline
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import value_cells
@@ -97,12 +97,30 @@ def test_a_cleared_event_has_the_style_of_what_is_well() -> None:
     assert all(event_style(event) == LEVEL_STYLES[levels[event.change]] for event in events)
 
 
+def test_the_curve_is_scaled_to_the_limits() -> None:
+    """Noise of a healthy machine is no mountain, and a value at ACT is at the edge."""
+    scale = (6.175, 6.825)
+    assert sparkline((6.5, 6.5001, 6.4999), scale) == BARS[4] + BARS[4] + BARS[3]
+    assert sparkline((6.8, 6.174, 5.0), scale) == BARS[7] + BARS[0] + BARS[0]
+    healthy = documents()[0].parameters["R_a"]
+    assert healthy.limit == pytest.approx(6.0)
+    assert drawn(documents()[0]).count(BARS[4]) == 1
+
+
+@pytest.mark.parametrize("width", [40, 60])
+def test_a_narrow_terminal_splits_no_word(width: int) -> None:
+    document = next(document for document in documents() if document.health and document.health.state is Level.ACT)
+    words = drawn(document, width=width).split()
+    assert {"estimated", "resistance", "winding:"} <= set(words)
+    assert {*value_cells(document.parameters["R_a"])[:3]} <= set(words)
+
+
 def test_each_machine_has_its_own_table_and_curves() -> None:
     first, second = documents()[0], documents()[0].model_copy(update={"machine": "press-9"})
     text = drawn(second, first, second)
     blocks = [block for block in text.split("\n\n") if "R_a" in block]
     assert [block.split()[0] for block in blocks] == [first.machine, "press-9"]
-    assert [block.count(BARS[3]) for block in blocks] == [1, 2]  # a point per report of that machine
+    assert [block.count(BARS[4]) for block in blocks] == [1, 2]  # a point per report of that machine
     assert "--machine NAME" in text
     assert "--machine NAME" not in drawn(first)
 

@@ -170,9 +170,12 @@ def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
 
 
 def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, float]:
-    """Return the baseline of a parameter, and its value at the reference temperature if a temperature is measured."""
+    """Return the baseline of a parameter, its limit, and its value at the reference temperature if one is measured."""
     quantity, item = plan.parameters.get(name, MonitoredQuantity()), report.parameters[name]
     judged = {"baseline": quantity.nominal} if quantity.has_baseline else {}
+    if quantity.limits:
+        worst = min(quantity.limits, key=lambda row: (-row.level.rank, abs(row.value - quantity.nominal)))
+        judged["limit"] = worst.value
     if quantity.temperature and item.value is not None:
         referred = quantity.referred(item.value, 0.0, report.window.observed or {})
         judged |= {"referred": referred[0]} if referred else {}

@@ -257,6 +257,8 @@ class ParameterDocument(StrictModel):
     nominal: float
     baseline: float | None = None
     """Value of the healthy machine, to which limits in percent refer; None if they refer to ``nominal``."""
+    limit: float | None = None
+    """Of the most severe limits, the one that is nearest to the healthy value; None without limits."""
     referred: float | None = None
     """Value at the reference temperature, by which the limits are judged; None if no temperature is measured."""
     raw: float | None = None

@@ -148,7 +148,7 @@ class Service:
     ) -> None:
         """``listen`` and ``recording`` replace the endpoints and the recording file that the machine file gives."""
         file, longest, period = machine.file, machine.problem.window.longest, machine.file.window.sample_period
-        self._machine = machine
+        self._machine, self._outputs = machine, {output.name for output in machine.twin.outputs}
         self._listen = file.zenoh.listen if listen is None else listen
         plans = machine.plans(machine.driver.sampling)
         self._rings = _rings(machine, max(plan.delay for plan in plans))
@@ -263,6 +263,7 @@ class Service:
         if self._history is not None:
             self._numbers, note = self._history.open(time.time())
             self._notes += (note,) if note else ()
+            self._history.description = describe_machine(self._machine.twin, self._machine.plan)
             self._history.start()
 
     def _reload(self) -> None:
@@ -275,6 +276,8 @@ class Service:
             log.warning("not reloaded, the daemon goes on as before: %s", error)
             return
         self._machine, self._evidence.files = change.machine, files
+        if self._history is not None:
+            self._history.description = describe_machine(change.machine.twin, change.machine.plan)
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
         if change.limits:
             self._supervisor.revise(lambda state: replace(state, plan=change.machine.plan))
@@ -306,8 +309,7 @@ class Service:
             self._supervisor.revise(lambda state: apply_decisions(state, decisions))
         self._windows += 1
         self._windows_bad += window.quality.verdict is Verdict.BAD
-        outputs = {output.name for output in self._machine.twin.outputs}
-        self._supervisor.submit(replace(window, absent=absent_sources(link, window, outputs)), now)
+        self._supervisor.submit(replace(window, absent=absent_sources(link, window, self._outputs)), now)
 
     def _adopt_achieved_period(self, period: float | None) -> None:
         """Use the sample period (s) that a polled machine achieves, if it is known, for the following windows."""
@@ -330,7 +332,6 @@ class Service:
         update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
         document = self._numbers.number(document.model_copy(update={**update, "notes": self._notes}))
         if self._history is not None:
-            self._history.description = describe_machine(self._machine.twin, self._supervisor.state.plan)
             self._history.add(document)
         if self._publisher is not None:
             self._publisher.publish(document)

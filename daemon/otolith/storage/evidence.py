@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
 
 VERSION = 1
 EVIDENCE, TWIN, MACHINE = "evidence.json", "twin.toml", "machine.toml"
-NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-\d{8}T\d{6}\.zip")
+NAME = re.compile(r"(?P<key>[^/]+)-(?P<number>\d{6,})-(?P<stamp>\d{8}T\d{6})\.zip")
 LIBRARIES = ("otolith", "numpy", "scipy", "sympy", "numba", "llvmlite")  # on which the last bit of a report may depend
 PUBLIC_KEYS = {"driver": ("type", "name", *FINGERPRINT_KEYS), "machine": ("name", "site"), "zenoh": ()}
 """Keys of tables of a machine file that bundles have; others may be secrets."""
@@ -279,6 +279,17 @@ def public_text(tables: Mapping[str, Any]) -> str:
     return "\n".join([*lines, ""])
 
 
+def bundles_of(site: str, machine: str) -> dict[str, Path]:
+    """Return the bundles of a machine in the state directory, by the time in their names: see :func:`stamp_of`."""
+    named = ((NAME.fullmatch(path.name), path) for path in sorted((state_directory() / "evidence").glob("*.zip")))
+    return {match["stamp"]: path for match, path in named if match and match["key"] == f"{site}.{machine}"}
+
+
+def stamp_of(end: float) -> str:
+    """Return the time in the name of the bundle of a window that ends at ``end`` (Unix s)."""
+    return datetime.fromtimestamp(end, UTC).strftime(STAMP)
+
+
 class EvidenceWriter(WriterThread):
     """The bundles of one machine while its daemon runs; the oldest are deleted for new ones."""
 
@@ -338,4 +349,4 @@ class EvidenceWriter(WriterThread):
             _, oldest = own.pop(0)
             total -= oldest.stat().st_size
             oldest.unlink()
-        return self.folder / f"{self._key}-{number:06d}-{datetime.fromtimestamp(end, UTC).strftime(STAMP)}.zip"
+        return self.folder / f"{self._key}-{number:06d}-{stamp_of(end)}.zip"

@@ -242,6 +242,10 @@ class HistoryReader:
         rows = self._rows("SELECT text FROM event WHERE time >= ? ORDER BY sequence", since)
         return [EventDocument.model_validate_json(text) for (text,) in rows]
 
+    def event_ends(self, since: float) -> dict[int, float]:
+        """Return the end of the window of each change of an event since a time, by its sequence number."""
+        return dict(self._rows("SELECT sequence, time FROM event WHERE time >= ?", since))
+
     def findings(self, since: float) -> list[dict[str, Any]]:
         """Return the findings since a time: ``first``, ``last``, ``count`` of windows, and the latest document."""
         query = "SELECT first, last, count, text FROM finding WHERE last >= ? ORDER BY first"

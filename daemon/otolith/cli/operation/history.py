@@ -3,9 +3,10 @@
 import csv
 import json
 import re
+import shlex
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -47,7 +48,7 @@ def age_or_date(_: click.Context, __: click.Parameter, text: str) -> float:
 @click.option("--parameter", "names", multiple=True, metavar="NAME", help="Only this one; may be repeated.")
 @click.option("--every", type=click.Choice(INTERVALS), show_default=False,
               help="Values of each window, minute, hour or day.  [default: as --since needs]")  # fmt: skip
-@click.option("--events", "only_events", is_flag=True, help="Only events and findings.")
+@click.option("--events", "only_events", is_flag=True, help="Only events with their evidence, and findings.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print the values, or the events, as CSV.")
 @AS_JSON
 @click.option("--parquet", type=FILE, callback=new_file, help="Write the values into this Parquet file.")
@@ -93,7 +94,8 @@ def history(
     elif as_json:
         _print_json(reader, interval, since, samples, events)
     else:
-        _print_table(reader, interval, since, samples, events, with_findings=only_events or not names)
+        bundles = _bundles(reader, since) if only_events else {}
+        _print_table(reader, interval, since, samples, events, bundles, with_findings=only_events or not names)
 
 
 def reader_of(machine: str) -> "HistoryReader":
@@ -201,6 +203,7 @@ def _print_json(
         "every": interval,
         "values": [asdict(sample) for sample in samples],
         "events": [event.model_dump(mode="json", exclude_none=True) for event in events],
+        "evidence": {number: str(path) for number, path in _bundles(reader, since).items()},
         "findings": reader.findings(since),
         "counters": reader.counters(since),
     }
@@ -213,6 +216,7 @@ def _print_table(
     since: float,
     samples: "Sequence[HistorySample]",
     events: "Sequence[EventDocument]",
+    bundles: "Mapping[int | None, Path]",
     *,
     with_findings: bool,
 ) -> None:
@@ -230,6 +234,8 @@ def _print_table(
     for event in events[-MAX_EVENTS:]:
         change = "" if event.end is not None else f"{event.change}: "  # the text of a cleared event begins with it
         console.print(f"{change}{event_text(event, local_time)}", style=event_style(event), markup=False)
+        if (bundle := bundles.get(event.sequence)) is not None:
+            click.echo(f"  otolith reproduce {shlex.quote(str(bundle))}")
     if len(events) > MAX_EVENTS:
         console.print(f"and {len(events) - MAX_EVENTS} earlier changes of events: --events --csv has them")
     for finding in reader.findings(since) if with_findings else ():
@@ -237,6 +243,15 @@ def _print_table(
         console.print(f"finding: {finding['text']}, {span}, in {finding['count']} windows", markup=False)
     if not samples and not events:
         click.echo("no values or events since then", err=True)
+
+
+def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
+    """Return the evidence of each change of an event since a time, by its sequence number, where there is some."""
+    from otolith.storage.evidence import bundles_of, stamp_of
+
+    bundles = bundles_of(reader.site, reader.machine)
+    stamps = {number: stamp_of(end) for number, end in reader.event_ends(since).items()}
+    return {number: bundles[stamp] for number, stamp in stamps.items() if stamp in bundles}
 
 
 def _table(samples: "Sequence[HistorySample]", width: int) -> object:

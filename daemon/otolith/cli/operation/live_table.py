@@ -17,10 +17,10 @@ from otolith.health.diagnosis import FindingKind
 from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
-from otolith.health.text import event_text, forecast_text, headline, interval_text, state_word, value_cells
+from otolith.health.text import event_text, forecast_text, headline, interval_text, state_word, value_cells, value_text
 
 HISTORY = 200  # windows that the curve of a parameter can show
-OTHER_COLUMNS = 72  # characters that the table needs beside the curve
+OTHER_COLUMNS = 72  # characters that the table needs beside the curve; a narrower terminal has lines instead
 WIDTH_WITH_LINES = 60  # characters of a terminal whose tables have lines; a narrower one has no room for them
 SILENT_WINDOWS = 3  # lengths of a window without a report until a warning; engineering choice, no test
 BARS = "▁▂▃▄▅▆▇█"
@@ -167,27 +167,38 @@ def _title_lines(document: ReportDocument, texts: Texts) -> list[Text]:
 
 def _parameters(
     parameters: Mapping[str, ParameterDocument], histories: Mapping[str, deque[float]], width: int, texts: Texts
-) -> Table:
-    length = width - OTHER_COLUMNS
+) -> RenderableType:
+    """A table of parameters; in a narrow terminal lines, as its columns would split words and numbers."""
+    length, say = width - OTHER_COLUMNS, texts.translated
+    if length < 0:
+        return Group(*(_parameter_line(name, row, say) for name, row in parameters.items()))
     curve = ("history",) if length > len("history") else ()  # below, numbers need the room
     table = parameter_table("status", *curve, width=width, texts=texts)
     for name, parameter in parameters.items():
-        status = Text(texts.translated(parameter.status), style=STYLES[parameter.status])
-        cells = [sparkline(tuple(histories.get(name, ()))[-length:]) for _ in curve]
-        table.add_row(name, *map(texts.translated, value_cells(parameter)), status, *cells)
+        status = Text(say(parameter.status), style=STYLES[parameter.status])
+        cells = [sparkline(tuple(histories.get(name, ()))[-length:], _scale(parameter)) for _ in curve]
+        table.add_row(name, *map(say, value_cells(parameter)), status, *cells)
     return table
 
 
-def _components(document: ReportDocument, width: int, texts: Texts) -> Table:
-    table, say = _table(width), texts.translated
+def _parameter_line(name: str, parameter: ParameterDocument, say: Callable[[str], str]) -> Text:
+    change = value_cells(parameter)[-1]
+    text = f" {say(value_text(parameter))}{f' ({change})' if change else ''} "
+    return Text.assemble((name, "bold"), text, (say(parameter.status), STYLES[parameter.status]))
+
+
+def _components(document: ReportDocument, width: int, texts: Texts) -> RenderableType:
+    table, say, lines = _table(width), texts.translated, []
     for column in ("component", "equation", "amplitude", "since", "status"):
         table.add_column(say(column), overflow="fold")  # a truncated equation would be a wrong one
     for component in document.components:
         amplitude = component.values["amplitude"]
         text = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
         status = f"{say(component.status)}, {say(component.approval)}"
-        table.add_row(component.meaning, component.equation, text, local_time(component.onset), status)
-    return table
+        cells = component.meaning, component.equation, text, local_time(component.onset), status
+        table.add_row(*cells)
+        lines.append(Text("{}: {}: {}, {}, {}".format(*cells)))
+    return Group(*lines) if width < OTHER_COLUMNS else table
 
 
 def _messages(document: ReportDocument, texts: Texts) -> list[Text]:
@@ -230,11 +241,20 @@ def _driver(driver: DriverDocument, word: str) -> list[Text]:
     return [*lines, Text(f"{word}: {driver.plan}", style="dim")] if driver.plan else lines
 
 
-def sparkline(values: tuple[float, ...]) -> str:
-    """A curve of one line; flat where the values differ by less than a millionth."""
+def _scale(parameter: ParameterDocument) -> tuple[float, float] | None:
+    """The ends of the curve: the healthy value is in its middle, and a value at its limit at its edge."""
+    if parameter.limit is None:
+        return None
+    healthy = parameter.nominal if parameter.baseline is None else parameter.baseline
+    return healthy - abs(parameter.limit - healthy), healthy + abs(parameter.limit - healthy)
+
+
+def sparkline(values: tuple[float, ...], scale: tuple[float, float] | None = None) -> str:
+    """A curve of one line, between its extremes or on a ``scale``; flat where they differ by less than a millionth."""
     if not values:
         return ""
-    low, high = min(values), max(values)
+    low, high = scale or (min(values), max(values))
     if high - low <= 1e-6 * max(abs(high), abs(low)):
         return BARS[3] * len(values)
-    return "".join(BARS[min(int((value - low) / (high - low) * len(BARS)), len(BARS) - 1)] for value in values)
+    heights = (int((value - low) / (high - low) * len(BARS)) for value in values)
+    return "".join(BARS[min(max(height, 0), len(BARS) - 1)] for height in heights)
