@@ -42,24 +42,28 @@ def _by_spelling(rows: str) -> dict[str, str]:
 
 EXACT = _by_spelling("""
     (N*m) = Nm NM N.m N-m; (kN*m) = kNm KNm; (mN*m) = mNm; (N*cm) = Ncm; (N*m*s) = Nms; (N*m/A) = N.m/A N-m/A
-    degree = ° º; degC = °C ºC ℃; degF = °F ºF ℉; kelvin = °K; (degree/s) = D/S; rpm = /min
+    (cN*m) = cNm; (daN*m) = daNm; metric_horsepower = PS
+    degree = ° º; degC = °C ºC ℃ Â°C \ufffdC; degF = °F ºF ℉; kelvin = °K; (degree/s) = D/S; rpm = /min
     V = v; kV = KV; milliohm = mOhm; megaohm = MOhm; kN = KN; kJ = KJ; MPa = Mpa
     (m/s) = M/s M/S; (m/s^2) = M/s2 M/S2; dimensionless = 1 - --
 """)
 """pint's names by spellings whose capitals matter."""
 
 FOLDED = _by_spelling("""
-    V = volt volts vrms v_rms vpk v_pk vpeak vdc vac; mV = mvolt mvolts millivolts
-    A = amp amps ampere amperes arms a_rms apk a_pk apeak adc aac; mA = mamp mamps milliamp milliamps; Ah = ah
-    ohm = ohm ohms; kiloohm = kohm; W = watt watts; kW = kw kilowatt kilowatts; kWh = kwh; J = joule joules
-    N = newton newtons; (N*m) = newtonmeter newtonmeters newton-meter newton-meters newtonmetre newtonmetres
+    V = volt volts vrms v_rms vpk v_pk vpeak vdc v_dc voltsdc vac; mV = mvolt mvolts millivolts
+    A = amp amps ampere amperes arms a_rms apk a_pk apeak a_peak adc a_dc ampsdc aac; Ah = ah
+    mA = mamp mamps milliamp milliamps; ohm = ohm ohms; kiloohm = kohm; kWh = kwh; J = joule joules
+    W = watt watts; kW = kw kilowatt kilowatts; N = newton newtons; (N*m) = newtonmeter newtonmeters newton-meter
+    (N*m) = newton-meters newtonmetre newtonmetres
     Hz = hz hertz; kHz = khz; s = sec secs second seconds sekunde sekunden sek; ms = msec msecs milliseconds
     min = min mins minute minutes minuten; h = hr hrs hour hours std stunden
     degree = deg degree degrees grad winkelgrad; rad = rad rads radian radians
     turn = rev revs revolution revolutions turn turns umdr umdrehung umdrehungen; (turn/s) = rps u/s r/s
     rpm = rpm r.p.m u/min 1/min r/min tr/min rev/min revs/min revolutions/minute umdr/min umdr./min umdrehungen/min
-    rpm = min^-1 min**-1 min-1
-    degC = °celsius celsius degc deg.c deg_c degreec degreesc degcelsius degreecelsius degreescelsius
+    rpm = min^-1 min**-1 min-1 min⁻¹ rot/min; (degree/s) = dps; torr = torr
+    (ft*lbf) = lb-ft lbf-ft ft-lb ft-lbf ft.lbf lbft ftlb; (inch*lbf) = in-lb in-lbf lb-in lbf-in inlb lbin
+    (inch*ozf) = oz-in ozf-in oz.in ozin; (cm*kgf) = kgf-cm kgf.cm kgfcm
+    degC = °celsius celsius cel degc deg.c deg_c degreec degreesc degcelsius degreecelsius degreescelsius
     degC = grad_c gradc gradcelsius; kelvin = kelvin degk
     degF = °fahrenheit fahrenheit degf deg.f deg_f degreef degreesf degfahrenheit degreesfahrenheit
     (km/h) = km/h km/hr km/std kmh kmph kph; (m/s^2) = m/ss; m = metre metres meter meters; km = km

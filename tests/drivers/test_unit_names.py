@@ -12,10 +12,11 @@ from tests.drivers.can_frames import dbc, decoder, frame
 
 TURN, DEGREE = 2 * math.pi, math.pi / 180
 SPELLINGS: dict[tuple[str, float, float], str] = {
-    ("V", 1, 0): "V|v|Volt|Volts|volt|volts|VOLT|VOLTS|Vdc|VDC|V DC|Vrms|V_rms|Vac",
+    ("V", 1, 0): "V|V_DC|Volts DC|v|Volt|Volts|volt|volts|VOLT|VOLTS|Vdc|VDC|V DC|Vrms|V_rms|Vac",
     ("V", 1e-3, 0): "mV|mVolt|mVolts|millivolts",
     ("V", 1e3, 0): "kV|KV",
-    ("A", 1, 0): "A|Amp|Amps|amps|AMPS|amp|Ampere|Amperes|ampere|Amp.|Arms|A rms|A_rms|ARMS|Apk|A peak|Adc|A DC",
+    ("A", 1, 0): "A|A_dc|A_peak|Amps DC|Amp|Amps|amps|AMPS|amp|Ampere|Amperes|ampere|Amp.|Arms|A rms|"
+    "A_rms|ARMS|Apk|A peak|Adc|A DC",
     ("A", 1e-3, 0): "mA|mAmp|mAmps|milliamps",
     ("ohm", 1, 0): "ohm|Ohm|Ohms|OHM|Ω|\u2126",
     ("ohm", 1e-3, 0): "mOhm|mohm|mΩ|milliohm",
@@ -23,20 +24,27 @@ SPELLINGS: dict[tuple[str, float, float], str] = {
     ("rad", DEGREE, 0): "°|º|deg|Deg|DEG|deg.|Degree|Degrees|degrees|DEGREES|Grad|Winkelgrad",
     ("rad", 1, 0): "rad|Rad|RAD|rads|Radian|Radians",
     ("rad", TURN, 0): "rev|Rev|turn|Turns|revolutions|Umdrehungen|Umdr",
-    ("rad/s", DEGREE, 0): "°/s|deg/s|Deg/s|deg/sec|Deg/Sec|degrees/s|Degree/Second|Grad/s|Grad/Sek|º/s|D/S",
+    ("rad/s", DEGREE, 0): "°/s|deg/s|Deg/s|deg/sec|Deg/Sec|degrees/s|Degree/Second|Grad/s|Grad/Sek|º/s|D/S|dps",
     ("rad/s", 1, 0): "rad/s|Rad/s|rad/sec|Radians/Second",
-    ("rad/s", TURN / 60, 0): "rpm|RPM|Rpm|r.p.m.|1/min|min-1|min^-1|/min|U/min|U/Min|Umdr/min|Umdrehungen/min|"
+    ("rad/s", TURN / 60, 0): "rpm|RPM|Rpm|r.p.m.|1/min|min-1|min⁻¹|rot/min|min^-1|/min|U/min|U/Min|Umdr/min|"
+    "Umdrehungen/min|"
     "Umdr./min|rev/min|Rev/Min|revs/min|Revolutions/Minute|r/min|tr/min|1/Min",
     ("rad/s", TURN, 0): "rps|rev/s|Rev/s|U/s|Umdr/s|r/s",
     ("rad/s^2", 1, 0): "rad/s2|rad/s²|rad/s^2|rad/s/s|rad/sec2|rad/s**2",
     ("rad/s^2", DEGREE, 0): "deg/s2|°/s2|°/s²|deg/s^2|Deg/s2|Grad/s2|deg/sec^2",
     ("degC", 1, 0): "°C|ºC|° C|℃|degC|DegC|deg C|Deg C|DEG C|deg.C|Degrees C|degrees C|Degree C|Celsius|celsius|"
+    "Cel|Â°C|\ufffdC|"
     "Degrees Celsius|deg Celsius|Grad C|Grad Celsius|GradC|C|deg_C|°Celsius",
     ("degC", 5 / 9, -160 / 9): "°F|degF|deg F|Deg F|Degrees F|Fahrenheit|F",
     ("K", 1, 0): "K|Kelvin|kelvin|degK|deg K|°K",
     ("N*m", 1, 0): "Nm|NM|N.m|N-m|N*m|N m|N·m|Newton meter|Newton-meters|newtonmeter",
     ("N*m", 1e3, 0): "kNm|KNm|kN*m",
-    ("N*m", 1e-2, 0): "Ncm",
+    ("N*m", 1e-2, 0): "Ncm|cNm|cN*m",
+    ("N*m", 10, 0): "daNm",
+    ("N*m", 1.3558179, 0): "lb-ft|ft-lb|lbf-ft|ft.lbf|lbf*ft|ft lbf|FT-LB",
+    ("N*m", 0.11298483, 0): "in-lb|lbf-in|lb-in|lbf*in",
+    ("N*m", 7.0615518e-3, 0): "oz-in|ozf-in|oz.in|ozf*in",
+    ("N*m", 0.0980665, 0): "kgf-cm|kgf.cm|kgf*cm",
     ("N*m/A", 1, 0): "Nm/A|N.m/A|Nm/Arms|Nm/Amp",
     ("N*m/s", 1, 0): "Nm/s|Nm/sec",
     ("m/s^2", 1, 0): "m/s2|m/s²|m/s^2|m/ss|m/s/s|m/sec2|m/sec^2|M/S2",
@@ -46,6 +54,8 @@ SPELLINGS: dict[tuple[str, float, float], str] = {
     ("N", 1, 0): "N|Newton|Newtons|newtons",
     ("N", 1e3, 0): "kN|KN|kn",
     ("W", 1, 0): "W|Watt|Watts|WATT|watts",
+    ("W", 735.49875, 0): "PS",
+    ("Pa", 133.322368, 0): "Torr|torr",
     ("W", 1e3, 0): "kW|KW|Kw|kw|kiloWatt",
     ("W*h", 1e3, 0): "kWh|KWh|KWH|kwh",
     ("J", 1, 0): "J|Joule|Joules",

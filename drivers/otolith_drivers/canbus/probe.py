@@ -37,19 +37,9 @@ COUNTER_OR_CHECKSUM = re.compile(
 
 # The predefined connection set of CiA 301: what a frame carries, by its identifier without the node.
 CANOPEN = {
-    0x080: "emergency",
-    0x180: "TPDO 1",
-    0x200: "RPDO 1",
-    0x280: "TPDO 2",
-    0x300: "RPDO 2",
-    0x380: "TPDO 3",
-    0x400: "RPDO 3",
-    0x480: "TPDO 4",
-    0x500: "RPDO 4",
-    0x580: "SDO answer",
-    0x600: "SDO request",
-    0x700: "heartbeat",
-}
+    **{0x080 + 0x100 * number: f"TPDO {number}" for number in range(1, 5)},
+    **{0x100 + 0x100 * number: f"RPDO {number}" for number in range(1, 5)},
+} | {0x080: "emergency", 0x580: "SDO answer", 0x600: "SDO request", 0x700: "heartbeat"}
 CANOPEN_BROADCASTS = {0x000: "NMT command", 0x080: "SYNC", 0x100: "TIME"}
 
 

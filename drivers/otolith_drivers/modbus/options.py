@@ -11,7 +11,7 @@ from otolith_drivers.base import Signal
 from otolith_drivers.common.scaled import Conversion, ScaledSource
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.modbus.protocol import Order, TypeName, bits, reader, registers_of
+from otolith_drivers.modbus.protocol import Order, TypeName, bit_reader, reader, registers_of
 from otolith_drivers.units import Quantity
 
 MAX_REGISTERS = 125  # of one request (Modbus Application Protocol V1.1b3, sections 6.3 and 6.4)
@@ -120,7 +120,7 @@ class ModbusSource(ScaledSource):
     @model_validator(mode="after")
     def _has_the_bits(self) -> Self:
         if self.bits is not None:
-            bits(self.bits, self.type)
+            bit_reader(self.bits, self.type)
         return self
 
 
@@ -216,5 +216,5 @@ def _number_reader(source: ModbusSource, order: Order) -> Callable[[Sequence[int
     whole = reader(source.type, order)
     if source.bits is None:
         return whole
-    field = bits(source.bits, source.type)
-    return lambda registers: field.of(whole(registers))
+    bits = bit_reader(source.bits, source.type)
+    return lambda registers: bits(whole(registers))

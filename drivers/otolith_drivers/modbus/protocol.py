@@ -8,7 +8,6 @@ the bytes A (highest) to D (lowest) of a 32-bit number; 64-bit numbers follow th
 import re
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 # Modbus Application Protocol V1.1b3, section 7.
@@ -37,16 +36,7 @@ WORDS_SWAPPED: frozenset[Order] = frozenset({"CDAB", "DCBA"})
 """Orders with the lowest register first."""
 BYTES_SWAPPED: frozenset[Order] = frozenset({"BADC", "DCBA"})
 """Orders with the low byte of each register first."""
-LETTERS: dict[TypeName, str] = {
-    "int16": "h",
-    "uint16": "H",
-    "int32": "i",
-    "uint32": "I",
-    "int64": "q",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
+LETTERS: dict[TypeName, str] = dict(zip(get_args(TypeName), "hHiIqQfd", strict=True))
 """Format characters of ``struct`` by type."""
 BITS = re.compile(r"(\d{1,2})(?:\.\.(\d{1,2}))?")
 
@@ -60,7 +50,6 @@ class ExceptionReplyError(Exception):
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
         self.code = code
-        self.is_illegal_function = code == 1
 
     @property
     def meaning(self) -> str:
@@ -110,20 +99,8 @@ def reader(kind: TypeName, order: Order) -> Callable[[Sequence[int]], float]:
     return read
 
 
-@dataclass(frozen=True, slots=True)
-class RegisterBits:
-    """A bit field of an integer; bit 0 is the lowest."""
-
-    low: int
-    high: int
-
-    def of(self, value: float) -> int:
-        """Return the field of the integer ``value``."""
-        return (int(value) >> self.low) & ((1 << (self.high - self.low + 1)) - 1)
-
-
-def bits(written: str, kind: TypeName) -> RegisterBits:
-    """Parse ``"3"`` or ``"4..7"``.
+def bit_reader(written: str, kind: TypeName) -> Callable[[float], int]:
+    """Return a function from an integer to its bits ``"3"`` or ``"4..7"``; bit 0 is the lowest.
 
     Raises:
         ValueError: malformed, not ascending, a field of a float, or beyond the bits of the type.
@@ -137,4 +114,5 @@ def bits(written: str, kind: TypeName) -> RegisterBits:
         raise ValueError(f"bits {written!r}: a {kind} has no bit fields")
     if not low <= high < width:
         raise ValueError(f"bits {written!r}: {kind} has bits 0 to {width - 1}; write the lower one first")
-    return RegisterBits(low, high)
+    mask = (1 << (high - low + 1)) - 1
+    return lambda value: int(value) >> low & mask

@@ -201,7 +201,7 @@ class RequestSet:
 def _hint(request: Request, error: ExceptionReplyError) -> str:
     """Return what may help, as the end of a sentence; empty if nothing is known."""
     other = {"holding": "input", "coil": "discrete"}.get(request.table)
-    return f'; try table = "{other}"' if error.is_illegal_function and other is not None else ""
+    return f'; try table = "{other}"' if error.code == 1 and other is not None else ""
 
 
 class PollSchedule:

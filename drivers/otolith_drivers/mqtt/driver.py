@@ -28,7 +28,6 @@ Source = MqttSource
 
 CONNECT_TIMEOUT = 3.0  # s for the network connection
 ANSWER_TIMEOUT = 5.0  # s for the broker to accept the client
-EXPIRED = (9, 10)  # error codes of OpenSSL: not valid yet, has expired
 LOOP_TIMEOUT = 0.1  # s; how late a stop may be noticed
 
 
@@ -178,9 +177,7 @@ class MqttListener(ThreadedDriver):
 
 def _cause(error: Exception) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        is_expired = error.verify_code in EXPIRED
-        way_out = "renew it, or set this computer's clock" if is_expired else "is ca right, and host its name?"
-        return f"the broker's certificate is refused: {error.verify_message.rstrip('.')}: {way_out}"
+        return f"the broker's certificate is refused: {error.verify_message}: are ca, host and the clock here right?"
     if isinstance(error, TimeoutError) and not error.errno:
         return f"no answer within {CONNECT_TIMEOUT:g} s: is a broker there, and is tls right?"
     return cause_of(error)

@@ -240,6 +240,7 @@ class BusEffect:
 
 
 class _BusSpan(Span):
+    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     on: Transport | None = None
     """Transport that is hit, if the machine is on several; without it all are."""
 
@@ -247,7 +248,6 @@ class _BusSpan(Span):
 class Dropouts(_BusSpan):
     """A share of the samples is not sent; over Modbus, requests during such a sample are not answered."""
 
-    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["dropouts"]
     share: Share
 
@@ -259,7 +259,6 @@ class Dropouts(_BusSpan):
 class Gone(_BusSpan):
     """The device sends and answers nothing; over Modbus TCP its port and connections are closed."""
 
-    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["gone"]
 
     def act(self, effect: BusEffect, number: int, _: np.random.Generator) -> BusEffect:
@@ -270,7 +269,6 @@ class Gone(_BusSpan):
 class Jitter(_BusSpan):
     """Samples are sent late: normally distributed with this deviation about a mean of three deviations, never early."""
 
-    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["jitter"]
     deviation: Annotated[float, BeforeValidator(Quantity("s", 0.0, 1.0))]
 
@@ -280,22 +278,14 @@ class Jitter(_BusSpan):
         return replace(effect, delay=effect.delay + delay)
 
 
-class ClockStep(StrictModel):
+class ClockStep(_BusSpan):
     """The clock of the node is set: from ``start`` on samples come later by ``by``, or earlier if it is negative.
 
     Samples that come earlier start with a burst, like those of a node that catches up with its clock.
     """
 
-    ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
     kind: Literal["clock_step"]
-    on: Transport | None = None
-    """See :class:`_BusSpan`."""
-    start: Seconds
     by: Annotated[float, BeforeValidator(Quantity("s", -60.0, 60.0))]
-
-    def covers(self, time: float) -> bool:
-        """Whether the clock was set before ``time`` (s)."""
-        return time >= self.start - ROUNDING
 
     def act(self, effect: BusEffect, _: int, __: np.random.Generator) -> BusEffect:
         """Delay each sample by the same time."""

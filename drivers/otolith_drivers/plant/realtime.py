@@ -70,13 +70,8 @@ class NodeSummary:
     @classmethod
     def of(cls, faults: Sequence[object]) -> "NodeSummary":
         """An empty summary for the faults of a scenario."""
-        return cls(
-            {
-                number: FaultCount(number, fault.kind)
-                for number, fault in enumerate(faults)
-                if isinstance(fault, BusFault)
-            }
-        )
+        acting = [(number, fault.kind) for number, fault in enumerate(faults) if isinstance(fault, BusFault)]
+        return cls({number: FaultCount(number, kind) for number, kind in acting})
 
     def count(self, effect: BusEffect, sample_period: float) -> None:
         """Count another sample."""

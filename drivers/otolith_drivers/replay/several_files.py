@@ -78,12 +78,6 @@ class JoinedReader(ReaderGroup):
         self._finished = 0
 
     @property
-    def progress(self) -> float:
-        """Share of the files that was read, 0 to 1."""
-        present = self._readers[self._finished][1].progress if self._finished < len(self._readers) else 0.0
-        return (self._finished + present) / len(self._readers)
-
-    @property
     def file(self) -> Path:
         """See :attr:`Reader.file`."""
         return self._readers[min(self._finished, len(self._readers) - 1)][1].path

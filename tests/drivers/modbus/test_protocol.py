@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
 from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, register_signal
-from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, bits, reader, registers_of
+from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, bit_reader, reader, registers_of
 from tests.drivers.registers import KINDS, item, registers
 
 
@@ -39,7 +39,7 @@ def test_bit_field_of_an_integer(word: int, one: int, other: int) -> None:
 @pytest.mark.parametrize(("written", "kind"), [("4..2", "uint16"), ("16", "int16"), ("x", "int16"), ("1", "float32")])
 def test_invalid_bit_field_is_refused(written: str, kind: TypeName) -> None:
     with pytest.raises(ValueError, match="bits"):
-        bits(written, kind)
+        bit_reader(written, kind)
 
 
 def test_scale_offset_and_unit_are_applied_in_order() -> None:
