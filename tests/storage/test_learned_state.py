@@ -283,7 +283,7 @@ FACTORS = st.sampled_from([-1.0, 0.0, 1e-30, 0.5, 2.0, 1e3, 1e30])
 
 
 SHORT = settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
-LONG = settings(SHORT, max_examples=300)
+LONG = settings(SHORT, max_examples=150)
 
 
 def check_changed(tmp_path: Path, data: st.DataObject) -> None:
