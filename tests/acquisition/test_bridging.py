@@ -193,6 +193,18 @@ def test_a_smooth_quantity_is_bridged_by_a_curve(missing: float, noise: float) -
     assert np.mean(squares) < 4.0 * (np.mean(stated) + noise**2)
 
 
+def test_no_curve_goes_far_beyond_the_samples() -> None:
+    """Where steps of 10 ms and of an hour follow each other, a spline overshoots a hundredfold."""
+    random = np.random.default_rng(11)
+    for _ in range(200):
+        times = np.cumsum(random.choice([1e-6, 0.01, 3600.0], 60))
+        values = np.sin(random.uniform(6.0, 30.0) * times / times[-1])
+        own, series = interval_of(times), Series(times, values)
+        samples = InputSamples(series, InputKind.LINE, 0.0, own, lost_samples(series, InputKind.LINE, own, NO_OTHERS))
+        at = np.linspace(times[0], times[-1], 200)
+        assert np.abs(bridge(samples, at, np.full(len(at), 0.01)).values).max() < 3.0
+
+
 def test_only_a_smooth_quantity_is_a_curve() -> None:
     random, times = np.random.default_rng(10), 0.05 * np.arange(40.0)
     rough: list[Array] = [

@@ -22,6 +22,7 @@ from otolith_drivers.base import Sampling
 LINE_NOISE = 1.5  # variance of a sample about the line through its neighbours, in variances of the noise of a sample
 CURVE_NOISE = 1.76  # the same about the cubic spline through the samples around it
 SMOOTHER = 1.5  # times the mean square about the spline, above which that about the line shows a smooth curve
+CREDIBLE = 3.0  # standard deviations from the line up to which a spline is used
 MIN_KNOTS = 5  # of a spline whose errors are measured
 NORMAL_SQUARE_MEDIAN = 0.455  # of the square of a standard normal deviate
 LINE_EXPONENTS = (1.0, 4.0)  # of the variance of a line, by its length: a random walk, and a smooth curve
@@ -236,8 +237,12 @@ def _line(samples: InputSamples, times: Array, before: Indices, after: Indices) 
     variance = line_variance(series, samples.noise)(length)
     of_curve = curve_variance(series, samples.noise)
     if of_curve is not None:
+        curve = CubicSpline(series.times, series.values)(times)
         curved = inside & (of_curve(length) < variance)  # a long gap is too long for a curve first
-        values = np.where(curved, CubicSpline(series.times, series.values)(times), values)
+        curved &= np.abs(curve - values) <= CREDIBLE * np.sqrt(
+            variance
+        )  # beside a burst of samples, a spline overshoots
+        values = np.where(curved, curve, values)
         variance = np.where(curved, of_curve(length), variance)
     return values, _Error(np.where(inside, variance * spread, 0.0), 0.5 * length)
 
