@@ -523,3 +523,27 @@ def test_it_is_read_while_it_is_written_and_where_nothing_can_be_written(
     assert len(HistoryReader(copy / path.name).samples(WINDOW, 0.0)) == 300
     assert [file.name for file in copy.iterdir()] == [path.name]
     copy.chmod(0o700)
+
+
+def test_rows_that_the_disk_has_damaged_are_left_out(opened: Callable[..., Simulated], path: Path) -> None:
+    """Each of a compressed report, an event, a finding and counters; what SQLite itself notices is another test."""
+    history = opened()
+    history.write(*documents(200))
+    reports, events = history.writer.reader.messages("report", 1000), history.writer.reader.events(0.0)
+    connection = sqlite3.connect(path)
+    for number in (reports[10], reports[-1]):
+        sequence = ReportDocument.from_json(number).sequence
+        ((packed,),) = connection.execute("SELECT text FROM report WHERE sequence = ?", (sequence,)).fetchall()
+        torn = packed[:40] + bytes([packed[40] ^ 4]) + packed[41:]
+        connection.execute("UPDATE report SET text = ? WHERE sequence = ?", (torn, sequence))
+    connection.execute("UPDATE event SET text = substr(text, 3) WHERE sequence = (SELECT min(sequence) FROM event)")
+    connection.execute("UPDATE finding SET text = '[]'")
+    connection.execute("UPDATE counters SET text = '{'")
+    connection.commit()
+    connection.close()
+    reader = HistoryReader(path)
+    assert reader.messages("report", 1000) == [*reports[:10], *reports[11:-1]]
+    assert [report.to_json() for report in reader.latest(3)] == reports[-2:-4:-1]
+    assert reader.events(0.0) == events[1:]
+    assert (reader.findings(0.0), reader.counters(0.0)) == ([], [])
+    assert len(reader.samples(WINDOW, 0.0)) == 200

@@ -56,8 +56,10 @@ def main(connection: Any, state: AdaptationState) -> None:
 
     Each step of a kernel is sent as well, and :class:`Ready` once.
     """
+    steps: list[kernel_cache.CompileStep] = []
 
     def report(step: kernel_cache.CompileStep) -> None:
+        steps.append(step)
         with contextlib.suppress(OSError):  # the daemon has died, which the next result notices
             connection.send(step)
 
@@ -66,7 +68,9 @@ def main(connection: Any, state: AdaptationState) -> None:
         connection.send(Ready())
         while (task := connection.recv()) is not None:
             connection.send(perform(*task))
-            kernel_cache.release_compiler()
+            if steps:
+                kernel_cache.release_compiler()
+                steps.clear()
 
 
 def perform(state: AdaptationState, window: Window) -> WorkerResult:

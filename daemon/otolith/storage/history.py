@@ -9,16 +9,18 @@ import contextlib
 import json
 import sqlite3
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from otolith.health.limits import Level, MonitoringPlan
 from otolith.health.schema import EventDocument, NumberDocument, ParameterDocument, ReportDocument
 from otolith.twin.definition import Definition, Role
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.user_dirs import state_directory
+
+Content = TypeVar("Content")
 
 SCHEMA_VERSION = 1
 APPLICATION_ID = 0x4F544F4C  # marks the file as ours: "OTOL"
@@ -206,6 +208,20 @@ class Tables:
         return self._series[key]
 
 
+def _unpacked(text: bytes | str) -> str:
+    return zlib.decompress(text).decode() if isinstance(text, bytes) else text
+
+
+def _undamaged(rows: Iterable[tuple[Any, ...]], parse: Callable[..., Content]) -> Iterator[Content]:
+    """Yield what ``parse`` returns for each row, without those whose content the disk has damaged."""
+    for row in rows:
+        try:
+            parsed = parse(*row)
+        except (zlib.error, ValueError, TypeError):
+            continue
+        yield parsed
+
+
 class HistoryReader:
     """Reads the history of a machine, also while a daemon writes; each call opens the database for itself."""
 
@@ -240,7 +256,7 @@ class HistoryReader:
     def events(self, since: float) -> list[EventDocument]:
         """Return the changes of events since a time, in the order in which they were published."""
         rows = self._rows("SELECT text FROM event WHERE time >= ? ORDER BY sequence", since)
-        return [EventDocument.model_validate_json(text) for (text,) in rows]
+        return list(_undamaged(rows, EventDocument.model_validate_json))
 
     def event_ends(self, since: float) -> dict[int, float]:
         """Return the end of the window of each change of an event since a time, by its sequence number."""
@@ -250,28 +266,33 @@ class HistoryReader:
         """Return the findings since a time: ``first``, ``last``, ``count`` of windows, and the latest document."""
         query = "SELECT first, last, count, text FROM finding WHERE last >= ? ORDER BY first"
         rows = self._rows(query, since)
-        return [{"first": first, "last": last, "count": count, **json.loads(text)} for first, last, count, text in rows]
+
+        def parse(first: float, last: float, count: int, text: str) -> dict[str, Any]:
+            return {"first": first, "last": last, "count": count, **json.loads(text)}
+
+        return list(_undamaged(rows, parse))
 
     def counters(self, since: float) -> list[dict[str, Any]]:
         """Return the last counters of each hour and start (``run``) of the daemon since a time."""
         rows = self._rows("SELECT hour, run, text FROM counters WHERE hour >= ? ORDER BY run, hour", since - HOUR)
-        return [{"hour": hour, "run": run, **json.loads(text)} for hour, run, text in rows]
+        return list(_undamaged(rows, lambda hour, run, text: {"hour": hour, "run": run, **json.loads(text)}))
 
     def states(self, since: float) -> list[tuple[str, float, Level]]:
         """Return part, begin and state of each change of a state, from the one at ``since`` on; the machine is ''."""
         before = "(SELECT max(since) FROM state AS other WHERE other.part = state.part AND since <= ?1)"
         query = f"SELECT * FROM state WHERE since >= coalesce({before}, ?1) ORDER BY since"  # noqa: S608 - our own text
-        return [(part, begin, Level(state)) for part, begin, state in self._later_rows("state", query, since)]
+        rows = self._later_rows("state", query, since)
+        return list(_undamaged(rows, lambda part, begin, state: (part, begin, Level(state))))
 
     def description(self) -> dict[str, Any]:
         """Return what :func:`describe_machine` wrote; empty if nobody did."""
         rows = self._later_rows("description", "SELECT text FROM description")
-        return dict(json.loads(rows[0][0])) if rows else {}
+        return next(_undamaged(rows, lambda text: dict(json.loads(text))), {})
 
     def latest(self, count: int) -> list[ReportDocument]:
         """Return the last reports, the newest first."""
         rows = self._rows("SELECT text FROM report ORDER BY sequence DESC LIMIT ?", count)
-        return [ReportDocument.from_json(zlib.decompress(text).decode()) for (text,) in rows]
+        return list(_undamaged(rows, lambda text: ReportDocument.from_json(_unpacked(text))))
 
     def messages(
         self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
@@ -286,7 +307,7 @@ class HistoryReader:
             "ORDER BY sequence LIMIT ?4"
         )
         rows = self._rows(query, after, start, end, limit)
-        return [zlib.decompress(text).decode() if isinstance(text, bytes) else text for (text,) in rows]
+        return list(_undamaged(rows, _unpacked))
 
     def _later_rows(self, table: str, query: str, *values: object) -> list[tuple[Any, ...]]:
         """Return the rows of a table that a database of an earlier version may lack; then there are none."""
