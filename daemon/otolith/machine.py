@@ -331,8 +331,10 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
         for name, row in amplitudes.items()
     }
     known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
+    signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
     language = file.machine.language
-    return MonitoringPlan(parameters, components, load_rules(language), language=language, known=known)
+    rules = load_rules(language)
+    return MonitoringPlan(parameters, components, rules, language=language, known=known, signals=signals)
 
 
 def _known(parameter: Parameter, context: Context) -> MonitoredQuantity:

@@ -164,7 +164,7 @@ def test_a_german_machine_has_german_sensor_faults() -> None:
     last = reports("sensor-frozen", 22)[-1]
     (event,) = last.events
     assert (event.condition_id, event.condition) == ("sensor", "ein Sensor misst falsch")
-    assert event.text.startswith("omega steht seit ")
+    assert event.text.startswith("Drehzahl des Rotors: omega steht seit ")
     assert " the " not in event_text(event)
     assert last.parameters["R_a"].reason.startswith("aus dem Zeitfenster wird nichts geschätzt: omega steht seit ")
 

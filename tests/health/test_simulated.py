@@ -69,7 +69,7 @@ def test_a_frozen_sensor_of_the_motor_is_one_event() -> None:
     documents = reports(motor("sensor-frozen"), 22)
     (event,) = [event for document in documents for event in announcements(document)]
     assert (event.part, event.state, event.condition) == ("sensors", Level.ACT, "a sensor is wrong")
-    assert event.text.startswith("omega is frozen at ")
+    assert event.text.startswith("rotor speed: omega is frozen at ")
 
 
 def test_a_sensor_that_works_again_leaves_no_other_event() -> None:

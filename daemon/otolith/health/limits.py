@@ -126,6 +126,8 @@ class MonitoringPlan:
     """Of the texts for people."""
     known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Of the parameters that are not estimated, against the values of the machine file."""
+    signals: Mapping[str, str] = field(default_factory=dict)
+    """Their meanings."""
 
     @property
     def texts(self) -> Texts:

@@ -116,8 +116,8 @@ def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, befor
     features = FindingFeatures(finding.kind, twin, finding.subject)
     part = PARTS.get(finding.kind, MACHINE)
     level = Level(severity(plan.rules, features))
-    text = finding.text
-    numbers = None
+    meaning, numbers = plan.signals.get(finding.subject, ""), None
+    text = f"{plan.texts.translated(meaning)}: {finding.text}" if meaning else finding.text
     if (value := finding.value) is not None:
         quantity = plan.known.get(finding.subject, MonitoredQuantity())
         part = quantity.part
