@@ -204,7 +204,7 @@ def certificate_warnings(presented: x509.Certificate, host: str | None, now: dat
     lines = []
     if not begin <= now <= end:
         lines.append(f"the server's certificate is valid from {begin:%Y-%m-%d} to {end:%Y-%m-%d} only: renew it")
-    with suppress(x509.ExtensionNotFound):
+    with suppress(x509.ExtensionNotFound, x509.DuplicateExtension, ValueError):  # controllers write faulty ones
         names = presented.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         hosts = [*names.get_values_for_type(x509.DNSName), *map(str, names.get_values_for_type(x509.IPAddress))]
         if host is not None and hosts and host.lower() not in map(str.lower, hosts):

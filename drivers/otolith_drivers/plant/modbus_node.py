@@ -137,11 +137,6 @@ class DriveRequestHandler(ServerRequestHandler):
         if self.server.drive.refuses_undecodable(pdu.dev_id):
             self._respond(pdu)
 
-    def send_garbage(self, data: bytes) -> None:
-        """Send bytes that are no answer."""
-        if self.transport is not None:
-            self.send(data)
-
     def _respond(self, response: ModbusPDU) -> None:
         if self.transport is not None:  # None if the client has disconnected
             self.server.drive.count_answer()
@@ -178,8 +173,8 @@ class DriveServer(ModbusTcpServer):
     def send_garbage(self, data: bytes) -> None:
         """Send bytes that are no answer on all connections."""
         for handler in self.active_connections.values():
-            if isinstance(handler, DriveRequestHandler):
-                handler.send_garbage(data)
+            if isinstance(handler, DriveRequestHandler) and handler.transport is not None:
+                handler.send(data)
 
 
 class _ModbusNode(Node):

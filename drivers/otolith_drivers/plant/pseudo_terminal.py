@@ -8,7 +8,8 @@ import pty
 import tempfile
 import tty
 from pathlib import Path
-from typing import Protocol
+
+from pymodbus.transport import ModbusProtocol
 
 from otolith_drivers.errors import DeviceError
 
@@ -21,15 +22,6 @@ UNPACED_SILENCE = 0.05  # s; end of a frame on a line without timing: longer tha
 WRITE_INTERVAL = 1e-3  # s; bytes are written in pieces of this length, the resolution of the event loop's clock
 MAX_READ = 4096  # bytes; the kernel buffers no more for a terminal
 DEFAULT_NAME = "ttyOtolith"
-
-
-class FrameReceiver(Protocol):
-    """The part of pymodbus' protocol that a line needs."""
-
-    recv_buffer: bytes
-
-    def data_received(self, data: bytes) -> None:
-        """Take bytes that have arrived."""
 
 
 class SerialLine:
@@ -89,7 +81,7 @@ class LineTransport(asyncio.Transport):
     no client reads is lost if the terminal is full, as on a wire.
     """
 
-    def __init__(self, end: int, receiver: FrameReceiver, baudrate: float) -> None:
+    def __init__(self, end: int, receiver: ModbusProtocol, baudrate: float) -> None:
         """``end`` is the file descriptor of the drive's end; ``baudrate`` in bit/s, infinite for no timing."""
         super().__init__()
         self._end, self._receiver = end, receiver

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from click.testing import CliRunner
@@ -194,6 +195,12 @@ def test_an_expired_certificate_is_a_warning(folder: Path) -> None:
     assert certificate_warnings(served, "127.0.0.1", now) == certificate_warnings(served, None, now) == []
     (line,) = certificate_warnings(served, None, now + timedelta(days=2))
     assert f"to {served.not_valid_after_utc:%Y-%m-%d} only: renew it" in line
+
+
+def test_a_certificate_with_a_faulty_extension_has_no_host() -> None:
+    served = MagicMock(not_valid_before_utc=datetime.min.replace(tzinfo=UTC), not_valid_after_utc=datetime.now(UTC))
+    served.extensions.get_extension_for_class.side_effect = ValueError("error parsing asn1 value")
+    assert certificate_warnings(served, "plc", served.not_valid_after_utc) == []
 
 
 @pytest.mark.parametrize(
