@@ -25,6 +25,7 @@ CHANNEL = "vcan0"
 STATISTICS = Path(f"/sys/class/net/{CHANNEL}/statistics")
 PATIENCE = 300.0  # s for what takes a few; a busy computer may give the guest a tenth of a processor
 RESISTANCE = 6.1  # ohm, of the plant; the machine file says 6.5
+PUNCTUALLY = ("chrt", "--fifo", "10")  # before a program that stands for a machine, which no computation delays
 OTOLITH = [sys.executable, "-m", "otolith"]
 BUS = 'interface = "socketcan"\nchannel = "vcan0"\n'
 # Short windows for short tests; the guest's only processor keeps the plant waiting for milliseconds.
@@ -157,8 +158,8 @@ class Machine:
         return self._programs[-1]
 
     def plant(self) -> Program:
-        """The simulated machine, once it is on the bus. No computation delays it, as it would delay no machine."""
-        program = self.start("chrt", "--fifo", "10", *OTOLITH, "plant", str(self.scenario))
+        """The simulated machine, once it is on the bus."""
+        program = self.start(*PUNCTUALLY, *OTOLITH, "plant", str(self.scenario))
         program.wait_for_output("Ctrl-C ends it")
         return program
 

@@ -12,6 +12,7 @@ from otolith.acquisition.window import Verdict
 from otolith.health.schema import CountersDocument, ParameterDocument, ReportDocument, Status
 from tests.vm.conftest import (
     CHANNEL,
+    PUNCTUALLY,
     RESISTANCE,
     Machine,
     Program,
@@ -117,7 +118,7 @@ def test_a_replayed_dump_says_what_the_live_bus_said(
 ) -> None:
     with machine_on_a_bus(tmp_path_factory.mktemp("replayed")) as machine:
         _, listener = machine.daemon()
-        player = machine.start("canplayer", "-I", str(live.dump))
+        player = machine.start(*PUNCTUALLY, "canplayer", "-I", str(live.dump))
         reports = listener.wait_for_good(7)
         assert player.process.wait(timeout=30) == 0
         assert transmitted() == live.frames
@@ -194,7 +195,7 @@ def test_it_lives_through_an_outage_of_the_bus(live: Live, watched: Watched, pla
     if how == "gone":
         run("ip", "link", "add", CHANNEL, "type", "vcan")
     run("ip", "link", "set", CHANNEL, "up")
-    player = watched.machine.start("canplayer", "-I", str(live.dump))
+    player = watched.machine.start(*PUNCTUALLY, "canplayer", "-I", str(live.dump))
     begun, seen = time.time(), len(good(reports))
     reports = listener.wait_for_good(2)
     first = good(reports)[seen]
