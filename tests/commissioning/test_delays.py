@@ -14,12 +14,31 @@ from otolith.commissioning.delays import IdentifiedDelays, SignalDelay, identify
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import shifted
-from otolith.machine import find_twin, load_machine
+from otolith.machine import find_twin, load_machine, load_twin
 from otolith.runtime.replay import Replay, open_recorded
 
 ROWS = Schedule(rows=Timing(0.01))
 SLOW = {"omega": Schedule(omega=Timing(0.05)), "i": Schedule(i=Timing(0.05)), "V_a": Schedule(omega=Timing(0.05))}
 MS = 1e-3
+LINEAR_MOTOR = """
+[twin]
+name = "linear_motor"
+title = "motor"
+source = "test"
+[states]
+n = { unit = "1", bounds = [-2000, 2000], meaning = "speed" }
+[inputs]
+u = { unit = "1", hold = "zoh", range = [-255, 255], meaning = "duty" }
+[outputs]
+n = { unit = "1", noise = 30, meaning = "speed" }
+[parameters]
+tau = { unit = "s", nominal = 0.15, bounds = [0.01, 2], meaning = "time constant" }
+gain = { unit = "1", nominal = 5, bounds = [0.5, 50], meaning = "speed per duty" }
+u_c = { unit = "1", nominal = 30, bounds = [0, 120], meaning = "duty of dry friction" }
+n_s = { unit = "1", nominal = 10, bounds = [1, 100], meaning = "speed within which dry friction changes its sign" }
+[equations]
+"der(n)" = "(gain*(u - u_c*tanh(n/n_s)) - n) / tau"
+"""
 
 
 def recorded(schedule: Schedule, seed: int, length: float = 13.0) -> Recording:
@@ -146,6 +165,30 @@ def test_noise_is_identified_without_the_delay(tmp_path: Path) -> None:
     assert deviation(late(identified)["omega"], 10 * MS) < 3.3
     assert [level.value for level in noise.outputs] == pytest.approx([0.005, 0.02], rel=0.1)
     assert [level.value for level in noise.states] == pytest.approx([0.0, 0.0], abs=0.02)
+
+
+@pytest.mark.parametrize(("seed", "is_found"), [(0, False), (3, True)])
+def test_a_delay_is_stated_only_if_it_exceeds_its_uncertainty(tmp_path: Path, seed: int, *, is_found: bool) -> None:
+    """The twin of a saturating motor lacks so much that its windows, with noise that covers it, may show no delay."""
+    random, step, delay = np.random.default_rng(seed), 2 * MS, 20 * MS
+    windows, speed, before = [], 0.0, 0.0
+    for index in range(7):
+        rows = []
+        for duty in np.repeat(np.sort(random.uniform(40.0, 255.0, 3)), 34)[:100] * (-1.0 if index % 3 else 1.0):
+            rows.append((duty, before + 15.0 * random.normal()))
+            before = speed
+            final = 1350.0 * np.sign(duty) * (1.0 - np.exp(-max(abs(duty) - 45.0, 0.0) / 60.0))
+            for _ in range(round(delay / step)):
+                speed += step * (final - speed) / 0.15
+        windows.append(Window.whole(index, 2.0 * index, delay, ("u", "n"), np.array(rows)))
+    (tmp_path / "motor.toml").write_text(LINEAR_MOTOR, encoding="utf-8")
+    twin = load_twin(tmp_path / "motor.toml")
+    problem = Problem(twin, (("n_s", 10.0),), twin.parameters[:3], noise=(30.0,))
+    signals = late(identify_delays_and_noise(problem, windows, {})[0])
+    assert set(signals) == ({"n"} if is_found else set())
+    for signal in signals.values():
+        assert signal.sd is not None
+        assert abs(signal.value - delay) < QUANTILE * signal.sd < signal.value
 
 
 def test_a_declared_delay_is_part_of_the_result(tmp_path: Path) -> None:

@@ -199,7 +199,7 @@ def delay_lines(machine: "LoadedMachine", delays: "IdentifiedDelays") -> Iterato
     elif late:
         yield "[signals]"
         yield from _aligned(rows)
-    yield from (f"# {signal.name}: {signal.remark}" for signal in delays.signals if not signal.is_late)
+    yield from (f"# {item.name}: {item.remark}" for item in delays.signals if item.remark and not item.is_late)
 
 
 def _row(level: "NoiseLevel", unit: str) -> tuple[str, str]:
