@@ -27,7 +27,7 @@ from otolith.machine_file import (
     SignalTable,
     WindowTable,
 )
-from otolith.twin.augmentation import sources
+from otolith.twin.augmentation import sensor_site, sites, sources
 from otolith.twin.component_families import FAMILY_NAMES
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import MAX_COEFFICIENT, read_twin
@@ -452,15 +452,20 @@ def _excluded(table: DiscoveryTable, twin: Definition, context: Context) -> froz
                 context.fail(("discovery", key), f"unknown name {name!r}: {nearest(name, list(known))}")
         return known if names is None else names
 
-    sites = [site.name for site in twin.sites]
     inputs = [source.name for source in sources(twin)]
     families = allowed("families", table.families, FAMILY_NAMES)
-    allowed_sites = allowed("sites", table.sites, sites)
+    allowed_sites = allowed("sites", table.sites, [site.name for site in twin.sites])
     allowed_inputs = allowed("inputs", table.inputs, [name for name in inputs if name])
+    doubted = {sensor_site(name) for name in allowed("sensors", table.sensors, twin.signals)}
+
+    def is_allowed(site: str, family: str, name: str) -> bool:
+        of_site = site in allowed_sites and family in families and (not name or name in allowed_inputs)
+        return of_site or site in doubted
+
     return frozenset(
-        key_of(site, family, name)
-        for site in sites
+        key_of(site.name, family, name)
+        for site in sites(twin)
         for family in FAMILY_NAMES
         for name in inputs
-        if family not in families or site not in allowed_sites or (name and name not in allowed_inputs)
+        if not is_allowed(site.name, family, name)
     )

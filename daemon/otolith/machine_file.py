@@ -166,6 +166,7 @@ class DiscoveryTable(StrictModel):
     families: tuple[str, ...] | None = None
     sites: tuple[str, ...] | None = None
     inputs: tuple[str, ...] | None = None
+    sensors: tuple[str, ...] | None = None
 
 
 class SwarmTable(StrictModel):

@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state, restore_components
 from otolith.cli.main import cli
+from otolith.estimation.problem import key_of
 from otolith.machine import load_machine
 from otolith.storage.state_store import StateStore
 from otolith_drivers.errors import ConfigurationError, ServiceError
@@ -171,6 +172,7 @@ def test_an_invalid_state_file_is_refused_by_name() -> None:
         ('families = ["periodik"]', "unknown name 'periodik'"),
         ('sites = ["shfat"]', "shaft"),
         ('inputs = ["angle(i)"]', "angle.omega."),
+        ('sensors = ["omeag"]', "omega"),
     ],
 )
 def test_an_invalid_restriction_of_the_search_is_an_error(tmp_path: Path, line: str, word: str) -> None:
@@ -188,6 +190,16 @@ def test_a_restricted_search_excludes_the_rest(tmp_path: Path) -> None:
     assert KEY not in excluded
     assert "shaft/linear/omega" in excluded
     assert "winding/periodic/t" in excluded
+    assert not any(key.startswith("sensor of") for key in excluded)
+
+
+def test_a_sensor_that_cannot_be_wrong_is_no_hypothesis(tmp_path: Path) -> None:
+    machine = tmp_path / "machine.toml"
+    text = MACHINE.read_text(encoding="utf-8") + '\n[discovery]\nsensors = ["i"]\n'
+    machine.write_text(text, encoding="utf-8")
+    excluded = load_machine(machine, with_driver=False).problem.excluded
+    assert {key_of("sensor of omega", "constant", ""), key_of("sensor of V_a", "linear", "V_a")} <= excluded
+    assert all(key.startswith("sensor of") and not key.startswith("sensor of i/") for key in excluded)
 
 
 @pytest.mark.usefixtures("commissioned")

@@ -20,6 +20,7 @@ from otolith.acquisition.window import Array
 from otolith.cli.main import cli
 from otolith.commissioning.identification import identify_noise
 from otolith.discovery.decision import WindowDecision
+from otolith.health.observations import SENSORS
 from otolith.health.schema import ReportDocument
 from otolith.health.text import finding_text
 from otolith.machine import load_machine, load_twin
@@ -43,6 +44,9 @@ SERVO_LOGS = tuple(
 KP_100 = 'gain = "0.2877 1/rad"'
 AT_REST = 0.02  # rad: an arm that moves by less within a window is at rest
 USED = 0.95  # share of the windows with motion
+ROTOR_WINDOW = 0.8  # s
+EVENT_WITHIN = 5.0  # s after a change that passes a limit
+SETTLED = 3  # windows after a change: from then on the published damping is the new one
 DAMPING = 0.05  # largest error of the damping of a window
 FIGURE = 0.03  # largest error of a figure on the page: that of two or three digits
 
@@ -172,15 +176,15 @@ def test_the_preview_is_printed_as_shown(folder: Path, monkeypatch: pytest.Monke
         r"(?:^    .*\n)+", page[page.index("## Before a replay") : page.index("## Late")], re.MULTILINE
     )
     assert [line[4:] for line in shown.splitlines()][:-1] == lines[:-1]  # the last is the computing time
-    assert "windows of 2 s with a record every 16 ms: 10, 10 usable" in text
+    assert "windows of 0.8 s with a record every 16 ms: 27, 27 usable" in text
     rows = {line.split()[0]: line.split()[-3:] for line in lines if line.startswith(("  inertia", "  damping"))}
-    assert rows == {"inertia": ["0", "of", "8"], "damping": ["8", "of", "8"]}
+    assert rows == {"inertia": ["0", "of", "8"], "damping": ["4", "of", "8"]}
 
 
 @needs_data
 def test_the_replay_prints_the_figures_of_the_guide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = printed(folder, "replay rotor-rig.toml healthy_104.csv", monkeypatch)
-    for shown in ("1481 rows read", "11 windows: 11 good, 0 bad", "the twin explains 11 of 11 up to the noise"):
+    for shown in ("1481 rows read", "28 windows: 28 good, 0 bad", "the twin explains 28 of 28 up to the noise"):
         assert shown in GUIDE
         assert shown in text
     (value, half_width) = re.findall(r"^\| `damping ([\d.]+) ± ([\d.]+)`", GUIDE, re.MULTILINE)[0]
@@ -196,7 +200,7 @@ def test_every_window_of_the_rotor_is_good(folder: Path, log: str) -> None:
     documents = reports(folder, "rotor-rig.toml", log)
     times = table(folder / f"{log}.csv")["t"]
     moving = times[np.flatnonzero(np.diff(times) > 2.0)[-1] + 1 :] if np.diff(times).max() > 2.0 else times
-    assert len(documents) == int((moving[-1] - moving[0]) / 2.0)
+    assert len(documents) == int((moving[-1] - moving[0]) / ROTOR_WINDOW)
     assert [document.window.quality.reasons for document in documents if document.window.quality.reasons] == []
     assert all(document.fit is not None for document in documents)
 
@@ -206,7 +210,7 @@ def test_every_window_of_the_rotor_is_good(folder: Path, log: str) -> None:
 def test_a_healthy_rotor_is_learned_from(folder: Path, log: str) -> None:
     documents = reports(folder, "rotor-rig.toml", log)
     assert refused(documents) == []
-    assert not any(document.findings for document in documents)
+    assert not any(document.findings or document.events for document in documents)
     columns = table(folder / f"{log}.csv")
     expected = columns["control_effort"][2:].mean() / columns["speed"][2:].mean()
     assert documents[-1].parameters["damping"].value == pytest.approx(expected, rel=DAMPING)
@@ -247,8 +251,37 @@ def test_the_guide_shows_the_damping_of_each_stretch(folder: Path) -> None:
         ]
         assert raw
         assert np.median(np.array(raw, dtype=np.float64)) == pytest.approx(float(alone), abs=1e-3)
+
+
+@needs_data
+def test_a_sensor_that_may_be_wrong_is_named_beside_the_damping(folder: Path) -> None:
+    text = (folder / "rotor-rig.toml").read_text(encoding="utf-8")
+    text = text.replace("sensors = []", "").replace('length = "0.8 s"', 'length = "2 s"')
+    (folder / "rotor-any-sensor.toml").write_text(text, encoding="utf-8")
+    documents = reports(folder, "rotor-any-sensor.toml", "damping_424")
     texts = [finding_text(finding) for document in documents for finding in document.findings]
     assert any("damping" in text and "speed reads" in text for text in texts)
+
+
+@needs_data
+@pytest.mark.parametrize(("log", "changes"), [("damping_420", 1), ("damping_424", 2)])
+def test_each_change_beyond_a_limit_is_an_event_within_five_seconds(folder: Path, log: str, changes: int) -> None:
+    """The other change, from 3 to 5 ohm, passes no limit of the guide."""
+    columns, documents = table(folder / f"{log}.csv"), reports(folder, "rotor-rig.toml", log)
+    times = columns["t"][1:][np.diff(columns["damper_ohm"]) != 0.0]
+    for time in times[:changes]:
+        ends = [document.window.end for document in documents for event in document.events if event.change is not None]
+        assert any(time < end <= time + EVENT_WITHIN for end in ends), (time, ends)
+    for document in documents:
+        assert document.components == ()
+        assert not any("sensor" in finding_text(finding) for finding in document.findings)
+        assert all(event.part != SENSORS for event in document.events)
+        inside = _inside(columns, document)
+        recent = (columns["t"] > document.window.end - SETTLED * ROTOR_WINDOW) & (columns["t"] < document.window.end)
+        if len(set(columns["damper_ohm"][recent])) == 1:
+            stretch = columns["damper_ohm"] == columns["damper_ohm"][inside][-1]
+            expected = columns["control_effort"][stretch].mean() / columns["speed"][stretch].mean()
+            assert document.parameters["damping"].value == pytest.approx(expected, rel=DAMPING)
 
 
 def _inside(columns: dict[str, Array], document: ReportDocument) -> NDArray[np.bool_]:

@@ -33,11 +33,16 @@ class ComponentSource:
 def sites(base: Definition) -> tuple[Site, ...]:
     """The author's sites, then one for the error of each sensor: outputs, then inputs."""
     names = [*(output.name for output in base.outputs), *(driven.name for driven in base.inputs)]
-    sensors = [(name, f"sensor of {name}") for name in names]
+    sensors = [(name, sensor_site(name)) for name in names]
     return (
         *base.sites,
         *(Site(sensor, base.unit_of(name), f"error of the {sensor}", name, "additive") for name, sensor in sensors),
     )
+
+
+def sensor_site(signal: str) -> str:
+    """Return the name of the site of errors of the sensor of ``signal``."""
+    return f"sensor of {signal}"
 
 
 @lru_cache(maxsize=64)
