@@ -296,6 +296,7 @@ def test_windows_of_the_servo_with_motion_are_used(folder: Path) -> None:
         columns = table(folder / f"{log}.csv")
         documents = reports(folder, f"servo-{log[-5:]}.toml", log)
         assert len(documents) == 3
+        assert not any(document.components for document in documents)
         for document in documents:
             inside = _inside(columns, document)
             if np.ptp(columns["position"][inside]) > AT_REST:
@@ -303,6 +304,15 @@ def test_windows_of_the_servo_with_motion_are_used(folder: Path) -> None:
                 problems += [f"{log}, {text}" for text in refused([document])]
     assert moving >= 18
     assert len(problems) <= (1.0 - USED) * moving, "\n".join(problems)
+
+
+@needs_data
+def test_the_free_arm_shows_inertia_and_dry_friction(folder: Path) -> None:
+    ((inertia, friction),) = re.findall(r"`T_c` are ([\d.]+) kg·m² and ([\d.]+) N·m", GUIDE)
+    drop = reports(folder, "servo-kp400.toml", "lift_and_drop_kp400")[1].parameters
+    assert drop["J_r"].raw == pytest.approx(float(inertia), rel=2.0 * FIGURE)
+    assert drop["T_c"].raw == pytest.approx(float(friction), rel=2.0 * FIGURE)
+    assert {item.value for item in drop.values()} == {None}
 
 
 @needs_data
