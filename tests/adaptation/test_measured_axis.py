@@ -16,10 +16,13 @@ import pytest
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import initial_state
+from otolith.adaptation.state import initial_state, restore_components
+from otolith.cli.commissioning.components import record_of
 from otolith.commissioning.consistency import consistency_test
 from otolith.commissioning.identification import DOUBTFUL, IdentifiedNoise, identify_noise
 from otolith.commissioning.likelihood import Likelihood
+from otolith.commissioning.structure import remaining_structure
+from otolith.estimation.augmented import augment
 from otolith.estimation.information import Identifiability
 from otolith.estimation.problem import Problem
 from otolith.health.schema import ParameterDocument, ReportDocument, Status
@@ -206,3 +209,36 @@ def test_missing_dry_friction_is_discovered(count: int) -> None:
     assert component.family == "Coulomb" or count < ALL_WINDOWS  # after four windows a flat power law explains as much
     assert component.values["amplitude"].value == pytest.approx(-20.4, rel=0.1)
     assert documents[-1].parameters["M"].value == pytest.approx(MASS, rel=0.01)
+
+
+# Pitch (m) and amplitude (N) of a least-squares fit of the force of each half, low-passed at 200 Hz, with friction by
+# direction. The half's windows begin at its first record, as those of a file of its own.
+HALVES = {0: (2.50127e-3, 1.058), 1: (2.50195e-3, 1.110)}
+
+
+@lru_cache
+def half(number: int) -> tuple[Window, ...]:
+    values = np.concatenate([window.values for window in windows()])
+    rows = values[number * len(values) // 2 :][: len(values) // 2]
+    pieces = rows.reshape(-1, RECORDS, rows.shape[1])
+    return tuple(Window.whole(k, 2.0 * k, PERIOD, ("F", "x"), piece) for k, piece in enumerate(pieces))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("number", HALVES)
+def test_a_commissioned_axis_follows_the_force_that_depends_on_position_on_either_half(number: int) -> None:
+    """Nothing but this force is offered; in the twin it stays, and no other component is adopted."""
+    twin = problem("servo_axis_directional")
+    noise = identify_noise(twin, half(number))
+    (shown,) = remaining_structure(twin, noise, half(number))
+    beside = identify_noise(augment(twin, [shown.component]), half(number))
+    for other, (pitch, amplitude) in HALVES.items():
+        state = restore_components(initial_state("axis", "lab", beside.applied(twin)), (record_of(shown),))
+        for window in half(other):
+            state, report = adapt(state, window)
+            (component,) = report.document.components
+            values = {name: value.value for name, value in component.values.items()}
+            assert component.id == "carriage/periodic/x"
+            assert 2.0 * np.pi / values["order"] == pytest.approx(pitch, rel=1e-3)
+            assert values["amplitude"] == pytest.approx(amplitude, rel=0.1)
+            assert report.document.parameters["M"].value == pytest.approx(MASS, rel=0.015)

@@ -134,6 +134,17 @@ def test_commission_approve_reject_and_forget(commissioned: tuple[str, str]) -> 
     assert KEY in store().decisions().forgotten
 
 
+@pytest.mark.usefixtures("commissioned")
+def test_a_replay_begins_with_the_approved_components_and_leaves_out_the_rejected_ones(data: Path) -> None:
+    first = otolith("replay", MACHINE, data, "--json").stdout.splitlines()[0]
+    (component,) = json.loads(first)["components"]
+    assert (component["id"], component["approval"]) == (KEY, "approved")
+    assert component["values"]["amplitude"]["value"] == pytest.approx(0.004, rel=0.1)
+    otolith("components", "reject", MACHINE, KEY)
+    documents = map(json.loads, otolith("replay", MACHINE, data, "--json").stdout.splitlines())
+    assert not any(document["components"] for document in documents)
+
+
 def test_commission_without_an_answer_keeps_nothing(
     data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from otolith.discovery.adopted import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.augmented import augment, indices, slot_of, without
-from otolith.estimation.imm_filter import ParameterCusum
+from otolith.estimation.imm_filter import TREND_MEMORY, ParameterCusum
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions
 from otolith.health.baseline import Baseline, with_baselines
@@ -221,4 +221,6 @@ def restore_components(state: AdaptationState, records: tuple[ComponentRecord, .
                 posterior = posterior.forget_phase(index)
             else:
                 posterior = posterior.reset_value(index, value, RESTART_FACTOR * sd)
+                # A trend moves it by no more than that: otherwise a pitch drifts until windows determine its trend.
+                posterior = posterior.reset_value(len(problem.free) + index, 0.0, RESTART_FACTOR * sd / TREND_MEMORY)
     return replace(state, posterior=posterior, adopted=tuple(record.adopted for record in records))

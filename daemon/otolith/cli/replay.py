@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from otolith.acquisition.quality import ReasonCounts, time_text
+from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_decisions, restore_components
 from otolith.cli.common import echo_warnings, progress_line
 from otolith.cli.operation.live_table import LEVEL_STYLES, STYLES, event_style, parameter_table, title
 from otolith.discovery.decision import WindowDecision
@@ -22,6 +23,7 @@ from otolith.health.text import component_text, event_text, finding_text, headli
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.preview import computing_time_text, preview_recording, short_lines
 from otolith.runtime.replay import RealTimePacer, Replay, open_recordings, replay_recorder
+from otolith.storage.state_store import store_of
 from otolith_drivers.errors import OtolithError, counted
 
 PLAIN_WIDTH = 110  # columns of a summary that goes into a file
@@ -128,6 +130,7 @@ def replay(
             _echo_preview(machine, data[0], stopped)
         wait = RealTimePacer(stopped).wait if real_time else None
         run = Replay(machine, recorded, stopped, wait, timing=timing)
+        run.state = _with_decisions(machine, run.state)
         with (
             replay_recorder(recording, machine.recorded(recorded.sampling)) as record,
             progress_line("reading", enabled=not as_json) as show,
@@ -145,6 +148,14 @@ def replay(
     console.print(summary)
     for line in (run.summary(), *run.warnings()):
         console.print(line, markup=False, soft_wrap=True)
+
+
+def _with_decisions(machine: LoadedMachine, state: AdaptationState) -> AdaptationState:
+    """Return the initial state with the components that the operator approved, and without those rejected."""
+    store, decisions = store_of(machine), store_of(machine).decisions()
+    approved = [record for record in store.components() if record.adopted.component.key in decisions.approved]
+    state = restore_components(state, tuple(approved))
+    return apply_decisions(state, OperatorDecisions(decisions.approved, decisions.rejected))
 
 
 def _echo_preview(machine: LoadedMachine, data: Path, stopped: Callable[[], bool]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise, with_initial_noise
-from otolith.commissioning.likelihood import FittedWindow, Likelihood, Progress
+from otolith.commissioning.likelihood import FIRST_FITS, FittedWindow, Likelihood, Progress
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delay_response, delayable, largest_delay, same_measurements, shifted, trial_delays
@@ -60,6 +60,8 @@ class IdentifiedDelays:
     """How many were used."""
     shifts: tuple[float, ...] = ()
     """By how much the samples of each signal are late in the windows, s; signed, zero for one of them."""
+    noise_without: IdentifiedNoise | None = None
+    """Noise levels of the windows as they come; None if the search did not need them."""
 
     @property
     def values(self) -> dict[str, float]:
@@ -123,6 +125,7 @@ def identify_delays_and_noise(
     """
     delays = identify_delays(with_initial_noise(problem, windows), windows, declared, progress)
     noise = identify_noise(problem, delays.applied(problem, windows), progress)
+    noise_without = None if any(delays.shifts) else noise
     for _ in range(MAX_REFINEMENTS if noise.windows else 0):
         refined = identify_delays(noise.applied(problem), windows, declared, progress, delays)
         is_settled = refined.shifts == delays.shifts
@@ -130,7 +133,7 @@ def identify_delays_and_noise(
         if is_settled:
             break
         noise = identify_noise(problem, delays.applied(problem, windows), progress)
-    return delays, noise
+    return replace(delays, noise_without=noise_without), noise
 
 
 def without_delays(delays: IdentifiedDelays, declared: Mapping[str, float]) -> IdentifiedDelays:
@@ -179,7 +182,9 @@ class _Search:
         results = tuple(self._results(point, active, declared))
         return IdentifiedDelays(results, len(self._windows), tuple(point.delays.tolist()))
 
-    def _evaluate(self, delays: Array, windows: Sequence[Window], starts: Sequence[Array]) -> _Point:
+    def _evaluate(
+        self, delays: Array, windows: Sequence[Window], starts: Sequence[Array], rounds: int = FIRST_FITS
+    ) -> _Point:
         """Fit the windows, shifted by ``delays``; each fit begins with the parameters of ``starts``."""
         fits = []
         given = dict(zip(self.names, delays.tolist(), strict=True))
@@ -187,7 +192,7 @@ class _Search:
         for window, start in zip(windows, starts, strict=True):
             moved = shifted(twin, window, given)
             moved = same_measurements(twin, moved, given, moved.start - window.start, self._between(window))
-            fits.append(self._likelihood.fit(self._levels, moved, [start]))
+            fits.append(self._likelihood.fit(self._levels, moved, [start], rounds))
         return _Point(delays, fits, self._likelihood.deviance(fits))
 
     def _between(self, window: Window) -> tuple[float, float]:
@@ -197,11 +202,13 @@ class _Search:
         first, last = max(int(first), 1), min(int(last), len(times) - 1)
         return float(times[first - 1 : first + 1].mean()), float(times[last - 1 : last + 1].mean())
 
-    def _again(self, point: _Point, delays: Array, chosen: Sequence[int] | None = None) -> _Point:
+    def _again(
+        self, point: _Point, delays: Array, chosen: Sequence[int] | None = None, rounds: int = FIRST_FITS
+    ) -> _Point:
         """Fit all or the ``chosen`` windows again at other delays, from the parameters of ``point``."""
         places = range(len(self._windows)) if chosen is None else chosen
         starts = [point.fits[at].guess[: len(self._problem.free)] for at in range(len(point.fits))]
-        return self._evaluate(delays, [self._windows[at] for at in places], starts)
+        return self._evaluate(delays, [self._windows[at] for at in places], starts, rounds)
 
     def _score(self, point: _Point, signals: Sequence[int]) -> _Score:
         """Return the Gauss-Newton step of the delays of ``signals``, the parameters of each window being free."""
@@ -239,7 +246,8 @@ class _Search:
         chosen = self._most_informative(point)
         before = self._part(point, chosen)
         best, added = before, -1
-        for index in others:
+        # Of two signals, one late is the other early: the trials have both signs.
+        for index in others[:1] if len(self.names) == 2 else others:
             trial = self._searched(before, index, float(alone[index].step[0]), chosen)
             if trial.deviance < best.deviance:
                 best, added = trial, index
@@ -288,13 +296,23 @@ class _Search:
         return _Point(point.delays, fits, self._likelihood.deviance(fits))
 
     def _searched(self, before: _Point, index: int, step: float, chosen: Sequence[int]) -> _Point:
-        """Return the ``chosen`` windows with the best delay of one signal, from a grid and then by Gauss-Newton."""
-        period = min(window.sample_period for window in self._windows)
-        best = before
-        for value in [step, *trial_delays(period, self._limit)]:
+        """Return the ``chosen`` windows with the best delay of one signal: a grid, a parabola, then Gauss-Newton.
+
+        The deviance is not smooth below a sample period, so that Gauss-Newton alone does not leave a point of the grid.
+        """
+
+        def trial(value: float, rounds: int) -> _Point:
             delays = before.delays.copy()
             delays[index] = np.clip(value, -self._limit, self._limit)
-            best = min(best, self._again(before, delays, chosen), key=lambda trial: trial.deviance)
+            return self._again(before, delays, chosen, rounds)
+
+        tried = trial_delays(min(window.sample_period for window in self._windows), self._limit)
+        values = np.unique(np.clip([step, 0.0, *tried], -self._limit, self._limit))
+        deviances = np.array([trial(value, 1).deviance for value in values.tolist()])
+        at = int(np.clip(np.argmin(deviances), 1, len(values) - 2))
+        bend, slope, _ = np.polyfit(values[at - 1 : at + 2] - values[at], deviances[at - 1 : at + 2], 2)
+        ends = [values[np.argmin(deviances)], values[at] - 0.5 * slope / bend if bend > 0.0 else 0.0]
+        best = min([before, *(trial(float(value), FIRST_FITS) for value in ends)], key=lambda point: point.deviance)
         return best if best is before else self._refined(best, [index], SEARCH_STEPS, chosen)
 
     def _refined(

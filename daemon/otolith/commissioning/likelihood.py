@@ -80,14 +80,14 @@ class Likelihood:
         self.problem = problem
         self._free = len(low)
 
-    def fit(self, levels: Array, window: Window, starts: Sequence[Array]) -> FittedWindow:
-        """The likeliest of the first fits from ``starts``, each (free,)."""
-        fits = [self._first_fit(levels, window, start) for start in starts]
+    def fit(self, levels: Array, window: Window, starts: Sequence[Array], rounds: int = FIRST_FITS) -> FittedWindow:
+        """The likeliest of the first fits from ``starts``, each (free,), with the predictor made ``rounds`` times."""
+        fits = [self._first_fit(levels, window, start, rounds) for start in starts]
         return min(fits, key=lambda fit: self.deviance([fit]))
 
     def refit(self, levels: Array, fits: Fits) -> list[FittedWindow]:
         """The same windows at other levels; each fit starts where the last one ended."""
-        return [self._fit(self._objective(levels, fit.window, fit.guess), fit.window, fit.guess) for fit in fits]
+        return [self._fit(self._objective(levels, fit, fit.guess), fit.window, fit.guess) for fit in fits]
 
     def deviance(self, fits: Fits) -> float:
         """Minus twice the restricted log-likelihood, up to a constant."""
@@ -97,22 +97,24 @@ class Likelihood:
         """At ``levels`` close to those of ``fits``, without a new fit: χ² is stationary at the fitted guess."""
         deviance, innovations, factors = 0.0, [], []
         for fit in fits:
-            objective = self._objective(levels, fit.window, fit.centre)
+            objective = self._objective(levels, fit, fit.centre)
             residuals, jacobian = objective.linearise(fit.guess)
             deviance += self._deviance(objective, float(residuals @ residuals), jacobian)
             innovations.append(self.project(residuals, fit.result.jacobian))
             factors.append(np.log(np.diagonal(objective.whitening, axis1=1, axis2=2)).ravel())
         return Linearisation(deviance, np.concatenate([*innovations, *factors]))
 
-    def _objective(self, levels: Array, window: Window, centre: Array) -> Objective:
-        return Objective(with_levels(self.problem, levels), window, centre[: self._free], centre[self._free :])
+    def _objective(self, levels: Array, fit: FittedWindow, centre: Array) -> Objective:
+        """Return the objective of the window of ``fit``; other levels rarely need other sub-steps."""
+        problem, substeps = with_levels(self.problem, levels), fit.objective.excitation.substeps
+        return Objective(problem, fit.window, centre[: self._free], centre[self._free :], substeps)
 
-    def _first_fit(self, levels: Array, window: Window, start: Array) -> FittedWindow:
+    def _first_fit(self, levels: Array, window: Window, start: Array, rounds: int) -> FittedWindow:
         objective = Objective(with_levels(self.problem, levels), window, start)
         guess = objective.guess(start)
-        for _ in range(FIRST_FITS - 1):
+        for _ in range(rounds - 1):
             guess = self._fit(objective, window, guess).guess
-            objective.set_predictor(guess[: self._free], guess[self._free :])
+            objective.set_predictor(guess[: self._free], guess[self._free :], objective.excitation.substeps)
         return self._fit(objective, window, guess)
 
     def _fit(self, objective: Objective, window: Window, centre: Array) -> FittedWindow:

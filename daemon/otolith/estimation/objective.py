@@ -64,8 +64,10 @@ class Objective:
     state is a nuisance parameter, estimated along with the rest.
     """
 
-    def __init__(self, problem: Problem, window: Window, start: Array, initial: Array | None = None) -> None:
-        """Build the predictor around ``start`` (free,) and ``initial`` (states,).
+    def __init__(
+        self, problem: Problem, window: Window, start: Array, initial: Array | None = None, substeps: int = 1
+    ) -> None:
+        """Build the predictor around ``start`` (free,) and ``initial`` (states,), with at least so many sub-steps.
 
         States that are NaN, by default all, start at the first record.
         """
@@ -98,19 +100,19 @@ class Objective:
         self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
         self.initial = self._first if initial is None else np.where(np.isnan(initial), self._first, initial)
         """(states,) around which the predictor was built."""
-        self.set_predictor(start, self.initial)
+        self.set_predictor(start, self.initial, substeps)
 
-    def set_predictor(self, parameters: Array, initial: Array) -> None:
-        """Compute sub-steps, gain and whitening around ``parameters`` (free,) and ``initial`` (states,)."""
+    def set_predictor(self, parameters: Array, initial: Array, substeps: int = 1) -> None:
+        """Compute at least ``substeps`` sub-steps, gain and whitening around ``parameters`` (free,) and ``initial``."""
         full = self.parameters(parameters[None])[0]
-        uncorrected = replace(self._excitation, gain=None, substeps=1)
+        uncorrected = replace(self._excitation, gain=None, substeps=substeps)
         while True:
             model = self._innovation_model(full, initial, uncorrected)
             corrected = replace(uncorrected, gain=model.gain)
-            substeps = self._substeps(full, initial, corrected)
-            if substeps <= uncorrected.substeps:  # otherwise the gain comes from too coarse an integrator
+            needed = self._substeps(full, initial, replace(corrected, substeps=substeps))
+            if needed <= uncorrected.substeps:  # otherwise the gain comes from too coarse an integrator
                 break
-            uncorrected = replace(uncorrected, substeps=substeps)
+            uncorrected = replace(uncorrected, substeps=needed)
         self.innovation_model = model
         self._excitation = corrected
 

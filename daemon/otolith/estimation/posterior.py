@@ -160,8 +160,8 @@ class Posterior:
         return replace(self, belief=belief)
 
     def reset_value(self, index: int, value: float, sd: float) -> "Posterior":
-        """Return the same with an independent ``value`` ± ``sd`` of one parameter, in its unit."""
-        scale = self.problem.scale[index]
+        """Return the same with an independent ``value`` ± ``sd`` of one parameter or trend, in its unit."""
+        scale = _size(self.problem)[index]
         return replace(self, belief=imm_filter.reset_marginal(self.belief, index, sd / scale, value / scale))
 
     def reset_parameters(self, moved: Iterable[int]) -> "Posterior":

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, local_time
+from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, local_time, progress_line
 
 if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
@@ -220,27 +220,27 @@ def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windo
     from otolith.cli.commissioning.noise import identified_record, noise_lines
     from otolith_drivers.errors import OtolithError
 
-    state = _replayed(machine, data)
-    record, is_pooled = identified_record(machine, data, windows), not state.adopted
-    identified = record.noise_beside(machine) if is_pooled and record.offered else record.noise
-    if is_pooled:  # the file's noise levels may have hidden a component, and no window alone shows what all show
-        components = tuple(_record_of(item) for item in record.offered)
+    record = identified_record(machine, data, windows)
+    identified = record.noise_beside(machine) if record.offered else record.noise
+    components = tuple(record_of(item) for item in record.offered)
+    state = None if components else _replayed(machine, data)
+    if state is None or not state.adopted:  # the file's noise levels may have hidden a component
         state = _replayed(replace(machine, problem=identified.applied(machine.problem)), data, components)
     click.echo("\n".join(noise_lines(machine, identified)))
-    if is_pooled and record.offered:
+    if record.offered:
         click.echo("# this process noise is right with the components below: if you approve them, put it into the file")
     elif state.adopted:
         click.echo("# this process noise contains the components below: keep that of the file if you approve them")
     else:
         click.echo("# put these tables into the machine file in place of its own", err=True)
-    _review(machine, store, state, approve_all=approve_all)
+    _review(machine, store, state, components, approve_all=approve_all)
     try:
         keep_baseline(machine, store, state.health.histories)
     except OtolithError as error:  # nothing that has limits, or a record that is too short
         click.echo(str(error), err=True)
 
 
-def _record_of(structure: "Structure") -> "ComponentRecord":
+def record_of(structure: "Structure") -> "ComponentRecord":
     """Return what a state is given of a structure, so that it is in the twin from the first window on."""
     from otolith.adaptation.state import ComponentRecord
     from otolith.discovery.adopted import AdoptedComponent
@@ -265,22 +265,35 @@ def _replayed(
     from otolith.adaptation.state import restore_components
     from otolith.runtime.replay import Replay, open_recorded
 
-    with open_recorded(machine, data) as recorded:
+    with open_recorded(machine, data) as recorded, progress_line("replay") as show:
         run = Replay(machine, recorded)
         run.state = restore_components(run.state, components)
         for report in run.reports():
+            show(f"window {report.document.window.index}, {run.progress:.0%} of the data")
             for finding in report.document.findings:
                 click.echo(f"window {report.document.window.index}: {finding.text}", err=True)
         echo_warnings(data, run.warnings())
         return run.state
 
 
-def _review(machine: "LoadedMachine", store: "StateStore", state: "AdaptationState", *, approve_all: bool) -> None:
-    """Ask for a decision on each component, keep the approved ones, and print the estimated parameters."""
+def _review(
+    machine: "LoadedMachine",
+    store: "StateStore",
+    state: "AdaptationState",
+    pooled: "tuple[ComponentRecord, ...]",
+    *,
+    approve_all: bool,
+) -> None:
+    """Ask for a decision on each component, keep the approved ones, and print the estimated parameters.
+
+    The values of ``pooled`` components are kept: all windows together are more precise than the filter after them.
+    """
     from otolith.adaptation.state import component_records
     from otolith.health.text import interval_text
 
-    records, approved, rejected = component_records(state), set[str](), set[str]()
+    precise = {_key(record): record for record in pooled}
+    records = tuple(precise.get(_key(record), record) for record in component_records(state))
+    approved, rejected = set[str](), set[str]()
     for record in records:
         click.echo(f"found {_key(record)}: {_equation(machine, record)}", err=True)
         (approved if approve_all or _is_healthy() else rejected).add(_key(record))

@@ -91,7 +91,7 @@ def identified_record(machine: "LoadedMachine", data: Path, count: int) -> Healt
         record = HealthyRecord(delays, identified, structure, punctual)
         if structure and any(signal.is_late for signal in delays.signals):
             # What the twin lacks has looked like a delay if it is still there with the delay.
-            without = identify_noise(problem, chosen, show)
+            without = delays.noise_without or identify_noise(problem, chosen, show)
             beside = remaining_structure(problem, without, chosen, show)
             if {item.component.key for item in beside} & {item.component.key for item in structure}:
                 record = HealthyRecord(without_delays(delays, declared), without, beside, chosen)
