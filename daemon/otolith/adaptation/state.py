@@ -222,6 +222,5 @@ def restore_components(state: AdaptationState, records: tuple[ComponentRecord, .
             else:
                 posterior = posterior.reset_value(index, value, RESTART_FACTOR * sd)
                 # A trend moves it by no more than that: otherwise a pitch drifts until windows determine its trend.
-                trend = len(problem.free) + index
-                posterior = posterior.reset_value(trend, 0.0, RESTART_FACTOR * sd / TREND_MEMORY)
+                posterior = posterior.reset_value(len(problem.free) + index, 0.0, RESTART_FACTOR * sd / TREND_MEMORY)
     return replace(state, posterior=posterior, adopted=tuple(record.adopted for record in records))

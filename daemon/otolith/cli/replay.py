@@ -152,11 +152,10 @@ def replay(
 
 def _with_decisions(machine: LoadedMachine, state: AdaptationState) -> AdaptationState:
     """Return the initial state with the components that the operator approved, and without those rejected."""
-    store = store_of(machine)
-    decisions = store.decisions()
-    approved = (record for record in store.components() if record.adopted.component.key in decisions.approved)
-    of_components = OperatorDecisions(decisions.approved, decisions.rejected)
-    return apply_decisions(restore_components(state, tuple(approved)), of_components)
+    store, decisions = store_of(machine), store_of(machine).decisions()
+    approved = [record for record in store.components() if record.adopted.component.key in decisions.approved]
+    state = restore_components(state, tuple(approved))
+    return apply_decisions(state, OperatorDecisions(decisions.approved, decisions.rejected))
 
 
 def _echo_preview(machine: LoadedMachine, data: Path, stopped: Callable[[], bool]) -> None:

@@ -264,21 +264,19 @@ class _Search:
     def _simplified(self, point: _Point, active: list[int]) -> tuple[_Point, list[int]]:
         """Return the same against the signal for which the fewest others have a significant delay.
 
-        What three of four signals have in common is a delay of the fourth. A delay that no longer exceeds its
-        uncertainty is dropped, as it would not be added.
+        What three of four signals have in common is a delay of the fourth.
         """
         variances = self._variances(point, active)
         with np.errstate(divide="ignore", invalid="ignore"):
             differences = point.delays - point.delays[:, None]
             significant = (differences != 0.0) & ~(differences**2 <= self._threshold * variances)
-        least = min(range(len(self.names)), key=lambda index: (significant[index].sum(), index in active))
+        least = int(np.argmin(significant.sum(axis=1)))
         fewer = np.flatnonzero(significant[least]).tolist()
         if len(fewer) >= len(active):
             return point, active
         delays = np.where(significant[least], differences[least], 0.0)
         simple = self._refined(self._again(point, delays), fewer)
-        is_subset = least not in active
-        return (simple, fewer) if is_subset or simple.deviance - point.deviance <= self._threshold else (point, active)
+        return (simple, fewer) if simple.deviance - point.deviance <= self._threshold else (point, active)
 
     def _variances(self, point: _Point, active: list[int]) -> Array:
         """Return the variances (signals, signals) of the differences between two delays; zero if both are given."""
@@ -308,13 +306,13 @@ class _Search:
             delays[index] = np.clip(value, -self._limit, self._limit)
             return self._again(before, delays, chosen, rounds)
 
-        period = min(window.sample_period for window in self._windows)
-        values = np.unique(np.clip([step, 0.0, *trial_delays(period, self._limit)], -self._limit, self._limit))
+        tried = trial_delays(min(window.sample_period for window in self._windows), self._limit)
+        values = np.unique(np.clip([step, 0.0, *tried], -self._limit, self._limit))
         deviances = np.array([trial(value, 1).deviance for value in values.tolist()])
         at = int(np.clip(np.argmin(deviances), 1, len(values) - 2))
         bend, slope, _ = np.polyfit(values[at - 1 : at + 2] - values[at], deviances[at - 1 : at + 2], 2)
-        ends = [float(values[np.argmin(deviances)]), float(values[at] - 0.5 * slope / bend) if bend > 0.0 else 0.0]
-        best = min([before, *(trial(value, FIRST_FITS) for value in ends)], key=lambda point: point.deviance)
+        ends = [values[np.argmin(deviances)], values[at] - 0.5 * slope / bend if bend > 0.0 else 0.0]
+        best = min([before, *(trial(float(value), FIRST_FITS) for value in ends)], key=lambda point: point.deviance)
         return best if best is before else self._refined(best, [index], SEARCH_STEPS, chosen)
 
     def _refined(
@@ -348,9 +346,6 @@ class _Search:
                 at_limit = abs(point.delays[index]) >= self._limit
                 results.append(SignalDelay(name, value, sd, AT_LIMIT if at_limit else ""))
                 continue
-            if len(active) == len(self.names) - 1:  # the delays of all others are against this one
-                results.append(SignalDelay(name, value))
-                continue
             undetected = float(np.sqrt(self._threshold * self._own_variance(point, active, index)))
             if undetected > MAX_UNCERTAINTY * self._limit * QUANTILE:
                 results.append(SignalDelay(name, value, None, UNOBSERVABLE))
@@ -361,7 +356,7 @@ class _Search:
     def _own_variance(self, point: _Point, active: list[int], index: int) -> float:
         """Return the variance of the delay of a signal that has none, beside those that have one."""
         others = [other for other in active if other != index]
-        if index in active:
+        if index in active or len(others) == len(self.names) - 1:
             return 0.0
         variance = float(self._score(point, [*others, index]).covariance[-1, -1])
         return variance if variance > 0.0 else np.inf

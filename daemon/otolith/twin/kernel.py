@@ -288,11 +288,9 @@ class Kernel:
     ) -> int:
         """The fewest substeps, a power of two up to ``limit``, with truncation errors below ``tolerance`` (outputs,).
 
-        The search begins with those of ``excitation``.
-
-        Shapes (parameters,), (states,). The error is estimated by halving the step (Richardson; Hairer, Norsett,
-        Wanner, Solving Ordinary Differential Equations I, section II.4). ``limit`` is that of an ordinary step:
-        the longest one may have as many more as it is longer, so that the cost is linear in the records.
+        Shapes (parameters,), (states,). From those of ``excitation`` on, steps are halved, which estimates the error
+        (Richardson; Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section II.4). ``limit`` is for
+        an ordinary step: the longest may have as many more as it is longer, so that the cost is linear in the records.
         """
         grid, count = excitation.grid, excitation.substeps
         if grid.period is None and grid.records > 1:
