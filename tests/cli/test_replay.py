@@ -133,7 +133,7 @@ def test_unknown_columns_are_named_and_ignored(tmp_path: Path, rows: Lines, caps
 
 def test_the_summary_has_parameters_and_counts(tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]) -> None:
     text = summed_up(written(tmp_path, rows[:-50]), capsys)
-    assert "motor at site, twin dc_motor (DT'), from t = 0 s to t = 8 s" in text
+    assert "motor (site): dc_motor (DT'), from t = 0 s to t = 8 s" in text
     assert "R_a" in text
     assert "ohm" in text
     assert "4 windows: 4 good, 0 bad; the twin explains 4 of 4" in text
