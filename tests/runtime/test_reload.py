@@ -1,11 +1,15 @@
 """A changed machine file: what a running daemon takes over, and what it names."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from otolith.health.baseline import Baseline
 from otolith.machine import load_machine
-from otolith.runtime.service import Reload, Service, reloaded
+from otolith.runtime.reload import Reload, reloaded
+from otolith.runtime.service import Service
+from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 
@@ -66,3 +70,18 @@ def test_a_file_that_vanishes_during_a_reload_does_not_end_the_daemon(
     monkeypatch.setattr("otolith.runtime.service.files_of", vanished)
     service._reload()
     assert "not reloaded, the daemon goes on as before: dc-motor-in-process.toml: no such file" in caplog.text
+
+
+def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -> None:
+    text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
+    text = text.replace('"scenarios/', f'"{EXAMPLES}/scenarios/')
+    path = tmp_path / "motor.toml"
+    path.write_text(text, encoding="utf-8")
+    service = Service(load_machine(path))
+    store = store_of(service._machine)
+    store.save_decisions(replace(store.decisions(), baselines={"R_a": Baseline(6.1, 0.01, 50, 1.0)}))
+    path.write_text(text.replace('"+45 %"', '"+60 %"'), encoding="utf-8")
+    service._reload()
+    limited = service._supervisor._next_state().plan.parameters["R_a"]
+    assert (limited.nominal, limited.has_baseline) == (6.1, True)
+    assert max(limit.value for limit in limited.limits) == pytest.approx(1.6 * 6.1)

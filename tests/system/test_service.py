@@ -188,7 +188,8 @@ def test_sighup_reloads_the_machine_file(own_machine: OwnMachine) -> None:
     file = own_machine.machine
     text = file.read_text(encoding="utf-8") + "\n[recording]\nenabled = false\n"
     file.write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "otolith", "run", str(file)]
+    # The daemon ignores SIGHUP where nohup does so for the tests.
+    command = ["env", "--default-signal=HUP", sys.executable, "-m", "otolith", "run", str(file)]
     daemon = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )

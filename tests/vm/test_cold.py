@@ -1,4 +1,4 @@
-"""The first start of a service on a core at a tenth of its speed. Runs in the guest, as root, for half an hour."""
+"""The first start of a service on a core at a tenth of its speed. Runs in the guest, as root: 15 minutes."""
 
 import shutil
 import time

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from otolith.acquisition.alignment import Indices
 from otolith.acquisition.samples import Interval, Series, SignalPlan
@@ -237,13 +236,11 @@ def _line(samples: InputSamples, times: Array, before: Indices, after: Indices) 
     variance = line_variance(series, samples.noise)(length)
     of_curve = curve_variance(series, samples.noise)
     if of_curve is not None:
-        curve = CubicSpline(series.times, series.values)(times)
-        curved = inside & (of_curve(length) < variance)  # a long gap is too long for a curve first
-        curved &= np.abs(curve - values) <= CREDIBLE * np.sqrt(
-            variance
-        )  # beside a burst of samples, a spline overshoots
+        curve, curve_error = _spline(series.times, series.values, times), of_curve(length)
+        # In a long gap a curve is worse than a line; beside a burst of samples it overshoots.
+        curved = inside & (curve_error < variance) & (np.abs(curve - values) <= CREDIBLE * np.sqrt(variance))
         values = np.where(curved, curve, values)
-        variance = np.where(curved, of_curve(length), variance)
+        variance = np.where(curved, curve_error, variance)
     return values, _Error(np.where(inside, variance * spread, 0.0), 0.5 * length)
 
 
@@ -319,8 +316,15 @@ def _about_curve(series: Series, reach: int) -> Array:
         for first in range(pitch):
             knots = slice(first, None, pitch)
             middles = slice(first + reach, -reach, pitch)
-            errors.append(values[middles] - CubicSpline(times[knots], values[knots])(times[middles]))
+            errors.append(values[middles] - _spline(times[knots], values[knots], times[middles]))
     return np.asarray(np.concatenate(errors))
+
+
+def _spline(knots: Array, values: Array, times: Array) -> Array:
+    """Return the cubic spline through ``values`` at ``knots``, at ``times``."""
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415 - only smooth inputs at irregular times need SciPy
+
+    return np.asarray(CubicSpline(knots, values)(times))
 
 
 def _outdated(samples: InputSamples, times: Array) -> _Error:

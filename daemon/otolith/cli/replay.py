@@ -152,7 +152,8 @@ def replay(
 
 def _with_decisions(machine: LoadedMachine, state: AdaptationState) -> AdaptationState:
     """Return the initial state with the components that the operator approved, and without those rejected."""
-    store, decisions = store_of(machine), store_of(machine).decisions()
+    store = store_of(machine)
+    decisions = store.decisions()
     approved = [record for record in store.components() if record.adopted.component.key in decisions.approved]
     state = restore_components(state, tuple(approved))
     return apply_decisions(state, OperatorDecisions(decisions.approved, decisions.rejected))

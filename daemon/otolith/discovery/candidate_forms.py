@@ -86,6 +86,8 @@ def scales_a_sum(base: Definition, site: int) -> bool:
     if site >= len(base.sites) or base.sites[site].mode != "multiplicative":
         return False
     ordered, _ = _equations(base)
+    if base.sites[site].into not in dict(ordered):
+        return False
 
     def quantity(doubled: str = "") -> Array:
         random = np.random.default_rng(0)
@@ -95,7 +97,9 @@ def scales_a_sum(base: Definition, site: int) -> bool:
         return np.asarray(sum(values[base.sites[site].into]))
 
     with np.errstate(all="ignore"):
-        return not any(np.allclose(quantity(each.name), 2.0 * quantity()) for each in base.parameters)
+        ratios = np.array([quantity(each.name) / quantity() for each in base.parameters])
+    scales_all = np.isclose(ratios, ratios[:, :1]).all(axis=1) & ~np.isclose(ratios[:, 0], 1.0)
+    return bool(np.isfinite(ratios).all()) and not scales_all.any()
 
 
 def rate_terms(base: Definition, columns: Mapping[str, Array], site: int = 0, entering: float = 0.0) -> list[Array]:

@@ -134,7 +134,9 @@ def _without_parameters(
     return [
         guess
         for guess, at in zip(guesses, first, strict=True)
-        if competing.is_sensor(guess.form) or scales_a_sum(twin, guess.form.site) or not same[at]
+        if competing.is_sensor(guess.form)
+        or (guess.form.model.name == "constant" and scales_a_sum(twin, guess.form.site))
+        or not same[at]
     ]
 
 

@@ -83,7 +83,7 @@ def explained_again(fitted: FittedHypothesis, item: Proposal, window: Window, be
     if before.phase is None or not before.phase.last_state or item.problem.delays:
         return fitted
     steps = ROUNDS * STEPS_OF_ROUND
-    again = fit(item.problem, window, item.prior, item.start, steps, state=before.phase.last_state)
+    again = fit(item.problem, window, item.prior, item.start, steps, state=before.phase.last_state).resolved(steps)
     return replace(fitted, fit=again) if again.chi_square < fitted.fit.chi_square else fitted
 
 
@@ -153,20 +153,22 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
 def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
     """Return the hypotheses; those of moved parameters also fitted from the values of the best, where they are better.
 
-    A component may lead the parameters out of a local minimum. It needs evidence against the parameters alone there.
+    With a component, a fit may reach another minimum. The component needs evidence against the parameters alone there.
     """
     best = min(fitted, key=_chi_square)
     if best.type is FaultType.PARAMETER or best.fit.cost > EXPLAINED:
         return fitted
     values = {free.label: value for free, value in zip(best.problem.free, best.fit.parameters, strict=True)}
-    stuck = [item for item in fitted if item.type is FaultType.PARAMETER and item.fit.cost > EXPLAINED]
+    unexplained = [item for item in fitted if item.type is FaultType.PARAMETER and item.fit.cost > EXPLAINED]
     proposals = []
-    for item in stuck:
+    for item in unexplained:
         own = zip(item.problem.free, item.fit.parameters, strict=True)
         start = np.array([values.get(free.label, value) for free, value in own])
         proposals.append(Proposal(item.hypothesis, item.problem, item.fit.prior, start))
-    freed = {id(old): new for old, new in zip(stuck, fit_hypotheses(proposals, fitted[0].fit.window), strict=True)}
-    return [min(item, freed.get(id(item), item), key=_chi_square) for item in fitted]
+    refitted = {
+        id(old): new for old, new in zip(unexplained, fit_hypotheses(proposals, fitted[0].fit.window), strict=True)
+    }
+    return [min(item, refitted.get(id(item), item), key=_chi_square) for item in fitted]
 
 
 def late_signals(null: FittedHypothesis, response: LinearResponse) -> list[FittedHypothesis]:

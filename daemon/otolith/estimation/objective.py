@@ -26,9 +26,8 @@ PENALTY = 1e30  # cost of a guess whose prediction is not finite
 MAX_SUBSTEPS_WITH_COMPONENTS = 8  # no number of sub-steps makes the step of dry friction smooth
 ADC_TOLERANCE = 0.01  # share of a step: how far level differences may be from whole multiples of it
 WHITE_ROUNDING = 2.0  # standard deviations of the noise: rounding to steps up to this size is white noise
-MAX_ADC_STEP = (
-    1000.0  # standard deviations of the noise: what differs by more are wrong values, no levels of a converter
-)
+# Standard deviations of the noise: what differs by more are wrong values, no levels of a converter.
+MAX_ADC_STEP = 1000.0
 MIN_ADC_LEVELS = 4  # levels in a window that show the step of a converter
 
 

@@ -11,9 +11,9 @@ from otolith.twin.definition import Definition, Parameter
 
 UNLIMITED = 1e30  # bound of an amplitude that nothing limits; any finite number would do
 MIN_SCALE = 0.01  # share of the width of the bounds: the size of a parameter whose nominal value is about zero
-MAX_CHANGE = 1.5  # ratio of two consecutive lengths
-MIN_CHANGE = 1.2  # ratio below which the length stays as it is
-SHORTENED = 0.5  # ratio after a window that the twin does not explain
+MAX_CHANGE = 1.5  # ratio of two consecutive window lengths
+MIN_CHANGE = 1.2  # ratio below which the window length stays as it is
+SHORTENED = 0.5  # ratio of window lengths after a window that the twin does not explain
 
 
 @dataclass(frozen=True, slots=True)

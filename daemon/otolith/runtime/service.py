@@ -11,21 +11,19 @@ import logging
 import math
 import os
 import signal
-import socket
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing.connection import wait
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from otolith.acquisition.quality import time_text
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
+from otolith.health.limits import MonitoringPlan
 from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
@@ -35,6 +33,8 @@ from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.event_command import EventCommand
 from otolith.runtime.process import SIGNALS
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
+from otolith.runtime.reload import reloaded
+from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
@@ -55,89 +55,6 @@ STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
-Key = tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Reload:
-    """The machine to go on with, and what has changed."""
-
-    machine: LoadedMachine
-    limits: bool
-    recording: bool
-    needs_restart: tuple[str, ...]
-    """Keys of the file that were changed and that a running daemon does not take over."""
-
-    @property
-    def text(self) -> str:
-        """What has changed, in words."""
-        changed = " and ".join(name for name in ("limits", "recording") if getattr(self, name)) or "nothing"
-        line = f"{self.machine.path}: reloaded, {changed} changed"
-        return f"{line}; only a restart takes over {', '.join(self.needs_restart)}" if self.needs_restart else line
-
-
-def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
-    """Return ``running`` with what it can take over from ``new``.
-
-    Limits may be percentages of values, so they are taken over only with the parameters they belong to.
-    """
-    old, file = running.file, new.file
-    changed = list(_differences(old.model_dump(), file.model_dump()))
-    recording = any(key[0] == "recording" for key in changed)
-    limits = [key for key in changed if _is_limit(key)]
-    rest = [key for key in changed if key[0] != "recording" and not _is_limit(key)]
-    if new.twin != running.twin and not any(key[0] == "twin" for key in rest):
-        rest.append(("twin", "file"))
-    update: dict[str, Any] = {"recording": file.recording}
-    if any(key[0] in {"twin", "parameters"} for key in rest):
-        rest, limits = [*rest, *limits], []
-    if limits:
-        update |= {"parameters": file.parameters, "components": file.components}
-    machine = replace(running, file=old.model_copy(update=update), plan=new.plan if limits else running.plan)
-    return Reload(machine, bool(limits), recording, tuple(".".join(key) for key in rest))
-
-
-def _is_limit(key: Key) -> bool:
-    return key[0] == "components" or (key[0] == "parameters" and key[-1] in {"watch", "act"})
-
-
-def _differences(old: Any, new: Any, key: Key = ()) -> Iterator[Key]:
-    """The keys at which two tables differ; a table that one of them lacks is compared with an empty one."""
-    if isinstance(old, Mapping) or isinstance(new, Mapping):
-        before, after = (value if isinstance(value, Mapping) else {} for value in (old, new))
-        for name in dict.fromkeys((*before, *after)):
-            yield from _differences(before.get(name), after.get(name), (*key, str(name)))
-    elif old != new:
-        yield key
-
-
-class Notifier:
-    """Sends nothing where systemd did not start the daemon."""
-
-    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        path = environment.get("NOTIFY_SOCKET", "")
-        self._address = "\0" + path[1:] if path.startswith("@") else path
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if path else None
-        microseconds, pid = environment.get("WATCHDOG_USEC"), environment.get("WATCHDOG_PID")
-        for_us = pid in (None, str(os.getpid()))
-        self.watchdog = float(microseconds) / 1e6 if for_us and microseconds and microseconds.isdigit() else None
-        """Timeout of systemd's watchdog in s, or None if there is no watchdog."""
-
-    def send(self, *assignments: str) -> None:
-        """Send assignments such as ``READY=1``; line breaks in them become spaces."""
-        if self._socket is None:
-            return
-        text = "\n".join(" ".join(assignment.split()) for assignment in assignments)
-        try:  # MSG_DONTWAIT: a full queue must not block; a dropped message is repeated by the next one
-            self._socket.sendmsg([text.encode()], [], socket.MSG_DONTWAIT, self._address)
-        except OSError:
-            return
-
-    def close(self) -> None:
-        """Close the socket."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
 
 
 class Service:
@@ -161,6 +78,7 @@ class Service:
         self._notes: tuple[str, ...] = ()
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
+        self._described: MonitoringPlan | None = None  # by the history
         state = initial_state(file.machine.name, file.machine.site, machine.problem, machine.plan)
         self._supervisor = Supervisor(state, longest * period, self._evidence.add)
         self._recorder = RecorderSupervisor(machine, recording)
@@ -263,7 +181,6 @@ class Service:
         if self._history is not None:
             self._numbers, note = self._history.open(time.time())
             self._notes += (note,) if note else ()
-            self._history.description = describe_machine(self._machine.twin, self._machine.plan)
             self._history.start()
 
     def _reload(self) -> None:
@@ -272,15 +189,15 @@ class Service:
         try:
             change = reloaded(self._machine, load_machine(self._machine.path))
             files = self._evidence.files if change.needs_restart else files_of(change.machine)
+            decisions = self._store.decisions()
         except (OtolithError, OSError) as error:
             log.warning("not reloaded, the daemon goes on as before: %s", error)
             return
         self._machine, self._evidence.files = change.machine, files
-        if self._history is not None:
-            self._history.description = describe_machine(change.machine.twin, change.machine.plan)
         log.log(logging.WARNING if change.needs_restart else logging.INFO, "%s", change.text)
         if change.limits:
-            self._supervisor.revise(lambda state: replace(state, plan=change.machine.plan))
+            # The decisions contain the baselines to which limits in percent refer.
+            self._supervisor.revise(lambda state: apply_decisions(replace(state, plan=change.machine.plan), decisions))
         if change.recording:
             self._recorder.reload(self._machine, time.monotonic(), RECORDER_FLUSH)
 
@@ -332,12 +249,19 @@ class Service:
         update = {"cost": cost, "counters": self._counters(), "driver": driver, "parameters": parameters}
         document = self._numbers.number(document.model_copy(update={**update, "notes": self._notes}))
         if self._history is not None:
+            self._describe()
             self._history.add(document)
         if self._publisher is not None:
             self._publisher.publish(document)
         if self._machine.file.recording.enabled:
             self._recorder.offer(Report(document, report.traces), time.monotonic())
         self._log(document, time.monotonic())
+
+    def _describe(self) -> None:
+        """Write the machine into the history as it is monitored: with baselines and limits that were changed."""
+        plan = self._supervisor.state.plan
+        if self._history is not None and plan != self._described:
+            self._history.description, self._described = describe_machine(self._machine.twin, plan), plan
 
     def _counters(self) -> CountersDocument:
         rings, driver = self._rings.counters(), self._machine.driver.counters()

@@ -1,8 +1,8 @@
 """The history of one machine in an SQLite database: what it keeps, and how it is read.
 
 A value of each parameter and window is kept, and merged into its minute, hour and day at once, so that nothing has to
-be summarised later. Times are Unix seconds. The writer is :mod:`otolith.storage.history_writer`, retention is
-:mod:`otolith.storage.history_writer`; any number of processes may read meanwhile.
+be summarised later. Times are Unix seconds. Writer and retention: :mod:`otolith.storage.history_writer`; any number of
+processes may read meanwhile.
 """
 
 import contextlib

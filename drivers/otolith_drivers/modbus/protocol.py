@@ -36,7 +36,16 @@ WORDS_SWAPPED: frozenset[Order] = frozenset({"CDAB", "DCBA"})
 """Orders with the lowest register first."""
 BYTES_SWAPPED: frozenset[Order] = frozenset({"BADC", "DCBA"})
 """Orders with the low byte of each register first."""
-LETTERS: dict[TypeName, str] = dict(zip(get_args(TypeName), "hHiIqQfd", strict=True))
+LETTERS: dict[TypeName, str] = {
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
 """Format characters of ``struct`` by type."""
 BITS = re.compile(r"(\d{1,2})(?:\.\.(\d{1,2}))?")
 
