@@ -56,7 +56,8 @@ def test_a_site_that_scales_a_sum_is_a_cause_beside_its_parts() -> None:
     head = [site.name for site in pump.sites].index("head")
     assert scales_a_sum(pump, head)
     rest = tuple(own for own in pump.definitions if own[0] != "dp")
-    for expression in ("h_0*omega^2", "h_0*(omega^2 - h_2*Q*abs(Q))", "omega^2/h_0", "(omega^2 + Q)/h_0^2"):  # the parameter is a factor of all
+    wholes = ("h_0*omega^2", "h_0*(omega^2 - h_2*Q*abs(Q))", "omega^2/h_0", "(omega^2 + Q)/h_0^2")
+    for expression in wholes:  # the parameter is a factor of all
         assert not scales_a_sum(replace(pump, definitions=(("dp", expression, ""), *rest)), head)
     assert not any(scales_a_sum(pump, site) for site in range(len(pump.sites) + 3) if site != head)
 
