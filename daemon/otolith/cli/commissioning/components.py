@@ -216,7 +216,6 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
 
 def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windows: int, *, approve_all: bool) -> None:
-    from otolith.cli.commissioning.components import keep_baseline
     from otolith.cli.commissioning.noise import identified_record, noise_lines
     from otolith_drivers.errors import OtolithError
 
