@@ -525,7 +525,9 @@ def test_it_is_read_while_it_is_written_and_where_nothing_can_be_written(
     copy.chmod(0o700)
 
 
-def test_rows_that_the_disk_has_damaged_are_left_out(opened: Callable[..., Simulated], path: Path) -> None:
+def test_rows_that_the_disk_has_damaged_are_left_out(
+    opened: Callable[..., Simulated], path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Each of a compressed report, an event, a finding and counters; what SQLite itself notices is another test."""
     history = opened()
     history.write(*documents(200))
@@ -543,6 +545,7 @@ def test_rows_that_the_disk_has_damaged_are_left_out(opened: Callable[..., Simul
     connection.close()
     reader = HistoryReader(path)
     assert reader.messages("report", 1000) == [*reports[:10], *reports[11:-1]]
+    assert f"{path}: 2 rows that the disk has damaged are left out" in caplog.text
     assert [report.to_json() for report in reader.latest(3)] == reports[-2:-4:-1]
     assert reader.events(0.0) == events[1:]
     assert (reader.findings(0.0), reader.counters(0.0)) == ([], [])

@@ -264,19 +264,21 @@ class _Search:
     def _simplified(self, point: _Point, active: list[int]) -> tuple[_Point, list[int]]:
         """Return the same against the signal for which the fewest others have a significant delay.
 
-        What three of four signals have in common is a delay of the fourth.
+        What three of four signals have in common is a delay of the fourth. A delay that no longer exceeds its
+        uncertainty is dropped, as it would not be added.
         """
         variances = self._variances(point, active)
         with np.errstate(divide="ignore", invalid="ignore"):
             differences = point.delays - point.delays[:, None]
             significant = (differences != 0.0) & ~(differences**2 <= self._threshold * variances)
-        least = int(np.argmin(significant.sum(axis=1)))
+        least = min(range(len(self.names)), key=lambda index: (significant[index].sum(), index in active))
         fewer = np.flatnonzero(significant[least]).tolist()
         if len(fewer) >= len(active):
             return point, active
         delays = np.where(significant[least], differences[least], 0.0)
         simple = self._refined(self._again(point, delays), fewer)
-        return (simple, fewer) if simple.deviance - point.deviance <= self._threshold else (point, active)
+        is_subset = least not in active
+        return (simple, fewer) if is_subset or simple.deviance - point.deviance <= self._threshold else (point, active)
 
     def _variances(self, point: _Point, active: list[int]) -> Array:
         """Return the variances (signals, signals) of the differences between two delays; zero if both are given."""
@@ -346,6 +348,9 @@ class _Search:
                 at_limit = abs(point.delays[index]) >= self._limit
                 results.append(SignalDelay(name, value, sd, AT_LIMIT if at_limit else ""))
                 continue
+            if len(active) == len(self.names) - 1:  # the delays of all others are against this one
+                results.append(SignalDelay(name, value))
+                continue
             undetected = float(np.sqrt(self._threshold * self._own_variance(point, active, index)))
             if undetected > MAX_UNCERTAINTY * self._limit * QUANTILE:
                 results.append(SignalDelay(name, value, None, UNOBSERVABLE))
@@ -356,7 +361,7 @@ class _Search:
     def _own_variance(self, point: _Point, active: list[int], index: int) -> float:
         """Return the variance of the delay of a signal that has none, beside those that have one."""
         others = [other for other in active if other != index]
-        if index in active or len(others) == len(self.names) - 1:
+        if index in active:
             return 0.0
         variance = float(self._score(point, [*others, index]).covariance[-1, -1])
         return variance if variance > 0.0 else np.inf

@@ -7,6 +7,7 @@ processes may read meanwhile.
 
 import contextlib
 import json
+import logging
 import sqlite3
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,6 +22,8 @@ from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.user_dirs import state_directory
 
 Content = TypeVar("Content")
+
+log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
 APPLICATION_ID = 0x4F544F4C  # marks the file as ours: "OTOL"
@@ -212,16 +215,6 @@ def _unpacked(text: bytes | str) -> str:
     return zlib.decompress(text).decode() if isinstance(text, bytes) else text
 
 
-def _undamaged(rows: Iterable[tuple[Any, ...]], parse: Callable[..., Content]) -> Iterator[Content]:
-    """Yield what ``parse`` returns for each row, without those whose content the disk has damaged."""
-    for row in rows:
-        try:
-            parsed = parse(*row)
-        except (zlib.error, ValueError, TypeError):
-            continue
-        yield parsed
-
-
 class HistoryReader:
     """Reads the history of a machine, also while a daemon writes; each call opens the database for itself."""
 
@@ -256,7 +249,7 @@ class HistoryReader:
     def events(self, since: float) -> list[EventDocument]:
         """Return the changes of events since a time, in the order in which they were published."""
         rows = self._rows("SELECT text FROM event WHERE time >= ? ORDER BY sequence", since)
-        return list(_undamaged(rows, EventDocument.model_validate_json))
+        return self._undamaged(rows, EventDocument.model_validate_json)
 
     def event_ends(self, since: float) -> dict[int, float]:
         """Return the end of the window of each change of an event since a time, by its sequence number."""
@@ -270,29 +263,32 @@ class HistoryReader:
         def parse(first: float, last: float, count: int, text: str) -> dict[str, Any]:
             return {"first": first, "last": last, "count": count, **json.loads(text)}
 
-        return list(_undamaged(rows, parse))
+        return self._undamaged(rows, parse)
 
     def counters(self, since: float) -> list[dict[str, Any]]:
         """Return the last counters of each hour and start (``run``) of the daemon since a time."""
         rows = self._rows("SELECT hour, run, text FROM counters WHERE hour >= ? ORDER BY run, hour", since - HOUR)
-        return list(_undamaged(rows, lambda hour, run, text: {"hour": hour, "run": run, **json.loads(text)}))
+        return self._undamaged(rows, lambda hour, run, text: {"hour": hour, "run": run, **json.loads(text)})
 
     def states(self, since: float) -> list[tuple[str, float, Level]]:
         """Return part, begin and state of each change of a state, from the one at ``since`` on; the machine is ''."""
         before = "(SELECT max(since) FROM state AS other WHERE other.part = state.part AND since <= ?1)"
         query = f"SELECT * FROM state WHERE since >= coalesce({before}, ?1) ORDER BY since"  # noqa: S608 - our own text
         rows = self._later_rows("state", query, since)
-        return list(_undamaged(rows, lambda part, begin, state: (part, begin, Level(state))))
+        return self._undamaged(rows, lambda part, begin, state: (part, begin, Level(state)))
 
     def description(self) -> dict[str, Any]:
         """Return what :func:`describe_machine` wrote; empty if nobody did."""
         rows = self._later_rows("description", "SELECT text FROM description")
-        return next(_undamaged(rows, lambda text: dict(json.loads(text))), {})
+        return next(iter(self._undamaged(rows, lambda text: dict(json.loads(text)))), {})
 
     def latest(self, count: int) -> list[ReportDocument]:
         """Return the last reports, the newest first."""
         rows = self._rows("SELECT text FROM report ORDER BY sequence DESC LIMIT ?", count)
-        return list(_undamaged(rows, lambda text: ReportDocument.from_json(_unpacked(text))))
+        reports = self._undamaged(rows, lambda text: ReportDocument.from_json(_unpacked(text)))
+        if rows and not reports:
+            raise ConfigurationError(f"{self.path}: cannot be read: the disk has damaged the last {len(rows)} reports")
+        return reports
 
     def messages(
         self, kind: str, limit: int, after: int = 0, start: float | None = None, end: float | None = None
@@ -307,7 +303,19 @@ class HistoryReader:
             "ORDER BY sequence LIMIT ?4"
         )
         rows = self._rows(query, after, start, end, limit)
-        return list(_undamaged(rows, _unpacked))
+        return self._undamaged(rows, _unpacked)
+
+    def _undamaged(self, rows: Iterable[tuple[Any, ...]], parse: Callable[..., Content]) -> list[Content]:
+        """Return what ``parse`` returns for each row, without those whose content the disk has damaged."""
+        contents, damaged = [], 0
+        for row in rows:
+            try:
+                contents.append(parse(*row))
+            except (zlib.error, ValueError, TypeError):
+                damaged += 1
+        if damaged:
+            log.warning("%s: %d rows that the disk has damaged are left out", self.path, damaged)
+        return contents
 
     def _later_rows(self, table: str, query: str, *values: object) -> list[tuple[Any, ...]]:
         """Return the rows of a table that a database of an earlier version may lack; then there are none."""
