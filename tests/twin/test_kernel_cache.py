@@ -117,16 +117,16 @@ from pathlib import Path
 from numba import njit
 from otolith import kernel_cache
 
-def resident():
+def resident_kb():
     text = Path("/proc/self/smaps").read_text(encoding="utf-8")
-    found = re.findall(r" r-xp .*libllvmlite\\.so\\n(?:.+kB\\n)*?Rss: +(\\d+) kB", text)
-    return sum(map(int, found))
+    kilobytes = re.findall(r" r-xp .*libllvmlite\\.so\\n(?:.+kB\\n)*?Rss: +(\\d+) kB", text)
+    return sum(map(int, kilobytes))
 
 add = njit(lambda a, b: a + b)
 assert add(1, 2) == 3
-before = resident()
+before = resident_kb()
 kernel_cache.release_compiler()
-print(before, resident())
+print(before, resident_kb())
 assert add(1.5, 2.0) == 3.5  # compiled again, for other types
 """
 
