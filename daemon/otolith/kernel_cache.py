@@ -143,11 +143,13 @@ def _remove_old(store: Path, keep: Path) -> None:
 def release_compiler() -> None:
     """Return memory to the system that loaded kernels do not need: LLVM's own code (50 MB), and what it has freed.
 
-    The code is only read, so that what a later compilation needs of it comes from the file again.
+    The code is only read, so that what a later compilation needs of it comes from the file again. Freed memory returns
+    by ``malloc_trim`` of glibc; with another C library, such as musl, it stays with the process.
     """
     libc = ctypes.CDLL(None)
     for line in Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines():
         if " r-xp " in line and line.endswith("libllvmlite.so"):
             begin, end = (int(text, 16) for text in line.partition(" ")[0].split("-"))
             libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), mmap.MADV_DONTNEED)
-    libc.malloc_trim(0)
+    if hasattr(libc, "malloc_trim"):
+        libc.malloc_trim(0)

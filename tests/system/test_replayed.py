@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from otolith.health.schema import ReportDocument
+from otolith.acquisition.window import Verdict
+from otolith.health.schema import ParameterDocument, ReportDocument
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -31,6 +32,18 @@ omega = {}
 [recording]
 enabled = false
 """
+
+
+def is_good(report: ReportDocument) -> bool:
+    """Whether the window of the report was good."""
+    return report.window.quality.verdict is Verdict.GOOD
+
+
+def width(parameter: ParameterDocument) -> float:
+    """The width of the 95 % interval."""
+    assert parameter.low is not None
+    assert parameter.high is not None
+    return parameter.high - parameter.low
 
 
 def replayed(*arguments: object) -> list[ReportDocument]:
@@ -80,15 +93,12 @@ def test_a_real_time_replay_estimates_as_the_fast_one(
         Subscriber(Connection((own_machine.endpoint,)), received.put),
     ):
         deadline = time.monotonic() + 2 * PATIENCE
-        while len(reports) < 4:
+        while len(reports) < 4 or sum(map(is_good, reports)) < 2:
             assert time.monotonic() < deadline, reports
             reports.append(ReportDocument.from_json(received.get(timeout=2 * PATIENCE)))
         daemon.terminate()
         assert daemon.wait(timeout=PATIENCE) == 0
-    good = [report for report in reports if report.window.quality.verdict == "good"]
-    assert len(good) >= 2
-    for report in good:
-        again = expected[report.window.index].parameters["R_a"]
-        assert again.low is not None
-        assert again.high is not None
-        assert report.parameters["R_a"].value == pytest.approx(again.value, abs=again.high - again.low)
+    for report in filter(is_good, reports):
+        # A busy computer misses windows, so that the daemon has learned from fewer of them and is less sure.
+        fast, ours = expected[report.window.index].parameters["R_a"], report.parameters["R_a"]
+        assert ours.value == pytest.approx(fast.value, abs=max(width(fast), width(ours)))

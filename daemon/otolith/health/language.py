@@ -2,10 +2,7 @@
 
 Rules and texts have a key. What the core, the twins and the drivers compose in English is translated by ``[phrases]``:
 a phrase is an English sentence with names in braces, and a sentence that it matches becomes its translation, with the
-parts translated too. These sentences have no keys with arguments, because they are values: windows, hypotheses and
-findings carry them through state, evidence and history, a twin of the user has words of its own, and each would need a
-key, its arguments and a place in the schema, in English as well. What no phrase matches stays English; a test reads
-what an operator reads for English words.
+parts translated too. What no phrase matches stays English.
 """
 
 import re

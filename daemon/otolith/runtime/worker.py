@@ -56,10 +56,11 @@ def main(connection: Any, state: AdaptationState) -> None:
 
     Each step of a kernel is sent as well, and :class:`Ready` once.
     """
-    steps: list[kernel_cache.CompileStep] = []
+    has_compiled = False
 
     def report(step: kernel_cache.CompileStep) -> None:
-        steps.append(step)
+        nonlocal has_compiled
+        has_compiled = True
         with contextlib.suppress(OSError):  # the daemon has died, which the next result notices
             connection.send(step)
 
@@ -68,9 +69,9 @@ def main(connection: Any, state: AdaptationState) -> None:
         connection.send(Ready())
         while (task := connection.recv()) is not None:
             connection.send(perform(*task))
-            if steps:
+            if has_compiled:
                 kernel_cache.release_compiler()
-                steps.clear()
+                has_compiled = False
 
 
 def perform(state: AdaptationState, window: Window) -> WorkerResult:

@@ -22,7 +22,9 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target device failed to respond",
 }
-PERMANENT_CODES = (1, 2, 3)
+ILLEGAL_FUNCTION = 1
+"""Exception of a device that does not serve the function, such as reading a table that it lacks."""
+PERMANENT_CODES = (ILLEGAL_FUNCTION, 2, 3)
 """Exceptions that a repeated request will meet again."""
 BUSY_CODES = (5, 6)
 """Exceptions that ask to repeat the request later."""

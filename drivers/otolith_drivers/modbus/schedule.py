@@ -11,7 +11,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from otolith_drivers.modbus.options import BIT_TABLES, RegisterSignal, Table
-from otolith_drivers.modbus.protocol import BUSY_CODES, GATEWAY_CODES, PERMANENT_CODES, ExceptionReplyError
+from otolith_drivers.modbus.protocol import (
+    BUSY_CODES,
+    GATEWAY_CODES,
+    ILLEGAL_FUNCTION,
+    PERMANENT_CODES,
+    ExceptionReplyError,
+)
 
 # Requests. Engineering choices, guarded by tests/drivers/modbus/test_schedule.py.
 MAX_FAILURES = 3  # in a row before a request or device is paused; one timeout on a noisy line is no dead device
@@ -201,7 +207,7 @@ class RequestSet:
 def _hint(request: Request, error: ExceptionReplyError) -> str:
     """Return what may help, as the end of a sentence; empty if nothing is known."""
     other = {"holding": "input", "coil": "discrete"}.get(request.table)
-    return f'; try table = "{other}"' if error.code == 1 and other is not None else ""
+    return f'; try table = "{other}"' if error.code == ILLEGAL_FUNCTION and other is not None else ""
 
 
 class PollSchedule:

@@ -23,7 +23,7 @@ from otolith_drivers.errors import ConfigurationError, ServiceError
 UNIT, SYSUSERS = "otolith@.service", "otolith.sysusers.conf"
 PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
 Table = Mapping[str, Any]
-Texts = Sequence[str]
+Endpoints = Sequence[str]  # of Zenoh
 USER, ETC = "otolith", Path("etc/otolith")
 # Drivers whose addresses are in the keys 'host', 'endpoint' and 'channel'.
 KNOWN_DRIVERS = {"can", "modbus", "mqtt", "opcua", "plant", "replay"}
@@ -127,7 +127,9 @@ def _strings(value: Any) -> Iterator[str]:
             yield from _strings(item)
 
 
-def drop_in(name: str, drivers: Sequence[Table], listen: Texts, connect: Texts, *, command: bool = False) -> str:
+def drop_in(
+    name: str, drivers: Sequence[Table], listen: Endpoints, connect: Endpoints, *, command: bool = False
+) -> str:
     """Return the drop-in of the unit: devices, addresses and kinds of sockets that the machine file needs, no others.
 
     ``command``: the daemon runs one for each event, which may use the network of this computer.
