@@ -80,11 +80,18 @@ class Case:
     """Changes the signals (records,) of a run in place, before noise is added."""
     quantum: float = 0.0
     """Step of the converters over the noise of the machine file; zero for none."""
+    later: tuple[tuple[int, Change], ...] = ()
+    """Further changes of the healthy machine, each with its first window."""
 
     @property
     def problem(self) -> Problem:
         """What the machine file states."""
         return problem_of(self.plant, self.free)
+
+    def change(self, window: int) -> Change:
+        """Return how the machine differs in a window."""
+        changes = ((0, self.before), (self.healthy, self.after), *self.later)
+        return next(own for first, own in reversed(changes) if window >= first)
 
 
 def observe(case: Case, runs: Sequence[int], seed: int) -> list[list[Observed]]:
@@ -101,7 +108,8 @@ def recordings(case: Case, problem: Problem, runs: Sequence[int], seed: int) -> 
     plant, twin = case.plant, problem.twin
     randoms = [generator(seed, case.plant.name, run) for run in runs]
     records = (case.healthy + case.changed) * plant.records
-    rows = simulate(plant, randoms, records, case.before, case.after, case.healthy * plant.records)
+    later = [(first * plant.records, change) for first, change in case.later]
+    rows = simulate(plant, randoms, records, case.before, case.after, case.healthy * plant.records, later)
     for number, random in enumerate(randoms):
         own = {name: rows[name][number].copy() for name in twin.signals}
         if case.disturb is not None:
@@ -120,9 +128,7 @@ def _reports(
     """Yield each report with the true values of the parameters."""
     state = initial_state(case.plant.twin, "bench", problem)
     for window in windows:
-        change = case.before if window.index < case.healthy else case.after
-        values = {**case.plant.parameters, **change.parameters}
-        values |= {name: values[name] * (1.0 + rate * (window.end - START)) for name, rate in change.ramps.items()}
+        values = case.change(window.index).grown(case.plant.parameters, window.end - START)
         state, report = adapt(state, window)
         truth = {free.name: in_twin_units(problem.twin, free.name, values[free.name]) for free in problem.free}
         yield report.document, truth

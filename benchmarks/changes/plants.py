@@ -93,7 +93,14 @@ class Change:
     terms: Mapping[str, Term] = field(default_factory=dict)
     """By site."""
     ramps: Mapping[str, float] = field(default_factory=dict)
-    """Growth of parameters per second, as shares of their values at the first record."""
+    """Growth of parameters per second, as shares of their values in the healthy machine."""
+    since: float = 0.0
+    """s since the first record: when the growth began."""
+
+    def grown(self, values: Mapping[str, float], time: float) -> dict[str, float]:
+        """Return the parameters of the machine at ``time`` (s since the first record), of healthy ones."""
+        own = {**values, **self.parameters}
+        return own | {name: own[name] * (1.0 + rate * (time - self.since)) for name, rate in self.ramps.items()}
 
     def measured(self, name: str, values: Array) -> Array:
         """Return what the sensor of a signal shows without noise."""
@@ -110,16 +117,26 @@ def generator(seed: int, name: str, run: int) -> np.random.Generator:
 
 
 def simulate(
-    plant: Plant, randoms: Sequence[np.random.Generator], records: int, before: Change, after: Change, at: int
+    plant: Plant,
+    randoms: Sequence[np.random.Generator],
+    records: int,
+    before: Change,
+    after: Change,
+    at: int,
+    later: Sequence[tuple[int, Change]] = (),
 ) -> dict[str, Array]:
-    """Return each signal without noise, (runs, records), of one run for each generator; the change comes at ``at``."""
+    """Return each signal without noise, (runs, records), of one run for each generator.
+
+    The change comes at record ``at``; ``later`` has further ones with their records, each of the healthy machine.
+    """
+    changes = ((0, before), (at, after), *later)
     times = np.arange(records + 1, dtype=np.float64) * plant.period
     runs = [plant.operate(random, times) for random in randoms]
     given = {name: np.array([run[name] for run in runs]) for name in runs[0]}
     state = {name: np.full(len(runs), value) for name, value in plant.initial.items()}
     rows: dict[str, Array] = {}
     for record in range(records):
-        change = after if record >= at else before
+        change = next(own for first, own in reversed(changes) if record >= first)
         now = {name: values[:, record] for name, values in given.items()}
         if plant.control is not None:
             now |= plant.control(state, now)
@@ -163,8 +180,7 @@ def _advance(
 def _values(plant: Plant, change: Change, time: float, inputs: Values, state: Values) -> Values:
     """Return parameters, and the value of the term at each site."""
     signals = {**inputs, **state} if change.terms else {}
-    values = {**plant.parameters, **change.parameters, **dict.fromkeys(plant.sites, 0.0)}
-    values |= {name: values[name] * (1.0 + rate * time) for name, rate in change.ramps.items()}
+    values = {**change.grown(plant.parameters, time), **dict.fromkeys(plant.sites, 0.0)}
     return values | {site: term(time, signals) for site, term in change.terms.items()}
 
 

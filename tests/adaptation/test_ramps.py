@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from benchmarks.changes.machines import TWO_MASS
+from benchmarks.changes.machines import PUMP, TWO_MASS
 from benchmarks.changes.observe import Case, coverage, observe
 from benchmarks.changes.plants import HEALTHY, Change
 
@@ -62,3 +62,15 @@ def test_a_drift_from_before_the_first_window_is_covered_and_no_step() -> None:
     reports = [window for run in observe(case, range(3), 1) for window in run]
     assert all(window.decision in (WindowDecision.LEARNED, WindowDecision.SUSPECTED) for window in reports)
     assert coverage([window.parameters["D_l"] for window in reports]).reaches(0.9)
+
+
+def test_a_parameter_that_moved_along_a_ramp_and_stopped_is_no_component() -> None:
+    """What follows the ramp contradicts its end; that the parameter has moved is still a hypothesis."""
+    window = PUMP.records * PUMP.period
+    ramp = Change(ramps={"T_c": -0.03}, since=6 * window)
+    stopped = Change(parameters={"T_c": (1.0 - 0.03 * 2 * window) * PUMP.parameters["T_c"]})
+    case = Case("stops", PUMP, ramp, healthy=6, changed=9, later=((8, stopped),))
+    for reports in observe(case, range(2), 1):
+        late = reports[8:]
+        assert all(report.components == () and report.decision is not WindowDecision.SENSOR for report in reports)
+        assert all(report.parameters["T_c"].holds_truth for report in late), [item.parameters["T_c"] for item in late]

@@ -69,6 +69,24 @@ def test_imm_error_shrinks_for_a_constant_parameter() -> None:
     assert np.mean(deviations[100:]) < 0.5 * 0.03
 
 
+@pytest.mark.parametrize("rate", [0.003, 0.01, 0.03, 0.1])
+@pytest.mark.parametrize("sd", [0.002, 0.03])
+def test_imm_follows_a_fast_ramp_that_a_hypothesis_has_shown(rate: float, sd: float) -> None:
+    """A trend decays by more than its process noise, and a filter that is sure of this lags behind the ramp."""
+    inside, moments = [], LENGTH * np.arange(1, 9)
+    for seed in range(20):
+        random, posterior = np.random.default_rng(seed), predict(Posterior.initial(PROBLEM), 0.0)
+        mean, covariance = np.array([1.0, rate]), np.diag([(sd / SIZE) ** 2] * 2)
+        shown = imm_filter.equal_modes(np.array([imm_filter.ADDED_LEVEL]), mean, covariance, 0.0, 1.0)
+        posterior = replace(posterior, belief=shown)
+        for moment in moments.tolist():
+            truth = SIZE * (1.0 + rate * moment)
+            posterior = update(predict(posterior, moment), evidence(truth, rate * SIZE, sd, random))
+            prior = posterior.prior()
+            inside.append(abs(prior.mean[0] - truth) <= 1.959964 * np.sqrt(prior.covariance[0, 0]))
+    assert np.mean(inside) >= 0.9
+
+
 def test_imm_interval_grows_without_windows() -> None:
     random, posterior = np.random.default_rng(2), Posterior.initial(PROBLEM)
     for time in TIMES[:100]:

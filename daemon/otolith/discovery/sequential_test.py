@@ -323,14 +323,25 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
         return fresh
     if gain <= DECISIVE:
         return test
-    known = {item.hypothesis.name for item in test.hypotheses}
-    added = [item for item in fresh.hypotheses if item.hypothesis.name not in known]
     lead = min(gain, MAX_WINDOW_EVIDENCE)
-    together = [*(item.worse_by(lead, lead) for item in test.hypotheses), *added]
+    together = _best_of_each([*(item.worse_by(lead, lead) for item in test.hypotheses), *fresh.hypotheses])
     filter_deviance = test.filter_deviance + lead - min(item.deviance for item in together)
     hypotheses = _sorted(together)[: 2 * MAX_HYPOTHESES]
     leading = test.leading if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
     return replace(test, hypotheses=hypotheses, leading=leading, filter_deviance=filter_deviance)
+
+
+def _best_of_each(tracked: Sequence[TrackedHypothesis]) -> list[TrackedHypothesis]:
+    """Return the hypotheses without the worse of two that state the same.
+
+    A new fit may be better: a parameter that has moved along a ramp may have stopped, or moved again.
+    """
+    best: dict[str, TrackedHypothesis] = {}
+    for item in tracked:
+        other = best.setdefault(item.hypothesis.name, item)
+        if item.deviance < other.deviance:
+            best[item.hypothesis.name] = item
+    return list(best.values())
 
 
 def _sorted(tracked: list[TrackedHypothesis]) -> tuple[TrackedHypothesis, ...]:

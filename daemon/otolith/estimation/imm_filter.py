@@ -128,8 +128,21 @@ def predict(posterior: ImmPosterior, end: float) -> ImmPosterior:
     transition, noise = process_model(min(elapsed, MAX_GAP))
     move = _block_diagonal(transition, np.ones(free))
     process_noise = _block_diagonal(noise, TREND_NOISE[posterior.level] ** 2)
-    covariance = move @ posterior.covariance @ move.T + process_noise
+    covariance = move @ posterior.covariance @ move.T + process_noise + _spread_of_decay(posterior.mean, elapsed)
     return replace(posterior, mean=posterior.mean @ move.T, covariance=covariance, end=end)
+
+
+def _spread_of_decay(mean: Array, elapsed: float) -> Array:
+    """Return the covariance (modes, 2 free, 2 free) of that a trend decays over ``elapsed`` s, or goes on.
+
+    A fast ramp decays by more than the process noise adds in a window. Without it the filter lags behind the ramp.
+    """
+    free = mean.shape[1] // 2
+    trend, elapsed = mean[:, free:], min(elapsed, TREND_MEMORY)
+    (_, run), (_, fade) = process_model(elapsed)[0]
+    lost = np.concatenate([trend * (elapsed - run), trend * (1.0 - fade)], axis=1)
+    own = np.tile(np.eye(free), (2, 2))  # the trends of two parameters decay independently
+    return np.asarray(lost[:, :, None] * lost[:, None, :] * own)
 
 
 def _mix(posterior: ImmPosterior) -> ImmPosterior:
