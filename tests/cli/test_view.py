@@ -3,6 +3,7 @@
 import os
 import stat
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from click.testing import CliRunner, Result
 
 from otolith.cli.main import cli
 from otolith.cli.operation import view as module
-from otolith.cli.operation.view import MAGIC
+from otolith.cli.operation.view import END, HEADER_BYTES, MAGIC, MESSAGE
+from tests.waiting import wait_for
 
 STAMP = "%Y%m%dT%H%M%S"
 BOUND = "--bind 127.0.0.1 --port auto"
@@ -42,7 +44,14 @@ if sys.argv[1:3] == ["rrd", "verify"]:
     sys.exit("".join(f'"{{path}}": Missing RRD footer\\n' for path in torn) or 0)
 if sys.argv[1:3] == ["rrd", "optimize"]:
     shutil.copy(sys.argv[4], sys.argv[6])
-else:
+elif sys.argv[-1] == "-":
+    open({str(log)!r}, "a").write(" ".join(sys.argv[1:]) + "\\n")
+    while data := sys.stdin.buffer.read1():
+        with open({str(log)!r} + ".data", "ab") as file:
+            file.write(data)
+        if data.endswith(b"close"):
+            break
+elif sys.argv[1:2] != ["analytics"]:
     open({str(log)!r}, "a").write(" ".join(sys.argv[1:]) + "\\n")
 """,
         encoding="utf-8",
@@ -150,3 +159,33 @@ def test_errors_name_the_way_out(services: Path, shown: Path, monkeypatch: pytes
     assert "is not installed" in str(run("--web").exception)
     program.unlink()
     assert "is not installed" in str(run("--web").exception)
+
+
+def message(text: bytes, kind: int = 1) -> bytes:
+    return MESSAGE.pack(kind, len(text)) + text
+
+
+def test_a_live_view_goes_on_with_what_is_added_and_with_the_next_file(services: Path, shown: Path) -> None:
+    """A torn message and the end of a file are left out, as the viewer would take the next file for their rest."""
+    header = MAGIC.ljust(HEADER_BYTES, b"+")
+    folder, results, sent = services / "press-3" / "recordings", list[Result](), shown.with_name("shown.txt.data")
+    first = made(folder, "hall.motor", 1200.0)
+    first.write_bytes(header + message(b"one") + MESSAGE.pack(1, 9) + b"torn")
+    made(folder, "hall.pump", 0.0)
+    command = threading.Thread(target=lambda: results.append(run("motor", "--live", "--web")), daemon=True)
+    command.start()
+    expected = header + message(b"one")
+    wait_for(lambda: sent.exists() and sent.read_bytes() == expected, 60.0)
+    marked = first.rename(first.with_name(f"{first.stem}-event.rrd"))
+    with marked.open("ab") as file:
+        file.write(b" rest" + message(b"two") + message(b"index", END) + b"footer")
+    expected += message(b"torn rest") + message(b"two")
+    wait_for(lambda: sent.read_bytes() == expected, 60.0)
+    second = made(folder, "hall.motor", -60.0)
+    second.write_bytes(header + message(b"three") + message(b"close"))
+    os.utime(second, (time.time() + 60.0,) * 2)
+    command.join(60.0)
+    assert sent.read_bytes() == expected + header + message(b"three") + message(b"close")
+    assert results[0].return_value == 0
+    assert arguments_of(shown) == f"{BOUND} --serve-web --web-viewer-port 0 -"
+    assert "without --since and --list" in str(run("motor", "--live", "--list").exception)

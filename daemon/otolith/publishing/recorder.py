@@ -5,6 +5,7 @@ one ``send_columns`` call per entity, because each call costs a kilobyte. ``samp
 for a replay; the curves in ``signals`` are for the viewer, and most of the time they have the extremes only.
 """
 
+import contextlib
 import json
 import logging
 import math
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
@@ -66,7 +68,7 @@ def main(connection: Any, path: Path, source: RecordedMachine, folder: Recording
     """
     if not has_room(path):
         return
-    sys.modules.setdefault("pandas", None)  # type: ignore[arg-type]  # pyarrow would import it: 34 MB for nothing
+    _do_without_pandas()
     recording = RotatedRecording(path, source, folder, time.time())
     try:
         while (report := connection.recv()) is not None and recording.has_room(time.time()):
@@ -74,6 +76,13 @@ def main(connection: Any, path: Path, source: RecordedMachine, folder: Recording
             connection.send(recording.waiting)
     finally:
         recording.close()
+
+
+def _do_without_pandas() -> None:
+    """Keep pyarrow from importing pandas where it is installed: 34 MB for nothing."""
+    sys.modules.setdefault("pandas", None)  # type: ignore[arg-type]
+    with contextlib.suppress(AttributeError):  # of its first use only: Rerun would leave out what it was converting
+        pa.array([None])
 
 
 def has_room(path: Path) -> bool:

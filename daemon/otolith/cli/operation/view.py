@@ -1,13 +1,17 @@
 """``otolith view``: recordings of one's own daemons and of services, listed, or opened in the Rerun viewer."""
 
+import contextlib
 import getpass
 import os
+import struct
 import subprocess
 import sysconfig
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import click
 
@@ -19,6 +23,10 @@ from otolith_drivers.user_dirs import cache_directory, state_directory
 
 SERVICES = Path("/var/lib/otolith")  # state directories of the instances of systemd/otolith@.service
 MAGIC = b"RRF2"  # first bytes of Rerun's files
+HEADER_BYTES = 12  # before their first message
+MESSAGE = struct.Struct("<QQ")  # before each message: its kind and its length in bytes
+END = 0  # kind of the message that closes a file; an index for random access follows
+LIVE_INTERVAL = 0.5  # s between two looks at a recording that is being written
 LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all interfaces
 
 
@@ -27,8 +35,9 @@ LOOPBACK = ("--bind", "127.0.0.1", "--port", "auto")  # Rerun's default are all 
 @click.option("--since", callback=lambda *given: given[-1] and age_or_date(*given), metavar="AGE|DATE",
               help="All recordings from here on, like 12h, 30d, 8w.")  # fmt: skip
 @click.option("--list", "only_list", is_flag=True, help="Only list the recordings.")
+@click.option("--live", is_flag=True, help="Show what is added to it as well.")
 @click.option("--web", is_flag=True, help="For a browser on this computer, instead of a window.")
-def view(recording: str | None, since: float | None, only_list: bool, web: bool) -> int:
+def view(recording: str | None, since: float | None, only_list: bool, live: bool, web: bool) -> int:
     """Open the newest recording, or FILE, in the Rerun viewer.
 
     MACHINE is the name of the machine that it is of, with or without its site, or an instance of the service.
@@ -38,13 +47,15 @@ def view(recording: str | None, since: float | None, only_list: bool, web: bool)
       otolith view
       otolith view press-3 --since 2h
       otolith view press-3 --list
-      otolith view --web
+      otolith view press-3 --live --web
     """
+    if live and (since or only_list):
+        raise click.UsageError("--live follows the newest recording: give it without --since and --list")
     path = Path(recording) if recording and (recording.endswith(".rrd") or Path(recording).is_file()) else None
     if path is not None:
         if since or only_list:
             raise click.UsageError("--since and --list choose among the recordings of a machine, not of a file")
-        return open_viewer([path], web=web)
+        return follow(lambda: path, web=web) if live else open_viewer([path], web=web)
     known = Recordings.search(recording or "")
     files = [file for file in known.files if since is None or file.end >= since]
     if only_list:
@@ -55,6 +66,8 @@ def view(recording: str | None, since: float | None, only_list: bool, web: bool)
         return 0
     if not files:
         raise ConfigurationError(known.none_text(since))
+    if live:
+        return follow(lambda: _newest(recording or "", files[0]), web=web)
     return open_viewer([file.path for file in (files[:1] if since is None else reversed(files))], web=web)
 
 
@@ -140,24 +153,90 @@ def open_viewer(paths: Sequence[Path], *, web: bool = False) -> int:
     """
     for path in paths:
         _check(path)
+    command, environment = _viewer(paths[0], web=web)
+    with tempfile.TemporaryDirectory(prefix="otolith-view-") as folder:
+        whole = list(_whole(Path(command[0]), paths, Path(folder)))
+        try:
+            return subprocess.run([*command, *map(str, whole)], env=environment, check=False).returncode  # noqa: S603 - our viewer
+        except KeyboardInterrupt:
+            return 0
+
+
+def follow(newest: Callable[[], Path], *, web: bool = False) -> int:
+    """Show the ``newest`` recording and what is added to it, then the one that follows it, and so on.
+
+    Returns the exit code of the viewer, and raises as :func:`open_viewer`.
+    """
+    _check(newest())
+    command, environment = _viewer(newest(), web=web)
+    viewer = subprocess.Popen([*command, "-"], env=environment, stdin=subprocess.PIPE)  # noqa: S603 - our viewer
+    assert viewer.stdin is not None  # noqa: S101 - for mypy
+    try:
+        while viewer.poll() is None:
+            with contextlib.suppress(FileNotFoundError), newest().open("rb") as file:  # an event renames it
+                _send(file, viewer, newest)
+            time.sleep(LIVE_INTERVAL)
+    except (BrokenPipeError, KeyboardInterrupt):  # the viewer was closed, or is to be
+        viewer.terminate()
+    finally:
+        with contextlib.suppress(BrokenPipeError):
+            viewer.stdin.close()
+    return max(0, viewer.wait())
+
+
+def _send(file: BinaryIO, viewer: "subprocess.Popen[bytes]", newest: Callable[[], Path]) -> None:
+    """Give a recording to the viewer as it grows, until there is a newer one or the viewer is closed."""
+    assert viewer.stdin is not None  # noqa: S101 - for mypy
+    is_last, is_begun = False, False
+    while not is_last and viewer.poll() is None:
+        is_last = not os.path.samestat(os.fstat(file.fileno()), newest().stat())
+        if not is_begun and os.fstat(file.fileno()).st_size >= HEADER_BYTES:
+            is_begun = bool(viewer.stdin.write(file.read(HEADER_BYTES)))
+        if is_begun:
+            viewer.stdin.writelines(whole_messages(file))
+        viewer.stdin.flush()
+        time.sleep(0.0 if is_last else LIVE_INTERVAL)
+
+
+def whole_messages(file: BinaryIO) -> Iterator[bytes]:
+    """Yield the messages that are complete, from the position of the file on, but not the one that closes it.
+
+    The viewer waits for the rest of a torn message, and takes the header of the next file for it.
+    """
+    place, size = file.tell(), os.fstat(file.fileno()).st_size
+    while place + MESSAGE.size <= size:
+        head = file.read(MESSAGE.size)
+        kind, length = MESSAGE.unpack(head)
+        if kind == END or place + MESSAGE.size + length > size:
+            break
+        yield head + file.read(length)
+        place = file.tell()
+    file.seek(place)
+
+
+def _newest(machine: str, first: RecordingFile) -> Path:
+    """Return the newest recording of the machine of ``first``."""
+    files = (file for file in Recordings.search(machine).files if file.key == first.key)
+    return next(files, first).path
+
+
+def _viewer(path: Path, *, web: bool) -> tuple[list[str], dict[str, str]]:
+    """Return command and environment of the viewer of ``path``.
+
+    Raises:
+        ServiceError: there is no display, or the viewer is not installed.
+    """
     if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         remedy = "'otolith view --web' serves it to a browser, through a tunnel like 'ssh -L'"
-        raise ServiceError(f"no display here: {remedy}; or copy {paths[0]} to a computer with one")
+        raise ServiceError(f"no display here: {remedy}; or copy {path} to a computer with one")
     program = Path(sysconfig.get_path("scripts")) / "rerun"
     # Only 'rerun analytics disable' switches its analytics off, by a file; a folder of ours keeps the user's settings.
     environment = {**os.environ, "XDG_CONFIG_HOME": str(cache_directory("viewer"))}
     command = [str(program), "analytics", "disable"]
     # The program may be there without the viewer that it starts: docs/service.md shows how to do without.
     if not program.exists() or subprocess.run(command, env=environment, capture_output=True, check=False).returncode:  # noqa: S603 - our viewer
-        raise ServiceError(f"{program}: the Rerun viewer is not installed; copy {paths[0]} to a computer that has it")
-    with tempfile.TemporaryDirectory(prefix="otolith-view-") as folder:
-        whole = list(_whole(program, paths, Path(folder)))
-        target = ("--serve-web", "--web-viewer-port", "0") if web else ()
-        command = [str(program), *LOOPBACK, *target, *map(str, whole)]
-        try:
-            return subprocess.run(command, env=environment, check=False).returncode  # noqa: S603 - our viewer
-        except KeyboardInterrupt:
-            return 0
+        raise ServiceError(f"{program}: the Rerun viewer is not installed; copy {path} to a computer that has it")
+    return [str(program), *LOOPBACK, *(("--serve-web", "--web-viewer-port", "0") if web else ())], environment
 
 
 def _check(path: Path) -> None:
