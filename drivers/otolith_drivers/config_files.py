@@ -173,9 +173,9 @@ def read(path: Path, key: tuple[str, ...] = ()) -> SourceFile:
         ConfigurationError: the file is missing, unreadable, too large, or not UTF-8.
     """
     try:
-        text = content(path, FILE_SIZE_LIMIT, key).decode("utf-8")
+        text = content(path, FILE_SIZE_LIMIT, key).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        text = f"{path}: not UTF-8 text (byte {error.start}): is this the right file?"
+        text = f"{path}: not UTF-8 text (byte {error.start}): is this the right file? If so, save it in UTF-8"
         raise ConfigurationError(text, key) from error
     return SourceFile(path, re.sub("\r\n?", "\n", text))
 

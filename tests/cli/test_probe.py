@@ -143,7 +143,7 @@ def test_a_narrow_terminal_gets_several_tables(drive: int, monkeypatch: pytest.M
 
 
 def test_refused_registers_are_exit_code_one(drive: int) -> None:
-    result = probe("modbus", f"127.0.0.1:{drive}", "--registers", "50..60")
+    result = probe("modbus", f"127.0.0.1:{drive}", "--registers", "0x32..0x3C")
     assert result.return_value == 1
     assert "--table input" in result.stdout
 
@@ -164,6 +164,7 @@ def test_a_missing_device_is_one_line_with_cause_and_advice() -> None:
         ("plc", "--registers", "9..3"),
         ("plc", "--registers", "0..5000"),
         ("plc", "--registers", "x"),
+        ("plc", "--registers", "0xFFFFF"),
         ("plc", "--registers", "0..3", "--first-address", "1"),
         ("plc", "--device", "1..9"),
     ],

@@ -77,6 +77,13 @@ def test_each_fault_is_a_line(tmp_path: Path, text: str, faults: int) -> None:
     assert len(str(caught.value).splitlines()) == faults
 
 
+def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:
+    """Editors of Windows write one in front of UTF-8."""
+    path = tmp_path / "file.toml"
+    path.write_bytes(b"\xef\xbb\xbfname = 'x'\r\n")
+    load(path)
+
+
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"a" * (2 << 20)])
 def test_binary_or_huge_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "file.toml"

@@ -83,6 +83,10 @@ def test_the_command_takes_the_saved_estimates(
     store.save(replace(state, health=HealthState(histories={"R_a": history(7.0, 50)})))
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert "baseline R_a = 7 ohm ± 0.028, mean of 50 estimates" in result.output
+    assert "beyond its limit" not in result.output
     assert store.decisions().baselines["R_a"].value == pytest.approx(7.0)
+    store.save(replace(state, health=HealthState(histories={"R_a": history(5.9, 50)})))
+    worn = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert "R_a: beyond its limit ACT below 6.175 ohm; if the machine is not healthy, undo it: --clear" in worn.output
     CliRunner().invoke(cli, [*arguments, "--clear"], catch_exceptions=False)
     assert store.decisions().baselines == {}

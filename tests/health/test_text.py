@@ -79,11 +79,11 @@ EVENT = EventDocument(
 
 def test_an_event_is_one_sentence_with_state_begin_certainty_and_advice() -> None:
     assert event_text(EVENT) == (
-        "ACT: winding: short circuit between turns since t = 74 s: R_a is 5.9 ohm (with 98.4 % probability); "
-        "plan a replacement"
+        "ACT: winding: short circuit between turns since t = 74 s: R_a is 5.9 ohm "
+        "(beyond the limit with 98.4 % probability); plan a replacement"
     )
     certain = EVENT.model_copy(update={"evidence": EvidenceDocument(windows=(27, 39), probability=1.0)})
-    assert "with over 99.9 % probability" in event_text(certain)
+    assert "(beyond the limit with over 99.9 % probability)" in event_text(certain)
 
 
 def test_a_cleared_event_has_begin_and_end() -> None:

@@ -316,6 +316,19 @@ def test_a_payload_that_is_no_text_ends_no_subscriber() -> None:
     assert "\ufffd\ufffd" in passed
 
 
+def test_watch_ends_as_asked_while_no_daemon_answers() -> None:
+    """A thread that comes back from Zenoh while the interpreter ends would abort the process with a core dump."""
+    connects = [f"--connect=tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(12)]
+    command = [sys.executable, "-m", "otolith", "watch", "--json", *connects]
+    watch = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert watch.stderr is not None
+    with watch.stderr:
+        assert watch.stderr.readline().startswith("no daemon reached yet")
+        watch.terminate()
+        assert watch.stderr.read() == ""
+    assert watch.wait(PATIENCE) == 128 + signal.SIGTERM
+
+
 def test_watch_prints_every_report_once_although_it_was_stopped(tmp_path: Path, start: Callable[..., Process]) -> None:
     """The command itself, as another process; its reader is slow as well."""
     endpoint, path = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", tmp_path / f"{SITE}.{MACHINE}{SUFFIX}"

@@ -254,8 +254,8 @@ print(sys.modules.get("pandas"))
 
 
 def test_the_recorder_does_without_pandas(tmp_path: Path) -> None:
-    """Where it is installed, pyarrow would import it, which costs 34 MB. No part of the layout is lost for that."""
-    command = [sys.executable, "-W", "error", "-c", RECORDS_NOTHING, str(MACHINE), str(tmp_path / "run.rrd")]
+    """Where it is installed, pyarrow would import it, which costs 34 MB; without it nothing of the layout is lost."""
+    command = [sys.executable, "-c", RECORDS_NOTHING, str(MACHINE), str(tmp_path / "run.rrd")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout == "None\n"
+    assert (done.stdout, done.stderr) == ("None\n", "")
     assert (tmp_path / "run.rrd").stat().st_size > 0

@@ -5,7 +5,7 @@ one ``send_columns`` call per entity, because each call costs a kilobyte. ``samp
 for a replay; the curves in ``signals`` are for the viewer, and most of the time they have the extremes only.
 """
 
-import contextlib
+import importlib.abc
 import json
 import logging
 import math
@@ -68,7 +68,7 @@ def main(connection: Any, path: Path, source: RecordedMachine, folder: Recording
     """
     if not has_room(path):
         return
-    _do_without_pandas()
+    sys.meta_path.insert(0, _WithoutPandas())
     recording = RotatedRecording(path, source, folder, time.time())
     try:
         while (report := connection.recv()) is not None and recording.has_room(time.time()):
@@ -78,11 +78,15 @@ def main(connection: Any, path: Path, source: RecordedMachine, folder: Recording
         recording.close()
 
 
-def _do_without_pandas() -> None:
-    """Keep pyarrow from importing pandas where it is installed: 34 MB for nothing."""
-    sys.modules.setdefault("pandas", None)  # type: ignore[arg-type]
-    with contextlib.suppress(AttributeError):  # of its first use only: Rerun would leave out what it was converting
-        pa.array([None])
+class _WithoutPandas(importlib.abc.MetaPathFinder):
+    """Refuses to import pandas, which pyarrow would do wherever it is installed: 34 MB for nothing.
+
+    None in ``sys.modules`` does not do: Cython takes it for the module, and the first column of Rerun is then lost.
+    """
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name=name)
 
 
 def has_room(path: Path) -> bool:

@@ -1,9 +1,11 @@
 """A subscriber that gets each message once and in order, also those that were published while it was away."""
 
+import contextlib
 import json
 import queue
 import threading
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Self
 
@@ -18,6 +20,7 @@ QUERY_TIMEOUT = 5.0  # s
 QUERY_TRIES = 5  # queries for what is missing
 QUERY_PAUSE = 0.5  # s between them
 MAX_BEHIND = 1000  # messages that wait for on_message; later ones come from the history
+MAX_CONNECTING = 32  # endpoints that are tried at the same time
 MAX_KEYS = 1000  # of machines, of which the position is kept
 
 
@@ -155,24 +158,29 @@ class Subscriber:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stopping.set()
-        for thread in self._threads:  # a session that is left open would keep the process alive
+        self._close_sessions()  # ends their queries
+        for thread in self._threads:  # one that comes back from Zenoh while the interpreter ends would abort it
             thread.join(QUERY_TIMEOUT)
-        for each in self._sessions.values():
-            close_session(each)
+        self._close_sessions()  # one that is left open would keep the process alive
+
+    def _close_sessions(self) -> None:
+        while self._sessions:
+            close_session(self._sessions.popitem()[1])
 
     def _connect(self) -> None:
         """Open a session for each endpoint, as soon as something answers there; it reconnects by itself."""
-        while not self._stopping.is_set():
-            for endpoint in self._endpoints or local_sockets():
-                if endpoint in self._sessions:
-                    continue
-                try:
-                    opened = session((), [endpoint], self._settings, "client")
-                except ServiceError:
-                    continue
+        with ThreadPoolExecutor(MAX_CONNECTING) as pool:
+            while not self._stopping.is_set():
+                missing = [each for each in self._endpoints or local_sockets() if each not in self._sessions]
+                tuple(pool.map(self._open, missing))
+                self._stopping.wait(QUERY_PAUSE)
+
+    def _open(self, endpoint: str) -> None:
+        with contextlib.suppress(ServiceError, zenoh.ZError):  # nothing answers there, or the session was closed
+            if not self._stopping.is_set():
+                opened = session((), [endpoint], self._settings, "client")
                 self._sessions[endpoint] = opened
                 self._declare(opened)
-            self._stopping.wait(QUERY_PAUSE)
 
     def _declare(self, opened: zenoh.Session) -> None:
         for topic in {REPORT, *self._topics}:  # a report also shows from where on events can be missing

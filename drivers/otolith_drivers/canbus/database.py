@@ -97,7 +97,7 @@ def load_database(path: Path) -> CanDatabase:
             f'{path}: the data sheet of a CANopen drive, not a CAN database: set eds = "..." in [driver] instead', KEY
         )
     text, faults = _text(path)
-    if excess := _excess(text):
+    if excess := _excess(text) if text.strip() else "it is empty":
         raise ConfigurationError(f"{path}: not a CAN database: {excess}", KEY)
     kind = FORMATS.get(path.suffix.lower())
     multiplexed: set[tuple[int, int, int]] = set()

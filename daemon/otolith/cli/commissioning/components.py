@@ -354,6 +354,7 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
         ConfigurationError: no parameter with limits has enough estimates.
     """
     from otolith.health.baseline import baselines
+    from otolith.health.limits import Level
     from otolith.health.prognosis import MIN_POINTS
     from otolith.health.text import interval_text
     from otolith_drivers.errors import ConfigurationError
@@ -368,5 +369,9 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
     for name, item in kept.items():
         text = interval_text(item.value, item.sd, limited[name].unit)
         click.echo(f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(item.end)}", err=True)
+        level, limit = limited[name].level(item.value, item.sd, Level.OK)
+        if limit is not None:
+            beyond = f"{level} {limit.side} {limit.value:.5g} {limited[name].unit}"
+            click.echo(f"{name}: beyond its limit {beyond}; if the machine is not healthy, undo it: --clear", err=True)
     for name in limited.keys() - kept.keys():
         click.echo(f"{name} has fewer than {MIN_POINTS} estimates: its limits stay as they were", err=True)

@@ -30,10 +30,11 @@ RECEIVE_TIMEOUT = 0.1  # s; how late a stop is noticed
 REFRESH = 4.0  # Hz of the live table
 SHOWN_VALUE = 40  # characters of a value of OPC UA
 Span = tuple[int, int]
+NUMBER = r"0x[0-9A-Fa-f]{1,4}|\d{1,5}"  # manuals write registers in either way
 
 
 class Range(click.ParamType[Span]):
-    """``"7"`` or ``"0..63"``: the first and the last number, within bounds."""
+    """``"7"`` or ``"0..63"``, also ``"0xFD00..0xFD1F"``: the first and the last number, within bounds."""
 
     name = "N | LOW..HIGH"
 
@@ -42,10 +43,10 @@ class Range(click.ParamType[Span]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Span:
         """First and last."""
-        match = re.fullmatch(r"(\d{1,5})(?:\.\.(\d{1,5}))?", str(value).strip())
+        match = re.fullmatch(rf"({NUMBER})(?:\.\.({NUMBER}))?", str(value).strip())
         if match is None:
             self.fail(f"{value!r}: write one number like 7, or the first and the last like 0..63", param, ctx)
-        first, last = int(match[1]), int(match[2] or match[1])
+        first, last = (int(number, 16 if "x" in number else 10) for number in (match[1], match[2] or match[1]))
         if not self._low <= first <= last <= self._high:
             self.fail(f"{value!r}: from {self._low} to {self._high}, the lower one first", param, ctx)
         if last - first >= self._max_count:
