@@ -49,6 +49,33 @@ def test_table_with_decimal_commas_units_and_cp1252(
     assert values(reports(path, capsys)) == pytest.approx(plain, rel=1e-6)
 
 
+@pytest.mark.parametrize("name", ["time", "Time (s)", "Timestamp [s]", "Zeit"])
+def test_table_whose_times_have_another_name(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    plain = values(reports(written(tmp_path, rows), capsys))
+    assert values(reports(written(tmp_path, rows, heading=(name, *HEADING[1:])), capsys)) == plain
+
+
+def test_table_whose_times_are_in_milliseconds_by_parentheses(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = values(reports(written(tmp_path, rows), capsys))
+    scaled = [[f"{1e3 * float(row[0]):.1f}", *row[1:]] for row in rows]
+    replayed = values(reports(written(tmp_path, scaled, heading=("time (ms)", *HEADING[1:])), capsys))
+    assert replayed == pytest.approx(plain, rel=1e-6)
+
+
+def test_table_prefers_t_to_other_names_and_refuses_two_of_them(tmp_path: Path, rows: Lines) -> None:
+    units = dict(zip(HEADING[1:], ("V", "N*m", "A", "rad/s"), strict=True))
+    doubled = [[row[0], *row] for row in rows]
+    with table.TableReader(written(tmp_path, doubled, heading=("time", *HEADING)), units) as reader:
+        assert reader.ignored == ("time",)
+    two = written(tmp_path, doubled, heading=("time", "timestamp", *HEADING[1:]))
+    with pytest.raises(OtolithError, match=r"'time', 'timestamp' may be the column of the time: rename one"):
+        table.TableReader(two, units)
+
+
 @pytest.mark.parametrize("style", ["tab", "quotes", "quoted decimal comma", "sep=", "gzip"])
 def test_table_separators_quotes_and_gzip(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str], style: str

@@ -37,6 +37,8 @@ TIME, SECONDS = "t", "s"  # column of the time, and its unit if the header names
 SEGMENT = "segment"  # optional column: a change of its text begins a new recording
 SEPARATORS = (";", "\t", ",")  # in this order: a comma may be a decimal sign
 HEADER_CELL = re.compile(r"(.*?)\s*(?:\[(.*)\])?")  # name and unit
+# Other names of the column of the time, if none is 't'; parentheses are as common around its unit as brackets.
+TIME_CELL = re.compile(r"(?:t|time|timestamp|zeit)\s*(?:[\[(](.*)[\])])?", re.IGNORECASE)
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
 NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
 BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
@@ -229,14 +231,16 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
     places: dict[str, tuple[int, str | None]] = {}
     others = []
     for index, cell in enumerate(cells):
-        match = HEADER_CELL.fullmatch(cell)
-        name, written = (match[1], match[2]) if match else (cell, None)
+        name, written = _name(cell), _unit(cell)
         if name not in known and name != SEGMENT:
             others += [name] if name else []
         elif name in places:
             raise ConfigurationError(f"{place}: column {index + 1} ({cell!r}): a second column {name}: remove one")
         else:
             places[name] = (index, written)
+    if TIME not in places and (times := _times(place, cells, places)):
+        places[TIME] = times
+        others.remove(_name(cells[times[0]]))
     columns: dict[str, Column] = {}
     for signal, request in wanted.items():
         if request.column not in places:
@@ -250,6 +254,27 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
     named = max(index for index, cell in enumerate(cells) if cell) + 1
     segment = None if SEGMENT in known or SEGMENT not in places else places[SEGMENT][0]
     return Header(number, separator, (named, len(cells)), columns, tuple(others), segment)
+
+
+def _name(cell: str) -> str:
+    match = HEADER_CELL.fullmatch(cell)
+    return match[1] if match else cell
+
+
+def _unit(cell: str) -> str | None:
+    match = HEADER_CELL.fullmatch(cell)
+    return match[2] if match else None
+
+
+def _times(place: str, cells: list[str], used: Mapping[str, tuple[int, str | None]]) -> tuple[int, str | None] | None:
+    """Position and unit of the column of the time in a header without a column ``t``; None if no name says time."""
+    taken = {index for index, _ in used.values()}
+    matches = [(index, TIME_CELL.fullmatch(cell)) for index, cell in enumerate(cells) if index not in taken]
+    times = [(index, match[1]) for index, match in matches if match is not None]
+    if len(times) > 1:
+        names = ", ".join(repr(cells[index]) for index, _ in times)
+        raise ConfigurationError(f"{place}: {names} may be the column of the time: rename one to 't [s]' or the like")
+    return times[0] if times else None
 
 
 def _header_line(path: Path, file: TextIO) -> tuple[int, str, str]:
@@ -267,7 +292,8 @@ def _header_line(path: Path, file: TextIO) -> tuple[int, str, str]:
 
 
 def _missing(request: ColumnRequest, others: list[str], cells: list[str]) -> str:
-    what = f"no column {request.column!r} ({'seconds' if request.column == TIME else request.unit})"
+    unit = "seconds, also called 'time'" if request.column == TIME else request.unit
+    what = f"no column {request.column!r} ({unit})"
     kind = seen(",".join(cells).encode())
     other = f"; is the file {kind} instead of a table?" if kind else ""
     if len(cells) < 2:
