@@ -45,6 +45,8 @@ LISTEN_ONLY: dict[str, dict[str, Any]] = {
 """Arguments of python-can for an interface that shall not acknowledge. For socketcan 'ip link' decides."""
 FILTERING = {"socketcan"}
 """Interfaces that get filters. Elsewhere they cost as much as they save, or hide error frames."""
+STAMPED_BY_KERNEL = {"socketcan", "udp_multicast"}
+"""Interfaces whose frames have the kernel's times, however late they are read."""
 WAYS_OUT = {
     "socketcan": "'ip -brief link show type can' lists what there is; set driver.channel or bring the interface up",
     "udp_multicast": "it needs a multicast route: 'ip route add 239.0.0.0/8 dev lo' as root makes one",
@@ -98,6 +100,11 @@ class BusOptions(StrictModel):
         if channel.startswith("vcan") and not kernel_has(channel):
             return "udp_multicast", DEFAULT_GROUP
         return "socketcan", channel
+
+    @property
+    def stamped_by_kernel(self) -> bool:
+        """Whether a frame has its time even if it is read late."""
+        return self.resolved()[0] in STAMPED_BY_KERNEL
 
     def title(self) -> str:
         """The bus in a few words."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import can
 
-from otolith_drivers.base import Counters, Deliver, Link, Sampling, Setup
+from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
 from otolith_drivers.canbus.bus import (
     MAX_CONSECUTIVE_BAD,
     BusOptions,
@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 RECEIVE_TIMEOUT = 0.2  # s; how late a stop may be noticed
 MAX_STAMP_AGE = 1.0  # s; an older kernel stamp is from before the wall clock was set
 CLOCK_CHECK_PERIOD = 0.05  # s; how long a wall clock that was set can falsify times
+GATHERING_TIME = 0.002  # s; frames of a busy bus are received together, so that not each of them wakes the thread
+MIN_GATHERED, MAX_GATHERED = 4, 1000  # frames in that time on a busy bus; frames that are received together
 CLOCK_TRIES, CLOCK_PRECISION = 5, 2e-5  # s; readings of the clocks, and when one is good enough
 SILENT_PERIODS, MIN_SILENCE, MAX_SILENCE = 10.0, 2.0, 60.0  # periods; s; s: when a silent bus is opened anew
 UNKNOWN_PERIOD_SILENCE = 10.0  # s; the same while no period is known
@@ -65,6 +67,7 @@ class CanReceiver(ThreadedDriver):
         self._unreadable = self._consecutive_bad = 0
         self._drops = DropCounter()
         self._last_frame = self._opened = 0.0
+        self._gathers = False
         self._next_reopening = 0.0
         """s of silence after which the bus is opened anew; doubles each time."""
 
@@ -131,23 +134,45 @@ class CanReceiver(ThreadedDriver):
 
     def _take_frames(self, bus: can.BusABC, deliver: Deliver) -> str | None:
         """Take frames until the next clock check; returns why the bus must be opened anew, or None."""
-        receive, decode, clock = bus.recv, self._decoder.decode, time.monotonic
+        decode, clock = self._decoder.decode, time.monotonic
         begun = now = clock()
-        offset = wall_clock_offset()
+        offset, count = wall_clock_offset(), 0
         while now - begun < CLOCK_CHECK_PERIOD:
+            frames: list[can.Message] = []
+            failure: Exception | None = None
             try:
-                frame = receive(RECEIVE_TIMEOUT)
-                now = clock()
-                if frame is None:
-                    break
-                if samples := decode(frame, monotonic_of(frame.timestamp, now + offset, now)):
-                    deliver(samples)
+                self._receive_waiting(bus, frames)
             except Exception as error:  # noqa: BLE001 - interfaces raise whatever their vendor's library raises
-                if self._is_only_a_bad_frame(error):
-                    return None
-                return f"{type(error).__name__}: {error}"
-            self._last_frame, self._consecutive_bad = now, 0
+                failure = error
+            now = clock()
+            wall, samples = now + offset, list[Sample]()
+            for frame in frames:
+                samples += decode(frame, monotonic_of(frame.timestamp, wall, now))
+            if samples:
+                deliver(samples)
+            if frames:
+                count += len(frames)
+                self._last_frame, self._consecutive_bad = now, 0
+            if failure is not None:
+                return None if self._is_only_a_bad_frame(failure) else f"{type(failure).__name__}: {failure}"
+            if not frames:
+                break
+        is_busy = count * GATHERING_TIME >= MIN_GATHERED * (now - begun)
+        self._gathers = is_busy and self._options.stamped_by_kernel
         return self._check_bus(bus, now)
+
+    def _receive_waiting(self, bus: can.BusABC, frames: list[can.Message]) -> None:
+        """Append the next frame to ``frames``, or on a busy bus all that have come after a short pause.
+
+        If none comes, this waits for ``RECEIVE_TIMEOUT``. The frames before an error are in ``frames``.
+        """
+        receive, wanted, timeout = bus.recv, 1, RECEIVE_TIMEOUT
+        if self._gathers:
+            time.sleep(GATHERING_TIME)
+            wanted = MAX_GATHERED
+        while len(frames) < wanted and (frame := receive(timeout)) is not None:
+            frames.append(frame)
+            timeout = 0.0
 
     def _check_bus(self, bus: can.BusABC, now: float) -> str | None:
         """Check what no frame shows: drops, bus off, silence. Returns why the bus must be opened anew, or None."""

@@ -1,5 +1,6 @@
 """The CAN driver on real buses: frames that no healthy node sends, and buses that fail."""
 
+import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -77,8 +78,6 @@ def test_buses_on_the_same_port_are_separate(own_machine: OwnMachine) -> None:
 
 
 def test_unreadable_frames_do_not_close_the_bus(own_machine: OwnMachine) -> None:
-    import socket  # noqa: PLC0415 - to send what no CAN node would
-
     with can_rig(own_machine) as rig:
         opened(rig)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -90,6 +89,33 @@ def test_unreadable_frames_do_not_close_the_bus(own_machine: OwnMachine) -> None
         assert rig.driver.counters().reconnects == 0
         assert rig.driver.link().up
         rig.driver.close()
+
+
+def test_frames_of_a_busy_bus_are_gathered_and_keep_their_times(
+    own_machine: OwnMachine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame that cannot be unpacked costs none of the frames that were received together with it."""
+    monkeypatch.setattr("otolith_drivers.canbus.driver.GATHERING_TIME", 0.2)  # a bus of 20 frames/s is busy
+    with can_rig(own_machine) as rig, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        samples = opened(rig)
+        driver = rig.driver
+        assert isinstance(driver, CanReceiver)
+        emit_until(rig, lambda: driver._gathers)
+        rig.emit()
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        sender.sendto(b"\xc1 no frame", (own_machine.group, own_machine.port))
+        before = len(samples)
+        for _ in range(20):
+            rig.emit()
+        wait_for(lambda: len(samples) >= before + 40 and len(samples) == driver.counters().received)
+        assert len({sample.time for sample in samples}) == len(samples)
+        assert (driver.counters().bad, driver.counters().reconnects) == (1, 0)
+        driver.close()
+
+
+def test_only_frames_with_the_time_of_the_kernel_are_gathered() -> None:
+    assert BusOptions(channel="can0").stamped_by_kernel
+    assert not BusOptions(interface="slcan", channel="/dev/ttyACM0").stamped_by_kernel
 
 
 def test_broken_bus_is_reopened(own_machine: OwnMachine, monkeypatch: pytest.MonkeyPatch) -> None:
