@@ -133,14 +133,15 @@ def simulate(
     times = np.arange(records + 1, dtype=np.float64) * plant.period
     runs = [plant.operate(random, times) for random in randoms]
     given = {name: np.array([run[name] for run in runs]) for name in runs[0]}
-    state = {name: np.full(len(runs), value) for name, value in plant.initial.items()}
+    each: Any = 0 if len(runs) == 1 else slice(None)  # numbers are five times as fast as arrays of one number
+    state: dict[str, Any] = {name: np.full(len(runs), value)[each] for name, value in plant.initial.items()}
     rows: dict[str, Array] = {}
     for record in range(records):
         change = next(own for first, own in reversed(changes) if record >= first)
-        now = {name: values[:, record] for name, values in given.items()}
+        now = {name: values[each, record] for name, values in given.items()}
         if plant.control is not None:
             now |= plant.control(state, now)
-        linear = {name: (now[name], given[name][:, record + 1]) for name in given if name not in plant.held}
+        linear = {name: (now[name], given[name][each, record + 1]) for name in given if name not in plant.held}
         signals = now | dict(state) | dict(plant.outputs(state, now, _values(plant, change, 0.0, now, state)))
         for name, values in signals.items():
             rows.setdefault(name, np.empty((len(runs), records)))[:, record] = change.measured(name, values)
@@ -152,17 +153,18 @@ def _advance(
     plant: Plant,
     change: Change,
     time: float,
-    state: dict[str, Array],
-    now: dict[str, Array],
-    linear: Mapping[str, tuple[Array, Array]],
-) -> dict[str, Array]:
+    state: dict[str, Any],
+    now: dict[str, Any],
+    linear: Mapping[str, tuple[Any, Any]],
+) -> dict[str, Any]:
     """Return the state one record later."""
     step = plant.period / plant.steps
+    values = None if change.ramps or change.terms else _values(plant, change, time, now, state)
 
-    def derivative(part: float, state: dict[str, Array]) -> Values:
+    def derivative(part: float, state: dict[str, Any]) -> Values:
         inputs = now | {name: first + part * (last - first) for name, (first, last) in linear.items()}
         moment = time + part * plant.period
-        return plant.rates(state, inputs, _values(plant, change, moment, inputs, state))
+        return plant.rates(state, inputs, values or _values(plant, change, moment, inputs, state))
 
     for number in range(plant.steps):
         first, middle, last = ((number + share) / plant.steps for share in (0.0, 0.5, 1.0))

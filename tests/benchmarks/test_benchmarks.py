@@ -55,13 +55,13 @@ def compared() -> dict[str, Any]:
 
 
 def test_bench_can_runs() -> None:
-    printed = run("bench_can", "2")
+    printed = run("bench_can", "0.5")
     assert "bus.recv alone" in printed
     assert "into the rings" in printed
 
 
 def test_bench_modbus_runs() -> None:
-    printed = run("bench_modbus", "2")
+    printed = run("bench_modbus", "0.5")
     assert "bare pymodbus loop" in printed
     assert "200 Hz asked" in printed
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -223,8 +224,14 @@ def two_terms(*moment: float) -> float:
     return 0.004 * math.sin(moment[1]) - 0.003 * float(np.sign(moment[-1]))
 
 
+@cache
+def with_two_terms() -> AdaptationState:
+    """The state after both terms were adopted."""
+    return run(initial("R_a", "D"), simulated("reversing", 24, Faults(torque=two_terms, since=3.0)))[0]
+
+
 def test_remaining_component_keeps_its_values() -> None:
-    state, _ = run(initial("R_a", "D"), simulated("reversing", 24, Faults(torque=two_terms, since=3.0)))
+    state = with_two_terms()
     before = {record.adopted.component.key: record.values[0] for record in component_records(state)}
     assert len(before) == 2
     first = state.problem.components[0].key
@@ -253,7 +260,7 @@ def test_one_of_three_components_disappears_and_two_remain() -> None:
     def torque(*moment: float) -> float:
         return two_terms(*moment) + (0.01 * math.sin(25.0 * moment[0]) if 6.0 < moment[0] < 14.0 else 0.0)
 
-    state, _ = run(initial("R_a", "D"), simulated("reversing", 24, Faults(torque=two_terms, since=3.0)))
+    state = with_two_terms()
     remaining = {component.key for component in state.problem.components}
     assert len(remaining) == 2
     state, documents = run(
@@ -273,7 +280,7 @@ def test_one_of_three_components_disappears_and_two_remain() -> None:
 
 def test_search_refuses_a_fourth_component() -> None:
     """The twin has three components, its limit. Windows with a fourth are refused and do not update the posterior."""
-    state, _ = run(initial("R_a", "D"), simulated("reversing", 24, Faults(torque=two_terms, since=3.0)))
+    state = with_two_terms()
     adopted = state.adopted[0]
     third = replace(adopted, component=replace(adopted.component, site="winding", family="linear", source="V_a"))
     keeping = (

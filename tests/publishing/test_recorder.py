@@ -39,6 +39,16 @@ def record(folder: Path, rows: Lines, name: str = "run.rrd") -> Path:
     return path
 
 
+@pytest.fixture
+def recording(rows: Lines, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording of ``rows``, which tests only read, beside their table; made once."""
+    folder = tmp_path_factory.getbasetemp() / "recorded"
+    if not (folder / "run.rrd").exists():
+        folder.mkdir(exist_ok=True)
+        record(folder, rows)
+    return folder / "run.rrd"
+
+
 def assert_same(first: list[ReportDocument], again: list[ReportDocument], share: float = 0.0) -> None:
     """Compare reports, except for what a recording does not contain: arrival times and counts of samples.
 
@@ -98,37 +108,33 @@ def test_the_delay_of_a_signal_is_subtracted_once(
     assert_same(first, again, share=0.1)
 
 
-def test_two_replays_of_a_recording_are_identical(
-    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = record(tmp_path, rows)
-    assert reports(path, capsys) == reports(path, capsys)
-    text = summed_up(path, capsys)
+def test_two_replays_of_a_recording_are_identical(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert reports(recording, capsys) == reports(recording, capsys)
+    text = summed_up(recording, capsys)
     assert "1000 records read, 0 reordered, 0 bad; 4000 samples, 0 lost" in text
 
 
-def test_a_recording_of_a_replay_has_the_same_samples(tmp_path: Path, rows: Lines, machine: LoadedMachine) -> None:
-    first = record(tmp_path, rows)
+def test_a_recording_of_a_replay_has_the_same_samples(tmp_path: Path, recording: Path, machine: LoadedMachine) -> None:
     second = tmp_path / "again.rrd"
-    replay(MACHINE, [first], second, as_json=True, stopped=lambda: False)
-    with open_recorded(machine, first) as one, open_recorded(machine, second) as other:
+    replay(MACHINE, [recording], second, as_json=True, stopped=lambda: False)
+    with open_recorded(machine, recording) as one, open_recorded(machine, second) as other:
         for left, right in zip(one.chunks(), other.chunks(), strict=True):
             assert left.times == pytest.approx(right.times, abs=2e-9)
             assert all(np.array_equal(left.columns[name], right.columns[name]) for name in UNITS)
 
 
 def test_a_recording_optimised_by_rerun_is_read(
-    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, better = record(tmp_path, rows), tmp_path / "better.rrd"
-    subprocess.run([RERUN, "rrd", "optimize", path, "-o", better], capture_output=True, check=True)
-    assert reports(better, capsys) == reports(path, capsys)
+    better = tmp_path / "better.rrd"
+    subprocess.run([RERUN, "rrd", "optimize", recording, "-o", better], capture_output=True, check=True)
+    assert reports(better, capsys) == reports(recording, capsys)
 
 
 def test_an_unclosed_recording_is_read_a_torn_one_repaired(
-    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, killed, torn = record(tmp_path, rows), tmp_path / "killed.rrd", tmp_path / "torn.rrd"
+    killed, torn = tmp_path / "killed.rrd", tmp_path / "torn.rrd"
     program = (
         "import os, sys; from pathlib import Path\n"
         "import otolith.publishing.recorder as module, otolith.cli.replay as replaying\n"
@@ -138,11 +144,13 @@ def test_an_unclosed_recording_is_read_a_torn_one_repaired(
         "replaying.replay(machine, [data], path, as_json=True, stopped=lambda: False)\n"
     )
     subprocess.run(
-        [sys.executable, "-c", program, MACHINE, tmp_path / "data.csv", killed], capture_output=True, check=False
+        [sys.executable, "-c", program, MACHINE, recording.with_name("data.csv"), killed],
+        capture_output=True,
+        check=False,
     )
-    assert reports(killed, capsys) == reports(path, capsys)
+    assert reports(killed, capsys) == reports(recording, capsys)
     assert "never closed by the recorder" in summed_up(killed, capsys)
-    torn.write_bytes(path.read_bytes()[:-20_000])
+    torn.write_bytes(recording.read_bytes()[:-20_000])
     with pytest.raises(ConfigurationError, match=r"torn\.rrd: damaged, .*'rerun rrd optimize --continue") as info:
         summed_up(torn, capsys)
     command = str(info.value).split("'")[1].replace("whole.rrd", str(tmp_path / "whole.rrd"))
@@ -187,13 +195,12 @@ def test_a_recording_whose_times_mean_something_unknown_is_refused(tmp_path: Pat
         RecordingReader(path, {"i": "A"})
 
 
-def test_the_error_names_a_signal_that_was_not_recorded(tmp_path: Path, rows: Lines) -> None:
-    path = record(tmp_path, rows)
+def test_the_error_names_a_signal_that_was_not_recorded(recording: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"no signal 'p' \(Pa\) was recorded: it has T_load, V_a, i, omega"):
-        RecordingReader(path, {**UNITS, "p": "Pa"})
+        RecordingReader(recording, {**UNITS, "p": "Pa"})
     with pytest.raises(ConfigurationError, match=r"signal 'i': unit 'A' does not measure what 'V' does"):
-        RecordingReader(path, {**UNITS, "i": "V"})
-    with RecordingReader(path, {**UNITS, "i": "mA"}) as milli, RecordingReader(path, UNITS) as plain:
+        RecordingReader(recording, {**UNITS, "i": "V"})
+    with RecordingReader(recording, {**UNITS, "i": "mA"}) as milli, RecordingReader(recording, UNITS) as plain:
         ampere = np.concatenate([part.columns["i"] for part in plain.chunks()])
         assert np.concatenate([part.columns["i"] for part in milli.chunks()]) == pytest.approx(1e3 * ampere)
 
