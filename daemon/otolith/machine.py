@@ -119,7 +119,12 @@ class LoadedMachine:
         """Bounds that a good window keeps."""
         window = self.file.window
         return QualityLimits(
-            window.missing_limit, window.gap_limit, window.jitter_limit, window.surplus_limit, window.irregularity_limit
+            missing=window.missing_limit,
+            gap=window.gap_limit,
+            jitter=window.jitter_limit,
+            surplus=window.surplus_limit,
+            irregularity=window.irregularity_limit,
+            same_time=window.same_time_limit,
         )
 
     def plans(self, sampling: Sampling | Mapping[str, Sampling]) -> tuple[SignalPlan, ...]:

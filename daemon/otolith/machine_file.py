@@ -148,6 +148,7 @@ class WindowTable(StrictModel):
     jitter_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 10.0))] = 0.005
     surplus_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.02
     irregularity_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 100.0))] = 0.3
+    same_time_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 0.25
 
 
 class EstimationTable(StrictModel):

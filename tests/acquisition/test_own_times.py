@@ -117,6 +117,32 @@ def test_a_register_renewed_every_fifth_row_is_used_and_counted_once(log: Log, c
     assert_valid_intervals([outcome(recording, document) for document in documents])
 
 
+@pytest.mark.parametrize("step", [0.015625, 0.05, 0.1])
+def test_rows_of_a_coarse_clock_give_the_estimates_of_exact_times(log: Log, step: float) -> None:
+    """The clock of the log stands still for several rows."""
+    recording = recorded(UNIFORM)
+    exact, rows = log.of(UNIFORM, recording), recording.rows()
+    coarse = [[f"{np.floor(float(row[0]) / step + 1e-6) * step:.6f}", *row[1:]] for row in rows]
+    documents = log.reports(UNIFORM, recording.header, coarse)
+    assert_used(documents)
+    for one, other in zip(exact, documents, strict=True):
+        for name in FREE:
+            assert other.parameters[name].raw == pytest.approx(one.parameters[name].raw, rel=1e-5)
+
+
+def test_irregular_rows_of_a_coarse_clock_are_refused_and_give_no_finding(log: Log) -> None:
+    """Their times are not known, so nothing can be concluded from them about a sensor or the machine."""
+    schedule = Schedule(rows=Timing(jitter=0.5), load="walk", load_noise=True)
+    recording = recorded(schedule)
+    rows = [[f"{np.floor(float(row[0]) / 0.1) * 0.1:.6f}", *row[1:]] for row in recording.rows()]
+    documents = log.reports(schedule, recording.header, rows)
+    assert len(documents) >= WINDOWS - 2
+    assert not any(document.findings for document in documents)
+    assert all(
+        "share a time but differ: log finer times" in document.window.quality.reasons[0] for document in documents
+    )
+
+
 COMMANDS = {
     "steps": Schedule(voltage="steps", commands_on_change=True),
     "outputs every 50 ms": Schedule(i=Timing(0.05), omega=Timing(0.05), commands_on_change=True),

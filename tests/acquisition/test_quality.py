@@ -50,7 +50,40 @@ def test_the_defaults_are_those_of_a_machine_file() -> None:
     table, limits = WindowTable(), QualityLimits()
     assert (limits.missing, limits.jitter) == (table.missing_limit, table.jitter_limit)
     assert (limits.surplus, limits.irregularity) == (table.surplus_limit, table.irregularity_limit)
+    assert limits.same_time == table.same_time_limit
     assert min(limits.gap, 600.0) == table.gap_limit  # a window is at most as long
+
+
+def test_a_command_whose_first_sample_comes_after_the_window_is_unknown_in_it() -> None:
+    """No bound is known of what it was before."""
+    rings, late = Rings(["y", "u"], 4000), GRID[GRID >= LENGTH]
+    windower = Windower([SignalPlan("y"), SignalPlan("u", "zoh")], RECORDS, PERIOD)
+    rings.deliver_columns({"y": (GRID, np.sin(GRID))})
+    assert windower.begin(rings, LENGTH, LENGTH)
+    rings.deliver_columns({"u": (late, np.sin(late))})
+    first, second = (windower.cut(rings, unix_offset=0.0).quality for _ in range(2))
+    assert first.verdict is Verdict.BAD
+    assert first.reasons[0].startswith("no samples of u from t = 0 s for 2 s: is the source on")
+    assert second.verdict is Verdict.GOOD
+
+
+@pytest.mark.parametrize("together", [2, 10])
+def test_same_time_limit_is_the_only_bound_of_samples_at_one_time(together: int) -> None:
+    """A reading that is recorded twice is no other one."""
+    times, share = np.floor(GRID / (PERIOD * together) + 1e-6) * PERIOD * together, 1.0 - 1.0 / together
+    values = {"other readings": np.sin(GRID), "one reading": np.sin(times)}
+    for name, readings in values.items():
+        for limit, is_good in ((share - 0.01, name == "one reading"), (share + 0.01, True)):
+            rings = Rings(["y"], 4000)
+            windower = Windower([SignalPlan("y")], RECORDS, PERIOD, replace(NO_LIMITS, same_time=limit))
+            rings.deliver_columns({"y": (times, readings)})
+            assert windower.begin(rings, 3.0 * LENGTH, 3.0 * LENGTH)
+            quality = windower.cut(rings, unix_offset=0.0).quality
+            assert (quality.verdict is Verdict.GOOD) == is_good
+            if not is_good:
+                assert quality.reasons[0].startswith(
+                    f"{share:.0%} of the samples of y share a time but differ: log finer"
+                )
 
 
 @pytest.mark.parametrize("kept", [1, 2, 10, 100])

@@ -34,6 +34,8 @@ class QualityLimits:
     """Share of samples of a cyclic signal for which there is no slot: a second sender."""
     irregularity: float = 0.3
     """Standard deviation of the interval of a cyclic signal over its mean: a second sender."""
+    same_time: float = 0.25
+    """Share of samples with the time, but not the value of another one: a coarse clock, or two machines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,12 @@ def assess_quality(
             {name: item.irregularity for name, item in cyclic.items()},
             limits.irregularity,
             "{0} comes at irregular intervals: do two nodes send it? If not, raise irregularity_limit ({2:.0%})",
+        ),
+        *_beyond(
+            records.ambiguous,
+            limits.same_time,
+            "{1:.0%} of the samples of {0} share a time but differ: log finer times, and one machine in a file; "
+            "or raise same_time_limit ({2:.0%})",
         ),
         *_beyond(jitters, limits.jitter, "{0} arrives with {1:.4g} s of jitter, more than jitter_limit ({2:.4g} s)"),
     ]

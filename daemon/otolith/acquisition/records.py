@@ -6,7 +6,7 @@ measurement. Inputs are bridged (:mod:`otolith.acquisition.bridging`).
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -46,7 +46,9 @@ class Records:
     held: frozenset[str]
     """Commands that are recorded only when they change."""
     unknown: frozenset[str]
-    """Inputs that never had a sample."""
+    """Inputs that have no sample before the end of the window."""
+    ambiguous: Mapping[str, float] = field(default_factory=dict)
+    """Share of the samples of some signals that have the time, but not the value of another one."""
 
 
 def lies_on_grid(times: Array, start: float, period: float) -> bool:
@@ -132,7 +134,11 @@ def make_records(series: Mapping[str, Series], plans: Mapping[str, SignalPlan], 
                 missing[:, column], _filled(fresh[name], start + grid.offsets), values[:, column]
             )
     held = frozenset(name for name in incomplete if kinds[name] is InputKind.ON_CHANGE)
-    unknown = frozenset(name for name, plan in plans.items() if plan.hold is not None and not len(fresh[name].times))
+    unknown = frozenset(
+        name
+        for name, plan in plans.items()
+        if plan.hold is not None and not (fresh[name].times[:1] < span.end - early).any()
+    )
     return Records(grid, values, missing, _bridge_error(bridged, values.shape), stale, held, unknown)
 
 

@@ -69,6 +69,8 @@ class Series:
     values: Array
     repeated: int = 0
     """Samples that were dropped because another one has the same time."""
+    differing: int = 0
+    """Those of them with another value."""
 
     def within(self, start: float, end: float) -> "Series":
         """Return the samples with ``start <= time < end``."""
@@ -104,7 +106,8 @@ def merge_equal_times(times: Array, values: Array, hold: str | None) -> Series:
             merged = np.add.reduceat(values, starts) / (ends - starts)
         equal = np.maximum.reduceat(values, starts) == np.minimum.reduceat(values, starts)
         merged = np.where(equal | ~np.isfinite(merged), values[starts], merged)
-    return Series(times[starts], merged, len(times) - len(starts))
+    differing = int(np.count_nonzero((np.diff(times) <= SAME_INSTANT) & (values[1:] != values[:-1])))
+    return Series(times[starts], merged, len(times) - len(starts), differing)
 
 
 def renewal(lengths: Array, steps: Array) -> int:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from otolith.acquisition.window import Array, Window
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 GRACE_PERIOD = 0.1  # s after its end that a window waits for late samples, at least,
 SLOW_GRACE = 1.5  # or so many intervals of the slowest input that needs its next sample, at most a window's length
+NO_SAMPLES = Series(np.zeros(0), np.zeros(0))
 
 
 @dataclass(slots=True)
@@ -34,6 +35,19 @@ class WindowerCounts:
     """Samples at the time of another one."""
     stale: int = 0
     """Readings of a register that had not been renewed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _AlignedSamples:
+    """The samples of each signal by its name, for a window."""
+
+    series: dict[str, Series]
+    cyclic: dict[str, CyclicSeries]
+    """Of the signals on the grid or with a clock."""
+    repeated: int
+    """Samples of the window at the time of another one."""
+    ambiguous: dict[str, float]
+    """Share of the samples of the window that have the time, but not the value of another one."""
 
 
 class Windower:
@@ -108,11 +122,12 @@ class Windower:
 
     def cut(self, rings: Rings, unix_offset: float) -> Window:
         """Return the next window; ``unix_offset`` is Unix time minus monotonic time, s."""
-        series, aligned, repeated = self._align(rings)
+        samples = self._align(rings)
         if self._index == 0:  # the grid was laid through a single sample, which may have been late
-            self._start += self._grid_shift(aligned, first=True)
-            series, aligned, repeated = self._align(rings)
-        records = make_records(series, self.plans, self._span())
+            self._start += self._grid_shift(samples.cyclic, first=True)
+            samples = self._align(rings)
+        records = make_records(samples.series, self.plans, self._span())
+        records = replace(records, ambiguous=samples.ambiguous)
         window = Window(
             index=self._index,
             start=self._start + unix_offset,
@@ -120,15 +135,15 @@ class Windower:
             signals=self.signals,
             values=records.values,
             missing=records.missing,
-            quality=assess_quality(records, self.plans, aligned, self._limits, self._span(unix_offset)),
+            quality=assess_quality(records, self.plans, samples.cyclic, self._limits, self._span(unix_offset)),
             bridge_error=records.bridge_error,
             observed=rings.observed_means(self._start, self.next_end),
         )
-        self.counts.repeated += repeated
+        self.counts.repeated += samples.repeated
         self.counts.stale += records.stale
-        self._grace = self._next_grace(series)
+        self._grace = self._next_grace(samples.series)
         self._index += 1
-        self._start = self._start + self.length + self._grid_shift(aligned, first=False)
+        self._start = self._start + self.length + self._grid_shift(samples.cyclic, first=False)
         return window
 
     def _grid_shift(self, aligned: dict[str, CyclicSeries], *, first: bool) -> float:
@@ -149,10 +164,13 @@ class Windower:
         if math.isfinite(self._start):
             self._start = max(self._start, start)
 
-    def _align(self, rings: Rings) -> tuple[dict[str, Series], dict[str, CyclicSeries], int]:
-        """Return the samples of each signal, the lateness of those on the grid, and the number of repeated samples."""
-        series = {name: self._samples(rings, plan) for name, plan in self.plans.items()}
-        repeated = sum(item.repeated for name, item in series.items() if not self.plans[name].is_cyclic)
+    def _align(self, rings: Rings) -> _AlignedSamples:
+        series, repeated, ambiguous = dict[str, Series](), 0, dict[str, float]()
+        for name, plan in self.plans.items():
+            series[name], merged = self._samples(rings, plan)
+            repeated += merged.repeated
+            if merged.differing:
+                ambiguous[name] = merged.differing / (len(merged.times) + merged.repeated)
         true = [name for name, plan in self.plans.items() if not plan.is_cyclic and self._has_clock_of_grid(plan)]
         self._adopt_phase([series[name] for name in true])
         aligned: dict[str, CyclicSeries] = {}
@@ -167,7 +185,7 @@ class Windower:
             elif self._is_on_grid(series[name]):
                 aligned[name] = align_to_grid(series[name], self._span(), GRACE_PERIOD)
             series[name] = aligned[name].series if name in aligned else series[name]
-        return series, aligned, repeated
+        return _AlignedSamples(series, aligned, repeated, ambiguous)
 
     def _has_clock_of_grid(self, plan: SignalPlan) -> bool:
         """Whether a signal comes from the source whose clock the grid follows: the first with cyclic signals."""
@@ -183,22 +201,20 @@ class Windower:
         ]
         return np.sort(np.concatenate(together)) if together else None
 
-    def _samples(self, rings: Rings, plan: SignalPlan) -> Series:
+    def _samples(self, rings: Rings, plan: SignalPlan) -> tuple[Series, Series]:
         """Return the samples of a signal from one window before this one until after it, and the one before them.
 
-        The number of repeated samples is that of this window alone.
+        The second series has those of this window alone, if some have equal times; it is empty otherwise.
         """
         start, end = self._start - self.length + plan.delay, self.next_end + max(self._grace, self.length) + plan.delay
         times, values = finite_samples(*rings.around(plan.name, start, end, self.next_end + plan.delay))
         if plan.is_cyclic:  # the alignment subtracts the delay
-            return Series(times, values)
+            return Series(times, values), NO_SAMPLES
         times = times - plan.delay if plan.delay else times
-        repeated = 0
-        if has_equal_times(times):
-            here = slice(*np.searchsorted(times, (self._start, self.next_end)))
-            repeated = merge_equal_times(times[here], values[here], plan.hold).repeated
-        merged = merge_equal_times(times, values, plan.hold)
-        return Series(merged.times, merged.values, repeated)
+        if not has_equal_times(times):
+            return Series(times, values), NO_SAMPLES
+        here = slice(*np.searchsorted(times, (self._start, self.next_end)))
+        return merge_equal_times(times, values, plan.hold), merge_equal_times(times[here], values[here], plan.hold)
 
     def _is_on_grid(self, series: Series) -> bool:
         times = self._within(series).times

@@ -185,7 +185,7 @@ def preview_recording(
         is_partial=max_rows is not None,
         computing_s=median(seconds) if seconds else None,
         longest_computing_s=max(seconds, default=None),
-        remarks=tuple(_remarks(survey.plans, statistics, samplings)),
+        remarks=(*survey.warnings, *_remarks(survey.plans, statistics, samplings)),
     )
 
 
@@ -195,6 +195,8 @@ class _Survey:
 
     machine: LoadedMachine
     sources: tuple[str, ...]
+    warnings: tuple[str, ...]
+    """Of the reader."""
     plans: tuple[SignalPlan, ...]
     statistics: RecordingStatistics
     windows: WindowPreview
@@ -235,6 +237,7 @@ def _survey(
                     moving.add(window)
             if max_rows is not None and run.statistics.rows > max_rows:
                 break
+        warnings = tuple(reader.warnings())
     chosen = moving.chosen() or usable.chosen()
     preview = WindowPreview(
         length_s=machine.file.window.length,
@@ -246,7 +249,7 @@ def _survey(
         refusals=tuple(f"{count} like: {example}" for count, example in refusals.most_frequent()),
         parameters=expected_accuracy(machine.problem, chosen),
     )
-    return _Survey(machine, sources, machine.plans(reader.sampling), run.statistics, preview, chosen)
+    return _Survey(machine, sources, warnings, machine.plans(reader.sampling), run.statistics, preview, chosen)
 
 
 def _moves(problem: Problem, window: Window) -> bool:
@@ -408,7 +411,7 @@ def _signal_remarks(sampling: SignalSampling) -> Iterator[str]:
         yield f"at time and with the value of the sample before: {count}"
     if sampling.repeated_times:
         count = counted(sampling.repeated_times, "sample")
-        yield f"at the time of the sample before, but with another value: {count}"
+        yield f"at the time of the sample before, but with another value: {count}; log times with more digits"
     if sampling.jitter > MIN_REMARKED_JITTER:
         yield f"the intervals vary by {sampling.jitter:.0%} (standard deviation over median)"
 

@@ -23,6 +23,7 @@ import pyarrow.compute as pc
 from otolith_drivers.base import Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, counted, nearest
+from otolith_drivers.replay.coarse_times import EvenTimes
 from otolith_drivers.replay.formats import seen
 from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows
 from otolith_drivers.units import factor
@@ -132,7 +133,7 @@ class TableReader(Reader):
         """
         data = DataFile(path)
         super().__init__(path, data)
-        self.counts = TableCounts()
+        self.counts, self._times = TableCounts(), EvenTimes()
         named = {name: (sources or {}).get(name, TableSource()) for name in units}
         self._wanted = {
             name: ColumnRequest(source.column or name, units[name], source.unit) for name, source in named.items()
@@ -160,6 +161,7 @@ class TableReader(Reader):
                 number += text.count("\n") + 1
             _check_length(f"{self.path}:{number}", len(rest))
         yield from self._rows(rest, number)
+        yield from self._times.rest()
         if not self.counts.rows:
             raise ConfigurationError(f"{self.path}{self._why_no_rows()}")
 
@@ -169,7 +171,7 @@ class TableReader(Reader):
         _check_length(f"{self.path}:{first + int(lengths.argmax())}", int(lengths.max()))
         rows = _TableChunk(self._header, self.counts, lines, first).rows(quoted='"' in text)
         if rows is not None:
-            yield rows
+            yield from self._times.of(rows)
 
     def _why_no_rows(self) -> str:
         if self.counts.first_bad is None:
@@ -189,11 +191,14 @@ class TableReader(Reader):
 
     def warnings(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.warnings`."""
+        lines = self._cut_off()
+        if (coarse := self._times.text()) is not None:
+            lines.insert(0, coarse)
         if self.counts.first_bad is None:
-            return self._cut_off()
+            return lines
         line, cause = self.counts.first_bad
         bad = f"bad cells: {self.counts.bad_cells}, bad rows: {self.counts.bad_rows}"
-        return [f"{bad}, the first in line {line}: {cause}", *self._cut_off()]
+        return [f"{bad}, the first in line {line}: {cause}", *lines]
 
 
 def _decoded(path: Path, data: DataFile) -> TextIO:

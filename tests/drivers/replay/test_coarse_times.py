@@ -1,0 +1,136 @@
+"""Rows of a coarse clock: regular ones are spread evenly, others keep their times."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from otolith_drivers.replay.coarse_times import EvenTimes
+from otolith_drivers.replay.readers import Array, Rows
+
+ROWS = 6000
+SEED = 5
+
+
+def signals(times: Array, random: np.random.Generator) -> dict[str, Array]:
+    """A command that is held for 0.2 s, and a measured quantity with noise."""
+    command = np.floor(times / 0.2) % 7.0
+    return {"u": command, "y": np.sin(3.0 * times) + 0.01 * random.normal(size=len(times))}
+
+
+def rows_at(times: Array, columns: dict[str, Array]) -> Rows:
+    lines = np.arange(2, len(times) + 2)
+    return Rows(times, columns, lines, np.zeros(len(times), dtype=np.int64))
+
+
+def spread(rows: Rows, size: int = ROWS) -> tuple[Array, EvenTimes]:
+    clock = EvenTimes()
+    parts = [
+        part for first in range(0, len(rows.times), size) for part in clock.of(rows.part(slice(first, first + size)))
+    ]
+    parts += clock.rest()
+    assert np.concatenate([part.lines for part in parts]).tolist() == rows.lines.tolist()
+    return np.concatenate([part.times for part in parts]), clock
+
+
+def regular(interval: float) -> tuple[Array, dict[str, Array]]:
+    times = 3.0 + interval * np.arange(ROWS, dtype=np.float64)
+    return times, signals(times, np.random.default_rng(SEED))
+
+
+STEPS: dict[str, tuple[float, Callable[[Array], Array]]] = {
+    "ten rows per step": (0.01, lambda times: np.floor(times / 0.1 + 1e-6) * 0.1),
+    "rounded to the nearest step": (0.01, lambda times: np.rint(times / 0.05) * 0.05),
+    "clock of a PC": (0.01, lambda times: np.floor(times / 0.015625 + 1e-6) * 0.015625),
+    "clock of a PC, in milliseconds": (0.0107, lambda times: np.round(np.floor(times / 0.015625) * 0.015625, 3)),
+    "whole seconds": (0.01, np.floor),
+    "Unix time in seconds": (0.0107, lambda times: np.floor(times) + 1.7e9),
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_rows_of_a_coarse_clock_are_spread_evenly(name: str) -> None:
+    """All rows are off by one and the same time, which no estimate depends on."""
+    interval, coarse = STEPS[name]
+    times, columns = regular(interval)
+    even, clock = spread(rows_at(coarse(times), columns))
+    off = even - times
+    assert np.ptp(off) < 0.25 * interval
+    assert np.ptp(np.diff(even)) < 0.3 * interval
+    assert (clock.text() or "").startswith(
+        f"rows that share times: {ROWS} were spread evenly; from line 2 on t has steps"
+    )
+
+
+def test_the_result_does_not_depend_on_chunks() -> None:
+    times, columns = regular(0.01)
+    rows = rows_at(np.floor(times / 0.1 + 1e-6) * 0.1, columns)
+    whole, _ = spread(rows)
+    for size in (1, 7, 2048, 2500):
+        assert spread(rows, size)[0].tolist() == whole.tolist()
+
+
+@pytest.mark.parametrize("step", [0.015625, 0.1])
+@pytest.mark.parametrize("kind", ["random intervals", "about a clock"])
+def test_irregular_rows_keep_their_times(step: float, kind: str) -> None:
+    random = np.random.default_rng(SEED)
+    times = np.cumsum(random.uniform(0.005, 0.015, ROWS))
+    if kind == "about a clock":
+        times = np.sort(0.01 * np.arange(1, ROWS + 1) + random.uniform(-0.005, 0.005, ROWS))
+    coarse = np.floor(times / step) * step
+    even, clock = spread(rows_at(coarse, signals(times, random)))
+    assert np.mean(even != coarse) < 0.1
+    assert clock.text() is None or step > 0.05
+
+
+def test_times_of_their_own_are_kept() -> None:
+    times = np.cumsum(np.random.default_rng(SEED).uniform(0.005, 0.015, ROWS))
+    even, clock = spread(rows_at(times, signals(times, np.random.default_rng(SEED))))
+    assert even.tolist() == times.tolist()
+    assert clock.text() is None
+
+
+def test_rows_written_twice_keep_their_times() -> None:
+    times, columns = regular(0.01)
+    twice = rows_at(np.repeat(times, 2), {name: np.repeat(values, 2) for name, values in columns.items()})
+    assert spread(twice)[0].tolist() == twice.times.tolist()
+
+
+def test_a_few_rows_at_one_time_keep_it() -> None:
+    times, columns = regular(0.01)
+    times[500::200] = times[499:-1:200]
+    even, clock = spread(rows_at(times, columns))
+    assert even.tolist() == times.tolist()
+    assert clock.text() is None
+
+
+@pytest.mark.parametrize("other", ["a second machine", "a second reading"])
+def test_two_machines_or_rows_recorded_twice_are_not_spread(other: str) -> None:
+    """Their times are right, so even ones would be wrong."""
+    times, columns = regular(0.02)
+    random = np.random.default_rng(SEED + 1)
+    second = signals(times + (7.3 if other == "a second machine" else 0.0), random)
+    both = {name: np.column_stack([columns[name], second[name]]).ravel() for name in columns}
+    rows = rows_at(np.repeat(times, 2), both)
+    even, clock = spread(rows)
+    assert even.tolist() == rows.times.tolist()
+    assert clock.text() is None
+
+
+def test_rows_after_a_gap_are_spread_anew() -> None:
+    times, columns = regular(0.01)
+    times[3005:] += 40.0
+    coarse = np.floor(times / 0.1 + 1e-6) * 0.1
+    even, _ = spread(rows_at(coarse, columns))
+    off = even - times
+    assert np.ptp(off[:3005]) < 1e-6
+    assert np.ptp(off[3005:]) < 1e-6
+    assert np.abs(off - off[0]).max() < 0.1
+
+
+def test_numbers_beyond_reason_are_no_error() -> None:
+    times = np.repeat(np.arange(600.0), 10)
+    values = np.where(np.arange(ROWS) % 3 == 0, 1e308, -1e308)
+    values[::7] = np.nan
+    even, _ = spread(rows_at(times, {"u": np.full(ROWS, np.nan), "y": values}))
+    assert np.isfinite(even).all()
