@@ -225,6 +225,17 @@ def half(number: int) -> tuple[Window, ...]:
 
 
 @pytest.mark.full
+def test_the_whole_record_offers_nothing_but_the_force_that_depends_on_position() -> None:
+    """Friction that grows less than linearly shows as a power at the least exponent: its shape is not determined."""
+    twin = problem("servo_axis_directional")
+    shown = remaining_structure(twin, identify_noise(twin, windows()), windows())
+    (offered,) = [item for item in shown if item.is_offered]
+    assert offered.component.key == "carriage/periodic/x"
+    assert 2.0 * np.pi / offered.component.inner == pytest.approx(2.5017e-3, rel=1e-3)
+    assert offered.component.amplitude == pytest.approx(1.07, rel=0.1)
+
+
+@pytest.mark.full
 @pytest.mark.parametrize("number", HALVES)
 def test_a_commissioned_axis_follows_the_force_that_depends_on_position_on_either_half(number: int) -> None:
     """Nothing but this force is offered; in the twin it stays, and no other component is adopted."""

@@ -1,7 +1,9 @@
 """``otolith noise``: lines for the machine file, JSON, and refusals."""
 
 import json
+import re
 import tomllib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +13,13 @@ from benchmarks.sampling.measure import some_motor, write_machine
 from benchmarks.sampling.schedules import Schedule, Timing, record
 from click.testing import CliRunner, Result
 
+from otolith.cli.commissioning.noise import HealthyRecord, noise_lines, structure_lines
 from otolith.cli.main import cli
+from otolith.commissioning.delays import IdentifiedDelays
+from otolith.commissioning.identification import IdentifiedNoise, NoiseLevel
+from otolith.commissioning.structure import Structure
+from otolith.commissioning.whiteness import Band, Whiteness
+from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.runtime.preview import EvenSpread
 from otolith_drivers.errors import ConfigurationError
@@ -40,7 +48,9 @@ def test_printed_lines_are_valid_in_a_machine_file(tmp_path: Path, data: Path) -
     assert set(tomllib.loads(result.stdout)) == {"noise", "process_noise"}
     assert "# identified from 5 windows of 2 s" in result.stdout
     assert "chi-square between windows" in result.stdout
-    assert "T_load" in result.stdout
+    contained = "not identifiable: its noise acts like process noise of omega, which contains what is not stated here"
+    assert re.search(rf'^T_load = "0.0002 N\*m" +# {contained}$', result.stdout, re.MULTILINE)
+    assert "# innovations of omega: white" in result.stdout
 
 
 def test_json_has_units_and_uncertainties(data: Path) -> None:
@@ -51,6 +61,8 @@ def test_json_has_units_and_uncertainties(data: Path) -> None:
     for level in document["outputs"]:
         assert 0.0 < level["sd"] < 0.2 * level["value"]
     assert document["consistency"]["degrees"] > 0
+    assert [row["output"] for row in document["whiteness"]] == ["i", "omega"]
+    assert document["whiteness"][0]["bands"]
 
 
 def test_a_late_signal_is_printed_with_its_delay(tmp_path: Path) -> None:
@@ -97,3 +109,32 @@ def test_windows_are_spread_over_the_data(count: int, most: int, kept: int) -> N
     assert max(gaps, default=0) <= 2 * min(gaps, default=0)
     assert not chosen or chosen[0] == 0
     assert kept < 2 or chosen[-1] >= 0.8 * (count - 1)
+
+
+def test_the_spectrum_of_coloured_innovations_is_printed_before_and_after_inflation() -> None:
+    machine = load_machine(MACHINE, with_driver=False)
+    bands = (Band(0.5, 2.0, 2.5), Band(2.0, 50.0, 0.9))
+    coloured, white = Whiteness("omega", 0.09, 0.07, 1e-9, 0.05, bands), Whiteness("i", 0.01, 0.01, 0.5, 0.5, bands)
+    levels = tuple(NoiseLevel(name, 0.0, None, "") for name in ("i", "omega"))
+    after = (white, replace(white, output="omega"))
+    noise = IdentifiedNoise(levels, levels, (), whiteness=(white, coloured), whiteness_after=after, windows=5)
+    lines = list(noise_lines(machine, noise))
+    first = lines.index("# innovations of i before inflation: white")
+    assert lines[first + 1 :] == [
+        "# innovations of omega before inflation: coloured, correlation 0.09 at 0.07 s",
+        "#   power over that of white noise, from 0.5 Hz: 2.5 to 2 Hz, 0.9 to 50 Hz",
+        "# innovations of i: white",
+        "# innovations of omega: white",
+    ]
+
+
+def test_a_structure_at_a_bound_is_printed_and_not_offered() -> None:
+    machine = load_machine(MACHINE, with_driver=False)
+    component = Component("shaft", "power", "omega", -0.5, 0.3, 0.0, 0.3, 4.0)
+    structure = [Structure(component, 0.05, 0.03, 500.0, is_restarted=False, is_at_bound=True)]
+    lines = list(structure_lines(machine, structure))
+    assert lines[0].startswith("# structure: shaft/power/omega: -0.5·omega^0.3 N*m")
+    assert lines[1] == "# its exponent lies at a bound of the search, so its shape is not known: not offered"
+    assert not any("commission" in line for line in lines)
+    record = HealthyRecord(IdentifiedDelays(()), IdentifiedNoise((), (), ()), structure, ())
+    assert record.offered == []

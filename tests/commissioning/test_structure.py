@@ -132,6 +132,20 @@ def test_an_exponent_is_uncertain_by_a_tenth(monkeypatch: pytest.MonkeyPatch) ->
     assert shown[0].inner_sd == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize(("exponent", "is_at_bound"), [(0.3, True), (0.31, False), (2.0, False), (4.0, True)])
+def test_a_shape_at_a_bound_of_the_search_is_not_offered(
+    monkeypatch: pytest.MonkeyPatch, exponent: float, is_at_bound: bool
+) -> None:
+    pooled = pooled_healthy()
+    form = next(form for form in allowed_forms(pooled.problem, pooled.x) if form.model.name == "power")
+    assert form.bounds == (0.3, 4.0)
+    monkeypatch.setattr(PooledResponse, "amplitudes_of_windows", lambda *_: (np.full(10, 5.0), np.ones(10)))
+    shown = module._structure(pooled, ScoredGuess(form, exponent, np.array([5.0, 0.0]), 50.0))
+    assert shown is not None
+    assert shown[0].is_at_bound is is_at_bound
+    assert shown[0].is_offered is not is_at_bound
+
+
 def test_few_windows_show_no_structure() -> None:
     windows = record(20, AMPLITUDE, 1)[:3]
     assert remaining_structure(PROBLEM, identify_noise(PROBLEM, windows), windows) == []

@@ -71,8 +71,8 @@ def sqrt_information(fit: FittedWindow, width: Array) -> Array:
 
 def inflate_process_noise(
     likelihood: Likelihood, levels: Callable[[float], Array], fits: Fits
-) -> tuple[float, ChiSquareTest]:
-    """The factor on process noise that makes the reduced chi-square of inconsistent ``fits`` one, and the test with it.
+) -> tuple[float, ChiSquareTest, Fits]:
+    """The factor on process noise that makes the reduced chi-square of ``fits`` one, and test and fits with it.
 
     ``levels`` returns the levels (outputs + states,) for a factor. If none suffices, the test of the largest is failed.
     """
@@ -94,4 +94,5 @@ def inflate_process_noise(
     if log_excess(high) <= 0.0:
         high = float(brentq(log_excess, low, high, xtol=FACTOR_TOLERANCE, rtol=FACTOR_TOLERANCE))
         log_excess(high)
-    return float(np.exp(high)), tried[high][1]
+    refitted, test = tried[high]
+    return float(np.exp(high)), test, refitted

@@ -15,6 +15,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Mask, Verdict, Window
 from otolith.commissioning.consistency import consistency_test, inflate_process_noise, sqrt_information
 from otolith.commissioning.likelihood import (
+    Fits,
     FittedWindow,
     Likelihood,
     LikelihoodPoint,
@@ -23,6 +24,7 @@ from otolith.commissioning.likelihood import (
     backward_elimination,
     with_levels,
 )
+from otolith.commissioning.whiteness import Whiteness, whiteness
 from otolith.estimation.objective import Objective
 from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
@@ -98,6 +100,10 @@ class IdentifiedNoise:
     consistency: Consistency = Consistency()
     before_inflation: tuple[float, ...] = ()
     """Levels of outputs and states before inflation; empty if nothing was identified."""
+    whiteness: tuple[Whiteness, ...] = ()
+    """Of the innovations before inflation, by output."""
+    whiteness_after: tuple[Whiteness, ...] = ()
+    """With the levels that are returned, if process noise was inflated."""
     log_likelihood: float | None = None
     """Restricted, before inflation, up to a constant; None if nothing was identified."""
     windows: int = 0
@@ -125,13 +131,15 @@ def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progre
         states = (NoiseLevel(state.name, level) for state, level in zip(twin.states, process, strict=True))
         return IdentifiedNoise(tuple(outputs), tuple(states), guess.remarks)
     best = backward_elimination(guess.variances, guess.fits, progress)
-    consistency, levels = _make_consistent(guess, best, progress)
+    consistency, levels, inflated = _make_consistent(guess, best, progress)
     return IdentifiedNoise(
         outputs=tuple(_output_levels(twin, guess, best)),
         states=tuple(_state_levels(twin, guess, best, levels, consistency.degrees)),
         remarks=guess.remarks,
         consistency=consistency,
         before_inflation=tuple(best.levels.tolist()),
+        whiteness=whiteness(best.fits),
+        whiteness_after=whiteness(inflated) if inflated else (),
         log_likelihood=-0.5 * best.deviance,
         windows=len(guess.fits),
         evaluations=likelihood.evaluations,
@@ -192,14 +200,19 @@ def _first_fits(
     return fits
 
 
-def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Progress) -> tuple[Consistency, Array]:
-    """The result of the consistency test, and the levels (outputs + states,), inflated if necessary."""
+def _make_consistent(
+    guess: _InitialGuess, best: LikelihoodPoint, progress: Progress
+) -> tuple[Consistency, Array, Fits]:
+    """The result of the consistency test, and the levels (outputs + states,), inflated if necessary.
+
+    If they are, the windows fitted with them are the last part; else there are none.
+    """
     likelihood, outputs = guess.variances.likelihood, len(guess.signal_noise)
     before = consistency_test(best.fits, likelihood.width)
     if not before.degrees:
-        return Consistency(remark=ONE_WINDOW if len(best.fits) == 1 else NOT_COMPARABLE), best.levels
+        return Consistency(remark=ONE_WINDOW if len(best.fits) == 1 else NOT_COMPARABLE), best.levels, ()
     if before.passed:
-        return Consistency(before.degrees, before.reduced, before.reduced, 1.0, CONSISTENT), best.levels
+        return Consistency(before.degrees, before.reduced, before.reduced, 1.0, CONSISTENT), best.levels, ()
     sensors, process = best.levels.copy(), best.levels.copy()
     sensors[outputs:], process[:outputs] = 0.0, 0.0
     added = not process.any()
@@ -207,12 +220,12 @@ def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Prog
         small = SMALL_PROCESS_SHARE * np.nan_to_num(guess.process)
         process[outputs:] = np.where(observable_states(likelihood.problem.base_model), small, 0.0)
     progress(f"reduced chi-square of the windows: {before.reduced:.3g}")
-    factor, after = inflate_process_noise(likelihood, lambda factor: sensors + factor * process, best.fits)
+    factor, after, inflated = inflate_process_noise(likelihood, lambda factor: sensors + factor * process, best.fits)
     if not after.degrees or not after.passed:
-        return Consistency(before.degrees, before.reduced, before.reduced, None, NOT_INFLATED), best.levels
+        return Consistency(before.degrees, before.reduced, before.reduced, None, NOT_INFLATED), best.levels, ()
     remark = ADDED if added else INFLATED + (DOUBTFUL if factor > MAX_PLAUSIBLE_FACTOR else "")
     consistency = Consistency(before.degrees, before.reduced, after.reduced, None if added else factor, remark)
-    return consistency, sensors + factor * process
+    return consistency, sensors + factor * process, inflated
 
 
 def _output_levels(twin: Definition, guess: _InitialGuess, best: LikelihoodPoint) -> Iterator[NoiseLevel]:
@@ -358,14 +371,20 @@ def _most_excited(problem: Problem, windows: Sequence[Window], sensors: Array) -
 
 def observable_states(twin: Definition) -> Mask:
     """(states,) the states in an output's equation, and those whose derivative depends on an input directly."""
-    definitions = {name: expression for name, expression, _ in twin.definitions}
+    outputs = (dict(twin.equations).get(output.name, output.name) for output in twin.outputs)
+    shown = set().union(*(_names(twin, expression) for expression in outputs))
+    driven = {state for signal in twin.inputs for state in driven_states(twin, signal.name)}
+    return np.array([state.name in shown | driven for state in twin.states])
+
+
+def driven_states(twin: Definition, signal: str) -> tuple[str, ...]:
+    """Return the states whose derivative depends on an input directly."""
     equations = dict(twin.equations)
+    return tuple(state.name for state in twin.states if signal in _names(twin, equations[f"der({state.name})"]))
 
-    def names(expression: str) -> set[str]:
-        direct = set(re.findall(r"[A-Za-z_]\w*", expression))
-        return direct.union(*(names(definitions[name]) for name in direct & definitions.keys()))
 
-    shown = set().union(*(names(equations.get(output.name, output.name)) for output in twin.outputs))
-    inputs = {signal.name for signal in twin.inputs}
-    driven = [bool(names(equations[f"der({state.name})"]) & inputs) for state in twin.states]
-    return np.array([state.name in shown or by_input for state, by_input in zip(twin.states, driven, strict=True)])
+def _names(twin: Definition, expression: str) -> set[str]:
+    """Return the names that an expression has, with those of the definitions that it uses."""
+    definitions = {name: text for name, text, _ in twin.definitions}
+    direct = set(re.findall(r"[A-Za-z_]\w*", expression))
+    return direct.union(*(_names(twin, definitions[name]) for name in direct & definitions.keys()))

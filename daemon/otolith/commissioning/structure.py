@@ -42,6 +42,7 @@ CHANCE_DEVIATE = 3.0  # standard deviations of χ² of the phases of further win
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
 MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
 MIN_SHARE = 0.5  # of the best score: a candidate with less only imitates the best
+AT_BOUND = 1e-3  # of an inner parameter: distance from a bound of the search at which it lies there
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,13 @@ class Structure:
     """-2 log evidence of all windows against a twin without it."""
     is_restarted: bool
     """Whether its phase is another in each window: a sine of time, or of an angle that begins at zero there."""
+    is_at_bound: bool = False
+    """Whether its inner parameter lies at a bound of the search: then no form that is searched has its shape."""
+
+    @property
+    def is_offered(self) -> bool:
+        """Whether it can be in the twin from the first window on: its shape, and its phase there, are determined."""
+        return not self.is_restarted and not self.is_at_bound
 
 
 class PooledResponse(ProjectedResponse):
@@ -250,4 +258,9 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
     )
     span = float(np.ptp(pooled.parts[0].x[form.source] if pooled.is_restarted(form) else pooled.x[form.source]))
     inner_sd = np.sqrt(12.0 / max(guess.score, 1.0)) / span if periodic else UNCERTAIN_SHAPE * guess.inner
-    return Structure(component, sd, float(inner_sd), guess.score, pooled.is_restarted(form)), form
+    at_bound = not periodic and form.model.inner is not None and _is_at_bound(guess.inner, form.bounds)
+    return Structure(component, sd, float(inner_sd), guess.score, pooled.is_restarted(form), at_bound), form
+
+
+def _is_at_bound(value: float, bounds: tuple[float, float]) -> bool:
+    return any(abs(value - bound) <= AT_BOUND * abs(bound) for bound in bounds)

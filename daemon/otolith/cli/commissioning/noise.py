@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from otolith.commissioning.identification import IdentifiedNoise, NoiseLevel
     from otolith.commissioning.structure import Structure
     from otolith.machine import LoadedMachine
+    from otolith.twin.definition import Input
 
 
 @click.command()
@@ -58,8 +59,8 @@ class HealthyRecord:
 
     @property
     def offered(self) -> "list[Structure]":
-        """The structure that can be in the twin from the first window on: its phase is the same in all of them."""
-        return [item for item in self.structure if not item.is_restarted]
+        """The structure that can be in the twin from the first window on."""
+        return [item for item in self.structure if item.is_offered]
 
     def noise_beside(self, machine: "LoadedMachine") -> "IdentifiedNoise":
         """The noise levels with the structure in the twin."""
@@ -135,12 +136,11 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
     twin, problem = machine.twin, machine.problem
     yield "[noise]"
     rows = [_row(level, twin.unit_of(level.name)) for level in identified.outputs]
-    rows += [
-        (f'{signal.name} = "{level:.3g} {signal.unit}"', "unchanged: not identified from data")
-        for signal, level in zip(twin.inputs, problem.input_noise, strict=True)
-        if level
-    ]
+    inputs = list(zip(twin.inputs, problem.input_noise, strict=True))
+    rows += [(f'{row.name} = "{level:.3g} {row.unit}"', _why_unchanged(machine, row)) for row, level in inputs if level]
     yield from _aligned(rows)
+    measured = (signal for signal, level in inputs if not level and signal.hold == "foh")
+    yield from (f"# {signal.name}: {_why_unchanged(machine, signal)}" for signal in measured)
     yield ""
     yield "[process_noise]"
     yield from _aligned([_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in identified.states])
@@ -152,7 +152,30 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
         factor = f"; process noise times {consistency.factor:.3g}" if (consistency.factor or 1.0) != 1.0 else ""
         yield f"# chi-square between windows, per degree of freedom: {consistency.before:.3g}{after}{factor}"
     yield f"# {consistency.remark}"
+    yield from _whiteness_lines(identified)
     yield from (f"# {remark}" for remark in identified.remarks)
+
+
+def _why_unchanged(machine: "LoadedMachine", signal: "Input") -> str:
+    """Why the noise of an input is not identified, and which levels contain it."""
+    from otolith.commissioning.identification import driven_states
+
+    states = driven_states(machine.twin, signal.name)
+    contain = f"process noise of {' and '.join(states)}" if states else "noise of the outputs"
+    return f"not identifiable: its noise acts like {contain}, which contains what is not stated here"
+
+
+def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
+    """The tests of the innovations, and the spectrum of those that are not white, as comments."""
+    inflated = bool(identified.whiteness_after)
+    stages = [(identified.whiteness, " before inflation" if inflated else ""), (identified.whiteness_after, "")]
+    for rows, when in stages:
+        for row in rows:
+            at = f"correlation {row.correlation:.2g} at {row.lag:.3g} s"
+            yield f"# innovations of {row.output}{when}: {'white' if row.is_white else f'coloured, {at}'}"
+            if not row.is_white and row.bands:
+                bands = (f"{band.ratio:.2g} to {band.high:.3g} Hz" for band in row.bands)
+                yield f"#   power over that of white noise, from {row.bands[0].low:.3g} Hz: {', '.join(bands)}"
 
 
 def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") -> Iterator[str]:
@@ -166,10 +189,17 @@ def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") 
         text = equation(machine.twin, component, values[: 2 if item.is_restarted else 3])
         again = f", again every {_repeat(machine, item)}" if component.periodic else ""
         yield f"# structure: {component.key}: {text} (amplitude ± {half_width_text(item.sd)}){again}"
+        if item.is_at_bound:
+            yield f"# its {_inner_meaning(item)} lies at a bound of the search, so its shape is not known: not offered"
     if structure:
         yield "# the twin lacks it in all windows alike, and the process noise above contains it"
-    if any(not item.is_restarted for item in structure):
+    if any(item.is_offered for item in structure):
         yield "# otolith commission asks whether it belongs to the healthy machine, and identifies the noise beside it"
+
+
+def _inner_meaning(item: "Structure") -> str:
+    inner = item.component.model.inner
+    return "value" if inner is None else inner.meaning
 
 
 def _repeat(machine: "LoadedMachine", item: "Structure") -> str:

@@ -1,0 +1,47 @@
+"""Intervals of machines whose load is measured with noise that no machine file states: process noise contains it."""
+
+import numpy as np
+import pytest
+from benchmarks.changes.healthy import MACHINES, Ageing, cases
+from benchmarks.changes.machines import in_twin_units
+from benchmarks.changes.observe import recordings
+
+from otolith.acquisition.window import Window
+from otolith.commissioning.identification import identify_noise
+from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import QUANTILE
+from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import estimate
+
+WINDOWS, RUNS = 12, 8
+LOADED = [machine for machine in MACHINES if machine.load == "T_load"]
+
+
+def coverage(machine: Ageing, *, learned: bool) -> dict[str, float]:
+    """Return the share of 95 % intervals that hold the truth, in single windows that noise was not learned from."""
+    (case,) = cases(WINDOWS, [f"{machine.plant.name}: load noise"])
+    first, *records = recordings(case, case.problem, range(RUNS + 1), seed=1)
+    problem = identify_noise(case.problem, first).applied(case.problem) if learned else case.problem
+    held = np.array([inside(problem, window, machine) for record in records for window in record])
+    return dict(zip((parameter.name for parameter in problem.free), held.mean(axis=0).tolist(), strict=True))
+
+
+def inside(problem: Problem, window: Window, machine: Ageing) -> list[bool]:
+    """Whether the interval of each free parameter holds the truth."""
+    rows = estimate(problem, window, initial_prior(problem), problem.nominal).parameters
+    truth = [in_twin_units(problem.twin, row.name, machine.plant.parameters[row.name]) for row in rows]
+    return [abs(row.value - value) <= QUANTILE * row.sd for row, value in zip(rows, truth, strict=True)]
+
+
+@pytest.mark.parametrize("machine", LOADED, ids=lambda machine: machine.plant.name)
+def test_identified_noise_makes_intervals_right_under_load_noise(machine: Ageing) -> None:
+    """Of 96 windows: 95 % less two of its standard deviations, 2.2 % each."""
+    shares = coverage(machine, learned=True)
+    assert min(shares.values()) >= 0.90
+    assert np.mean(list(shares.values())) >= 0.93
+
+
+@pytest.mark.parametrize("machine", LOADED, ids=lambda machine: machine.plant.name)
+def test_intervals_are_too_narrow_if_nothing_states_the_noise_of_the_load(machine: Ageing) -> None:
+    """The innovations of each window are too few to show it: noise must be identified."""
+    assert min(coverage(machine, learned=False).values()) < 0.90
