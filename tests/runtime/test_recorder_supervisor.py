@@ -118,3 +118,16 @@ def test_a_file_is_never_larger_than_an_eighth_of_the_budget(machine: LoadedMach
     small = replace(machine, file=machine.file.model_copy(update={"recording": recording}))
     assert RecorderSupervisor(machine)._folder().budget.rotate_bytes == 256e6
     assert RecorderSupervisor(small)._folder().budget.rotate_bytes == 0.1e9
+
+
+@pytest.mark.parametrize("value", ["off", "0", "False"])
+def test_the_environment_may_switch_recordings_off(
+    supervisor: RecorderSupervisor, machine: LoadedMachine, monkeypatch: pytest.MonkeyPatch, value: str
+) -> None:
+    """As ``systemd/otolith.default`` shows; Rerun would raise an error instead of recording nothing."""
+    monkeypatch.delenv("RERUN", raising=False)
+    assert supervisor.is_enabled
+    monkeypatch.setenv("RERUN", value)
+    assert not supervisor.is_enabled
+    supervisor.reload(machine, 0.0, 0.0)
+    assert not supervisor._process.alive

@@ -14,12 +14,21 @@ from benchmarks.discovery.motor import R_A, D, Faults, simulate_motor
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from otolith.adaptation.state import EVERYTHING, AdaptationState, OperatorDecisions, apply_decisions, component_records
+from otolith.adaptation.state import (
+    EVERYTHING,
+    AdaptationState,
+    OperatorDecisions,
+    apply_decisions,
+    component_records,
+    initial_state,
+)
 from otolith.estimation.imm_filter import ParameterCusum
 from otolith.health.events import HealthState
 from otolith.health.schema import EventChange, ForecastDocument, ReportDocument, Status
+from otolith.machine import load_machine
 from otolith.storage.state_store import MAX_KEPT, MAX_STATE_BYTES, StateStore
 from otolith_drivers.errors import OtolithError
+from tests.conftest import EXAMPLES
 from tests.runtime.motors import NAMES, PROBLEM, START, UNBALANCE, fresh, healthy, noisy, run, unbalanced, windows
 
 KEPT = Path(__file__).parents[1] / "golden" / "state_files"
@@ -351,6 +360,28 @@ def test_files_of_version_1_are_read(tmp_path: Path) -> None:
     assert json.loads(store.components_path.read_text(encoding="utf-8"))["version"] == 2
     assert store_in(tmp_path, "0123456789abcdef").restore(fresh(), START + 90.0)[0].adopted == state.adopted
     assert store_in(tmp_path, "of other signals").restore(fresh(), START + 90.0)[0].adopted == ()
+
+
+def test_the_filter_and_events_of_an_earlier_version_2_are_read(tmp_path: Path) -> None:
+    """A daemon of 2026-11-23, 08:00 wrote the file; its fingerprints were removed, so that the twin may change."""
+    source = KEPT / "version-2" / "demo.dc-motor-in-process.json"
+    shutil.copy(source, tmp_path)
+    machine = load_machine(EXAMPLES / "dc-motor-in-process.toml", with_driver=False)
+    names = machine.file.machine
+    store = StateStore(names.site, names.name, machine.twin, tmp_path)
+    cold = initial_state(names.name, names.site, machine.problem, machine.plan)
+    state, note = store.restore(cold, 1_795_452_999.0)
+    assert note == ""
+    assert [known.component.key for known in state.adopted] == ["shaft/periodic/t"]
+    assert {event.id for event in state.health.open_events} == {
+        "limit/R_a@1795452938.2",
+        "component/shaft/periodic@1795452821.2",
+    }
+    assert state.posterior.belief.end == pytest.approx(1_795_452_960.2, abs=0.1)
+    store.save(state)
+    again, note = store.restore(cold, 1_795_452_999.0)
+    assert note == ""
+    assert again.posterior.belief.end == state.posterior.belief.end
 
 
 def test_a_state_that_is_not_plausible_is_not_saved(tmp_path: Path) -> None:

@@ -28,7 +28,8 @@ work=$(mktemp -d)
 trap 'rm -rf --one-file-system "$work"' EXIT
 export SHARE=$share DISK=$work/disk
 boot() { tests/vm/run.sh "$@" || code=1; }
-boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py tests/vm/test_life.py
+boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py tests/vm/test_life.py \
+  tests/vm/test_troubles.py tests/vm/test_boots.py::test_before_a_reboot
 boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_reboot '&&' python -m tests.vm.cut_power
 boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_power_cut
 echo "system tests took $((SECONDS - begun)) s"

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -20,6 +21,9 @@ from otolith.health.schema import CountersDocument, ParameterDocument, ReportDoc
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
 from tests.conftest import EXAMPLES, free_port
+
+if TYPE_CHECKING:
+    from tests.vm.service import Instance
 
 CHANNEL = "vcan0"
 STATISTICS = Path(f"/sys/class/net/{CHANNEL}/statistics")
@@ -205,6 +209,14 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
     with machine_on_a_bus(tmp_path_factory.mktemp("compiled")) as machine:
         machine.daemon(seconds=400.0)
     print(f"kernels compiled, or found, in {time.monotonic() - begun:.1f} s")
+
+
+@pytest.fixture(scope="session")
+def press(tmp_path_factory: pytest.TempPathFactory) -> "Instance":
+    """A service that has estimated, raised an event, and found a component that is approved."""
+    from tests.vm.service import learned_instance  # noqa: PLC0415 - it imports this module
+
+    return learned_instance(tmp_path_factory.mktemp("press"))
 
 
 @pytest.fixture

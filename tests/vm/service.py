@@ -14,7 +14,9 @@ from tests.conftest import EXAMPLES
 from tests.vm.conftest import PATIENCE, RESISTANCE, SCENARIO, WINDOW, Reports, run
 
 ROOT = Path(__file__).parents[2]
+SHARE = Path("/mnt/share")
 PROGRAM = "/opt/otolith/bin/otolith"
+STRANGER = "65533"  # a user of no group
 TRUTH = {"R_a": RESISTANCE, "D": 0.00143}  # of the plant
 # The motor of the other tests, simulated by the daemon, with a load that its twin lacks.
 PLANT = (
@@ -156,3 +158,29 @@ def simulated_machine(folder: Path, extra: str = "") -> Path:
     file = folder / "press.toml"
     file.write_text(f"{text}\n{WINDOW}{extra}", encoding="utf-8")
     return file
+
+
+def learned_instance(folder: Path) -> Instance:
+    """A service that has estimated, raised an event, and found a component that is approved."""
+    previous = [str(path) for path in SHARE.glob("previous/*.whl")]
+    if previous:
+        install_wheel(*previous)
+    press = Instance("press")
+    press.install(simulated_machine(folder))
+    run("systemctl", "enable", "--now", press.unit, seconds=300.0)
+    deadline = time.monotonic() + 400.0
+    while not ((report := press.wait_for_reports(1, seconds=300.0)[-1]).components and report.events):
+        assert time.monotonic() < deadline, report.to_json()
+        time.sleep(1.0)
+    print(f"a component after {report.window.index} windows")
+    component = report.components[0].id
+    press.otolith("components", "approve", str(press.file), component)
+    while press.reports()[-1].components[0].approval != "approved":
+        assert time.monotonic() < deadline
+        time.sleep(0.5)
+    return press
+
+
+def install_wheel(*wheels: str) -> None:
+    run("/opt/otolith/bin/pip", "--disable-pip-version-check", "install", "--quiet", "--no-index", "--no-deps",
+        "--force-reinstall", *wheels, seconds=300.0)  # fmt: skip

@@ -1,4 +1,4 @@
-"""A service that was enabled goes on after a boot. Each test runs in a boot of its own, after test_life.py."""
+"""A service that was enabled goes on after a boot. The first test ends one, each other one runs in its own."""
 
 import json
 from pathlib import Path
@@ -11,6 +11,12 @@ WHOLE = Path.home() / "whole.rrd"
 
 def remembered(press: Instance) -> Before:
     return Before(**json.loads(press.remembered.read_text(encoding="utf-8")))
+
+
+def test_before_a_reboot(press: Instance) -> None:
+    """The tests of the next boot go on from here."""
+    press.remember(press.before())
+    assert not press.failure()
 
 
 def test_after_a_reboot() -> None:

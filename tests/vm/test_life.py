@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -11,40 +12,11 @@ import pytest
 
 from tests.publishing import attacker
 from tests.vm.conftest import PATIENCE, run
-from tests.vm.service import Instance, simulated_machine
+from tests.vm.service import PROGRAM, SHARE, STRANGER, Instance, install_wheel, simulated_machine
 from tests.waiting import within
 
-SHARE = Path("/mnt/share")
-STRANGER = "65533"  # a user of no group
 READY = 3.0  # s from the start to readiness, if all kernels are compiled
 WINDOW_LENGTH, FIRST_REPORT = 1.0, 2.0  # s: of `WINDOW`; from the end of the first window to its report
-
-
-@pytest.fixture(scope="module")
-def press(tmp_path_factory: pytest.TempPathFactory) -> Instance:
-    """A service that has estimated, raised an event, and found a component that is approved."""
-    previous = [str(path) for path in SHARE.glob("previous/*.whl")]
-    if previous:
-        install_wheel(*previous)
-    press = Instance("press")
-    press.install(simulated_machine(tmp_path_factory.mktemp("press")))
-    run("systemctl", "enable", "--now", press.unit, seconds=300.0)
-    deadline = time.monotonic() + 400.0
-    while not ((report := press.wait_for_reports(1, seconds=300.0)[-1]).components and report.events):
-        assert time.monotonic() < deadline, report.to_json()
-        time.sleep(1.0)
-    print(f"a component after {report.window.index} windows")
-    component = report.components[0].id
-    press.otolith("components", "approve", str(press.file), component)
-    while press.reports()[-1].components[0].approval != "approved":
-        assert time.monotonic() < deadline
-        time.sleep(0.5)
-    return press
-
-
-def install_wheel(*wheels: str) -> None:
-    run("/opt/otolith/bin/pip", "--disable-pip-version-check", "install", "--quiet", "--no-index", "--no-deps",
-        "--force-reinstall", *wheels, seconds=300.0)  # fmt: skip
 
 
 def test_nobody_else_reads_or_publishes(press: Instance) -> None:
@@ -107,16 +79,22 @@ def test_all_processes_take_at_most_300_mb(press: Instance) -> None:
     assert sum(taken) <= 300.0
 
 
-def test_what_was_learned_survives_an_upgrade(press: Instance) -> None:
+def test_what_was_learned_survives_removal_and_upgrade(press: Instance) -> None:
+    """As docs/service.md says; a second installation has nothing to do."""
     before, source = press.before(), Path.home() / "press"
     source.mkdir()
+    file = simulated_machine(source)
+    drop_in = Path(f"/etc/systemd/system/{press.unit}.service.d")
+    run("systemctl", "disable", "--now", press.unit)
+    press.file.unlink()
+    shutil.rmtree(drop_in)
     install_wheel(*map(str, SHARE.glob("*.whl")))
-    press.install(simulated_machine(source))
-    run("systemctl", "restart", press.unit)
+    shown = run(PROGRAM, "install", "--dry-run", str(file))
+    assert f"to write: {press.file}\n" in shown
+    assert not press.file.exists()
+    press.install(file)
+    again = run(PROGRAM, "install", str(file), seconds=300.0)
+    assert "write: " not in again
+    assert "replace: " not in again
+    run("systemctl", "enable", "--now", press.unit)
     press.check_continued(before)
-
-
-def test_it_goes_on_until_the_computer_is_switched_off(press: Instance) -> None:
-    """The tests of the next boot go on from here."""
-    press.remember(press.before())
-    assert not press.failure()

@@ -123,11 +123,14 @@ def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bo
       otolith run config/dc-motor.toml
       otolith run config/dc-motor.toml --listen tcp/127.0.0.1:7450
     """
+    import faulthandler
+
     from otolith.machine import load_machine
     from otolith.runtime.service import Service
     from otolith_drivers.errors import ConfigurationError
 
     log_to_stderr(verbose=verbose)
+    faulthandler.enable()  # systemd's watchdog sends SIGABRT: the log then has where each thread was
     try:
         machine = load_machine(file)
     except ConfigurationError as error:

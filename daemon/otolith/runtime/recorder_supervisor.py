@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import time
 from pathlib import Path
 
@@ -18,6 +19,7 @@ log = logging.getLogger(__name__)
 RECORDER_ROOM = 32  # windows that wait for the recorder
 RECORDER_HEALTHY_AGE = 60.0  # s after which the restart pause of the recorder is reset
 RECORDER_TIMEOUT = 60.0  # s without an answer, while windows wait, after which the recorder hangs
+FORBIDDEN = {"0", "false", "off"}  # values of RERUN that switch its logging off
 MIN_FILES = 8  # files that the budget has room for at least
 
 
@@ -34,6 +36,11 @@ class RecorderSupervisor:
         self._problem = ""
         self.dropped = 0
         """Windows that were not recorded."""
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether the machine file wants recordings, and Rerun's variable of the environment does not forbid them."""
+        return self._machine.file.recording.enabled and os.environ.get("RERUN", "").lower() not in FORBIDDEN
 
     @property
     def restarts(self) -> int:
@@ -65,7 +72,7 @@ class RecorderSupervisor:
         self._process.stop(seconds)
         self._unanswered = self._unwritten = 0
         self._machine = machine
-        if machine.file.recording.enabled:
+        if self.is_enabled:
             self._planned_starts += self._process.starts >= self._planned_starts
             self._try_to_start(now)
 

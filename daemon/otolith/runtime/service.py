@@ -131,7 +131,7 @@ class Service:
         self._writer.start()
         self._evidence.start()
         self._supervisor.start()
-        if self._machine.file.recording.enabled:
+        if self._recorder.is_enabled:
             self._recorder.start(time.monotonic())
         self._started_at = self._progress_at = time.monotonic()
         self._notifier.send("READY=1", f"STATUS=listening: {driver.describe()[0]}", f"MAINPID={os.getpid()}")
@@ -213,7 +213,7 @@ class Service:
             self._windower.records = self._supervisor.records
             self._save(time.monotonic())
         self._feed_watchdog(time.monotonic())
-        if self._machine.file.recording.enabled:
+        if self._recorder.is_enabled:
             self._recorder.poll(time.monotonic())
 
     def _cut(self, now: float) -> None:
@@ -253,7 +253,7 @@ class Service:
             self._history.add(document)
         if self._publisher is not None:
             self._publisher.publish(document)
-        if self._machine.file.recording.enabled:
+        if self._recorder.is_enabled:
             self._recorder.offer(Report(document, report.traces), time.monotonic())
         self._log(document, time.monotonic())
 
