@@ -7,6 +7,7 @@ import _signal  # type: ignore[import-not-found]  # mypy has no stub for the C m
 _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
 import errno  # noqa: E402 - after the line above
+import io  # noqa: E402 - as above
 import os  # noqa: E402 - as above
 import sys  # noqa: E402 - as above
 
@@ -23,6 +24,9 @@ def main() -> None:
     from otolith.cli.main import cli  # noqa: PLC0415
     from otolith_drivers.errors import OtolithError  # noqa: PLC0415
 
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that has no 'Ω' gets a '?'
+            stream.reconfigure(errors="replace")
     try:
         code = cli.main(prog_name="otolith", standalone_mode=False)
     except click.ClickException as error:

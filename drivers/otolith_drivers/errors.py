@@ -9,9 +9,15 @@ Each message names the file or device, the key or signal, the value, the bound o
 raised where the fault is detected; only ``otolith.__main__`` prints it, as one line, and turns it into an exit code.
 """
 
+import sys
 from collections.abc import Sequence
 
 MAX_NAMES = 12  # names of messages, arbitration IDs or signals in a line
+
+
+def installation_of(extra: str) -> str:
+    """The command that installs an extra into the environment of this Otolith, whichever ``pip`` a shell would take."""
+    return f"{sys.executable} -m pip install 'otolith[{extra}]'"
 
 
 class OtolithError(Exception):

@@ -5,7 +5,7 @@ from importlib.metadata import entry_points
 from typing import cast
 
 from otolith_drivers.base import DriverType
-from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.errors import ConfigurationError, installation_of, nearest
 
 ENTRY_POINT_GROUP = "otolith.drivers"
 
@@ -40,8 +40,8 @@ def find(name: str) -> DriverType:
             return cast("DriverType", point.load())
     except ImportError as error:
         if name in EXTRAS:
-            way_out = f"pip install 'otolith[{name}]'"
-            raise ConfigurationError(f"driver {name!r} needs the extra {name!r}: {way_out} ({error})") from error
+            missing = f"driver {name!r} needs the extra {name!r}"
+            raise ConfigurationError(f"{missing}: {installation_of(name)} ({error})") from error
         raise ConfigurationError(f"driver {name!r} cannot be loaded: {error}") from error
     text = f"unknown driver {name!r}: {nearest(name, known())}; a package that brings its own must be installed here"
     raise ConfigurationError(text)

@@ -95,3 +95,11 @@ def test_the_page_of_a_twin_calls_a_parameter_known_or_estimated() -> None:
     assert re.search(r"R_a .* estimated ", page)
     assert re.search(r"K_e .* known ", page)
     assert "instrumented" not in page
+
+
+def test_a_terminal_without_greek_letters_gets_question_marks() -> None:
+    command = [sys.executable, "-m", "otolith", "twin", "show", "dc_motor"]
+    latin = {**os.environ, "PYTHONIOENCODING": "latin-1"}
+    result = subprocess.run(command, env=latin, capture_output=True, encoding="latin-1", check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "K?" in result.stdout

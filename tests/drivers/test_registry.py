@@ -19,5 +19,5 @@ def test_a_missing_library_is_named_with_its_extra(name: str, library: str, monk
     for module in [module for module in sys.modules if module.startswith((f"otolith_drivers.{name}", library))]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(ConfigurationError, match=re.escape(f"pip install 'otolith[{name}]'")):
+    with pytest.raises(ConfigurationError, match=re.escape(f"{sys.executable} -m pip install 'otolith[{name}]'")):
         registry.find(name)

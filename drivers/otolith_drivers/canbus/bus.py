@@ -4,6 +4,7 @@ The driver and the simulated plant share it, so that the same options mean the s
 what python-can does not: a larger receive buffer, the number of dropped frames, and whether the bus is up.
 """
 
+import logging
 import os
 import re
 import socket
@@ -31,6 +32,8 @@ SO_RCVBUFFORCE, SO_MEMINFO, IP_MULTICAST_ALL = 33, 55, 49
 MEMORY_INFO, DROPS_FIELD = struct.Struct("9I"), 8
 
 Result = TypeVar("Result")
+
+logging.getLogger("can.bus").setLevel(logging.ERROR)  # it warns of a bus that could not be opened: an error here
 
 LISTEN_ONLY: dict[str, dict[str, Any]] = {
     "cantact": {"monitor": True},

@@ -254,7 +254,8 @@ class ModbusPoller(ThreadedDriver):
     def _end_complete_round(self, duration: float, *, repeated: bool) -> None:
         """End a round in which all devices answered, and log a change of the period or the first known rate."""
         if self._schedule.end(duration, repeated=repeated):
-            log.warning("%s: %s", self._options.title(), self._schedule.describe())
+            level = logging.WARNING if self._schedule.is_slow else logging.INFO
+            log.log(level, "%s: %s", self._options.title(), self._schedule.describe_period())
         if self._schedule.known and not self._rate_logged and self._schedule.achieved is not None:
             self._rate_logged = True
             rate = self._schedule.describe()

@@ -312,8 +312,20 @@ class PollSchedule:
     def describe(self) -> str:
         """Return the requested and achieved rate in words."""
         achieved = "achieved: not known yet" if self.achieved is None else f"{1 / self.achieved:.1f} achieved"
-        coarser = f" (the grid is now {self.period * 1e3:g} ms)" if self.period > self.requested else ""
+        coarser = f" (the grid is now {self.period * 1e3:g} ms)" if self.is_slow else ""
         return f"{1 / self.requested:g} Hz asked, {achieved}{coarser}"
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether the line or this computer is slower than requested."""
+        return self.period > self.requested
+
+    def describe_period(self) -> str:
+        """Return the present and the requested period in words, for the moment at which the present one begins."""
+        if not self.is_slow:
+            return f"read every {self.period * 1e3:g} ms again, as asked"
+        asked = f"instead of every {self.requested * 1e3:g} ms"
+        return f"read every {self.period * 1e3:g} ms from now on, {asked}: a round of requests takes too long for that"
 
 
 def _usual_period(period: float) -> float:

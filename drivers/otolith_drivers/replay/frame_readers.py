@@ -15,7 +15,7 @@ from otolith_drivers.canbus import ASAMMDF, can
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT
 from otolith_drivers.canbus.signals import CLASSIC_LENGTH
 from otolith_drivers.common.remote_clock import unix_time
-from otolith_drivers.errors import ConfigurationError, some_names
+from otolith_drivers.errors import ConfigurationError, installation_of, some_names
 from otolith_drivers.replay.formats import GZIP, seen
 
 STANDARD_DIGITS = 3  # of an identifier of 11 bits
@@ -157,7 +157,7 @@ class Mf4Frames:
             kind = seen(head)
             raise ConfigurationError(f"{path}: is not an unpacked MF4 file{f' but {kind}' if kind else ''}")
         if find_spec(ASAMMDF) is None:
-            raise ConfigurationError(f"{path}: an MF4 file needs the extra 'mf4': pip install 'otolith[mf4]'")
+            raise ConfigurationError(f"{path}: an MF4 file needs the extra 'mf4': {installation_of('mf4')}")
         self._path = path
 
     def frames(self) -> Iterator[tuple[int, can.Message | str]]:

@@ -1,5 +1,8 @@
 """The CAN driver on real buses: frames that no healthy node sends, and buses that fail."""
 
+import errno
+import gc
+import os
 import socket
 import threading
 from collections.abc import Callable
@@ -143,6 +146,22 @@ def test_missing_bus_is_a_device_error(interface: str) -> None:
     """A real channel has no substitute: an empty bus would look like a silent drive."""
     with pytest.raises(DeviceError, match="can7"):
         open_bus(BusOptions(interface=interface, channel="can7"))
+
+
+def test_a_bus_that_cannot_be_opened_is_nothing_but_an_error(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """python-can logs that the bus which it could not open was not shut down."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(socket.socket, "bind", refuse)
+        with pytest.raises(DeviceError, match="No such device; it needs a multicast route"):
+            open_bus(BusOptions(interface="udp_multicast"))
+    gc.collect()
+    assert caplog.messages == []
 
 
 def test_channel_unknown_to_the_interface_is_refused() -> None:

@@ -87,12 +87,14 @@ def test_period_is_kept_or_lengthened_to_what_fits() -> None:
     assert schedule.achieved == pytest.approx(0.025)
     assert missed > 0
     assert "100 Hz asked, 40.0 achieved" in schedule.describe()
+    assert schedule.describe_period().startswith("read every 25 ms from now on, instead of every 10 ms: a round of req")
     for _ in range(FAST_DECISIONS * DECISION_ROUNDS + 2 * DECISION_ROUNDS):
         now = max(now, schedule.due)
         schedule.begin(now)
         now += 0.004
         schedule.end(0.004, repeated=False)
     assert schedule.period == 0.01
+    assert schedule.describe_period() == "read every 10 ms again, as asked"
 
 
 def test_busy_computer_does_not_change_the_period() -> None:

@@ -266,7 +266,7 @@ def test_probe_lists_the_variables_with_value_type_and_unit(port: int) -> None:
 
 
 def test_probe_of_no_server_is_one_line() -> None:
-    with pytest.raises(DeviceError, match="Connection refused"):
+    with pytest.raises(DeviceError, match="Connection refused; the host answers, but the port is closed"):
         CliRunner().invoke(
             cli, ["probe", "opcua", "opc.tcp://127.0.0.1:9"], standalone_mode=False, catch_exceptions=False
         )

@@ -391,7 +391,9 @@ async def _browse(options: "OpcuaOptions", most: int) -> "list[Variable]":
         async with connected(options, credentials) as (client, _):
             return await browse(client, most)
     except Exception as error:  # the library raises anything that a server makes it raise
-        raise DeviceError(f"OPC UA {options.endpoint}: {reason(error, options.timeout)}") from error
+        refused = isinstance(error, ConnectionRefusedError)
+        remedy = "; the host answers, but the port is closed: is the server on, and the port right?" if refused else ""
+        raise DeviceError(f"OPC UA {options.endpoint}: {reason(error, options.timeout)}{remedy}") from error
 
 
 def _opcua_document(variable: "Variable") -> dict[str, Any]:
