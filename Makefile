@@ -25,7 +25,7 @@ help:
 demo: $(RUNTIME)
 	$(BIN)/python -m otolith demo
 
-# One process more than cores, as many tests wait for real time. A file's tests stay together and share what they compute.
+# More processes than cores, as many tests wait for real time. A file's tests stay together and share what they compute.
 WORKERS ?= $(shell expr 2 \* $$(nproc) + 1)
 SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
 test: $(DEV)

@@ -159,12 +159,11 @@ def _advance(
 ) -> dict[str, Any]:
     """Return the state one record later."""
     step = plant.period / plant.steps
-    values = None if change.ramps or change.terms else _values(plant, change, time, now, state)
 
     def derivative(part: float, state: dict[str, Any]) -> Values:
         inputs = now | {name: first + part * (last - first) for name, (first, last) in linear.items()}
         moment = time + part * plant.period
-        return plant.rates(state, inputs, values or _values(plant, change, moment, inputs, state))
+        return plant.rates(state, inputs, _values(plant, change, moment, inputs, state))
 
     for number in range(plant.steps):
         first, middle, last = ((number + share) / plant.steps for share in (0.0, 0.5, 1.0))

@@ -66,6 +66,14 @@ def test_every_file_a_page_names_is_there(page: str) -> None:
     assert lost <= {"my-machine.toml", "error.txt"}
 
 
+@pytest.mark.parametrize("page", [*PAGES, "CHANGELOG.md"])
+def test_lines_are_at_most_120_wide(page: str) -> None:
+    """Except tables and code."""
+    text = re.sub(r"^ *```.*?^ *```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    prose = [line for line in text.splitlines() if not line.startswith(("|", "    "))]
+    assert [line for line in prose if len(line) > 120] == []
+
+
 def test_every_make_target_of_the_docs_exists() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for page in PAGES:
