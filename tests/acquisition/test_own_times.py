@@ -3,6 +3,8 @@
 Every recording is replayed through the command line with the default limits.
 """
 
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -141,6 +143,25 @@ def test_irregular_rows_of_a_coarse_clock_are_refused_and_give_no_finding(log: L
     assert all(
         "share a time but differ: log finer times" in document.window.quality.reasons[0] for document in documents
     )
+
+
+def test_a_replay_at_1_khz_stays_within_300_mb(tmp_path: Path) -> None:
+    """With pandas, which is installed beside the reader of MF4 logs, pyarrow would take 45 MB more."""
+    schedule = Schedule(rows=Timing(0.001))
+    machine = write_machine(tmp_path, schedule, '[window]\nsample_period = "1 ms"')
+    recording = recorded(schedule, length=8.0)
+    data = write(tmp_path, recording.header, recording.rows())
+    program = (
+        "import sys; from pathlib import Path; from otolith.cli.replay import replay\n"
+        "replay(Path(sys.argv[1]), [Path(sys.argv[2])], None, as_json=False, stopped=lambda: False)\n"
+        "print(*(line for line in open('/proc/self/status') if line.startswith('VmHWM')))\n"
+        "print('pandas', 'pandas' in sys.modules)\n"
+    )
+    command = [sys.executable, "-c", program, str(machine), str(data)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "4 windows: 4 good" in printed
+    assert "pandas False" in printed
+    assert int(printed.split("VmHWM:")[1].split()[0]) < 300_000  # kB
 
 
 COMMANDS = {

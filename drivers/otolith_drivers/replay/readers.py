@@ -69,14 +69,15 @@ class Rows:
     def part(self, rows: slice, marks: Mask | None = None) -> "Rows":
         """Return some of the rows, if given with other marks."""
         columns = {name: values[rows] for name, values in self.columns.items()}
-        kept = self.begins[rows] if marks is None else marks
+        kept = self.marks[rows] if marks is None and self.marks is not None else marks
         return Rows(self.times[rows], columns, self.lines[rows], self.bad[rows], kept)
 
     def followed_by(self, other: "Rows") -> "Rows":
         """Return these rows and those of ``other``."""
         columns = {name: np.concatenate([values, other.columns[name]]) for name, values in self.columns.items()}
         times, lines = np.concatenate([self.times, other.times]), np.concatenate([self.lines, other.lines])
-        bad, marks = np.concatenate([self.bad, other.bad]), np.concatenate([self.begins, other.begins])
+        bad, marked = np.concatenate([self.bad, other.bad]), self.marks is not None or other.marks is not None
+        marks = np.concatenate([self.begins, other.begins]) if marked else None
         return Rows(times, columns, lines, bad, marks)
 
 

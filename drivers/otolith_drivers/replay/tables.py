@@ -11,9 +11,12 @@ import codecs
 import csv
 import io
 import re
+import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple, TextIO
 
 import numpy as np
@@ -43,6 +46,22 @@ TIME_CELL = re.compile(r"(?:t|time|timestamp|zeit)\s*(?:[\[(](.*)[\])])?", re.IG
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
 NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
 BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
+
+
+def _keep_pandas_out() -> None:
+    """Let pyarrow see a pandas that is too old, which it does not use; otherwise it would import pandas, with 45 MB.
+
+    It decides once, at its first conversion. Only the reader of MF4 logs needs pandas, which imports it itself.
+    """
+    if "pandas" not in sys.modules:
+        sys.modules["pandas"] = too_old = ModuleType("pandas")
+        too_old.__dict__["__version__"] = "0.1"
+        with warnings.catch_warnings(action="ignore"):
+            pa.array([0]).to_numpy()
+        del sys.modules["pandas"]
+
+
+_keep_pandas_out()
 
 
 class TableSource(StrictModel):

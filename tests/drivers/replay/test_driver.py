@@ -2,6 +2,7 @@
 
 import threading
 import time
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import tables as table
 from otolith_drivers.replay.driver import Options, ReplayDriver, Source, build
+from otolith_drivers.replay.readers import Rows
 from tests.conftest import EXAMPLES, SIGNALS
 from tests.drivers.logs import UNITS, frames_of, live, written
 from tests.waiting import wait_for, within
@@ -62,7 +64,7 @@ def test_replay_keeps_spacing_and_counts_every_cell(tmp_path: Path, pace: str) -
     begun = time.monotonic()
     got = played(driver)
     with table.TableReader(path, {"i": "A", "omega": "rad/s"}) as opened:
-        (rows,) = opened.chunks()
+        rows = reduce(Rows.followed_by, opened.chunks())
     for name, values in rows.columns.items():
         there = np.isfinite(values)
         assert [sample.value for sample in got if sample.signal == name] == values[there].tolist()
