@@ -258,6 +258,21 @@ def test_the_data_are_read_once_and_again_for_a_proposal_unless_the_preview_is_s
     assert counts == [(1, False), (2, True), (2, True), (1, False)]
 
 
+@pytest.mark.parametrize(("end", "kind"), [(1.0, "largest"), (-1.0, "smallest")])
+def test_a_saturated_sensor_is_remarked(tmp_path: Path, rows: Lines, end: float, kind: str) -> None:
+    """A tenth of the readings of the current are at the end of its range; a turning point or a rest is no end."""
+    readings = np.array([float(row[3]) for row in rows])
+    limit = float(np.quantile(end * readings, 0.9))
+    clipped = [[*row[:3], repr(end * min(end * float(row[3]), limit)), *row[4:]] for row in rows]
+    (remark,) = [text for text in previewed(written(tmp_path, clipped)).remarks if "exactly" in text]
+    assert remark.startswith(f"i: 10% of the samples have exactly its {kind} value")
+    assert "leave these cells blank" in remark
+    times = np.array([float(row[0]) for row in rows])
+    healthy = np.maximum(np.round(10.0 * np.sin(times), 2), 0.0)  # turns at the step of its converter, and rests at 0
+    natural = [[*row[:3], repr(float(value)), *row[4:]] for row, value in zip(rows, healthy, strict=True)]
+    assert not [text for text in previewed(written(tmp_path, natural)).remarks if "exactly" in text]
+
+
 @pytest.mark.parametrize("constant", [(3, 4), (4,)])
 def test_a_constant_output_determines_nothing(tmp_path: Path, rows: Lines, constant: tuple[int, ...]) -> None:
     still = [["1.5" if index in constant else cell for index, cell in enumerate(row)] for row in rows]

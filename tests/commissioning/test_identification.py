@@ -236,6 +236,27 @@ def test_inconsistency_that_process_noise_cannot_explain(monkeypatch: pytest.Mon
     assert (levels(noise)[2:] == 0.0).all()
 
 
+@pytest.mark.parametrize("disturbed", [(4,), (0, 7)])
+def test_a_few_windows_that_contradict_all_others_are_left_out(disturbed: tuple[int, ...]) -> None:
+    """Somebody brakes the shaft in one or two of ten windows: that is not the noise of the others."""
+    random = np.random.default_rng(31)
+    windows = [window(random, index, D=0.02 if index in disturbed else TRUTH["D"]) for index in range(10)]
+    noise = identify_noise(PROBLEM, windows)
+    assert noise.windows == 10 - len(disturbed)
+    assert levels(noise)[:2] == pytest.approx(SENSORS, rel=0.1)
+    assert levels(noise)[2:] * np.sqrt(PERIOD) == pytest.approx(0.0, abs=0.05 * SENSORS.min())
+    starts = ", ".join(f"{2 * index} s" for index in disturbed)
+    assert text.EXCLUDED_OUTLYING.format(len(disturbed), 10, starts) in noise.remarks
+
+
+def test_a_third_of_the_windows_is_no_exception() -> None:
+    random = np.random.default_rng(32)
+    windows = [window(random, index, D=0.02 if index in {1, 4, 7} else TRUTH["D"]) for index in range(9)]
+    noise = identify_noise(PROBLEM, windows)
+    assert noise.windows >= 8
+    assert (noise.consistency.factor or np.inf) > 1.0  # None if process noise was added
+
+
 def test_observable_states_are_measured_or_driven() -> None:
     assert observable_states(TWIN).tolist() == [True, True]
     two_mass = find_twin("two_mass")

@@ -48,6 +48,9 @@ ROTOR_WINDOW = 0.8  # s
 EVENT_WITHIN = 5.0  # s after a change that passes a limit
 SETTLED = 3  # windows after a change: from then on the published damping is the new one
 DAMPING = 0.05  # largest error of the damping of a window
+BENCH = {"K": 0.047, "J": 8e-5, "T_c": 0.0085}  # of the simulated motor; R is 5 ohm, as its file says
+COUNTS, ROW = 400, 0.02  # of its encoder per turn; s between its rows
+STEPS = 200  # of the simulation between two rows
 FIGURE = 0.03  # largest error of a figure on the page: that of two or three digits
 
 
@@ -65,11 +68,33 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert KP_100 in GUIDE
     text = (place / "servo-kp400.toml").read_text(encoding="utf-8")
     (place / "servo-kp100.toml").write_text(re.sub(r'gain = ".*?"', KP_100, text), encoding="utf-8")
+    write_bench_log(place / "bench.csv")
+    write_bench_log(place / "worn.csv", worn=0.0125)
     if DATA is not None:
         for name in ("rotor_rig", "servo_pendulum"):
             for log in logs(name).glob("*.csv"):
                 shutil.copy(log, place)
     return place
+
+
+def write_bench_log(path: Path, seconds: float = 40.0, worn: float | None = None) -> None:
+    """A simulated motor as a microcontroller logs it; its dry friction is ``worn`` (N*m) in the second half."""
+    random = np.random.default_rng(1)
+    step = ROW / STEPS
+    speed = angle = duty = 0.0
+    before, rows = 0, ["time,pwm,rpm"]
+    for row in range(round(seconds / ROW)):
+        counts = int(angle / (2.0 * np.pi) * COUNTS)
+        duty = float(random.integers(70, 221)) if row % 40 == 0 else duty
+        rows.append(f"{row * ROW:.3f},{duty:.0f},{(counts - before) / COUNTS / ROW * 60.0:.1f}")
+        before = counts
+        dry = worn if worn is not None and row * ROW >= 0.5 * seconds else BENCH["T_c"]
+        for _ in range(STEPS):
+            torque = BENCH["K"] * (duty / 255.0 * 12.0 - BENCH["K"] * speed) / 5.0
+            stopping = torque + BENCH["J"] * speed / step
+            speed += step * (torque - min(max(stopping, -dry), dry)) / BENCH["J"]
+            angle += step * speed
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
 _REPORTS: dict[tuple[str, str], list[ReportDocument]] = {}
@@ -320,3 +345,44 @@ def test_the_gain_of_the_guide_is_that_of_the_manual(folder: Path) -> None:
     for gain in (100, 400):
         known = dict(load_machine(folder / f"servo-kp{gain}.toml", with_driver=False).problem.known)
         assert known["gain"] == pytest.approx(gain * 4096 / (2 * np.pi) / (256 * 885), rel=1e-3)
+
+
+def test_a_duty_and_a_speed_show_three_parameters(folder: Path) -> None:
+    identifiable = {row.name: row for row in structural_identifiability(load_twin(folder / "bench-motor.toml"))}
+    assert {name for name, row in identifiable.items() if not row.identifiable} == {"R"}
+    last = reports(folder, "bench.toml", "bench")[-1]
+    for name, truth in BENCH.items():
+        known = last.parameters[name]
+        assert known.low is not None
+        assert known.high is not None
+        assert known.low <= truth <= known.high
+        assert known.high - known.low < 0.03 * truth
+    assert not last.components
+
+
+def test_a_resistance_that_is_too_large_makes_the_others_too_small(folder: Path) -> None:
+    wrong = (folder / "bench.toml").read_text(encoding="utf-8") + '\n[parameters]\nR = "5.5 ohm"\n'
+    (folder / "bench-wrong.toml").write_text(wrong, encoding="utf-8")
+    last = reports(folder, "bench-wrong.toml", "bench")[-1]
+    expected = {"K": BENCH["K"], "J": BENCH["J"] / 1.1, "T_c": BENCH["T_c"] / 1.1}
+    for name, value in expected.items():
+        assert last.parameters[name].value == pytest.approx(value, rel=0.02)
+
+
+def test_the_delay_of_a_speed_from_counts_is_identified(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (folder / "bench.toml").read_text(encoding="utf-8")
+    (folder / "bench-late.toml").write_text(text.replace(', delay = "10 ms"', ""), encoding="utf-8")
+    printed_text = printed(folder, "noise bench-late.toml bench.csv", monkeypatch)
+    (delay,) = re.findall(r'speed = \{ delay = "([\d.]+) ms" \}', printed_text)
+    assert float(delay) == pytest.approx(10.0, abs=1.0)
+
+
+def test_more_friction_is_followed_and_no_sensor_is_blamed(folder: Path) -> None:
+    documents = reports(folder, "bench.toml", "worn")
+    change = next(at for at, document in enumerate(documents) if document.window.end > 20.01)
+    for document in documents[change + SETTLED :]:
+        friction = document.parameters["T_c"]
+        assert friction.low is not None
+        assert friction.high is not None
+        assert friction.low <= 0.0125 <= friction.high
+    assert not [finding for document in documents for finding in document.findings if finding.subject == SENSORS]

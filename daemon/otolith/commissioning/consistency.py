@@ -20,6 +20,8 @@ SIGNIFICANCE = 0.05  # probability of a larger chi-square by chance, below which
 MAX_FACTOR = 1e4  # on process noise
 BRACKET_RATIO = 2.0  # between successive factors until they enclose the solution
 FACTOR_TOLERANCE = 0.01  # of the factor's logarithm
+MAX_OUTLYING_SHARE = 0.2  # of the windows: more of them are no exceptions
+OUTLYING = 4.75  # standard deviations from which on a window is not one of the machine that the others show
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,36 @@ def consistency_test(fits: Fits, width: Array) -> ChiSquareTest:
     degrees = len(stacked) - int(rank)
     deviations = stacked @ mean - whitened
     return ChiSquareTest(float(deviations @ deviations) / degrees if degrees else float("nan"), degrees)
+
+
+def outlyingness(fits: Fits, index: int, width: Array) -> float:
+    """By how many standard deviations chance fails to explain window ``index`` if the machine is that of the others.
+
+    That is the larger of two: of its innovations, and of its distance from the weighted mean of the others, whose
+    uncertainty counts as well.
+    """
+    fit, others = fits[index], [*fits[:index], *fits[index + 1 :]]
+    free = fit.objective.free
+    deviate = _normal_deviate(fit.result.chi_square, int(fit.objective.count))
+    # Without the reduction by large residuals, which would make a misfit look uncertain instead of improbable.
+    own = sqrt_information(fit, width) * max(fit.cost, 1.0)
+    roots = [sqrt_information(other, width) for other in others]
+    stacked = np.vstack(roots)
+    if not len(own) or not len(stacked):
+        return deviate
+    estimates = [root @ (other.guess[:free] / width[:free]) for root, other in zip(roots, others, strict=True)]
+    mean = np.linalg.lstsq(stacked, np.concatenate(estimates), rcond=None)[0]
+    distance = own @ (fit.guess[:free] / width[:free] - mean)
+    # The bounds are the prior, so that what the others do not determine is uncertain.
+    uncertainty = np.linalg.inv(stacked.T @ stacked + np.eye(free))
+    chi_square = distance @ np.linalg.solve(np.eye(len(own)) + own @ uncertainty @ own.T, distance)
+    return max(deviate, _normal_deviate(float(chi_square), len(own)))
+
+
+def _normal_deviate(chi_square: float, degrees: int) -> float:
+    """Standard normal deviate of the same probability (E. B. Wilson, M. M. Hilferty, PNAS 17, 1931)."""
+    spread = 2.0 / (9.0 * degrees)
+    return float((np.cbrt(chi_square / degrees) - 1.0 + spread) / np.sqrt(spread))
 
 
 def sqrt_information(fit: FittedWindow, width: Array) -> Array:

@@ -13,7 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Verdict, Window
-from otolith.commissioning.consistency import consistency_test, inflate_process_noise, sqrt_information
+from otolith.commissioning.consistency import (
+    MAX_OUTLYING_SHARE,
+    OUTLYING,
+    consistency_test,
+    inflate_process_noise,
+    outlyingness,
+    sqrt_information,
+)
 from otolith.commissioning.likelihood import (
     Fits,
     FittedWindow,
@@ -53,6 +60,10 @@ NOT_SIGNIFICANT = "not significant: up to about {:.1g} {} per square root of a s
 NO_WINDOW = "no window can be used: nothing was identified"
 EXCLUDED = "windows excluded because they are badly sampled, too short, or the twin cannot follow them: {} of {}"
 EXCLUDED_AT_REST = "windows excluded because nothing moves in them: {} of {}"
+EXCLUDED_OUTLYING = (
+    "windows excluded because they contradict all others: {} of {}, from {}: a standstill, a disturbance or a change "
+    "of the machine; the levels do not hold there"
+)
 ONE_WINDOW = "consistency of windows: not tested, as there is only one window"
 NOT_COMPARABLE = "consistency of windows: not tested, as no two windows determine the same parameters"
 CONSISTENT = "consistency of windows: they scatter as their uncertainties predict"
@@ -131,7 +142,7 @@ def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progre
         states = (NoiseLevel(state.name, level) for state, level in zip(twin.states, process, strict=True))
         return IdentifiedNoise(tuple(outputs), tuple(states), guess.remarks)
     best = backward_elimination(guess.variances, guess.fits, progress)
-    consistency, levels, inflated = _make_consistent(guess, best, progress)
+    guess, best, consistency, levels, inflated = _without_outlying(guess, best, progress)
     return IdentifiedNoise(
         outputs=tuple(_output_levels(twin, guess, best)),
         states=tuple(_state_levels(twin, guess, best, levels, consistency.degrees)),
@@ -198,6 +209,39 @@ def _first_fits(
         fits.append(fit)
         starts = [problem.nominal, fit.guess[: len(problem.free)]]
     return fits
+
+
+def _without_outlying(
+    guess: _InitialGuess, best: LikelihoodPoint, progress: Progress
+) -> tuple[_InitialGuess, LikelihoodPoint, Consistency, Array, Fits]:
+    """The same without the few windows that no noise of the others explains, and what :func:`_make_consistent` returns.
+
+    One window in which the machine sticks, or somebody touches it, would otherwise be explained by process noise that
+    hides what the other windows show.
+    """
+    likelihood, outlying = guess.variances.likelihood, list[FittedWindow]()
+    made = _make_consistent(guess, best, progress)
+    limit = int(MAX_OUTLYING_SHARE * len(guess.fits))
+    while len(outlying) < limit:
+        scores = [outlyingness(best.fits, index, likelihood.width) for index in range(len(best.fits))]
+        index = int(np.argmax(scores))
+        if made[0].factor == 1.0 and scores[index] < OUTLYING:
+            break
+        first = [*guess.fits[:index], *guess.fits[index + 1 :]]
+        progress(f"without the window at {best.fits[index].window.start:g} s")
+        # From the first fits, as those at levels that this window has spoilt may be at another minimum.
+        others = backward_elimination(guess.variances, first, progress)
+        made_of_others = _make_consistent(guess, others, progress)
+        fits = likelihood.refit(made_of_others[1], [best.fits[index], *others.fits])
+        if outlyingness(fits, 0, likelihood.width) < OUTLYING:
+            break
+        outlying.append(fits[0])
+        guess, best, made = replace(guess, fits=first), others, made_of_others
+    if outlying:
+        starts = ", ".join(f"{round(start, 6) + 0.0:g} s" for start in sorted(fit.window.start for fit in outlying))
+        remark = EXCLUDED_OUTLYING.format(len(outlying), len(outlying) + len(guess.fits), starts)
+        guess = replace(guess, remarks=(*guess.remarks, remark))
+    return guess, best, *made
 
 
 def _make_consistent(

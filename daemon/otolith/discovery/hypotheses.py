@@ -426,7 +426,8 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
         component = problem.components[-1]
         site = site_of(twin, component.site)
         error = float(values[indices(problem, len(problem.components) - 1)[0]])
-        off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g} {site.unit}"
+        unit = "" if site.unit == "1" else f" {site.unit}"
+        off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g}{unit}"
         return f"{site.into} reads {off} off: look at the sensor and its scale"
     return "; ".join(
         f"{component.site}: {equation(twin, component, values[indices(problem, slot)].tolist())}"

@@ -18,7 +18,7 @@ import numpy as np
 from otolith.acquisition.quality import ReasonCounts
 from otolith.acquisition.recording_statistics import RecordingStatistics, SignalSampling
 from otolith.acquisition.samples import Check, SignalPlan
-from otolith.acquisition.window import Verdict, Window
+from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.estimation.information import QUANTILE, AccuracyTarget, Identifiability, classify, information
 from otolith.estimation.objective import Objective, adc_step
@@ -37,6 +37,9 @@ MAX_PERIOD_ERROR = 0.02  # share by which the sample period may differ from the 
 MAX_LENGTHENING = 10.0  # times the length of a window: a parameter that needs more needs another experiment
 MIN_PROPOSED_WINDOWS = 3  # windows of the proposed length that the recording has at least
 MIN_REMARKED_JITTER = 0.5  # of the interval: a larger jitter is remarked
+MIN_LEVELS = 20  # different values of a signal, below which the ends of its range are steps of its converter
+MIN_AT_END = 0.02  # share of the samples at one end of the range that is remarked,
+MIN_END_RATIO = 5.0  # if it is larger than that of the values next to it by this factor
 WIDTH = 80  # columns of a terminal
 
 Item = TypeVar("Item")
@@ -388,9 +391,23 @@ def _remarks(
             remarks += _renewal_remarks(sampling)
         if plan.hold is None and sampling.samples > 1 and not np.ptp(sampling.values):
             remarks.append("the value never changes, so it determines no parameter")
+        if plan.hold != "zoh":  # a command is often at the end of its range
+            remarks += _end_remarks(sampling.values)
         for remark in remarks:
             shared.setdefault(remark, []).append(plan.name)
     yield from (f"{', '.join(names)}: {remark}" for remark, names in shared.items())
+
+
+def _end_remarks(values: Array) -> Iterator[str]:
+    """Yield at which end of its range a measurement stays, as a saturated sensor does; zero is a machine at rest."""
+    levels, counts = np.unique(values, return_counts=True)
+    if len(levels) < MIN_LEVELS:
+        return
+    for name, at, near in (("smallest", 0, slice(1, 4)), ("largest", -1, slice(-4, -1))):
+        share = counts[at] / len(values)
+        if levels[at] and share >= MIN_AT_END and counts[at] > MIN_END_RATIO * counts[near].mean():
+            exactly = f"{share:.0%} of the samples have exactly its {name} value, {levels[at]:.4g}"
+            yield f"{exactly}: if the sensor ends there, leave these cells blank"
 
 
 def _renewal_remarks(sampling: SignalSampling) -> Iterator[str]:
