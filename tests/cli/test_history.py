@@ -184,3 +184,13 @@ def test_a_history_of_another_version_is_not_read(written: HistoryWriter) -> Non
     error = run(MACHINE).exception
     assert isinstance(error, ConfigurationError)
     assert "version 99" in str(error)
+
+
+def test_an_instance_of_the_service_has_its_own_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """docs/service.md: the name of the machine file; the machine in it may have another one."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "line-7"))
+    request.getfixturevalue("written")
+    assert run("line-7", "--since", "1d").output == run(MACHINE, "--since", "1d").output != ""
+    assert "no history of a machine 'line-8'" in str(run("line-8").exception)

@@ -28,7 +28,7 @@ work=$(mktemp -d)
 trap 'rm -rf --one-file-system "$work"' EXIT
 export SHARE=$share DISK=$work/disk
 boot() { tests/vm/run.sh "$@" || code=1; }
-boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py tests/vm/test_life.py \
+SECONDS_AT_MOST=1800 boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py tests/vm/test_life.py \
   tests/vm/test_troubles.py tests/vm/test_boots.py::test_before_a_reboot
 boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_reboot '&&' python -m tests.vm.cut_power
 boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_power_cut

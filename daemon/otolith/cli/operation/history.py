@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import shlex
 import sys
@@ -99,7 +100,7 @@ def history(
 
 
 def reader_of(machine: str) -> "HistoryReader":
-    """Return the history of a machine file, or of a machine by its name.
+    """Return the history of a machine file, or of a machine by its name or that of its instance of the service.
 
     Raises:
         ConfigurationError: the file is wrong, or there is no history, or several, of that name.
@@ -113,7 +114,8 @@ def reader_of(machine: str) -> "HistoryReader":
         names = load_machine(Path(machine), with_driver=False).file.machine
         return HistoryReader(history_path(names.site, names.name))
     known = [HistoryReader(path) for path in sorted(history_directory().glob(f"*{SUFFIX}"))]
-    chosen = [reader for reader in known if reader.machine == machine]
+    is_instance = Path(os.environ.get("STATE_DIRECTORY", "")).name == machine  # which systemd names so
+    chosen = [reader for reader in known if reader.machine == machine or is_instance]
     if not chosen:
         hint = nearest(machine, [reader.machine for reader in known])
         raise ConfigurationError(f"no history of a machine {machine!r} in {history_directory()}: {hint}")
