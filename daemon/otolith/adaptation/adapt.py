@@ -93,9 +93,7 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
     is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
-    values = np.array([own.value for own in estimated.parameters])
-    sd = np.array([own.sd for own in estimated.parameters])
-    shifts = state.shifts.after(predicted.shifts(values, sd, estimated.fit.window.grid.length))
+    shifts = _shifts(state, predicted, estimated)
     moved = shifts.moved
     is_calm = is_expected and not screening.is_positive
     test = None if state.test is None else continue_test(state.test, predicted, screening).with_filter(estimated.fit)
@@ -117,6 +115,15 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
         else:
             result = _apply_decision(state, predicted, estimated, test)
     return replace(result, searched=True, shifts=shifts)
+
+
+def _shifts(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> ParameterCusum:
+    """Return the sums of shifts after a window; estimates without trends are biased where a parameter drifts fast."""
+    if estimated.drifts:
+        return state.shifts
+    values = np.array([own.value for own in estimated.parameters])
+    sd = np.array([own.sd for own in estimated.parameters])
+    return state.shifts.after(predicted.shifts(values, sd, estimated.fit.window.grid.length))
 
 
 def _apply_decision(

@@ -326,10 +326,8 @@ def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple
     latest = int(measured[-MIN_RECORDS_AFTER]) if len(measured) >= MIN_RECORDS_AFTER else 0
     first = min(onset, latest)
     later, rest = _advance_phases(predicted, window, first), window.since(first)
-    problem, prior = later.problem, later.prior()
-    if onset > latest:
-        return later, fit_hypotheses([nothing_happened(problem, prior)], rest)
-    return later, search(screening_test(linearised(problem, rest, prior, prior.mean)))
+    (null,) = fit_hypotheses([nothing_happened(later.problem, later.prior())], rest)
+    return later, [null] if onset > latest else search(screening_test(null.fit))
 
 
 def find_onset(predicted: Posterior, window: Window) -> int:
