@@ -231,7 +231,8 @@ def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:
     test = result.test
     if test is None or result.posterior.problem.free != problem.free:
         return result
-    wrong = test.filter_probability if result.is_explained else max(test.filter_probability, WRONG_WINDOW)
+    is_sure = result.is_explained and test.settled > 1  # one window alone is as likely to be wrong itself
+    wrong = test.filter_probability if is_sure else max(test.filter_probability, WRONG_WINDOW)
     mixed = mixture(test.hypotheses, test.probabilities, problem, result.after, wrong)
     return replace(result, before=mixed, after=mixed, is_mixture=True)
 
