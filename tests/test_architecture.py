@@ -18,6 +18,7 @@ SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root
 MAX_FILE_LINES = 600
 # Room for history, security, recordings, several sources and their commands: beyond it something must be replaced.
 MAX_SOURCE_LINES = 33_060
+MAX_MODULES = 190  # in daemon and drivers
 MAX_MODULES_IN_A_FOLDER = 12
 MAX_LAYERS = 13
 
