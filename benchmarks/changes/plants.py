@@ -99,8 +99,8 @@ class Change:
 
     def grown(self, values: Mapping[str, float], time: float) -> dict[str, float]:
         """Return the parameters of the machine at ``time`` (s since the first record), of healthy ones."""
-        own = {**values, **self.parameters}
-        return own | {name: own[name] * (1.0 + rate * (time - self.since)) for name, rate in self.ramps.items()}
+        own, elapsed = {**values, **self.parameters}, max(time - self.since, 0.0)
+        return own | {name: own[name] * (1.0 + rate * elapsed) for name, rate in self.ramps.items()}
 
     def measured(self, name: str, values: Array) -> Array:
         """Return what the sensor of a signal shows without noise."""

@@ -65,9 +65,13 @@ def summarise(step: Step, runs: Sequence[Sequence[Observed]]) -> dict[str, Any]:
 
 
 def _is_sensor(window: Observed) -> bool:
-    """Whether a sensor is the most probable hypothesis of the report; equal probabilities are a class."""
+    """Whether a sensor is the most probable hypothesis of the report; equal probabilities are a class.
+
+    Hypotheses that parameters moved share the probability of their member of the class.
+    """
     if window.decision is WindowDecision.SENSOR:
         return True
-    rivals = [item.probability for item in window.stated if item.reason != "SENSOR"]
+    moved = sum(item.probability for item in window.stated if item.reason == "PARAMETER")
+    rivals = [item.probability for item in window.stated if item.reason not in ("PARAMETER", "SENSOR")]
     best = max((item.probability for item in window.stated if item.reason == "SENSOR"), default=0.0)
-    return best > max(rivals, default=0.0) + EQUAL
+    return best > max(moved, *rivals, 0.0) + EQUAL

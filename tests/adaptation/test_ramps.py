@@ -64,6 +64,16 @@ def test_a_drift_from_before_the_first_window_is_covered_and_no_step() -> None:
     assert coverage([window.parameters["D_l"] for window in reports]).reaches(0.9)
 
 
+def test_estimates_without_trends_of_a_parameter_on_a_fast_ramp_are_no_step() -> None:
+    at = 7
+    ramp = Change(ramps={"D_l": -0.03}, since=at * TWO_MASS.records * TWO_MASS.period)
+    case = Case("ramp", TWO_MASS, ramp, healthy=at, changed=9)
+    late = [report for reports in observe(case, range(4), 3) for report in reports[at + 3 :]]
+    assert all(report.components == () for report in late)
+    assert all(report.decision is not WindowDecision.SENSOR for report in late)
+    assert coverage([report.parameters["D_l"] for report in late]).reaches(0.9)
+
+
 def test_a_parameter_that_moved_along_a_ramp_and_stopped_is_no_component() -> None:
     """What follows the ramp contradicts its end; that the parameter has moved is still a hypothesis."""
     window = PUMP.records * PUMP.period

@@ -124,7 +124,11 @@ def test_windows_without_an_interval_do_not_count_as_held(
 
 @pytest.mark.parametrize(
     ("hypotheses", "met"),
-    [(stated(u=0.5, k_v=0.5), True), (stated(u=0.6, k_v=0.4), False), (stated(u=0.4, k_v=0.6), True)],
+    [
+        *((stated(u=0.5, k_v=0.5), True), (stated(u=0.6, k_v=0.4), False), (stated(u=0.4, k_v=0.6), True)),
+        ([*stated(u=0.5, k_v=0.47), Stated("PARAMETER", "h_0, k_v", 0.03)], True),
+        ([*stated(u=0.5, k_v=0.30), Stated("COMPONENT", "pipe: 0.1·Q Pa", 0.2)], False),
+    ],
 )
 def test_a_step_must_not_make_a_sensor_the_most_probable_hypothesis(hypotheses: list[Stated], met: bool) -> None:
     step = next(step for step in steps.steps(0, 4) if step.case.name == "dc_motor: R_a +20%")

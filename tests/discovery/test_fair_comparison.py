@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from benchmarks.changes import classes
-from benchmarks.changes.machines import ONE_MASS, TWO_MASS
+from benchmarks.changes.machines import DC_MOTOR, ONE_MASS, PUMP, TWO_MASS
 from benchmarks.changes.observe import Case, observe, recordings
-from benchmarks.changes.plants import Change
+from benchmarks.changes.plants import Change, Term
 
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
@@ -68,3 +68,27 @@ def test_a_step_of_the_head_curve_and_a_loss_of_head_are_a_class_without_the_oth
     (trial,) = (own for own in classes.trials(5, 5) if own.case.name == f"h_0 / constant head: {truth}")
     outcomes = [classes.judge(trial, run) for run in observe(trial.case, [0, 1], 1)]
     assert all(outcome.right for outcome in outcomes), outcomes
+
+
+@pytest.mark.parametrize("names", [("K_t", "K_e"), ("J", "L_a")])
+def test_two_known_parameters_that_move_at_once_are_no_components(names: tuple[str, str]) -> None:
+    """As of magnets that weaken: the estimated parameters stay as they are, and what has moved is named."""
+    old = DC_MOTOR.parameters
+    change = Change(parameters={name: 1.1 * old[name] for name in names})
+    (reports,) = observe(Case("two", DC_MOTOR, change, ("R_a", "D"), healthy=6, changed=5), [0], 1)
+    for report in reports[6:]:
+        best = report.stated[0]
+        assert report.components == ()
+        assert report.decision is WindowDecision.SUSPECTED
+        assert (best.reason, set(best.text.split(", "))) == ("PARAMETER", set(names))
+        assert all(report.parameters[name].holds_truth for name in ("R_a", "D"))
+
+
+def test_a_parameter_that_moves_beside_a_known_one_is_followed() -> None:
+    """A constant pressure is the static one; a component of another shape must not take its place."""
+    change = Change(parameters={"k_v": 1.15 * PUMP.parameters["k_v"]}, terms={"pipe": Term("constant", amplitude=-6e3)})
+    (reports,) = observe(Case("two", PUMP, change, healthy=6, changed=5), [0], 1)
+    for report in reports[7:]:
+        assert report.components == ()
+        assert report.stated[0].text == "p_static, k_v"
+        assert all(own.holds_truth for own in report.parameters.values())

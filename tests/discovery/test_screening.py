@@ -5,13 +5,24 @@ from functools import cache
 
 import numpy as np
 import pytest
+from benchmarks.changes.machines import TWO_MASS
+from benchmarks.changes.observe import Case, recordings
+from benchmarks.changes.plants import Change
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
-from otolith.discovery.hypotheses import FaultType
+from otolith.discovery import search
+from otolith.discovery.hypotheses import FaultType, FittedHypothesis
 from otolith.discovery.linear_response import PROBES, LinearResponse, basis_functions
-from otolith.discovery.screening import COARSE, allowed_forms, inner_grid
+from otolith.discovery.screening import (
+    COARSE,
+    DECISIVE,
+    ScreeningResult,
+    allowed_forms,
+    inner_grid,
+    screen_window,
+)
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
@@ -148,3 +159,29 @@ def test_a_healthy_window_at_1_khz_needs_little_memory(name: str) -> None:
     finally:
         tracemalloc.stop()
     assert peak < MAX_BYTES
+
+
+def test_after_an_onset_the_linear_response_is_that_of_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The twist of a shaft is not measured, so that a fit starts far from where it ends."""
+    onset = 5.1 * TWO_MASS.records * TWO_MASS.period
+    ramp = Change(ramps={"k_s": 0.05}, since=onset)
+    case = Case("onset", TWO_MASS, ramp, healthy=5, changed=1)
+    (recorded,) = recordings(case, case.problem, [1], 3)
+    state = initial_state("two_mass", "bench", case.problem)
+    for window in recorded[:-1]:
+        state, _ = adapt(state, window)
+    predicted = state.posterior.predict(recorded[-1])
+    screening = screen_window(predicted, estimate_window(predicted, recorded[-1]), determined=True)
+    responses: list[LinearResponse] = []
+
+    whole = search.search
+
+    def searched(again: ScreeningResult) -> list[FittedHypothesis]:
+        responses.append(again.response)
+        return whole(again)
+
+    monkeypatch.setattr(search, "search", searched)
+    _, fitted = search.search_from_onset(predicted, screening)
+    assert fitted[0].fit.window.start > onset
+    error = responses[0].chi_square - fitted[0].chi_square
+    assert error <= DECISIVE * fitted[0].chi_square / fitted[0].fit.count

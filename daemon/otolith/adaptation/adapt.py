@@ -93,9 +93,7 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
     is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
-    values = np.array([own.value for own in estimated.parameters])
-    sd = np.array([own.sd for own in estimated.parameters])
-    shifts = state.shifts.after(predicted.shifts(values, sd, estimated.fit.window.grid.length))
+    shifts = _shifts(state, predicted, estimated)
     moved = shifts.moved
     is_calm = is_expected and not screening.is_positive
     test = None if state.test is None else continue_test(state.test, predicted, screening).with_filter(estimated.fit)
@@ -117,6 +115,15 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
         else:
             result = _apply_decision(state, predicted, estimated, test)
     return replace(result, searched=True, shifts=shifts)
+
+
+def _shifts(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> ParameterCusum:
+    """Return the sums of shifts after a window; estimates without trends are biased where a parameter drifts fast."""
+    if estimated.drifts:
+        return state.shifts
+    values = np.array([own.value for own in estimated.parameters])
+    sd = np.array([own.sd for own in estimated.parameters])
+    return state.shifts.after(predicted.shifts(values, sd, estimated.fit.window.grid.length))
 
 
 def _apply_decision(
@@ -224,7 +231,8 @@ def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:
     test = result.test
     if test is None or result.posterior.problem.free != problem.free:
         return result
-    wrong = test.filter_probability if result.is_explained else max(test.filter_probability, WRONG_WINDOW)
+    is_sure = result.is_explained and test.settled > 1  # one window alone is as likely to be wrong itself
+    wrong = test.filter_probability if is_sure else max(test.filter_probability, WRONG_WINDOW)
     mixed = mixture(test.hypotheses, test.probabilities, problem, result.after, wrong)
     return replace(result, before=mixed, after=mixed, is_mixture=True)
 

@@ -83,7 +83,7 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     if best.cost > MAX_COST:
         return WindowOutcome(WindowDecision.REFUSED, best)
     if test.is_ambiguous:
-        several = test.windows >= AMBIGUOUS_WINDOWS
+        several = test.settled >= AMBIGUOUS_WINDOWS
         return WindowOutcome(WindowDecision.AMBIGUOUS if several else WindowDecision.SUSPECTED, best)
     agreed = test.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
     if best.type is FaultType.NOISE and agreed:

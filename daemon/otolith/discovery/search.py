@@ -43,6 +43,7 @@ from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delayable, largest_delay, trial_delays
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.augmentation import MAX_COMPONENTS
+from otolith.twin.definition import Parameter
 
 ROUNDS, STEPS_OF_ROUND = 5, 5  # of Gauss-Newton for a hypothesis
 FAR_WORSE = 10.0  # times the least χ² of all candidates: one that leaves more after a round is not fitted further
@@ -140,6 +141,8 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     noisier = noisier_sensors(fitted[0])
     fitted += [] if noisier is None else [noisier]
     fitted += late_signals(fitted[0], screening.response)
+    if _convincing(fitted) is None:
+        fitted += _several_moved(fitted)
     components = [item for item in fitted if item.type is FaultType.COMPONENT]
     best = min(components, key=_chi_square, default=None)
     while best is not None and len(best.problem.components) < MAX_COMPONENTS and _convincing(fitted) in (None, best):
@@ -230,28 +233,66 @@ def _convincing(fitted: list[FittedHypothesis]) -> FittedHypothesis | None:
 
 def _one_parameter_moved(problem: Problem, prior: Prior, response: LinearResponse) -> list[Proposal]:
     """Propose that one parameter, estimated or known, has moved: those that would explain most."""
+    return [_moved(problem, prior, name, number) for name, number in _would_explain_most(problem, response)]
+
+
+def _would_explain_most(problem: Problem, response: LinearResponse) -> list[tuple[str, int]]:
+    """Return the labels of the parameters that would explain most if they moved, and how many are considered."""
+    labels = [*(item.label for item in problem.free), *(item.name for item in _given(problem))]
+    names = [*(item.name for item in problem.free), *labels[len(problem.free) :]]
+    gains = response.score_parameters(names)
+    leading = np.argsort(-gains, kind="stable")[:MAX_MOVED].tolist()
+    return [(labels[at], len(labels)) for at in leading if gains[at] > MIN_MOVED_SHARE * gains.max(initial=0.0)]
+
+
+def _given(problem: Problem) -> list[Parameter]:
+    """Return the parameters that the machine file gives as known, within their bounds."""
     known = dict(problem.known)
-    given = [
+    return [
         replace(parameter, nominal=known[parameter.name])
         for parameter in problem.base_model.parameters
         if parameter.name in known and parameter.low < known[parameter.name] < parameter.high
     ]
-    parameters = [*problem.free, *given]
-    gains = response.score_parameters([parameter.name for parameter in parameters])
-    proposals = []
-    for index in np.argsort(-gains, kind="stable")[:MAX_MOVED].tolist():
-        if gains[index] <= MIN_MOVED_SHARE * gains.max(initial=0.0):
-            continue
-        parameter = parameters[index]
-        moved = FaultHypothesis(FaultType.PARAMETER, parameter.label, 1, float(len(parameters)))
-        if index < len(problem.free):
-            proposals.append(Proposal(moved, problem, forget_parameter(prior, problem, index), prior.mean))
-        else:
-            rest = tuple(pair for pair in problem.known if pair[0] != parameter.name)
-            wider = replace(problem, free=(*problem.free, parameter), known=rest)
-            extended = forget_parameter(extend_prior(prior, problem, wider), wider, len(problem.free))
-            proposals.append(Proposal(moved, wider, extended, extended.mean))
-    return proposals
+
+
+def _moved(
+    problem: Problem, prior: Prior, label: str, alternatives: float, before: FittedHypothesis | None = None
+) -> Proposal:
+    """Return the hypothesis that a parameter has moved, and those of the fit ``before``, which is of ``problem``."""
+    start = prior.mean if before is None else np.array(before.fit.parameters)
+    labels = [label] if before is None else [*before.name.split(", "), label]
+    order = [item.name for item in problem.base_model.parameters]
+    name = ", ".join(sorted(labels, key=lambda own: order.index(own) if own in order else len(order)))
+    added, others = (0, 1.0) if before is None else (before.hypothesis.added, before.hypothesis.alternatives)
+    stated = FaultHypothesis(FaultType.PARAMETER, name, added + 1, others * alternatives)
+    free = [item.label for item in problem.free]
+    if label in free:
+        return Proposal(stated, problem, forget_parameter(prior, problem, free.index(label)), start)
+    parameter = next(item for item in _given(problem) if item.name == label)
+    rest = tuple(pair for pair in problem.known if pair[0] != label)
+    wider = replace(problem, free=(*problem.free, parameter), known=rest)
+    extended = forget_parameter(extend_prior(prior, problem, wider), wider, len(problem.free))
+    return Proposal(stated, wider, extended, np.append(start[: len(problem.free)], parameter.nominal))
+
+
+def _several_moved(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
+    """Fit the hypotheses that further parameters have moved beside the best single one, one more at a time.
+
+    Without them a component would take the place of a second known parameter.
+    """
+    single = [item for item in fitted if item.type is FaultType.PARAMETER and item.hypothesis.added == 1]
+    count = fitted[0].fit.count
+    best, more = min(single, key=_chi_square, default=None), list[FittedHypothesis]()
+    while best is not None and best.fit.cost > EXPLAINED and best.hypothesis.added < MAX_MOVED:
+        response = LinearResponse(best.fit.linearised_at_end())
+        named = [row for row in _would_explain_most(best.problem, response) if row[0] not in best.name.split(", ")]
+        proposals = [_moved(best.problem, best.fit.prior, label, number, best) for label, number in named]
+        further = min(fit_hypotheses(proposals, best.fit.window, FAR_WORSE), key=_chi_square, default=None)
+        if further is None or best.deviance(count, 1.0) - further.deviance(count, 1.0) <= DECISIVE:
+            break
+        more.append(further)
+        best = further
+    return more
 
 
 def _with_another_component(best: FittedHypothesis) -> FittedHypothesis | None:
@@ -326,10 +367,8 @@ def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple
     latest = int(measured[-MIN_RECORDS_AFTER]) if len(measured) >= MIN_RECORDS_AFTER else 0
     first = min(onset, latest)
     later, rest = _advance_phases(predicted, window, first), window.since(first)
-    problem, prior = later.problem, later.prior()
-    if onset > latest:
-        return later, fit_hypotheses([nothing_happened(problem, prior)], rest)
-    return later, search(screening_test(linearised(problem, rest, prior, prior.mean)))
+    (null,) = fit_hypotheses([nothing_happened(later.problem, later.prior())], rest)
+    return later, [null] if onset > latest else search(screening_test(null.fit))
 
 
 def find_onset(predicted: Posterior, window: Window) -> int:

@@ -75,6 +75,8 @@ class SequentialTest:
     """Windows since the test was opened; hypotheses that a later search added are younger."""
     leading: int = 1
     """Consecutive windows in which the best hypothesis was the best."""
+    settled: int = 1
+    """Windows since a hypothesis of a new search took the lead."""
     last: FitSummary = FitSummary()
     """Of the last window."""
     clear: int = CLEAR_WINDOWS
@@ -244,8 +246,8 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     if test.windows > MAX_OPEN_WINDOWS:
         hypotheses = without_duplicates(hypotheses, interchangeable(hypotheses))
     leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
-    followed = replace(test, hypotheses=_screened(hypotheses, steps), leading=leading, last=last)
-    followed = replace(followed, filter_deviance=filter_deviance)
+    followed = replace(test, hypotheses=_screened(hypotheses, steps), leading=leading, settled=test.settled + 1)
+    followed = replace(followed, last=last, filter_deviance=filter_deviance)
     return replace(followed, clear=0 if followed.has_equal_causes else test.clear + 1)
 
 
@@ -327,8 +329,10 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     together = _best_of_each([*(item.worse_by(lead, lead) for item in test.hypotheses), *fresh.hypotheses])
     filter_deviance = test.filter_deviance + lead - min(item.deviance for item in together)
     hypotheses = _sorted(together)[: 2 * MAX_HYPOTHESES]
-    leading = test.leading if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
-    return replace(test, hypotheses=hypotheses, leading=leading, filter_deviance=filter_deviance)
+    joined = replace(test, hypotheses=hypotheses, filter_deviance=filter_deviance)
+    if any(item.posterior is joined.best.posterior for item in fresh.hypotheses):
+        return replace(joined, leading=1, settled=1)
+    return joined if joined.best.hypothesis.name == test.best.hypothesis.name else replace(joined, leading=1)
 
 
 def _best_of_each(tracked: Sequence[TrackedHypothesis]) -> list[TrackedHypothesis]:

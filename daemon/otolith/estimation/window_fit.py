@@ -184,6 +184,8 @@ class WindowEstimate:
     """Of the components, to the next window."""
     generations: int
     evaluations: int
+    drifts: bool = False
+    """Whether parameters that stay constant leave more of the window than those with trends."""
 
 
 class Search(Enum):
@@ -334,6 +336,7 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
         advance=phase_advance(problem, both.fit.window, last_state),
         generations=generations,
         evaluations=both.evaluations,
+        drifts=both.alone.chi_square > both.fit.window_chi_square + EQUALLY_GOOD * max(both.cost, 1.0) ** 2,
     )
 
 
