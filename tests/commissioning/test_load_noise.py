@@ -1,13 +1,15 @@
-"""Intervals of machines whose load is measured with noise that no machine file states: process noise contains it."""
+"""Machines whose load is measured with an error that no machine file states: process noise contains it."""
 
 import numpy as np
 import pytest
 from benchmarks.changes.healthy import MACHINES, Ageing, cases
-from benchmarks.changes.machines import in_twin_units
-from benchmarks.changes.observe import recordings
+from benchmarks.changes.machines import DC_MOTOR, in_twin_units
+from benchmarks.changes.observe import Case, recordings
+from benchmarks.changes.plants import HEALTHY, Plant
 
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Array, Window
 from otolith.commissioning.identification import identify_noise
+from otolith.commissioning.structure import remaining_structure
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
@@ -45,3 +47,24 @@ def test_identified_noise_makes_intervals_right_under_load_noise(machine: Ageing
 def test_intervals_are_too_narrow_if_nothing_states_the_noise_of_the_load(machine: Ageing) -> None:
     """The innovations of each window are too few to show it: noise must be identified."""
     assert min(coverage(machine, learned=False).values()) < 0.90
+
+
+def with_slow_load(random: np.random.Generator, plant: Plant, rows: dict[str, Array]) -> None:
+    """Hide a part of the load that changes slowly: 0.002 N*m, correlated over half a second."""
+    share, load = np.exp(-plant.period / 0.5), np.zeros(len(rows["T_load"]))
+    shocks = 0.002 * np.sqrt(1.0 - share**2) * random.standard_normal(len(load))
+    for record in range(1, len(load)):
+        load[record] = share * load[record - 1] + shocks[record]
+    rows["T_load"] = rows["T_load"] - load
+
+
+@pytest.mark.parametrize("seed", [0, 7])
+def test_a_slow_load_is_inconsistent_and_coloured_and_no_structure(seed: int) -> None:
+    """White process noise that explains its changes lets sines of low frequency gain; seed 7 has one."""
+    case = Case("slow load", DC_MOTOR, HEALTHY, healthy=24, changed=0, disturb=with_slow_load)
+    (windows,) = recordings(case, case.problem, [0], seed)
+    noise = identify_noise(case.problem, windows)
+    assert noise.consistency.factor is not None
+    assert noise.consistency.factor > 2.0
+    assert not all(row.is_white for row in noise.whiteness)
+    assert remaining_structure(case.problem, noise, windows) == []

@@ -41,6 +41,7 @@ SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by
 CHANCE_DEVIATE = 3.0  # standard deviations of χ² of the phases of further windows, which count as chance
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
 MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
+NEIGHBOURS = (2, 3, 4, 5)  # spectral lines beside a sine, with which its gain is compared
 MIN_SHARE = 0.5  # of the best score: a candidate with less only imitates the best
 AT_BOUND = 1e-3  # of an inner parameter: distance from a bound of the search at which it lies there
 
@@ -147,6 +148,23 @@ class PooledResponse(ProjectedResponse):
         shortest = min(float(np.ptp(part.x[form.source])) for part in self.parts)
         return replace(form, bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, np.finfo(float).tiny)), high))
 
+    def stands_out(self, guess: Guess) -> bool:
+        """Whether a sine gains more than its neighbours in the spectrum, as one with a phase in each window must.
+
+        Its amplitudes are positive whatever the noise. The ratio of its gain to the mean of its neighbours' has an F
+        distribution if it is coloured noise that is smooth over them (D. J. Thomson, Proceedings of the IEEE 70, 1982,
+        section XIII).
+        """
+        from scipy.special import fdtrc  # noqa: PLC0415 - only noise identification needs SciPy
+
+        form, frequency = guess
+        line = 2.0 * np.pi / min(float(np.ptp(part.x[form.source])) for part in self.parts)
+        around = frequency + line * np.array([step for step in NEIGHBOURS for step in (-step, step)])
+        guesses = [guess, *((form, float(value)) for value in around if value >= line)]
+        gains = np.sum([part.score(guesses).gain for part in self.parts], axis=0)
+        values, ratio = 2.0 * len(self.parts), float(gains[0] / gains[1:].mean())
+        return bool(fdtrc(values, values * (len(guesses) - 1), ratio) < SIGNIFICANCE)
+
     def amplitudes_of_windows(self, guess: Guess, amplitudes: Array) -> tuple[Array, Array]:
         """Return the amplitude (windows,) that each window gives, in the pooled phase, and the information on it."""
         columns = self.responses(basis_functions([guess]))
@@ -239,6 +257,8 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
     mean = float(shares @ values)
     sd = float(np.sqrt((shares**2 * (values - mean) ** 2).sum()))
     effective = 1.0 / float((shares**2).sum())
+    if pooled.is_restarted(form) and not pooled.stands_out((form, guess.inner)):
+        return None
     if effective <= 2.0 or abs(mean) < sd * float(stdtrit(effective - 1.0, 1.0 - SIGNIFICANCE)):
         return None
     columns = pooled.responses(basis_functions([(form, guess.inner)]))
