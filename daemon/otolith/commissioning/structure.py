@@ -38,7 +38,7 @@ from otolith.twin.component_families import SourceKind
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree
 SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance
-CHANCE_DEVIATE = 3.0  # standard deviations of χ² of the phases of further windows, which count as chance
+CHANCE_DEVIATE = 3.0  # standard deviations that count as chance: of χ² of further phases, of a parameter's value
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
 MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
 NEIGHBOURS = (2, 3, 4, 5)  # spectral lines beside a sine, with which its gain is compared
@@ -92,7 +92,37 @@ class PooledResponse(ProjectedResponse):
             column += basis.shape[1]
         self._remainder = np.concatenate(residuals)
         self._remainder = self._remainder - self._basis @ (self._basis.T @ self._remainder)
+        self._states, self._start = self._basis, fits[0].parameters
+        self._parameters, self._components = self._without_states(np.vstack(shared)), np.zeros((rows, 0))
+        self._innovations = self._remainder
         self.explain(np.vstack(shared))
+
+    def _without_states(self, columns: Array) -> Array:
+        return columns - self._states @ (self._states.T @ columns)
+
+    def is_within_bounds(self, guess: ScoredGuess) -> bool:
+        """Whether the parameters beside a component may be within their bounds.
+
+        A component that resembles what a parameter does may have any amplitude if the parameter makes up for it.
+        """
+        free = len(self._start)
+        columns = self.columns(guess)
+        design = np.hstack([self._parameters, -self._components, -self._without_states(columns)])
+        step = np.linalg.lstsq(design, -self._innovations, rcond=None)[0][:free]
+        variances = np.diag(np.linalg.pinv(design.T @ design, hermitian=True))[:free]
+        reach = CHANCE_DEVIATE * np.sqrt(np.maximum(variances, 0.0))
+        low, high = self.problem.bounds
+        return bool(((self._start + step + reach >= low) & (self._start + step - reach <= high)).all())
+
+    def columns(self, guess: ScoredGuess) -> Array:
+        """Return the responses to a component (residuals, columns)."""
+        columns = self.responses(basis_functions([(guess.form, guess.inner)]))
+        return self.by_window(columns) if self.is_restarted(guess.form) else columns
+
+    def add_component(self, columns: Array) -> None:
+        """Project out a component, and count it as one in what follows."""
+        self._components = np.hstack([self._components, self._without_states(columns)])
+        self.explain(columns)
 
     def explain(self, columns: Array) -> None:
         """Project out what ``columns`` (residuals, columns) explain."""
@@ -207,7 +237,12 @@ def remaining_structure(
     while len(structures) < MAX_COMPONENTS:
         guesses = best_guesses(pooled, allowed, CompetingForms.among(problem, allowed))
         best = max((guess.score for guess in guesses), default=0.0)
-        likely = (guess for guess in guesses if guess.score > max(DECISIVE, MIN_SHARE * best) and guess.is_readable)
+        threshold = max(DECISIVE, MIN_SHARE * best)
+        likely = [guess for guess in guesses if guess.score > threshold and guess.is_readable]
+        impossible = [guess.form for guess in likely if not pooled.is_within_bounds(guess)]
+        if impossible:
+            allowed = [form for form in allowed if form not in impossible]
+            continue
         structure = next(filter(None, (_structure(pooled, guess) for guess in likely)), None)
         if structure is None:
             break
@@ -261,8 +296,7 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
         return None
     if effective <= 2.0 or abs(mean) < sd * float(stdtrit(effective - 1.0, 1.0 - SIGNIFICANCE)):
         return None
-    columns = pooled.responses(basis_functions([(form, guess.inner)]))
-    pooled.explain(pooled.by_window(columns) if pooled.is_restarted(form) else columns)
+    pooled.add_component(pooled.columns(guess))
     first, second = guess.amplitudes
     periodic = len(form.model.phases) > 1
     twin = pooled.problem.base_model
