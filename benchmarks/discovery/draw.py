@@ -165,7 +165,7 @@ def detection_limit(structure: CandidateForm, inner: float, phase: float, landsc
 
 def _information(structure: CandidateForm, inner: float, phase: float, landscape: LinearResponse) -> float:
     """Information about the amplitude: gain of the fit per squared amplitude, independent of the noise."""
-    at_phase = replace(structure, model=replace(structure.model, phases=(phase,)))
+    at_phase = structure._replace(model=replace(structure.model, phases=(phase,)))
     curve = basis_functions([(at_phase, inner)])
     gains = landscape.score_responses(landscape.responses(curve), np.zeros((1, 2), dtype=np.int64))
     amplitude: float = gains.amplitudes[0, 0]

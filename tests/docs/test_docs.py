@@ -89,8 +89,8 @@ def test_ci_calls_the_readmes_test_command() -> None:
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
-        ("otolith.cli.main", {"numpy", "numba", "rerun", "pymoo", "pint", "can", "zenoh", "pydantic"}),
-        ("otolith.runtime.service", {"numba", "rerun", "pymoo", "sympy", "matplotlib"}),
+        ("otolith.cli.main", {"numpy", "numba", "rerun", "pymoo", "pint", "can", "zenoh", "pydantic", "asyncio"}),
+        ("otolith.runtime.service", {"numba", "rerun", "pymoo", "sympy", "matplotlib", "asyncio"}),
     ],
 )
 def test_nobody_loads_what_others_need(module: str, absent: set[str]) -> None:

@@ -8,7 +8,7 @@ does. The amplitudes of the windows must agree, which those of coloured noise do
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -176,7 +176,7 @@ class PooledResponse(ProjectedResponse):
             return form
         low, high = form.bounds
         shortest = min(float(np.ptp(part.x[form.source])) for part in self.parts)
-        return replace(form, bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, np.finfo(float).tiny)), high))
+        return form._replace(bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, np.finfo(float).tiny)), high))
 
     def stands_out(self, guess: Guess) -> bool:
         """Whether a sine gains more than its neighbours in the spectrum, as one with a phase in each window must.

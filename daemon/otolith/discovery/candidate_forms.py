@@ -8,8 +8,8 @@ equations.
 
 import ast
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +29,7 @@ TRIALS = 3  # random values of all quantities at which it is tested whether a pa
 PROBE = 1e-3  # in the unit of a site: difference that gives its coefficient; components enter linearly
 
 
-@dataclass(frozen=True, slots=True)
-class CandidateForm:
+class CandidateForm(NamedTuple):
     """A component without amplitude, inner parameter and phase."""
 
     site: int
@@ -43,18 +42,20 @@ class CandidateForm:
 
 
 @lru_cache(maxsize=64)
-def candidate_table(base: Definition) -> tuple[tuple[str, CandidateForm], ...]:
-    """Return the key and the form of every component that ``base``, a twin without slots, could have.
+def candidate_table(base: Definition, taken: frozenset[str]) -> tuple[CandidateForm, ...]:
+    """Return the form of every component that ``base``, a twin without slots, could have, but for keys in ``taken``.
 
     The bounds of inner parameters depend on the window, and so does which forms it can distinguish.
     """
     machine_sites = len(base.sites)
     return tuple(
-        (key_of(site.name, model.name, source.name), CandidateForm(index, model, number))
+        CandidateForm(index, model, number)
         for index, site in enumerate(sites(base))
         for model in COMPONENT_FAMILIES
         for number, source in enumerate(sources(base))
-        if source.kind in model.inputs and (index < machine_sites or _is_sensor_error(model, source, site.into))
+        if source.kind in model.inputs
+        and (index < machine_sites or _is_sensor_error(model, source, site.into))
+        and key_of(site.name, model.name, source.name) not in taken
     )
 
 

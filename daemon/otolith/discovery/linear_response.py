@@ -15,6 +15,7 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.discovery.candidate_forms import CandidateForm
+from otolith.estimation.data_checks import median
 from otolith.estimation.information import orthonormal_basis
 from otolith.estimation.objective import Objective, input_matrix
 from otolith.estimation.problem import Problem
@@ -59,10 +60,10 @@ def basis_functions(guesses: Iterable[Guess]) -> BasisFunctions:
     """Return one curve for each guess, or two a quarter turn apart where the phase is free."""
     shapes: dict[tuple[float, int, float, float], int] = {}
     curves = []
-    for form, inner in guesses:
-        code = family_code(form.model.name)
-        keys = [(code, form.source, inner, phase) for phase in form.model.phases]
-        curves += [(shapes.setdefault(key, len(shapes)), form.site) for key in keys]
+    for (site, model, source, _), inner in guesses:
+        code = family_code(model.name)
+        for phase in model.phases:
+            curves.append((shapes.setdefault((code, source, inner, phase), len(shapes)), site))  # noqa: PERF401
     families, source_indices, inners, phases = np.array(list(shapes), dtype=np.float64).reshape(-1, 4).T
     of_curves, site_indices = np.array(curves, dtype=np.int64).reshape(-1, 2).T
     return BasisFunctions(families, source_indices.astype(np.int64), inners, phases, of_curves, site_indices)
@@ -200,7 +201,7 @@ class LinearResponse(ProjectedResponse):
 
     def _input(self, index: int, values: Array) -> Array:
         """Return an input (records,); a constant where it varies by no more than its noise."""
-        noise = np.median(self.objective.noise.inputs[:, index])
+        noise = median(self.objective.noise.inputs[:, index])
         return values if values.std() > MIN_INPUT_VARIATION * noise else np.full(len(values), values.mean())
 
     def estimated_gains(self, source: int, frequencies: Array) -> Array:

@@ -3,6 +3,7 @@
 All allowed forms are scored by the linear response, on a grid of their inner parameters.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -92,10 +93,15 @@ def inner_grid(form: CandidateForm, x: Array, fineness: float) -> Array:
     if inner is None:
         return np.array([low])
     if inner.points:
-        points = max(round(inner.points / fineness**2), 2)
-        return np.exp(np.linspace(np.log(low), np.log(high), points))
+        return np.asarray(geometric_grids([form.bounds], inner.points, fineness)[0])
     width = fineness * 2.0 * np.pi / max(float(np.ptp(x[form.source])), 1e-9)  # of a spectral line
     return np.arange(low, high, width)
+
+
+def geometric_grids(bounds: list[tuple[float, float]], points: int, fineness: float) -> Array:
+    """Return values (forms, points) between the ``bounds`` of inner parameters with grids of so many ``points``."""
+    low, high = np.log(np.array(bounds)).T
+    return np.asarray(np.exp(np.linspace(low, high, max(round(points / fineness**2), 2), axis=1)))
 
 
 def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[CandidateForm]:
@@ -103,16 +109,15 @@ def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozen
 
     ``twin`` is the base model. Forms whose keys are ``taken`` are left out.
     """
-    ranges = [SourceRange.of(values) for values in x]
+    ranges = SourceRange.of_each(x)
     bounds: dict[tuple[str, int], tuple[float, float] | None] = {}
     library = []
-    for key, form in candidate_table(twin):
-        shape = form.model.name, form.source
+    for site, model, source, _ in candidate_table(twin, taken):
+        shape = model.name, source
         if shape not in bounds:
-            bounds[shape] = _inner_bounds(form.model, ranges[form.source])
-        within = bounds[shape]
-        if within is not None and key not in taken:
-            library.append(CandidateForm(form.site, form.model, form.source, within))
+            bounds[shape] = _inner_bounds(model, ranges[source])
+        if (within := bounds[shape]) is not None:
+            library.append(CandidateForm(site, model, source, within))
     return library
 
 
@@ -133,8 +138,12 @@ def allowed_forms(problem: Problem, x: Array) -> list[CandidateForm]:
     if len(problem.components) >= MAX_COMPONENTS:
         return []
     taken = problem.excluded | {component.key for component in problem.components}
-    forms = [form for form in candidate_library(twin, x, taken) if problem.discover or form.site >= len(twin.sites)]
+    forms = candidate_library(twin, x, taken)
+    if not problem.discover:
+        forms = [form for form in forms if form.site >= len(twin.sites)]
     friction = [component for component in problem.components if component.model.threshold_like]
+    if not friction:
+        return forms
     return [bounded for form in forms if (bounded := _beside_friction(twin, form, x, friction)) is not None]
 
 
@@ -158,19 +167,23 @@ def _beside_friction(
             low = max(low, MIN_HUMP * component.inner)
         elif abs(float((np.sign(x[source]) * np.sign(x[form.source])).mean())) > SAME_SIGN:
             return None
-    return replace(form, bounds=(low, high)) if low <= high else None
+    return form._replace(bounds=(low, high)) if low <= high else None
 
 
 def grid_guesses(response: ProjectedResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
     """Return all forms with all inner parameters of their grids, which the sites of a machine share."""
+    shapes = {(form.model.name, form.source): form for form in reversed(forms)}
     grids: dict[tuple[str, int], list[float]] = {}
-    guesses = []
-    for form in forms:
-        shape = form.model.name, form.source
-        if shape not in grids:
+    geometric: defaultdict[int, list[tuple[str, int]]] = defaultdict(list)
+    for shape, form in shapes.items():
+        if form.model.inner is not None and form.model.inner.points:
+            geometric[form.model.inner.points].append(shape)
+        else:
             grids[shape] = inner_grid(form, response.x, fineness).tolist()
-        guesses += [(form, inner) for inner in grids[shape]]
-    return guesses
+    for points, alike in geometric.items():
+        rows = geometric_grids([shapes[shape].bounds for shape in alike], points, fineness)
+        grids.update(zip(alike, rows.tolist(), strict=True))
+    return [(form, inner) for form in forms for inner in grids[form.model.name, form.source]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,8 +201,9 @@ class ScoredGuesses:
         """Score ``guesses`` by the linear response."""
         statistics = response.score(guesses)
         count = response.count
-        parameters = np.array([_parameter_count(form) for form, _ in guesses], dtype=np.float64)
-        counts = np.array([competing.of(form) for form, _ in guesses])
+        forms = {id(form): form for form, _ in guesses}  # far fewer than guesses
+        row_of = {key: (float(_parameter_count(form)), competing.of(form)) for key, form in forms.items()}
+        parameters, counts = np.array([row_of[id(form)] for form, _ in guesses]).reshape(-1, 2).T
         variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)
         scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * counts)
         return cls(guesses, statistics.amplitudes, np.asarray(scores))
@@ -237,11 +251,12 @@ def screen_window(predicted: Posterior, estimated: WindowEstimate, *, determined
 
     Of a very long window the last records are screened, so that a search ends before the next window.
     """
-    problem, prior, window = predicted.problem, predicted.prior(), estimated.fit.window
+    problem, window = predicted.problem, estimated.fit.window
     is_known = determined and not predicted.unknown_phases()
     is_long = window.records > MAX_RECORDS and not problem.components
     if is_known and not is_long:
         return screen_fit(estimated.fit)
+    prior = predicted.prior()
     start = prior.mean if is_known else np.array([parameter.value for parameter in estimated.parameters])
     recent = window.since(window.records - MAX_RECORDS) if is_long else window
     screening = screen_fit(linearised(problem, recent, prior, start))
@@ -286,8 +301,8 @@ def screen_fit(fitted: Fit) -> ScreeningResult:
     source_kinds = [source.kind for source in sources(problem.base_model)]
     forms = [
         form
-        for form in allowed_forms(problem, response.x)
-        if problem.discover and (len(form.model.phases) == 1 or source_kinds[form.source] is kind)
+        for form in (allowed_forms(problem, response.x) if problem.discover else [])
+        if len(form.model.phases) == 1 or source_kinds[form.source] is kind
     ]
     competing = CompetingForms.among(problem, forms)
     spectral = [form for form in forms if len(form.model.phases) > 1]

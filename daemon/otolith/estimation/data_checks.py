@@ -161,8 +161,8 @@ def spike_records(values: Array, noise: float, times: Array | None = None) -> Ma
     share = steps[1:] / (steps[:-1] + steps[1:])  # of the sample before in the line
     second = values[1:-1] - (share * values[:-2] + (1.0 - share) * values[2:])
     product = steps[:-1] * steps[1:]
-    spread = np.maximum(product / _median(product), 1.0)
-    usual = max(MAD_TO_SD * _median(np.abs(second)), SECOND_DIFFERENCE_SD * noise)
+    spread = np.maximum(product / median(product), 1.0)
+    usual = max(MAD_TO_SD * median(np.abs(second)), SECOND_DIFFERENCE_SD * noise)
     usual = max(usual, float(np.finfo(float).eps * np.abs(values).max()))  # of the rounding of numbers
     height = SPIKE_HEIGHT * max(usual, float(np.finfo(float).tiny))
     high = np.abs(second[1:-1]) > height * spread[1:-1]
@@ -177,7 +177,7 @@ def spike_records(values: Array, noise: float, times: Array | None = None) -> Ma
     return spikes
 
 
-def _median(values: Array) -> float:
+def median(values: Array) -> float:
     """Return the median of ``values`` (n,), which are finite, in a tenth of NumPy's time for a short window."""
     half = len(values) // 2
     low, high = np.partition(values, (half - 1, half))[half - 1 : half + 1].tolist()

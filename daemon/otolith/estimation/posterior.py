@@ -248,7 +248,7 @@ class Posterior:
 
 def _size(problem: Problem) -> Array:
     """Return the sizes (2 free,) of parameters and trends."""
-    return np.tile(problem.scale, 2)
+    return np.concatenate([problem.scale, problem.scale])
 
 
 def _advance_phase(belief: ImmPosterior, problem: Problem, slot: int, by: float) -> ImmPosterior:

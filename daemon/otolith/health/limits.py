@@ -31,7 +31,10 @@ class Level(StrEnum):
     @property
     def rank(self) -> int:
         """Position from the least severe to the most severe."""
-        return list(Level).index(self)
+        return LEVELS.index(self)
+
+
+LEVELS = tuple(Level)
 
 
 @dataclass(frozen=True, slots=True)

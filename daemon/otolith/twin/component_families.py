@@ -52,10 +52,12 @@ class SourceRange:
     """Largest change from record to record."""
 
     @classmethod
-    def of(cls, x: Array) -> "SourceRange":
-        """Return the range of ``x`` (records,); NaN separates windows."""
-        step = float(np.nan_to_num(np.abs(np.diff(x))).max(initial=0.0))
-        return cls(float(np.nanmin(x)), float(np.nanmax(x)), float(np.nanmin(np.abs(x))), step)
+    def of_each(cls, x: Array) -> "list[SourceRange]":
+        """Return the range of each row of ``x`` (sources, records); NaN separates windows."""
+        steps = np.fmax.reduce(np.abs(np.diff(x)), axis=1, initial=0.0)
+        smallest = np.fmin.reduce(np.abs(x), axis=1)
+        columns = (np.fmin.reduce(x, axis=1), np.fmax.reduce(x, axis=1), smallest, steps)
+        return [cls(*row) for row in np.array(columns).T.tolist()]
 
     @property
     def width(self) -> float:
@@ -200,6 +202,7 @@ COMPONENT_FAMILIES: tuple[ComponentFamily, ...] = (
                     dissipates=True),
 )  # fmt: skip
 FAMILY_NAMES = tuple(row.name for row in COMPONENT_FAMILIES)
+_CODES = {name: 1.0 + index for index, name in enumerate(FAMILY_NAMES)}
 
 
 def family_of(name: str) -> ComponentFamily:
@@ -209,4 +212,4 @@ def family_of(name: str) -> ComponentFamily:
 
 def family_code(name: str) -> float:
     """The number of a family in compiled code; 0 stands for none."""
-    return 1.0 + FAMILY_NAMES.index(name)
+    return _CODES[name]

@@ -1,6 +1,5 @@
 """``otolith probe``: what is on a bus, and lines for the machine file."""
 
-import asyncio
 import contextlib
 import json
 import re
@@ -360,6 +359,8 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
       otolith probe opcua opc.tcp://192.168.0.10:4840
       otolith probe opcua opc.tcp://plc:4840 --user otolith --password-file pw
     """
+    import asyncio
+
     from otolith.cli.commissioning.probe_view import stdout_console
     from otolith_drivers.config_files import validated
     from otolith_drivers.registry import find
