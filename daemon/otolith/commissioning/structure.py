@@ -103,8 +103,11 @@ class PooledResponse(ProjectedResponse):
     def is_within_bounds(self, guess: ScoredGuess) -> bool:
         """Whether the parameters beside a component may be within their bounds.
 
-        A component that resembles what a parameter does may have any amplitude if the parameter makes up for it.
+        A component that resembles what a parameter does may have any amplitude if the parameter makes up for it. A sine
+        with a phase in each window resembles none.
         """
+        if self.is_restarted(guess.form):
+            return True
         free = len(self._start)
         columns = self.columns(guess)
         design = np.hstack([self._parameters, -self._components, -self._without_states(columns)])
