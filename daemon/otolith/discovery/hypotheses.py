@@ -28,7 +28,6 @@ MAX_DELAY_CHANGE = 5.0  # standard deviations: a delay that differs more between
 MAX_DELAY_SDS = 100  # windows whose delays count for the parameters
 MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less shows no delay
 NARROWEST = 1.01  # of the least width of a hump: as narrow as its range allows
-CURVES = ("exponential", "negative exponential", "power")  # at the end of its range each becomes another family
 MS = 1e3  # ms in a second
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 
@@ -151,17 +150,13 @@ def with_candidate(
 def is_possible(problem: Problem, values: Array) -> bool:
     """Whether the components of ``problem`` lie within their physical ranges where the free parameters are ``values``.
 
-    At the end of its range a component stands for something else: an exponential for a line or a step, a power for dry
-    friction. Below its range, a power of a speed would be an infinite force at rest. The transition of dry friction may
-    have either end, as it need not show. Beside dry friction, a hump at rest that is as narrow as its range allows
-    stands for how the friction rounds off.
+    At the end of its range a component stands for something else. Beside dry friction, a hump at rest that is as narrow
+    as its range allows stands for how the friction rounds off.
     """
     friction = {(item.site, item.source) for item in problem.components if item.model.threshold_like}
     for slot, component in enumerate(problem.components):
         amplitude, *rest = (float(values[at]) for at in indices(problem, slot))
         if not component.amplitude_low < amplitude < component.amplitude_high:
-            return False
-        if component.family in CURVES and not component.low < rest[0] < component.high:
             return False
         is_hump = component.model.threshold_at_rest and (component.site, component.source) in friction
         if is_hump and rest[0] <= NARROWEST * component.low:
