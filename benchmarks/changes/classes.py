@@ -122,7 +122,7 @@ def _pump() -> list[Trial]:
 
 def _load() -> list[Trial]:
     pair, free = "constant torque / offset of T_load", ("R_a", "D")
-    members = (Member("COMPONENT", "^shaft(:|/constant)"), Member("SENSOR", r"^T_load reads .*N\*m"))
+    members = (Member("COMPONENT", "^shaft(:|/constant)"), Member("SENSOR", r"^T_load reads .*N·m"))
     torque = Change(terms={"shaft": Term("constant", amplitude=-0.006)})
     offset = Change(offsets={"T_load": -0.006})
     return [

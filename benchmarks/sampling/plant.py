@@ -4,12 +4,11 @@ The equations are linear. Between two changes of the inputs the voltage is const
 time, so each mode of the motor has a closed solution, and outputs can be sampled at any times.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Literal
 
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 
 from otolith.acquisition.window import Array
 
@@ -90,14 +89,14 @@ def simulate(motor: Motor, initial: Array, start: float, inputs: Inputs, times: 
     return states[np.searchsorted(events, times)]
 
 
-def _scan(factors: Array, terms: Array, first: float) -> list[float]:
-    """Return ``first`` and what ``x -> factor * x + term`` makes of it, step by step."""
-    pairs: Iterable[tuple[float, float]] = zip(factors.tolist(), terms.tolist(), strict=True)
+def _scan(factors: Array, terms: Array, first: float) -> Array:
+    """Return ``first`` and what ``x -> factor * x + term`` makes of it, step by step.
 
-    def step(value: float, pair: tuple[float, float]) -> float:
-        return pair[0] * value + pair[1]
-
-    return list(accumulate(pairs, step, initial=first))
+    These are the unknowns of a triangular system with the factors below its diagonal.
+    """
+    bands = np.stack([np.ones(len(factors) + 1), -np.append(factors, 0.0)])
+    values, _ = dtbtrs(bands, np.concatenate([[first], terms]), uplo="L", diag="U")
+    return np.asarray(values).ravel()
 
 
 def phi_1(exponents: Array) -> Array:

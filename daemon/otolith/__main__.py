@@ -6,7 +6,8 @@ import _signal  # type: ignore[import-not-found]  # mypy has no stub for the C m
 
 _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
-import errno  # noqa: E402 - after the line above
+import codecs  # noqa: E402 - after the line above
+import errno  # noqa: E402 - as above
 import io  # noqa: E402 - as above
 import os  # noqa: E402 - as above
 import sys  # noqa: E402 - as above
@@ -14,6 +15,18 @@ import sys  # noqa: E402 - as above
 # The matrices are small, so threads of the linear algebra cost more than they save. Set before NumPy is loaded.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+
+PLAIN = {"Ω": "ohm", "µ": "u", "·": "*", "²": "^2", "³": "^3", "°": "deg", "θ": "angle", "±": "+-", "−": "-"}
+PLAIN |= dict(zip("▁▂▃▄▅▆▇█", "__..--^^", strict=True))  # curves
+"""What stands for a symbol where the encoding of a terminal lacks it; for others a question mark."""
+
+
+def written_plainly(error: UnicodeError) -> tuple[str, int]:
+    """Handle the error of a codec: return what stands for the characters that it lacks, and where they end."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return "".join(PLAIN.get(character, "?") for character in error.object[error.start : error.end]), error.end
 
 
 def main() -> None:
@@ -24,9 +37,10 @@ def main() -> None:
     from otolith.cli.main import cli  # noqa: PLC0415
     from otolith_drivers.errors import OtolithError  # noqa: PLC0415
 
+    codecs.register_error("otolith", written_plainly)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that has no 'Ω' gets a '?'
-            stream.reconfigure(errors="replace")
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that has no 'Ω' gets 'ohm'
+            stream.reconfigure(errors="otolith")
     try:
         code = cli.main(prog_name="otolith", standalone_mode=False)
     except click.ClickException as error:

@@ -155,6 +155,7 @@ def _driver_config(
             signal,
             units[signal],
             validate(own_keys(file.signals[signal]), module.Source, source, under=("signals", signal)),
+            twin.ordinary_range(signal),
         )
         for signal in signals
     )

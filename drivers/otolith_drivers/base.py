@@ -31,6 +31,8 @@ class Signal:
     unit: str
     source: Any
     """Address of the signal: an instance of the driver's ``Source``."""
+    ordinary: tuple[float, float] | None = None
+    """Values of an input in ordinary operation, in ``unit``; None for all other signals."""
 
 
 class Sampling(StrEnum):

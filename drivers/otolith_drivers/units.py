@@ -8,7 +8,7 @@ import contextlib
 import math
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -89,6 +89,15 @@ ODD_PREFIX = re.compile(
 """A prefix that machines do not have with its unit, so that another unit or a file in capitals is meant."""
 
 
+PRODUCTS = {r"\*\*": "^", r"\s*\*\s*": "·", r"\^2(?![\d.])": "²", r"\^3(?![\d.])": "³"}
+SYMBOLS = {
+    r"(?<![^\W\d_])([kMGmnu]?)[Oo]hms?\b": r"\1Ω",
+    r"(?<![^\W\d_])u(?=[ΩAVWNFHgmsT]\b)": "µ",
+    r"\b(?:delta_)?deg(?=[CF]\b)|\bdeg(?:rees?)?\b": "°",
+}
+"""What people write by the pattern of what files write: in formulas, and in units besides."""
+
+
 class UnitNameError(ValueError):
     """A text names no unit, or leaves open which."""
 
@@ -103,6 +112,31 @@ def _registry() -> "pint.UnitRegistry[float]":
         with contextlib.suppress(OtolithError):
             shutil.rmtree(cache_directory("units"), ignore_errors=True)
         return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+
+
+@cache
+def unit_text(written: str) -> str:
+    """Return a unit of a file as people write it: ``N·m·s/rad`` for ``N*m*s/rad``; empty for the number 1."""
+    is_number = re.fullmatch(r"\s*|1|dimensionless|(\w+)/\1", written)
+    return "" if is_number else _replaced(written, SYMBOLS | PRODUCTS)
+
+
+def formula_text(written: str) -> str:
+    """Return a formula as people write it; the angle of ``omega`` is ``θ``, that of ``omega_load`` ``θ_load``."""
+    angles = re.sub(r"\bangle\((?:omega(?=_|\)))?_?(\w*)\)", lambda match: f"θ_{match[1]}".removesuffix("_"), written)
+    return _replaced(angles, PRODUCTS)
+
+
+def equation_text(written: str) -> str:
+    """Return the equation of a component as people write it; a unit may stand behind its last space."""
+    formula, space, unit_of_it = written.rpartition(" ")
+    return f"{formula_text(formula)} {unit_text(unit_of_it)}" if space else formula_text(written)
+
+
+def _replaced(text: str, symbols: Mapping[str, str]) -> str:
+    for pattern, symbol in symbols.items():
+        text = re.sub(pattern, symbol, text)
+    return text
 
 
 @cache

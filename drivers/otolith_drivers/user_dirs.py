@@ -11,10 +11,10 @@ SERVICES = Path("/run/otolith")
 
 
 def state_directory() -> Path:
-    """Return the folder for recordings and estimated parameters.
+    """Return the folder for recordings and estimated parameters; it may be missing, and who only reads leaves it so.
 
     Raises:
-        ServiceError: the folder cannot be created or is not writable.
+        ServiceError: there is no home directory.
     """
     return _user_directory("STATE_DIRECTORY", "XDG_STATE_HOME", ".local/state")
 
@@ -28,7 +28,7 @@ def runtime_directory() -> Path:
     own = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
     is_own = own.is_absolute() and own.is_dir() and own.stat().st_uid == os.geteuid()  # not so after su or sudo
     folder = _user_directory("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR" if is_own else "XDG_STATE_HOME", ".local/state")
-    return _guarded(folder, "readers trust its sockets")
+    return _guarded(writable(folder), "readers trust its sockets")
 
 
 def runtime_folders() -> list[Path]:
@@ -60,13 +60,14 @@ def _guarded(folder: Path, reason: str) -> Path:
 
 
 def writable(folder: Path) -> Path:
-    """Return ``folder``, created if it is missing.
+    """Return ``folder``, created if it is missing, as the missing ones above it: for this user alone.
 
     Raises:
         ServiceError: the folder cannot be created or is not writable.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        for missing in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
+            missing.mkdir(exist_ok=True, mode=0o700)
     except OSError as error:
         raise ServiceError(f"{folder}: cannot be created: {error.strerror}") from error
     if not os.access(folder, os.W_OK | os.X_OK):
@@ -89,11 +90,11 @@ def check_writable(folder: Path) -> None:
 
 def _user_directory(systemd: str, xdg: str, fallback: str) -> Path:
     if service_folders := os.environ.get(systemd):
-        return writable(Path(service_folders.split(":")[0]))
+        return Path(service_folders.split(":")[0])
     base = Path(os.environ.get(xdg, ""))
     if not base.is_absolute():  # the XDG specification says to ignore relative paths
         home = Path(os.environ.get("HOME", ""))
         if not home.is_absolute():
             raise ServiceError(f"no home directory: set {xdg} or HOME to an absolute path")
         base = home / fallback
-    return writable(base / "otolith")
+    return base / "otolith"

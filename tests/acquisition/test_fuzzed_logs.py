@@ -23,7 +23,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.health.schema import ReportDocument
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.replay import Replay, open_recorded
-from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, Kernel
+from otolith.twin.kernel import MAX_SUBSTEPS, Excitation
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay.readers import Reader, Rows
 
@@ -291,17 +291,17 @@ class Work:
 @pytest.fixture(scope="module")
 def work() -> Iterator[Work]:
     """Counts the steps of all kernels."""
-    counted, arguments = Work(), Kernel._arguments
+    counted, arguments = Work(), Excitation.__dict__["arguments"].func
 
-    def counting(kernel: Kernel, excitation: Excitation) -> Any:
+    def counting(excitation: Excitation) -> Any:
         steps = int(excitation.counts.sum())
         counted.records += excitation.grid.records
         counted.steps += steps
         counted.worst = max(counted.worst, steps / max(excitation.grid.records, 1))
-        return arguments(kernel, excitation)
+        return arguments(excitation)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Kernel, "_arguments", counting)
+        patch.setattr(Excitation, "arguments", property(counting))
         yield counted
 
 

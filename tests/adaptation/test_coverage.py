@@ -49,7 +49,7 @@ def cramer_rao_bound(problem: Problem, record: Window, initial: Array) -> Array:
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))[: len(truth)])
 
 
-@pytest.mark.parametrize("windows", [400, pytest.param(2000, marks=pytest.mark.full)])
+@pytest.mark.parametrize("windows", [200, pytest.param(2000, marks=pytest.mark.full)])
 @pytest.mark.parametrize("names", SETS, ids="-".join)
 def test_95_percent_intervals_cover_the_truth(names: tuple[str, ...], windows: int) -> None:
     free = tuple(parameter for parameter in TWIN.parameters if parameter.name in names)

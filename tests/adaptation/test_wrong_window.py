@@ -80,7 +80,9 @@ def reports(windows: list[Window], free: tuple[str, ...]) -> list[ReportDocument
 
 
 @pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.__name__)
-@pytest.mark.parametrize("free", [("R_a",), ("R_a", "D"), ("R_a", "L_a", "J", "D")], ids=len)
+@pytest.mark.parametrize(
+    "free", [("R_a",), pytest.param(("R_a", "D"), marks=pytest.mark.full), ("R_a", "L_a", "J", "D")], ids=len
+)
 @pytest.mark.parametrize("at", [0, pytest.param(1, marks=pytest.mark.full), 5])
 def test_a_wrong_window_is_given_up(
     wrong: Callable[[Array], Array], free: tuple[str, ...], at: int, scenario: MotorScenario, windows: Cut
@@ -114,6 +116,26 @@ def test_windows_that_are_wrong_now_and_then_move_no_estimate(
             assert resistance.value is not None
             assert resistance.sd is not None
             assert abs(resistance.value - TRUTH["R_a"]) <= SDS * resistance.sd, document.window.index
+
+
+@pytest.mark.parametrize("wrong", [1, 3])
+@pytest.mark.parametrize("seed", [2, 7, *(pytest.param(seed, marks=pytest.mark.full) for seed in (0, 1, 3, 4, 5, 6))])
+def test_windows_that_no_hypothesis_explains_leave_no_doubt(
+    seed: int, wrong: int, scenario: MotorScenario, windows: Cut
+) -> None:
+    """Registers are read up to 0.1 s late while a computer is busy, all signals at once."""
+    cut = [window for window, _ in windows(scenario.model_copy(update={"faults": ()}), WINDOWS)]
+    values = np.concatenate([window.values for window in cut])
+    late = np.random.default_rng(seed).exponential(2.0, len(values)).astype(int)
+    late[wrong * len(values) // WINDOWS :] = 0
+    values = values[np.maximum(np.arange(len(values)) - late, 0)]
+    read = [replace(window, values=part) for window, part in zip(cut, np.array_split(values, WINDOWS), strict=True)]
+    for document in reports(read, ("R_a",))[wrong + 1 :]:
+        resistance = document.parameters["R_a"]
+        assert resistance.value is not None
+        assert resistance.sd is not None
+        assert resistance.sd < 0.003 * TRUTH["R_a"], document.window.index
+        assert abs(resistance.value - TRUTH["R_a"]) <= SDS * resistance.sd, document.window.index
 
 
 def test_nothing_is_estimated_from_what_no_hypothesis_explains(scenario: MotorScenario, windows: Cut) -> None:

@@ -155,9 +155,27 @@ def test_noisy_sensors_are_quantised_and_estimates_accurate() -> None:
     assert 1e-5 < noisy.score.published.maximum < 0.01
 
 
-def test_limiting_noise_of_damping() -> None:
-    limit = study(Job(row_of("hydraulic-fluid"), Kind.LIMIT, SHORT / 2), quiet)
+def limit_of_damping(seconds: float) -> Limit:
+    limit = study(Job(row_of("hydraulic-fluid"), Kind.LIMIT, seconds), quiet)
     assert isinstance(limit, Limit)
+    return limit
+
+
+def test_limiting_noise_of_damping_to_an_order_of_magnitude(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(studies, "BISECTIONS", 2)
+    limit = limit_of_damping(2 * studies.LENGTH)
+    assert limit.alone.kept is not None
+    assert limit.alone.lost is not None
+    assert limit.together.lost is not None
+    assert limit.unaided.lost is not None
+    assert 0.1 < limit.alone.kept < 7.0 < limit.alone.lost < 100.0  # damping contributes 7 Pa
+    assert limit.unaided.lost <= limit.together.lost >= limit.alone.lost
+    assert f"alone at {limit.alone.lost:.3g} Pa" in limit_in_words(limit)
+
+
+@pytest.mark.full
+def test_limiting_noise_of_damping() -> None:
+    limit = limit_of_damping(SHORT / 2)
     assert limit.alone.kept is not None
     assert limit.alone.lost is not None
     assert limit.together.lost is not None
@@ -166,7 +184,6 @@ def test_limiting_noise_of_damping() -> None:
     assert limit.together.lost > limit.alone.lost
     assert limit.unaided.lost is not None
     assert limit.unaided.lost <= limit.together.lost
-    assert f"alone at {limit.alone.lost:.3g} Pa" in limit_in_words(limit)
 
 
 def test_jobs_follow_the_options() -> None:

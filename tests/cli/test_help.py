@@ -1,5 +1,6 @@
 """Help of every command: at most 80 columns, with an example; docs/reference/commands.md has every option."""
 
+import codecs
 import os
 import re
 import subprocess
@@ -11,6 +12,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from otolith.__main__ import written_plainly
 from otolith.cli.main import cli
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
@@ -103,3 +105,11 @@ def test_a_terminal_without_greek_letters_gets_question_marks() -> None:
     result = subprocess.run(command, env=latin, capture_output=True, encoding="latin-1", check=False)
     assert (result.returncode, result.stderr) == (0, "")
     assert "K?" in result.stdout
+
+
+def test_a_terminal_without_a_symbol_gets_its_plain_form() -> None:
+    codecs.register_error("otolith", written_plainly)
+    shown = "R_a 5.98 Ω ± 0.01, 2e-3 N·m·s/rad, 4 m/s², 60 °C, sin(1·θ), ▁▄█, 中"
+    plain = "R_a 5.98 ohm +- 0.01, 2e-3 N*m*s/rad, 4 m/s^2, 60 degC, sin(1*angle), _.^, ?"
+    assert shown.encode("ascii", "otolith").decode() == plain
+    assert "5.98 ohm ± 0.01, 2e-3 N·m·s/rad, 4 m/s²" in shown.encode("latin-1", "otolith").decode("latin-1")

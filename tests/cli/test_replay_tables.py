@@ -126,6 +126,29 @@ def test_table_counts_and_locates_bad_rows_and_cells(
     assert "bad cells: 2, bad rows: 2, the first in line 232: i is '#REF!', no number" in text
 
 
+def test_table_with_sentinels_is_one_with_blank_cells(
+    tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blank = [list(row) for row in rows]
+    for at, (column, sentinel) in enumerate([(3, "-9999"), (4, "32767"), (4, "65535"), (1, "-9999"), (2, "-999")]):
+        for row in range(210 + at, 900, 97):
+            rows[row][column], blank[row][column] = sentinel, ""
+    plain = values(reports(written(tmp_path, blank), capsys))
+    data = written(tmp_path, rows)
+    documents = reports(data, capsys)
+    assert values(documents) == plain
+    assert not any(document.events for document in documents)
+    text = summed_up(data, capsys)
+    for signal, sentinel in [
+        ("i", "-9999"),
+        ("omega", "32767"),
+        ("omega", "65535"),
+        ("V_a", "-9999"),
+        ("T_load", "-999"),
+    ]:
+        assert f"{signal}: {sentinel} in 8 cells is no reading and left out" in text
+
+
 def test_table_rows_are_reordered_within_the_window(
     tmp_path: Path, rows: Lines, capsys: pytest.CaptureFixture[str]
 ) -> None:

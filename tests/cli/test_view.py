@@ -90,7 +90,7 @@ def test_recordings_of_a_service_and_of_oneself_are_listed(services: Path, tmp_p
     assert "10 min" in lines[0]
     assert "2.0 MB  site.pump" in lines[0]
     assert "event" in lines[1]
-    assert lines[2].startswith(f"{time.strftime('%F %T', time.localtime(1e9))}      - min       0.0 MB  -  ")
+    assert lines[2].startswith(f"{time.strftime('%F %T %Z', time.localtime(1e9))}      - min       0.0 MB  -  ")
     assert len({line.index("/") for line in lines}) == 1
     assert [run(name, "--list").stdout.count("\n") for name in ("pump", "hall.motor", "motor", "press-3", "mot")] == [
         *[1] * 4,

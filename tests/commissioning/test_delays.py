@@ -128,7 +128,7 @@ def test_an_early_signal_makes_all_others_late(tmp_path: Path) -> None:
         assert deviation(signal, 15 * MS) < 3.3
 
 
-@pytest.mark.parametrize("count", [6, pytest.param(60, marks=pytest.mark.full)])
+@pytest.mark.parametrize("count", [10, pytest.param(60, marks=pytest.mark.full)])
 def test_intervals_hold_the_truth(tmp_path: Path, count: int) -> None:
     """Each recording has another motor, another late signal and another delay."""
     random = np.random.default_rng(10)

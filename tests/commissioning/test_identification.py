@@ -85,6 +85,32 @@ def test_process_noise_beside_sensor_noise(process: tuple[float, float], seed: i
     assert noise.consistency.factor == 1.0
 
 
+@pytest.mark.parametrize("process", [1e-3, 4e-3])
+def test_a_level_far_below_its_first_guess_is_found_with_few_fits(process: float) -> None:
+    """The first guess shows from record to record: at 1 kHz it is a hundred times what windows show as a whole."""
+    twin, random, period, records = find_twin("servo_axis"), np.random.default_rng(4), 1e-3, 1000
+    times = period * np.arange(4 * records)
+    forces = 150.0 * np.sin(4.4 * times) + 90.0 * np.sin(14.4 * times)
+    position = velocity = 0.0
+    positions = []
+
+    def acceleration(force: float, speed: float) -> float:
+        return float(force - 200.0 * speed - 20.0 * np.tanh(speed / 0.002)) / 95.0
+
+    for force in forces:
+        positions.append(position)
+        middle = velocity + 0.5 * period * acceleration(force, velocity)
+        position += period * middle
+        velocity += period * acceleration(force, middle) + process * np.sqrt(period) * random.normal()
+    values = np.column_stack([forces, positions + 1e-5 * random.normal(size=len(times))])
+    parts = [values[first : first + records] for first in range(0, len(values), records)]
+    windows = [Window.whole(index, float(index), period, twin.signals, part) for index, part in enumerate(parts)]
+    free = tuple(parameter for parameter in twin.parameters if parameter.name != "v_s")
+    noise = identify_noise(Problem(twin, (("v_s", 0.002),), free, (1e-6,)), windows)
+    assert levels(noise) == pytest.approx([1e-5, 0.0, process], rel=0.2)
+    assert noise.evaluations < 130 * len(windows)
+
+
 def thinned(random: np.random.Generator, whole: Window, missing: float, rows: float = 0.0) -> Window:
     """The window without a share of the samples of its outputs, and without a share of its rows."""
     kept = np.flatnonzero(random.random(whole.records) >= rows)

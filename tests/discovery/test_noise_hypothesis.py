@@ -4,14 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.changes.healthy import MACHINES, cases
+from benchmarks.changes.observe import recordings
 from benchmarks.discovery.motor import Faults
 
 from otolith.acquisition.window import Window
+from otolith.adaptation.state import initial_state
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import Status
 from tests.discovery.test_search import initial, run, simulated
 
 STATED = {"i": 0.005, "omega": 0.02}  # A, rad/s
+(LOAD_NOISE,) = (machine.load_noise for machine in MACHINES if machine.plant.name == "pump")
 WHITE = {WindowDecision.LEARNED, WindowDecision.SUSPECTED, WindowDecision.NOISIER}
 
 
@@ -59,3 +63,27 @@ def test_a_step_of_a_parameter_is_no_noise() -> None:
     _, documents = run(initial("R_a", "D"), [*before, *after[len(before) :]])
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.7, rel=2e-3)
     assert all(document.decision is not WindowDecision.NOISIER for document in documents)
+
+
+def test_noise_of_a_measured_input_is_named_and_no_component_is_adopted() -> None:
+    """The noise of the pump's throttle position, which nothing states, colours the innovations."""
+    (case,) = cases(24, ["pump: load noise"])
+    (windows,) = recordings(case, case.problem, [0], seed=1)
+    state, documents = run(initial_state("pump", "test", case.problem), windows)
+    decisions = [document.decision for document in documents]
+    assert set(decisions) <= WHITE
+    assert WindowDecision.NOISIER in decisions[:6]
+    assert set(decisions[6:]) == {WindowDecision.LEARNED}
+    assert not state.adopted
+    (finding,) = documents[-1].findings
+    assert finding.text.startswith("u is noisier than stated: 0.00")
+    torque, throttle = state.problem.input_noise
+    assert torque == 0.0
+    assert throttle == pytest.approx(LOAD_NOISE, rel=0.35)
+
+
+def test_errors_of_a_sensor_are_no_noise_of_an_input_that_is_smooth() -> None:
+    windows = noisier(simulated("steps", 6, Faults()), {"omega": 1.5}, smooth=8)
+    before = initial("R_a", "D")
+    state, _ = run(before, windows)
+    assert state.problem.input_noise == before.problem.input_noise

@@ -18,8 +18,10 @@ from otolith.discovery.linear_response import PROBES, LinearResponse, basis_func
 from otolith.discovery.screening import (
     COARSE,
     DECISIVE,
+    ESTIMATE_SHARE,
     ScreeningResult,
     allowed_forms,
+    grid_guesses,
     inner_grid,
     screen_window,
 )
@@ -28,6 +30,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import estimate_window
 from otolith.machine import find_twin
+from otolith.twin.component_families import family_code
 from otolith.twin.definition import Role
 from otolith.twin.kernel import Excitation, kernel_of
 
@@ -124,7 +127,22 @@ def test_estimated_gains_follow_their_distribution(name: str) -> None:
     degrees = PROBES - 1
     assert np.median(ratio) == pytest.approx(degrees * (1.0 - 2.0 / (9.0 * degrees)) ** 3, rel=0.15)
     assert np.quantile(ratio, [0.01, 0.99]) == pytest.approx([5.2, 30.6], rel=0.25)
-    assert ratio.max() < PROBES / 0.3  # no line that gains enough would be left out
+    assert ratio.max() < PROBES / ESTIMATE_SHARE  # no line that gains enough would be left out
+
+
+@pytest.mark.parametrize("name", ["dc_motor", "servo_axis"])
+def test_estimated_gains_of_other_forms_follow_theirs(name: str) -> None:
+    """The true gain over the estimate, times PROBES, is χ² distributed with PROBES degrees of freedom."""
+    linear = response(name)
+    forms = [form for form in allowed_forms(linear.problem, linear.x) if len(form.model.phases) == 1]
+    guesses = grid_guesses(linear, forms, COARSE)
+    exact = linear.score(guesses).gain
+    gains = linear.estimated_gains_of([(family_code(form.model.name), form.source, b, 0.0) for form, b in guesses])
+    ratio = PROBES * exact / gains[np.arange(len(guesses)), [form.site for form, _ in guesses]]
+    ratio = ratio[exact > 0.0]  # the others are what a parameter does
+    assert len(ratio) > 0.8 * len(guesses)
+    assert np.median(ratio) == pytest.approx(PROBES, rel=0.25)
+    assert ratio.max() < PROBES / ESTIMATE_SHARE  # none that gains enough would be left out
 
 
 @pytest.mark.parametrize("name", ["dc_motor", "servo_axis"])

@@ -299,17 +299,17 @@ def test_search_refuses_a_fourth_component() -> None:
     assert len(three) == 3
 
     def more(*moment: float) -> float:
-        return two_terms(*moment) + (0.01 * math.sin(25.0 * moment[0]) if moment[0] < 8.0 else 0.0)
+        return two_terms(*moment) + (0.01 * math.sin(25.0 * moment[0]) if moment[0] < 4.0 else 0.0)
 
-    _, documents = run(full, simulated("reversing", 20, Faults(torque=more)))
-    for document in documents[:4]:
+    _, documents = run(full, simulated("reversing", 16, Faults(torque=more)))
+    for document in documents[:2]:
         assert document.decision is WindowDecision.REFUSED
         assert [component.id for component in document.components] == three
         assert document.parameters["R_a"].status in (Status.UNESTIMATED, Status.INVALID)
         assert document.decision.value in document.parameters["R_a"].reason
         names = [hypothesis.text for hypothesis in document.explanations if hypothesis.reason is FaultType.PARAMETER]
         assert not any(component in name.split(" and ") for name in names for component in three)
-    assert WindowDecision.REFUSED not in {document.decision for document in documents[4:]}
+    assert WindowDecision.REFUSED not in {document.decision for document in documents[2:]}
     assert {document.decision for document in documents[-3:]} == {WindowDecision.LEARNED}
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
     assert len(documents[-1].components) == 2  # the restored third component does not exist in the plant

@@ -15,6 +15,7 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from tests.conftest import free_port
+from tests.waiting import PATIENCE
 
 Words = dict[int, int]
 
@@ -48,12 +49,12 @@ def library_server(words: Words, moving: Callable[[int], Words] | None = None) -
 
     thread = threading.Thread(target=loop.run_until_complete, args=(serve(),), name="server")
     thread.start()
-    assert up.wait(10.0)
+    assert up.wait(PATIENCE)
     try:
         yield port
     finally:
         ending = servers[0].shutdown()  # type: ignore[no-untyped-call]
-        asyncio.run_coroutine_threadsafe(ending, loop).result(5.0)
+        asyncio.run_coroutine_threadsafe(ending, loop).result(PATIENCE)
         thread.join(5.0)
         loop.close()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.units import factor, unit
+from otolith_drivers.units import equation_text, factor, unit, unit_text
 from tests.drivers.can_frames import dbc, decoder, frame
 
 TURN, DEGREE = 2 * math.pi, math.pi / 180
@@ -155,3 +155,35 @@ def test_ambiguous_unit_of_a_database_asks_for_unit(tmp_path: Path) -> None:
     read = decoder(tmp_path, {"phi": ("rad", {"signal": "Angle", "unit": "degree"})}, text)
     (sample,) = read.decode(frame(385, bytes([180, 0, 0, 0, 0, 0, 0, 0])), 0.0)
     assert sample.value == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize(
+    ("written", "shown"),
+    [
+        *(("ohm", "Ω"), ("mohm", "mΩ"), ("kOhm", "kΩ"), ("uohm", "µΩ"), ("uA", "µA"), ("um", "µm"), ("us", "µs")),
+        *(("N*m*s/rad", "N·m·s/rad"), ("kg*m^2", "kg·m²"), ("N*m**2/A", "N·m²/A"), ("m^3/s", "m³/s")),
+        *(("1/s^0.5", "1/s^0.5"), ("m^2.5", "m^2.5"), ("(rad/s)/s^0.5", "(rad/s)/s^0.5"), ("rad/s^2", "rad/s²")),
+        *(("degC", "°C"), ("delta_degC", "°C"), ("degF", "°F"), ("deg/s", "°/s"), ("degree", "°"), ("rpm", "rpm")),
+        *(("1", ""), ("", ""), ("rad/rad", ""), ("m/mm", "m/mm"), ("kelvin", "kelvin"), ("bus", "bus")),
+        *(("L/min", "L/min"), ("Ω", "Ω"), ("N·m", "N·m")),
+    ],
+)
+def test_a_unit_is_shown_by_its_usual_symbols_and_read_back(written: str, shown: str) -> None:
+    assert unit_text(written) == shown
+    if shown and written != "bus":  # no unit, but the end of a word is no ohm and its begin no prefix
+        assert unit(shown).dimensionality == unit(written).dimensionality
+
+
+@pytest.mark.parametrize(
+    ("written", "shown"),
+    [
+        ("0.0053·sin(1·angle(omega) - 3.06) N*m", "0.0053·sin(1·θ - 3.06) N·m"),
+        ("0.2·sin(3·angle(omega_load) + 1.00) N*m", "0.2·sin(3·θ_load + 1.00) N·m"),
+        ("2·sign(angle(n)) ohm", "2·sign(θ_n) Ω"),
+        ("0.5·omega^0.3 N*m", "0.5·omega^0.3 N·m"),
+        ("0.1·exp(-(ohm/0.2)^2)", "0.1·exp(-(ohm/0.2)²)"),
+        ("0.3·deg", "0.3·deg"),
+    ],
+)
+def test_an_equation_is_shown_with_symbols_and_keeps_its_names(written: str, shown: str) -> None:
+    assert equation_text(written) == shown

@@ -68,7 +68,9 @@ def frozen_from(window: Window, signal: str, first: int, last: int = RECORDS) ->
 
 def faults(problem: Problem, window: Window, state: AdaptationState | None = None) -> tuple[str, ...]:
     posterior = Posterior.initial(problem) if state is None else state.posterior
-    return tuple(sensor.text for sensor in check_window(window, posterior.predict(window)).faulty_sensors)
+    return tuple(
+        f"{sensor.text}; {sensor.advice}" for sensor in check_window(window, posterior.predict(window)).faulty_sensors
+    )
 
 
 @pytest.mark.parametrize("wrong", [0.5, 1.5])
@@ -195,7 +197,7 @@ def test_stuck_axis_with_coarse_encoder_is_not_frozen(forces: str, stated: float
         predicted = posterior.predict(window)
         assert check_window(window, predicted).faulty_sensors == ()
         estimated = estimate_window(predicted, window)
-        posterior = predicted.update(estimated.evidence, estimated.advance)
+        posterior = predicted.update(predicted.innovation(estimated.evidence), estimated.advance)
         at_rest += np.mean(np.diff(part[:, 1]) == 0.0) > 0.9
     assert at_rest >= 4
 
@@ -208,7 +210,8 @@ def test_noisy_position_that_stops_dead_is_frozen() -> None:
     posterior = Posterior.initial(axis(1e-4, friction=True))
     assert check_window(window, posterior.predict(window)).faulty_sensors == ()
     estimated = estimate_window(posterior.predict(window), window)
-    posterior = posterior.predict(window).update(estimated.evidence, estimated.advance)
+    predicted = posterior.predict(window)
+    posterior = predicted.update(predicted.innovation(estimated.evidence), estimated.advance)
     moving = replace(window, index=1, start=2.0, values=values[RECORDS : 2 * RECORDS])
     (sensor,) = check_window(frozen_from(moving, "x", 80), posterior.predict(moving)).faulty_sensors
     assert sensor.signal == "x"

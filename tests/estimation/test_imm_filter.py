@@ -38,7 +38,7 @@ def predict(posterior: Posterior, end: float) -> Posterior:
 
 
 def update(posterior: Posterior, evidence: Evidence) -> Posterior:
-    return posterior.update(evidence, PhaseAdvance(0.0, 0.0, ()))
+    return posterior.update(posterior.innovation(evidence), PhaseAdvance(0.0, 0.0, ()))
 
 
 def follow(history: Array, sd: float, seed: int) -> tuple[Array, Array]:
@@ -129,8 +129,9 @@ def test_evidence_that_is_far_more_precise_in_one_direction_gives_a_posterior(pr
     prediction = imm_filter.initial_modes(np.zeros(4), np.diag([1.0, 1.0, 1e-6, 1e-6]))
     root = np.outer([1.0, -0.3, 1.7, 0.1], [precision, 0.4 * precision, 0.0, 0.0]) + 1e-9 * np.eye(4)
     certain = Evidence(np.zeros(4), root, np.array([0.5, -0.2, 0.1, 0.3]))
-    assert 0.0 <= imm_filter.nis(prediction, certain) < 1.0
-    mean, covariance = imm_filter.moment_match(imm_filter.update(prediction, certain))
+    innovation = imm_filter.innovation_of(prediction, certain)
+    assert 0.0 <= innovation.nis < 1.0
+    mean, covariance = imm_filter.moment_match(imm_filter.update(innovation))
     assert np.isfinite(mean).all()
     assert np.linalg.eigvalsh(covariance).min() >= -1e-9
     assert covariance[0, 0] < 1.0

@@ -121,7 +121,7 @@ def test_a_value_that_presses_on_its_bound_is_at_bound_however_wide_its_interval
     resistance = report.document.parameters["R_a"]
     assert resistance.identifiability is Identifiability.AT_BOUND
     assert resistance.status is Status.INVALID
-    assert "at its bound 7 ohm" in resistance.reason
+    assert "at its bound 7 Ω" in resistance.reason
 
 
 def test_unexplained_window_does_not_update_the_posterior(scenario: MotorScenario, windows: Cut) -> None:

@@ -52,7 +52,7 @@ def test_report_and_event_name_the_baseline() -> None:
     assert document.parameters["R_a"].baseline == 7.0
     (event,) = document.events
     assert event.state is Level.WATCH
-    assert "(-7.1% of the baseline), below its limit 6.65 ohm" in event.text
+    assert "(-7.1% of the baseline), below its limit 6.65 Ω" in event.text
     without = assess(with_baselines(plan, {}), HealthState(), report(0, 6.5))[1]
     assert without.parameters["R_a"].baseline is None
 
@@ -82,11 +82,11 @@ def test_the_command_takes_the_saved_estimates(
     state = initial_state(names.name, names.site, machine.problem, machine.plan)
     store.save(replace(state, health=HealthState(histories={"R_a": history(7.0, 50)})))
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert "baseline R_a = 7 ohm ± 0.028, mean of 50 estimates" in result.output
+    assert "baseline R_a = 7 Ω ± 0.028, mean of 50 estimates" in result.output
     assert "beyond its limit" not in result.output
     assert store.decisions().baselines["R_a"].value == pytest.approx(7.0)
     store.save(replace(state, health=HealthState(histories={"R_a": history(5.9, 50)})))
     worn = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert "R_a: beyond its limit ACT below 6.175 ohm; if the machine is not healthy, undo it: --clear" in worn.output
+    assert "R_a: beyond its limit ACT below 6.175 Ω; if the machine is not healthy, undo it: --clear" in worn.output
     CliRunner().invoke(cli, [*arguments, "--clear"], catch_exceptions=False)
     assert store.decisions().baselines == {}

@@ -28,6 +28,7 @@ from otolith.health.schema import (
     Status,
     WindowDocument,
 )
+from otolith.health.text import event_text
 from otolith.machine import load_rules
 
 NOMINAL, WATCH, ACT = 6.5, 6.3, 6.0  # ohm
@@ -163,6 +164,17 @@ def test_a_value_that_wanders_around_its_limit_is_one_event() -> None:
     raised = [item for item in changes(documents) if item[2] is Level.ACT]
     assert len(raised) == 1
     assert state_of(documents[-1], "winding") is Level.ACT
+
+
+def test_a_value_back_inside_its_limit_is_not_said_to_be_beyond_it() -> None:
+    """An event lasts until its value is clearly inside; meanwhile its text is true."""
+    documents = assessed(report(index, WATCH + (0.005 if index > 5 else -0.1)) for index in range(12))
+    before, after = (events(document)["winding"] for document in (documents[5], documents[-1]))
+    assert (before.state, after.state) == (Level.WATCH, Level.WATCH)
+    assert ", below its limit 6.3 Ω" in before.text
+    assert ", still near its limit 6.3 Ω" in after.text
+    assert "beyond" in event_text(before)
+    assert "beyond" not in event_text(after)
 
 
 @pytest.mark.parametrize("status", [Status.HELD, Status.INVALID])
@@ -336,7 +348,7 @@ def test_a_known_parameter_that_has_moved_is_judged_by_the_limits_of_the_twin(
     if expected:
         event = events(documents[-1])["magnets"]
         assert event.condition == "the magnetic field of the motor has dropped at once"
-        assert "0.034 N*m/A ± 2e-05 (-10.5%), stated as 0.038" in event.text
+        assert "0.034 N·m/A ± 0.00002 (-10.5%), stated as 0.038" in event.text
 
 
 def test_a_component_beyond_its_limit_is_an_event_since_its_onset() -> None:

@@ -88,16 +88,20 @@ def test_every_phrase_is_one_that_the_program_composes(language: Language) -> No
     ("english", "german"),
     [
         (
-            "a sensor is wrong: V reads -0.3% off: look at the sensor and its scale (20%); or K_e (1%)",
-            "ein Sensor misst falsch: V zeigt um -0.3% falsch an: Sensor und Skalierung prüfen (20 %); oder K_e (1 %)",
+            "a sensor is wrong: V reads -0.3% off: look at the sensor and its scale (>99%); or K (1%)",
+            "ein Sensor misst falsch: V zeigt um -0.3% falsch an: Sensor und Skalierung prüfen (>99 %); oder K (1 %)",
         ),
         (
-            "i is frozen at 3 A for 2 s (20 samples) from t = 4 s while the twin moves on: look at the sensor",
-            "i steht seit t = 4 s für 2 s (20 Messwerte) auf 3 A fest, während der Zwilling sich bewegt: Sensor prüfen",
+            "i is frozen at 3 A for 2 s (20 samples) from t = 4 s while the twin moves on",
+            "i steht seit t = 4 s für 2 s (20 Messwerte) auf 3 A fest, während der Zwilling sich bewegt",
         ),
         (
-            "without x in checks of i in [signals], as in checks = [], it counts as measured; 3 records are too few",
-            "ohne x in checks von i in [signals], wie in checks = [], gilt es als gemessen; 3 Datensätze sind zu wenig",
+            "i is clipped at 3 A from t = 4 s: 20 of 100 records do not count; look at the range of the sensor",
+            "i ist ab t = 4 s bei 3 A begrenzt: 20 von 100 Datensätzen zählen nicht; Messbereich des Sensors prüfen",
+        ),
+        (
+            "if these readings are right, write checks = [] under i in [signals]; 3 records are too few",
+            "wenn diese Messwerte stimmen, checks = [] unter i in [signals] eintragen; 3 Datensätze sind zu wenig",
         ),
         (
             "a step of V_a from 3 to 5 V would decide if the other inputs stay as they are",
@@ -154,7 +158,7 @@ def test_a_german_machine_has_german_events_and_states() -> None:
     assert events["winding"].condition_id == "winding-turns"
     assert event_text(events["winding"]).startswith("HANDELN: Wicklung: Windungsschluss in der Wicklung seit t = ")
     assert "Ankerwiderstand R_a ist 5." in events["winding"].text
-    assert "unter dem Grenzwert 6.175 ohm" in events["winding"].text
+    assert "unter dem Grenzwert 6.175 Ω" in events["winding"].text
     assert events["shaft"].text.startswith("neu: Drehmoment auf der Welle ")
     assert last.health.parts["shaft"].reason == "Unwucht der Welle"
     assert last.health.parts["shaft"].state is Level.ACT  # what programs read is the same in all languages
@@ -164,9 +168,11 @@ def test_a_german_machine_has_german_sensor_faults() -> None:
     last = reports("sensor-frozen", 22)[-1]
     (event,) = last.events
     assert (event.condition_id, event.condition) == ("sensor", "ein Sensor misst falsch")
-    assert event.text.startswith("Drehzahl des Rotors: omega steht seit ")
+    assert event.text.startswith("Drehzahl des Rotors: omega steht das ganze Zeitfenster von ")
     assert " the " not in event_text(event)
-    assert last.parameters["R_a"].reason.startswith("aus dem Zeitfenster wird nichts geschätzt: omega steht seit ")
+    assert last.parameters["R_a"].reason.startswith(
+        "aus dem Zeitfenster wird nichts geschätzt: omega steht das ganze Zeitfenster von "
+    )
 
 
 def words(text: str) -> set[str]:

@@ -57,7 +57,7 @@ def test_report_contains_only_finite_numbers(
 
 
 def test_report_omits_absent_fields_and_names_its_schema() -> None:
-    evidence = WindowEvidence(reason="window not estimated from: no samples of i")
+    evidence = WindowEvidence(reason="nothing is estimated from this window: no samples of i")
     _, document = publish(RESISTANCE, ALLOWED, MarginalPosterior(6.5, 3.0, 0.0, 1.0), evidence, PreviousStatus())
     published = json.loads(report(R_a=document).to_json())
     assert published["schema"] == "otolith.report/1"

@@ -2,6 +2,7 @@
 
 import pytest
 
+from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingKind
 from otolith.health.limits import Level
 from otolith.health.schema import (
@@ -16,7 +17,16 @@ from otolith.health.schema import (
     Severity,
     Status,
 )
-from otolith.health.text import announcements, event_text, finding_text, headline, summary, value_cells, value_text
+from otolith.health.text import (
+    announcements,
+    event_text,
+    finding_text,
+    headline,
+    interval_text,
+    summary,
+    value_cells,
+    value_text,
+)
 from tests.health.test_events import report
 
 ESTIMATED = ParameterDocument(value=5.98561, sd=0.00382, unit="ohm", nominal=6.5, status=Status.ESTIMATED)
@@ -33,13 +43,35 @@ LEAK = FindingDocument(
 
 
 def test_value_text_has_unit_and_95_percent_interval() -> None:
-    assert value_text(ESTIMATED) == "5.9856 ohm ± 0.0075"
-    assert value_cells(ESTIMATED) == ("5.9856", "0.0075", "ohm", "-7.91%")
+    assert value_text(ESTIMATED) == "5.9856 Ω ± 0.0075"
+    assert value_cells(ESTIMATED) == ("5.9856", "0.0075", "Ω", "-7.91%")
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "text"),
+    [
+        (0.0014296, 1.5e-6, "0.0014296 N·m·s/rad ± 0.0000015"),
+        (0.00014296, 1.5e-7, "142.96e-6 N·m·s/rad ± 0.15e-6"),
+        (0.00012, 1.2e-4, "120e-6 N·m·s/rad ± 120e-6"),
+        (300.0, 123.0, "300 N·m·s/rad ± 120"),
+        (-0.003, 3.9, "-0.003 N·m·s/rad ± 3.9"),
+        (6.5, 1.2e-6, "6.5 N·m·s/rad ± 0.0000012"),
+        (5.0, 2e-12, "5 N·m·s/rad ± 2e-12"),
+        (0.0, 2e-5, "0 N·m·s/rad ± 20e-6"),
+        (0.0, 0.0, "0 N·m·s/rad ± 0"),
+    ],
+)
+def test_value_and_interval_have_one_power_of_ten(value: float, half: float, text: str) -> None:
+    assert interval_text(value, half / QUANTILE, "N*m*s/rad") == text
+
+
+def test_a_plain_number_has_no_unit_in_its_text() -> None:
+    assert interval_text(0.5, 0.1 / QUANTILE, "1") == "0.5 ± 0.1"
 
 
 def test_unknown_value_text_has_no_number() -> None:
     assert value_text(UNKNOWN) == "unknown"
-    assert value_cells(UNKNOWN) == ("unknown", "", "ohm", "")
+    assert value_cells(UNKNOWN) == ("unknown", "", "Ω", "")
 
 
 @pytest.mark.parametrize("value", [6.5001, 6.4999])
@@ -58,7 +90,7 @@ def test_summary_is_one_line_with_reasons_and_warnings() -> None:
         update={"parameters": {"R_a": ESTIMATED, "L_a": UNKNOWN}, "findings": (LEAK,), "driver": driver}
     )
     assert summary(document) == (
-        "window 3 good, R_a 5.9856 ohm ± 0.0075, L_a unknown (unestimated: no current), fault: a leak; close it, "
+        "window 3 good, R_a 5.9856 Ω ± 0.0075, L_a unknown (unestimated: no current), fault: a leak; close it, "
         "no connection: unplugged, slow, and 2 more warnings"
     )
 

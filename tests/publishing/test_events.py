@@ -1,11 +1,14 @@
 """An event is published and logged once, when it changes, and shown as long as it is not cleared."""
 
 import logging
+import re
 import socket
+import time
 
 import pytest
 from rich.console import Console
 
+from otolith.cli.common import local_time
 from otolith.cli.operation.live_table import BARS, LEVEL_STYLES, LiveTable, event_style, sparkline
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, ParameterDocument, ReportDocument, Status
@@ -107,7 +110,7 @@ def test_the_curve_is_scaled_to_the_limits() -> None:
     assert drawn(documents()[0]).count(BARS[4]) == 1
 
 
-@pytest.mark.parametrize("width", [40, 60])
+@pytest.mark.parametrize("width", [40, 60, 70, 75, 80])
 def test_a_narrow_terminal_splits_no_word(width: int) -> None:
     document = next(document for document in documents() if document.health and document.health.state is Level.ACT)
     words = drawn(document, width=width).split()
@@ -125,7 +128,7 @@ def test_each_machine_has_its_own_table_and_curves() -> None:
     assert "--machine NAME" not in drawn(first)
 
 
-@pytest.mark.parametrize("width", [40, 60])
+@pytest.mark.parametrize("width", [40, 60, 70, 80])
 def test_a_narrow_terminal_cuts_no_number(width: int) -> None:
     document = documents()[0]
     wide = ParameterDocument(
@@ -133,4 +136,25 @@ def test_a_narrow_terminal_cuts_no_number(width: int) -> None:
     )  # the longest cells
     text = drawn(document.model_copy(update={"parameters": {"h_2": wide}}), width=width)
     assert "…" not in text
-    assert all(cell in text for cell in ("h_2", *value_cells(wide)) if cell != wide.unit)
+    assert all(cell in text for cell in ("h_2", *value_cells(wide)))
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_a_silent_machine_is_grey_and_dated_beside_a_running_one(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    at_act = next(document for document in documents() if document.health and document.health.state is Level.ACT)
+    running = at_act.model_copy(update={"machine": "z-runs"})
+    table, console = LiveTable(lambda: "connected"), Console(width=width, force_terminal=True, color_system="standard")
+    table.add(at_act.to_json())
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 4000.0)
+    table.add(running.to_json())
+    with console.capture() as capture:
+        console.print(table)
+    silent, whole = capture.get().split("\x1b[1mz-runs")
+    text = re.sub(r"\x1b\[[\d;]*m", "", silent)
+    assert f"no report since {local_time(at_act.window.end)} (67 min): connected" in " ".join(text.split())
+    value, half, *_ = value_cells(at_act.parameters["R_a"])
+    assert value in text
+    assert half in text
+    assert set(re.findall(r"\x1b\[([\d;]*)m", silent.partition("connected")[2])) == {"0", "2"}
+    assert "\x1b[1;31mACT" in whole

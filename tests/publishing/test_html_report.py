@@ -4,6 +4,7 @@ import json
 import re
 import sqlite3
 from collections.abc import Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -103,7 +104,7 @@ def test_a_machine_without_events_is_ok_and_there_is_nothing_to_do() -> None:
 def test_one_window_is_a_point() -> None:
     shown = page(written(reports(1)), now=START + 2.0)
     assert "polyline" in shown.elements
-    assert "6.5 ohm ± 0.02" in shown.text
+    assert "6.5 Ω ± 0.02" in shown.text
 
 
 def test_a_history_without_a_report_is_no_data() -> None:
@@ -135,6 +136,9 @@ def test_a_daemon_that_has_stopped_is_no_data_with_the_last_state() -> None:
     assert "NO DATA no report since" in text
     assert "(2 h)" in text
     assert "The last report: ACT since" in text
+    well = page(written(reports(50, health=state_of(Level.OK, START))), now=START + 7300.0).text
+    assert "whole machine NO DATA" in well
+    assert "No limit is passed" not in well
 
 
 def test_an_event_has_its_states_and_its_evidence() -> None:
@@ -234,22 +238,25 @@ COUNTS = {"degrading": 55, "unbalance": 40, "sensor-fault": 48}
 """Windows of each simulated situation: shortly after what is announced last."""
 ANNOUNCED = {
     "degrading": ("WATCH winding: short circuit between turns", "reaches ACT in", "measure resistance and insulation"),
-    "unbalance": ("ACT shaft: unbalanced shaft", "amplitude", "balance the rotor", "+ (1/J) * U1", "ACT 0.004"),
+    "unbalance": ("ACT shaft: unbalanced shaft", "amplitude", "balance the rotor", "+ (1/J)·U1", "ACT 0.004"),
     "sensor-fault": ("ACT sensors: a sensor is wrong", "check the sensor and its cable", "R_a, D : not estimated in"),
 }
 
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The page of each situation."""
-    return {name: pictures.page(pictures.simulated(name, count), tmp_path_factory.mktemp(name))
-            for name, count in COUNTS.items()}  # fmt: skip
+    """The page of each situation, and a German one."""
+    reports = {name: pictures.simulated(name, count) for name, count in COUNTS.items()}
+    last = reports["unbalance"][-1]
+    german = last.document.to_json().replace('"language":"en"', '"language":"de"').replace('"ACT"', '"WATCH"')
+    reports["german"] = [*reports["unbalance"][:-1], replace(last, document=ReportDocument.from_json(german))]
+    return {name: pictures.page(rows, tmp_path_factory.mktemp(name)) for name, rows in reports.items()}
 
 
 @pytest.mark.parametrize("situation", COUNTS)
 def test_a_simulated_machine_is_described_in_words(simulated: dict[str, str], situation: str) -> None:
     shown = Page(simulated[situation])
-    for text in (*ANNOUNCED[situation], "domega/dt = (K_t*i - T_load - D*omega) / J", "armature resistance"):
+    for text in (*ANNOUNCED[situation], "domega/dt = (K_t·i - T_load - D·omega) / J", "armature resistance"):
         assert text in shown.text
 
 
@@ -272,7 +279,9 @@ def tab() -> Iterator[Browser]:
 def test_a_page_logs_and_requests_nothing_in_a_browser(
     simulated: dict[str, str], tab: Browser, tmp_path: Path, width: int, height: int
 ) -> None:
-    for name, text in {**simulated, "harmful": shown_text(harmful()), "empty": shown_text(written([]))}.items():
+    silent = shown_text(written(reports(50, health=state_of(Level.OK, START))), now=START + 7300.0)
+    own = {"harmful": shown_text(harmful()), "silent": silent, "empty": shown_text(written([]))}
+    for name, text in {**simulated, **own}.items():
         path = tmp_path / f"{name}.html"
         path.write_text(text, encoding="utf-8")
         tab.open(path, width, height, is_phone=width < 500)
@@ -283,6 +292,8 @@ def test_a_page_logs_and_requests_nothing_in_a_browser(
         assert tab.value("document.documentElement.scrollWidth") <= width
         assert tab.value(VERDICT) <= height
         assert tab.value(SMALLEST) >= 11
+        assert name == "harmful" or tab.value(SPLIT) == []
+        assert tab.value(CUT) == []
 
 
 FIRST = "document.querySelectorAll('.verdict > .badge, .verdict .event:first-of-type')"
@@ -292,6 +303,22 @@ SMALLEST = (
     "Math.min(...[...document.querySelectorAll('body *')].map(row => parseFloat(getComputedStyle(row).fontSize)))"
 )
 """Size of the smallest text, px."""
+CUT = """[...document.querySelectorAll('.labels span')].filter(
+  row => row.getBoundingClientRect().right > row.parentElement.getBoundingClientRect().right
+).map(row => row.textContent)"""
+"""Labels of plots that are wider than their column."""
+SPLIT = r"""(() => {
+  const split = [], range = document.createRange();
+  const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (texts.nextNode())
+    for (const number of texts.currentNode.data.matchAll(/\d[\d.:-]*|\b[A-Z]+\b/g)) {
+      range.setStart(texts.currentNode, number.index);
+      range.setEnd(texts.currentNode, number.index + number[0].length);
+      if (new Set([...range.getClientRects()].map(part => Math.round(part.top))).size > 1) split.push(number[0]);
+    }
+  return split;
+})()"""
+"""Numbers, times and states that do not stand on one line."""
 
 
 def test_a_printed_page_has_few_sheets_of_paper(simulated: dict[str, str], tab: Browser, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def test_the_text_has_state_what_since_when_how_sure_and_what_to_do() -> None:
     assert text.startswith("# ACT\nsince ")
     for part in (
         "## ACT: winding: short circuit between turns of the winding\nsince",
-        "R\\_a is 5.8 ohm",
+        "R\\_a is 5.8 Ω",
         "% probability)",
         "**What to do: plan a replacement of the winding",
     ):

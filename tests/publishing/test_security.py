@@ -30,7 +30,7 @@ from otolith.publishing.zenoh_session import ALIVE, Publisher, session
 from tests.conftest import free_port
 from tests.health.test_events import report
 from tests.publishing import attacker
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE, wait_for
 
 STRANGER = 65533  # a user of no group
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
@@ -65,7 +65,7 @@ class Reader:
 
     def queried(self) -> list[str]:
         """All answers to a query for the reports of all machines."""
-        replies = self.session.get("otolith/*/*/report", target=zenoh.QueryTarget.ALL, timeout=5.0)
+        replies = self.session.get("otolith/*/*/report", target=zenoh.QueryTarget.ALL, timeout=PATIENCE)
         return [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
 
     def receives(self, publisher: Publisher, count: int = 5) -> list[str]:

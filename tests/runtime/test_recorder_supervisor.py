@@ -63,7 +63,7 @@ def test_a_stopped_recorder_is_killed_and_counted(
     supervisor.offer(first, 200.0)
     wait_for(answered(supervisor, 201.0))
     supervisor.stop(10.0)
-    _, second = sorted((tmp_path / "recordings").iterdir())
+    _, second = sorted((tmp_path / "recordings").iterdir(), key=lambda path: path.stat().st_mtime_ns)
     with RecordingReader(second, UNITS) as reader:
         assert sum(len(part.times) for part in reader.chunks()) == 200
 

@@ -21,11 +21,13 @@ from otolith.adaptation.state import (
     apply_decisions,
     component_records,
     initial_state,
+    with_problem,
 )
 from otolith.estimation.imm_filter import ParameterCusum
 from otolith.health.events import HealthState
 from otolith.health.schema import EventChange, ForecastDocument, ReportDocument, Status
 from otolith.machine import load_machine
+from otolith.storage.learned_state import learned_state, restored
 from otolith.storage.state_store import MAX_KEPT, MAX_STATE_BYTES, StateStore
 from otolith_drivers.errors import OtolithError
 from tests.conftest import EXAMPLES
@@ -74,6 +76,17 @@ def test_a_restored_state_gives_the_same_reports_bit_for_bit(
     after = windows(simulate_motor("sweep", 4.0, Faults(), seed=4), START + 26.0)
     reports = [[report.to_json() for report in run(each, after)[1]] for each in (warm, state)]
     assert reports[0] == reports[1]
+
+
+def test_noise_of_inputs_is_restored_and_older_files_lack_it(tmp_path: Path) -> None:
+    state, levels = healthy(), [2.0 * level for level in PROBLEM.levels]
+    document = learned_state(with_problem(state, PROBLEM.with_levels(levels)), "")
+    assert document.filter is not None
+    assert restored(document, fresh(), START + 30.0).problem.levels == tuple(levels)
+    older = with_problem(state, PROBLEM.with_levels((*PROBLEM.levels[:2], *levels[2:])))
+    record = document.filter.model_copy(update={"noise": tuple(levels[2:])})
+    warm = restored(document.model_copy(update={"filter": record}), fresh(), START + 30.0)
+    assert warm.problem.levels == older.problem.levels
 
 
 @pytest.mark.parametrize("away", [20.0, 8 * 3600.0, YEAR, -3600.0, -YEAR, -START], ids=lambda away: f"{away:g} s")

@@ -80,7 +80,7 @@ def is_saved(store: StateStore) -> bool:
     return learned is not None and all(before["known"] for before in learned["previous"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.full)])
 def test_the_first_reports_after_a_restart_hold_the_truth(
     start: Start, store: StateStore, number: signal.Signals
 ) -> None:

@@ -11,6 +11,7 @@ from tests.system.conftest import Running, is_estimated
 from tests.waiting import EXACT, within
 
 TRUE = 6.5  # ohm
+OFTEN = ("can", "modbus-rtu")  # no other test of make test estimates over the latter
 MAX_DEVIATION = 3.5  # standard deviations: one run in two thousand exceeds them by chance
 
 
@@ -22,7 +23,9 @@ def is_healthy(report: ReportDocument) -> bool:
 
 
 @pytest.mark.timed
-@pytest.mark.parametrize("transport", TRANSPORTS)
+@pytest.mark.parametrize(
+    "transport", [pytest.param(name, marks=() if name in OFTEN else pytest.mark.full) for name in TRANSPORTS]
+)
 def test_every_transport_gives_the_same_resistance(transport: str, tmp_path: Path) -> None:
     running = Running(OwnMachine(tmp_path / transport, transport, faults=""), tmp_path)
     try:

@@ -15,7 +15,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
 from otolith.adaptation.state import AdaptationState, with_posterior
 from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
-from otolith.discovery.ambiguity import WRONG_WINDOW, mixture
+from otolith.discovery.ambiguity import mixture
 from otolith.discovery.decision import (
     MAX_COST,
     UPDATES,
@@ -29,8 +29,8 @@ from otolith.discovery.screening import screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, open_test
 from otolith.estimation.augmented import slot_of
-from otolith.estimation.data_checks import CheckedWindow, check_window
-from otolith.estimation.imm_filter import ParameterCusum
+from otolith.estimation.data_checks import CheckedWindow, check_window, without_saturated
+from otolith.estimation.imm_filter import Innovation, ParameterCusum
 from otolith.estimation.information import QUANTILE, Identifiability, information
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
@@ -40,7 +40,7 @@ from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
 
-UNUSED = "window not estimated from: "
+UNUSED = "nothing is estimated from this window: "
 MIN_GAP_SHARE = 0.05  # of a window: a shorter gap is not named; engineering choice
 
 
@@ -59,7 +59,8 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
         else:  # steps between faulty values are none of a converter
             predicted = state.posterior.predict(window)
     act = _estimate if checked.is_usable else _reject
-    result = replace(act(state, predicted, checked), notes=checked.notes)
+    result = act(state, predicted, checked)
+    result = replace(result, notes=(*checked.notes, *(sensor.text for sensor in result.faulty_sensors)))
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)
@@ -71,19 +72,33 @@ def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWind
     """Return the result of a window whose data are usable, unless a gap leaves nothing to determine."""
     search = Search.NEVER if some_parameter_is_determined(state.previous) else Search.FROM_BOUNDS
     estimated = estimate_window(predicted, checked.window, search)
+    innovation = predicted.innovation(estimated.evidence)
+    if not _is_expected(innovation, estimated) and (rest := without_saturated(predicted, checked.window)) is not None:
+        again = estimate_window(predicted, rest.window, search)
+        result = _decide(state, predicted, again, predicted.innovation(again.evidence))
+        return replace(result, faulty_sensors=rest.faulty_sensors)
     gap = unbridged_gap(estimated) if checked.window.bridge_error is not None else ""
-    return _reject(state, predicted, replace(checked, bad=(gap,))) if gap else _decide(state, predicted, estimated)
+    if gap:
+        return _reject(state, predicted, replace(checked, bad=(gap,)))
+    return _decide(state, predicted, estimated, innovation)
+
+
+def _is_expected(innovation: Innovation, estimated: WindowEstimate) -> bool:
+    """Whether the twin explains the window, and its prediction agrees with it."""
+    return estimated.cost <= EXPLAINED and innovation.is_expected
 
 
 def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
     """Return the result of a window whose data are faulty: it does not update the posterior."""
     decision = WindowDecision.BAD if checked.bad else WindowDecision.SENSOR
-    reason = UNUSED + "; ".join(checked.bad or (sensor.text for sensor in checked.faulty_sensors))
+    reason = UNUSED + "; ".join(checked.bad or (f"{sensor.text}; {sensor.advice}" for sensor in checked.faulty_sensors))
     result = WindowResult.unchanged(state, predicted, decision, reason=reason)
     return replace(result, faulty_sensors=checked.faulty_sensors)
 
 
-def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
+def _decide(
+    state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, innovation: Innovation
+) -> WindowResult:
     """Test the estimate against the prediction, and screen the window for what the twin lacks.
 
     An expected window without such a sign updates the filter. Otherwise, or while a test is open, hypotheses are
@@ -92,7 +107,7 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
-    is_expected = estimated.cost <= EXPLAINED and predicted.expects(estimated.evidence)
+    is_expected = _is_expected(innovation, estimated)
     shifts = _shifts(state, predicted, estimated)
     moved = shifts.moved
     is_calm = is_expected and not screening.is_positive
@@ -100,18 +115,20 @@ def _decide(state: AdaptationState, predicted: Posterior, estimated: WindowEstim
     if test is not None and test.best.type is FaultType.NOTHING and not is_expected:
         test = None  # the window shows something else than what opened the test
     if test is not None:
-        act = _update_filter_beside if is_calm and not moved and not test.rejects_filter else _apply_decision
-        result = act(state, predicted, estimated, test)
+        if is_calm and not moved and not test.rejects_filter:
+            result = _update_filter_beside(state, innovation, estimated, test)
+        else:
+            result = _apply_decision(state, predicted, estimated, test)
     elif is_calm:
         if moved:
             result = _follow_shifts(state, predicted.reset_parameters(moved), estimated)
         else:
-            result = _update_filter(state, predicted, estimated)
+            result = _update_filter(state, innovation, estimated)
         return replace(result, shifts=shifts)
     else:
         state, test = replace(state, test=None), open_test(predicted, screening)
         if is_expected and test.is_null_possible:
-            result = _update_filter(state, predicted, estimated)
+            result = _update_filter(state, innovation, estimated)
         else:
             result = _apply_decision(state, predicted, estimated, test)
     return replace(result, searched=True, shifts=shifts)
@@ -130,7 +147,7 @@ def _apply_decision(
     state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, test: SequentialTest
 ) -> WindowResult:
     """Return the result of a window that the filter does not expect, or that shows what the twin lacks."""
-    test = replace(test, quiet=0)
+    test = replace(test, quiet=0, is_explained=test.is_explained or test.explains)
     outcome = decide(test, state.learned)
     if outcome.update is PosteriorUpdate.HYPOTHESIS:
         return _adopt_hypothesis(state, estimated, test, outcome)
@@ -140,30 +157,29 @@ def _apply_decision(
         return WindowResult.unchanged(state, predicted, WindowDecision.REFUSED, estimate=estimated)
     if state.test is None:  # a change in the last records is left to the next window: nothing else was compared
         return WindowResult.unchanged(state, predicted, WindowDecision.SUSPECTED, estimate=estimated)
-    return _update_filter(state, predicted, estimated)
+    return _update_filter(state, predicted.innovation(estimated.evidence), estimated)
 
 
 def _update_filter_beside(
-    state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, test: SequentialTest
+    state: AdaptationState, innovation: Innovation, estimated: WindowEstimate, test: SequentialTest
 ) -> WindowResult:
     """Update the filter with a window that shows nothing of what opened the test.
 
     The window that opened it may have been wrong, so that the filter goes on. But windows of a machine at rest are no
     evidence against its hypotheses: it is closed only when windows are decisive evidence for the filter. Until then the
-    filter is one of the hypotheses.
+    filter is one of the hypotheses. Hypotheses that explain no window have no evidence to lose.
     """
-    result = _update_filter(state, predicted, estimated)
-    if test.accepts_filter or test.best.type is FaultType.NOTHING:
+    result = _update_filter(state, innovation, estimated)
+    if test.accepts_filter or test.best.type is FaultType.NOTHING or not test.is_explained:
         return result
     return _with_mixture(replace(result, test=replace(test, quiet=test.quiet + 1)), state.problem)
 
 
-def _update_filter(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
+def _update_filter(state: AdaptationState, innovation: Innovation, estimated: WindowEstimate) -> WindowResult:
     """Return the result of a window that updates the filter; a faded component that it does not need is removed."""
-    before = predicted.prior()
     if state.test is not None and state.test.quiet == 0:  # the windows before were wrong for an unknown reason
-        predicted = predicted.inflate_variance(state.test.null_reduced_chi_square)
-    posterior = predicted.update(estimated.evidence, estimated.advance)
+        innovation = innovation.inflate_variance(state.test.null_reduced_chi_square)
+    posterior, before = state.posterior.update(innovation, estimated.advance), estimated.fit.prior
     result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), (), estimate=estimated)
     return _without_faded(state, result, estimated) if state.adopted else result
 
@@ -171,7 +187,7 @@ def _update_filter(state: AdaptationState, predicted: Posterior, estimated: Wind
 def _follow_shifts(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
     """Return the result of a window that, with those before, shows a change; ``predicted`` forgets what has moved."""
     again = estimate_window(predicted, estimated.fit.window)
-    result = _update_filter(state, predicted, again)
+    result = _update_filter(state, predicted.innovation(again.evidence), again)
     if result.decision is WindowDecision.FADED:
         return result
     return replace(result, decision=WindowDecision.STEPPED, before=result.after)
@@ -231,9 +247,7 @@ def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:
     test = result.test
     if test is None or result.posterior.problem.free != problem.free:
         return result
-    is_sure = result.is_explained and test.settled > 1  # one window alone is as likely to be wrong itself
-    wrong = test.filter_probability if is_sure else max(test.filter_probability, WRONG_WINDOW)
-    mixed = mixture(test.hypotheses, test.probabilities, problem, result.after, wrong)
+    mixed = mixture(test.hypotheses, test.probabilities, problem, result.after, test.wrong_probability)
     return replace(result, before=mixed, after=mixed, is_mixture=True)
 
 

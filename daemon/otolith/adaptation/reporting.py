@@ -47,6 +47,7 @@ from otolith.health.status import (
     some_parameter_is_determined,
 )
 from otolith.twin.component_families import SourceKind
+from otolith_drivers.units import equation_text
 
 DISAGREEING_RATIO = 3.0  # ratio of variances above which windows disagree with each other
 DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
@@ -56,6 +57,8 @@ DATA_FAULTS = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
 OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
 """Decisions after which the hypotheses of a test go on, and their mixture is published."""
 OPEN_CONDITION = "the data do not yet decide between the hypotheses"
+NOT_EXPLAINED = "no hypothesis explains the data up to the noise: the cause may be one that is not among them"
+NEAREST = "not explained: the nearest hypothesis, {hypothesis}, leaves {factor:.1f} times the noise"
 SENSOR_CONDITION = "its samples cannot be true"
 NOISE_CONDITION = "the innovations are white, but larger than [noise] allows"
 NOISE_ADVICE = "if it has always been so, correct [noise]; otherwise inspect the sensor, its cable and its supply"
@@ -115,7 +118,7 @@ class WindowResult:
     @property
     def is_explained(self) -> bool:
         """Whether the best hypothesis of an open test explains the window up to the noise."""
-        return self.test is None or self.test.best.cost <= EXPLAINED
+        return self.test is None or self.test.explains
 
     def contradictions(self, state: AdaptationState) -> int:
         """Return how many windows in a row, with this one, did not update the posterior; bad data are not counted."""
@@ -137,7 +140,6 @@ def make_report(
     _add_advice(parameters, result, situation)
     components = _component_documents(problem, result.after, result.adopted)
     undecided = None if result.is_accepted and not result.is_mixture else result.test
-    explanations = _explanations(undecided)
     document = ReportDocument(
         machine=state.machine,
         site=state.site,
@@ -147,12 +149,10 @@ def make_report(
         decision=result.decision,
         parameters=parameters,
         components=components,
-        explanations=explanations,
+        explanations=_explanations(undecided),
         findings=(
             *(_sensor_finding(sensor, window.start) for sensor in result.faulty_sensors),
-            *_findings(
-                components, explanations, result, result.noisier_since(state), _experiment(undecided, situation)
-            ),
+            *_findings(components, undecided, result, result.noisier_since(state), _experiment(undecided, situation)),
         ),
         **_fit_and_cost(problem, result),
     )
@@ -215,8 +215,7 @@ def _reason(state: AdaptationState, result: WindowResult) -> str:
     if decision is not WindowDecision.LEARNED:
         reasons.append(decision.value)
     if test is not None and result.is_mixture:
-        others = [f"or {other.text} ({other.probability:.0%})" for other in alternatives_of(test, test.best)[:2]]
-        reasons.append("; ".join([f"{describe_hypothesis(test.best)} ({test.probabilities[0]:.0%})", *others]))
+        reasons.append(_hypotheses_text(test))
     if result.estimate.cost > EXPLAINED and decision is not WindowDecision.REFUSED:
         reasons.append(UNEXPLAINED)
     variance_ratio = result.posterior.belief.variance_ratio
@@ -320,16 +319,24 @@ def _component_document(
 
 
 def _explanations(test: SequentialTest | None) -> tuple[AlternativeDocument, ...]:
-    """Return the competing hypotheses, the most probable first."""
-    if test is None or test.best.type is FaultType.NOTHING:
+    """Return the competing hypotheses, the most probable first; none if even that does not explain the window."""
+    if test is None or test.best.type is FaultType.NOTHING or not test.explains:
         return ()
     best = Alternative(test.best.type, describe_hypothesis(test.best), test.probabilities[0])
-    return _alternative_documents((best, *alternatives_of(test, test.best)))
+    return _alternative_documents((best, *alternatives_of(test, test.best)), 1.0 - test.wrong_probability)
 
 
-def _alternative_documents(alternatives: Sequence[Alternative]) -> tuple[AlternativeDocument, ...]:
+def _hypotheses_text(test: SequentialTest) -> str:
+    """Return the most probable hypotheses in words; without probabilities if none explains the window."""
+    stated = [f"{item.text} ({_share(item.probability)})" for item in _explanations(test)[:3]]
+    return "; or ".join(stated) or NEAREST.format(hypothesis=describe_hypothesis(test.best), factor=test.best.cost)
+
+
+def _alternative_documents(alternatives: Sequence[Alternative], right: float = 1.0) -> tuple[AlternativeDocument, ...]:
+    """Return the documents of ``alternatives``, of which one holds with the probability ``right``."""
     return tuple(
-        AlternativeDocument(reason=item.type, text=item.text, probability=item.probability) for item in alternatives
+        AlternativeDocument(reason=item.type, text=item.text, probability=right * item.probability)
+        for item in alternatives
     )
 
 
@@ -342,21 +349,22 @@ def _sensor_finding(sensor: FaultySensor, start: float) -> FindingDocument:
         condition=SENSOR_CONDITION,
         text=sensor.text,
         since=start,
+        advice=sensor.advice,
     )
 
 
 def _findings(
     components: Sequence[ComponentDocument],
-    explanations: Sequence[AlternativeDocument],
+    undecided: SequentialTest | None,
     result: WindowResult,
     noisier_since: float | None,
     experiment: str,
 ) -> tuple[FindingDocument, ...]:
     """Return a finding for each component that is not approved, for noisier sensors, and for an open test.
 
-    ``experiment`` is what would decide the test.
+    ``undecided`` is the test if it is still open, and ``experiment`` what would decide it.
     """
-    decision, test = result.decision, result.test
+    decision = result.decision
     findings = [
         _component_finding(component)
         for component in components
@@ -375,23 +383,29 @@ def _findings(
                 advice=NOISE_ADVICE,
             )
         )
-    if explanations and test is not None:
-        best, kind, subject = explanations[0], *_kind_and_subject(decision, test)
-        others = "".join(f"; or {other.text} ({other.probability:.0%})" for other in explanations[1:3])
+    if undecided is not None and undecided.best.type is not FaultType.NOTHING:
+        kind, subject = _kind_and_subject(decision, undecided)
+        stated = f"{undecided.best.type}: " if undecided.explains else ""
+        condition = AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION
         findings.append(
             FindingDocument(
                 id=f"{kind}/{subject}" if subject else "undecided",
                 kind=kind,
                 subject=subject,
                 severity=Severity.FAULT if decision in DATA_FAULTS else Severity.WARNING,
-                condition=AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION,
-                text=f"{best.reason}: {best.text} ({best.probability:.0%}){others}",
-                since=test.onset,
-                advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),
-                value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
+                condition=condition if undecided.explains else NOT_EXPLAINED,
+                text=stated + _hypotheses_text(undecided),
+                since=undecided.onset,
+                advice="; ".join(filter(None, (experiment, _machine_file_advice(undecided)))),
+                value=_moved_value(undecided, subject) if kind is FindingKind.MOVED else None,
             )
         )
     return tuple(findings)
+
+
+def _share(probability: float) -> str:
+    """A probability; what is undecided has no 100 %, and an alternative that is named no 0 %."""
+    return ">99%" if probability > 0.99 else "<1%" if probability < 0.01 else f"{probability:.0%}"
 
 
 def _kind_and_subject(decision: WindowDecision, test: SequentialTest) -> tuple[FindingKind, str]:
@@ -412,7 +426,8 @@ def _moved_known(test: SequentialTest) -> str:
     """Return the parameter that the machine file gives as known and that has moved for all that the test shows."""
     names = {parameter.name for parameter in test.best.problem.free} & {name for name, _ in test.problem.known}
     is_sure = test.leading >= COMPONENT_WINDOWS and test.probability(FaultType.PARAMETER) >= COMPONENT_PROBABILITY
-    return names.pop() if test.best.type is FaultType.PARAMETER and len(names) == 1 and is_sure else ""
+    is_alone = test.explains and test.best.type is FaultType.PARAMETER and len(names) == 1
+    return names.pop() if is_alone and is_sure else ""
 
 
 def _moved_value(test: SequentialTest, name: str) -> NumberDocument:
@@ -434,7 +449,7 @@ def _component_finding(component: ComponentDocument) -> FindingDocument:
         subject=component.site,
         severity=Severity.WARNING,
         condition=component.conditions,
-        text=f"new {component.meaning}: {component.equation}",
+        text=f"new {component.meaning}: {equation_text(component.equation)}",
         since=component.onset,
     )
 
@@ -451,7 +466,7 @@ def _machine_file_advice(test: SequentialTest) -> str:
 
 def _experiment(test: SequentialTest | None, situation: Situation | None) -> str:
     """Return the experiment that would distinguish the most probable hypothesis from the next one."""
-    if test is None or situation is None:
+    if test is None or situation is None or not test.explains:
         return ""
     others = test.alternatives(test.best)
     return deciding_experiment(test.best, others[0][0], situation) if others else ""

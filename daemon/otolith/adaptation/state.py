@@ -87,7 +87,7 @@ def cleared(state: AdaptationState) -> AdaptationState:
     problem = state.problem
     for component in problem.components:
         problem = without(problem, component)
-    problem = replace(problem, noise=problem.stated_noise or problem.noise, stated_noise=(), steps=())
+    problem = replace(problem.with_levels(problem.stated_levels), steps=())
     initial = initial_state(state.machine, state.site, problem, state.plan)
     return replace(initial, restricted=state.restricted, approved=state.approved)
 

@@ -110,9 +110,9 @@ def echo_warnings(data: Path, lines: Iterable[str]) -> None:
 
 
 def local_time(seconds: float) -> str:
-    """Unix ``seconds`` as date and time of this computer's time zone."""
+    """Unix ``seconds`` as date and time of this computer's time zone, with its name."""
     try:
-        return time.strftime("%F %T", time.localtime(seconds))
+        return time.strftime("%F %T %Z", time.localtime(seconds))
     except (ValueError, OverflowError, OSError):
         return f"{seconds:g} s"  # no clock has such a time, but a file may
 

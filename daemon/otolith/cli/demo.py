@@ -28,7 +28,7 @@ from otolith.cli.common import INTERRUPTED, drain, local_time
 from otolith.cli.operation.live_table import LEVEL_STYLES, LiveTable, event_style
 from otolith.estimation.information import QUANTILE
 from otolith.health.schema import ComponentDocument, EventDocument, HealthDocument, ReportDocument, Status
-from otolith.health.text import announcements, event_text, half_width_text, headline, summary
+from otolith.health.text import announcements, event_text, headline, number_text, number_texts, summary
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import SOCKET, Connection, listening
@@ -37,6 +37,7 @@ from otolith.runtime.process import ChildProcess
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from otolith_drivers.plant.faults import Unbalance
 from otolith_drivers.plant.scenario import load_scenario
+from otolith_drivers.units import equation_text, unit_text
 from otolith_drivers.user_dirs import state_directory, writable
 
 # The verdict. Engineering choices; tests/system/test_main_job.py runs the demo and asserts the same TOLERANCE.
@@ -132,10 +133,10 @@ class UnbalanceComparison:
 
     def __str__(self) -> str:
         """Injected and discovered equation."""
-        injected = f"injected {self.amplitude:.4g}·sin({self.inner:.4g}·{self.source} + ...) N*m"
+        injected = equation_text(f"injected {self.amplitude:.4g}·sin({self.inner:.4g}·{self.source} + ...) N*m")
         if self.component is None:
             return f"{injected}; no component was found"
-        return f"{injected}; found {self.component.equation} ({self.component.conditions})"
+        return f"{injected}; found {equation_text(self.component.equation)} ({self.component.conditions})"
 
 
 def compare_unbalance(fault: Unbalance, inertia: float, components: Sequence[ComponentDocument]) -> UnbalanceComparison:
@@ -348,16 +349,15 @@ class Demo:
         table = Table(title=f"injected and estimated, good windows with excitation{every}")
         for column in ("window", "parameter", "injected", "estimated ± 95 %", "unit", "error"):
             table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
-        units = {parameter.name: parameter.unit for parameter in self._machine.problem.free}
+        units = {parameter.name: unit_text(parameter.unit) for parameter in self._machine.problem.free}
         last = [] if (len(rows) - 1) % step == 0 else rows[-1:]
         for row in [*rows[::step], *last]:
             text, error, style = "unknown", "", None
             if row.estimated is not None:
-                text, error = f"{row.estimated:.5g} ± {half_width_text(row.sd)}", f"{row.error:.3%}"
+                text, error = " ± ".join(number_texts(row.estimated, QUANTILE * row.sd)), f"{row.error:.3%}"
                 style = "red" if row.wrong else None
-            table.add_row(
-                str(row.window), row.parameter, f"{row.injected:.5g}", text, units[row.parameter], error, style=style
-            )
+            injected, unit = number_text(row.injected), units[row.parameter]
+            table.add_row(str(row.window), row.parameter, injected, text, unit, error, style=style)
         return table
 
     def _print_changes(self, rows: list[Comparison]) -> None:
@@ -367,7 +367,8 @@ class Demo:
             errors = [row.error for row in own if row.estimated is not None]
             if errors:
                 before, after = own[0].injected, own[-1].injected
-                change = f"from {before:.5g} to {after:.5g} {parameter.unit} ({after / before - 1:+.1%})"
+                values = f"from {number_text(before)} to {number_text(after)} {unit_text(parameter.unit)}"
+                change = f"{values} ({after / before - 1:+.1%})"
                 error = f"largest error {max(errors):.3%} in {len(errors)} windows"
                 self._print(f"{parameter.name} went {change}; {error}")
 

@@ -32,15 +32,14 @@ from otolith.commissioning.likelihood import (
     with_levels,
 )
 from otolith.commissioning.whiteness import Whiteness, whiteness
+from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
+from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
 from otolith.estimation.objective import Objective
 from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
-DIFFERENCE_ORDER = 4  # differences of this order remove what a cubic follows over five records
-DIFFERENCE_GAIN = np.sqrt(70.0)  # of white noise by these differences: √(1² + 4² + 6² + 4² + 1²)
-NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal deviate
 PROCESS_DECADES = range(-14, 3)  # searched for the initial process noise, in widths of the state's bounds
 OBSERVABLE = np.log(2.0)  # increase of the mean log variance of the innovations: process noise as large as all other
 PROCESS_RESOLUTION = 0.125  # decades, of the initial process noise
@@ -142,15 +141,16 @@ def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progre
         states = (NoiseLevel(state.name, level) for state, level in zip(twin.states, process, strict=True))
         return IdentifiedNoise(tuple(outputs), tuple(states), guess.remarks)
     best = backward_elimination(guess.variances, guess.fits, progress)
-    guess, best, consistency, levels, inflated = _without_outlying(guess, best, progress)
+    guess, best, made = _without_outlying(guess, best, progress)
+    consistency = made.consistency
     return IdentifiedNoise(
         outputs=tuple(_output_levels(twin, guess, best)),
-        states=tuple(_state_levels(twin, guess, best, levels, consistency.degrees)),
+        states=tuple(_state_levels(twin, guess, best, made.levels, consistency.degrees)),
         remarks=guess.remarks,
         consistency=consistency,
         before_inflation=tuple(best.levels.tolist()),
         whiteness=whiteness(best.fits),
-        whiteness_after=whiteness(inflated) if inflated else (),
+        whiteness_after=whiteness(made.inflated) if made.inflated else (),
         log_likelihood=-0.5 * best.deviance,
         windows=len(guess.fits),
         evaluations=likelihood.evaluations,
@@ -211,9 +211,20 @@ def _first_fits(
     return fits
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _ConsistentLevels:
+    """What the consistency test leads to."""
+
+    consistency: Consistency
+    levels: Array
+    """(outputs + states,), inflated if necessary."""
+    inflated: Fits = ()
+    """The windows fitted with inflated levels; none if they are not."""
+
+
 def _without_outlying(
     guess: _InitialGuess, best: LikelihoodPoint, progress: Progress
-) -> tuple[_InitialGuess, LikelihoodPoint, Consistency, Array, Fits]:
+) -> tuple[_InitialGuess, LikelihoodPoint, _ConsistentLevels]:
     """The same without the few windows that no noise of the others explains, and what :func:`_make_consistent` returns.
 
     One window in which the machine sticks, or somebody touches it, would otherwise be explained by process noise that
@@ -225,14 +236,14 @@ def _without_outlying(
     while len(outlying) < limit:
         scores = [outlyingness(best.fits, index, likelihood.width) for index in range(len(best.fits))]
         index = int(np.argmax(scores))
-        if made[0].factor == 1.0 and scores[index] < OUTLYING:
+        if made.consistency.factor == 1.0 and scores[index] < OUTLYING:
             break
         first = [*guess.fits[:index], *guess.fits[index + 1 :]]
         progress(f"without the window at {best.fits[index].window.start:g} s")
         # From the first fits, as those at levels that this window has spoilt may be at another minimum.
         others = backward_elimination(guess.variances, first, progress)
         made_of_others = _make_consistent(guess, others, progress)
-        fits = likelihood.refit(made_of_others[1], [best.fits[index], *others.fits])
+        fits = likelihood.refit(made_of_others.levels, [best.fits[index], *others.fits])
         if outlyingness(fits, 0, likelihood.width) < OUTLYING:
             break
         outlying.append(fits[0])
@@ -241,22 +252,19 @@ def _without_outlying(
         starts = ", ".join(f"{round(start, 6) + 0.0:g} s" for start in sorted(fit.window.start for fit in outlying))
         remark = EXCLUDED_OUTLYING.format(len(outlying), len(outlying) + len(guess.fits), starts)
         guess = replace(guess, remarks=(*guess.remarks, remark))
-    return guess, best, *made
+    return guess, best, made
 
 
-def _make_consistent(
-    guess: _InitialGuess, best: LikelihoodPoint, progress: Progress
-) -> tuple[Consistency, Array, Fits]:
-    """The result of the consistency test, and the levels (outputs + states,), inflated if necessary.
-
-    If they are, the windows fitted with them are the last part; else there are none.
-    """
+def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Progress) -> _ConsistentLevels:
+    """Test whether the windows agree with each other, and inflate the process noise if they do not."""
     likelihood, outputs = guess.variances.likelihood, len(guess.signal_noise)
     before = consistency_test(best.fits, likelihood.width)
     if not before.degrees:
-        return Consistency(remark=ONE_WINDOW if len(best.fits) == 1 else NOT_COMPARABLE), best.levels, ()
+        remark = ONE_WINDOW if len(best.fits) == 1 else NOT_COMPARABLE
+        return _ConsistentLevels(Consistency(remark=remark), best.levels)
     if before.passed:
-        return Consistency(before.degrees, before.reduced, before.reduced, 1.0, CONSISTENT), best.levels, ()
+        consistency = Consistency(before.degrees, before.reduced, before.reduced, 1.0, CONSISTENT)
+        return _ConsistentLevels(consistency, best.levels)
     sensors, process = best.levels.copy(), best.levels.copy()
     sensors[outputs:], process[:outputs] = 0.0, 0.0
     added = not process.any()
@@ -266,10 +274,11 @@ def _make_consistent(
     progress(f"reduced chi-square of the windows: {before.reduced:.3g}")
     factor, after, inflated = inflate_process_noise(likelihood, lambda factor: sensors + factor * process, best.fits)
     if not after.degrees or not after.passed:
-        return Consistency(before.degrees, before.reduced, before.reduced, None, NOT_INFLATED), best.levels, ()
+        consistency = Consistency(before.degrees, before.reduced, before.reduced, None, NOT_INFLATED)
+        return _ConsistentLevels(consistency, best.levels)
     remark = ADDED if added else INFLATED + (DOUBTFUL if factor > MAX_PLAUSIBLE_FACTOR else "")
     consistency = Consistency(before.degrees, before.reduced, after.reduced, None if added else factor, remark)
-    return consistency, sensors + factor * process, inflated
+    return _ConsistentLevels(consistency, sensors + factor * process, inflated)
 
 
 def _output_levels(twin: Definition, guess: _InitialGuess, best: LikelihoodPoint) -> Iterator[NoiseLevel]:
@@ -295,6 +304,17 @@ def _state_levels(
             own = sd / most_probable if most_probable else 0.0
             of_factor = 0.0 if value == most_probable else 1.0 / np.sqrt(2.0 * degrees)
             yield NoiseLevel(state.name, value, value * float(np.hypot(own, of_factor)), "")
+
+
+def explains_no_window(problem: Problem, noise: IdentifiedNoise, window: Window) -> bool:
+    """Return whether the sensors alone are too noisy for the levels of ``problem``, with its process noise.
+
+    Then no hypothesis is accepted in any window, not even that a sensor is noisier than stated.
+    """
+    objective = Objective(problem, window, problem.nominal)
+    variances = objective.present * np.array([level.value for level in noise.outputs]) ** 2
+    ratio = np.einsum("rop,rp->", objective.whitening**2, variances) / objective.count
+    return bool(ratio > MAX_NOISE_FACTOR**2)
 
 
 def with_initial_noise(problem: Problem, windows: Sequence[Window]) -> Problem:
@@ -347,31 +367,11 @@ def sample_noise(output: str, windows: Sequence[Window]) -> float:
     """
     deviations = []
     for window in windows:
-        differences = _differences(output, window)
+        differences = sample_differences(output, window)
         if len(differences):
-            robust = float(np.median(np.abs(differences))) / NORMAL_MEDIAN
+            robust = MAD_TO_SD * float(np.median(np.abs(differences)))
             deviations.append(robust or float(np.std(differences)))
     return float(np.median(list(filter(None, deviations)) or [0.0])) if deviations else float("nan")
-
-
-def _differences(output: str, window: Window) -> Array:
-    """(differences,) of neighbouring samples, without what a cubic follows; of the noise's standard deviation.
-
-    At times that are not uniform they are divided differences (J. Stoer, R. Bulirsch, Introduction to Numerical
-    Analysis, section 2.1.3), normalised to the same gain for white noise.
-    """
-    present, values = ~window.missing_in(output), window.column(output)
-    if window.grid.period is not None and present.all():
-        return np.asarray(np.diff(values, DIFFERENCE_ORDER) / DIFFERENCE_GAIN)
-    values, times = values[present], window.grid.offsets[present]
-    if len(values) <= DIFFERENCE_ORDER:
-        return np.zeros(0)
-    neighbours = np.lib.stride_tricks.sliding_window_view(times, DIFFERENCE_ORDER + 1)
-    spacings = neighbours[:, :, None] - neighbours[:, None, :] + np.eye(DIFFERENCE_ORDER + 1)
-    weights = 1.0 / (spacings / np.ptp(neighbours, axis=1)[:, None, None]).prod(axis=2)
-    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-    around = np.lib.stride_tricks.sliding_window_view(values, DIFFERENCE_ORDER + 1)
-    return np.asarray((weights * (around - around[:, :1])).sum(axis=1))  # exactly zero if all five are equal
 
 
 def _observable_process_noise(problem: Problem, sensors: Array, window: Window) -> Array:

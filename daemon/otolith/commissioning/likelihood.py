@@ -93,12 +93,17 @@ class Likelihood:
         """Minus twice the restricted log-likelihood, up to a constant."""
         return sum(self._deviance(fit.objective, fit.result.chi_square, fit.result.jacobian) for fit in fits)
 
-    def linearise(self, levels: Array, fits: Fits) -> Linearisation:
-        """At ``levels`` close to those of ``fits``, without a new fit: χ² is stationary at the fitted guess."""
+    def linearise(self, levels: Array | None, fits: Fits) -> Linearisation:
+        """At ``levels`` close to those of ``fits``, without a new fit: χ² is stationary at the fitted guess.
+
+        None stands for the levels of ``fits``.
+        """
         deviance, innovations, factors = 0.0, [], []
         for fit in fits:
-            objective = self._objective(levels, fit, fit.centre)
-            residuals, jacobian = objective.linearise(fit.guess)
+            objective, residuals, jacobian = fit.objective, fit.result.residuals, fit.result.jacobian
+            if levels is not None:
+                objective = self._objective(levels, fit, fit.centre)
+                residuals, jacobian = objective.linearise(fit.guess)
             deviance += self._deviance(objective, float(residuals @ residuals), jacobian)
             innovations.append(self.project(residuals, fit.result.jacobian))
             factors.append(np.log(np.diagonal(objective.whitening, axis1=1, axis2=2)).ravel())
@@ -185,7 +190,7 @@ class VarianceParametrisation:
     def derivatives(self, point: LikelihoodPoint) -> tuple[Array, Array]:
         """Gradient (free,) of the deviance by the shares, to second order, and its expected Hessian (free, free)."""
         steps = DIFFERENCE_STEP * np.maximum(point.shares, MIN_DIFFERENCE_SHARE)
-        here = self.likelihood.linearise(point.levels, point.fits)
+        here = self.likelihood.linearise(None, point.fits)
         ahead = [self.likelihood.linearise(self.levels(row), point.fits) for row in point.shares + np.diag(steps)]
         jacobian = np.array([(there.whitened - here.whitened) / step for there, step in zip(ahead, steps, strict=True)])
         hessian = 2.0 * jacobian @ jacobian.T
@@ -263,14 +268,21 @@ def _minimum_of_model(gradient: Array, hessian: Array, shares: Array) -> Array:
 def _line_search(
     variances: VarianceParametrisation, point: LikelihoodPoint, step: Array, slope: float
 ) -> LikelihoodPoint:
-    """The best of a few points along ``step``, where the deviance has ``slope``; ``point`` if none is better."""
-    best, length = point, 1.0
+    """The best of a few points along ``step``, where the deviance has ``slope``; ``point`` if none is better.
+
+    A parabola through a point that is much too far shows the minimum much too near, as the deviance falls slowly and
+    rises steeply where a variance approaches zero. Then longer steps are tried again.
+    """
+    best, length, longest = point, 1.0, 1.0
     for _ in range(MAX_TRIALS):
         trial = variances.evaluate(point.shares + length * step, point.fits)
         best = min(best, trial, key=lambda candidate: candidate.deviance)
         bend = trial.deviance - point.deviance - length * slope
         minimum = -slope * length**2 / (2.0 * bend) if bend > 0.0 else np.inf
         if minimum > LENGTH_TOLERANCE * length:
-            break
-        length = max(minimum, MIN_LENGTH_RATIO * length)
+            shorter, length = length, min(minimum, float(np.sqrt(length * longest)))
+            if shorter >= LENGTH_TOLERANCE * length:
+                break
+        else:
+            longest, length = length, max(minimum, MIN_LENGTH_RATIO * length)
     return best

@@ -78,6 +78,13 @@ def _equations(base: Definition) -> tuple[list[tuple[str, ast.expr]], dict[str, 
     return ordered, {name: to_base(unit)[0] for name, unit in base.units().items()}
 
 
+@lru_cache(maxsize=256)
+def _entrance(base: Definition, site: int) -> tuple[ast.expr, float]:
+    """Return the tree of what a site multiplies, and the scale of its unit."""
+    entered = base.sites[site]
+    return parse(entered.through), to_base(entered.unit)[0]
+
+
 @lru_cache(maxsize=64)
 def scales_a_sum(base: Definition, site: int) -> bool:
     """Whether a site scales a quantity as a whole, of which each parameter of the twin scales a part only.
@@ -121,8 +128,8 @@ def rate_terms(base: Definition, columns: Mapping[str, Array], site: int = 0, en
             if entered.mode == "multiplicative":
                 values[name] = [(1.0 + entering) * term for term in values[name]]
             else:
-                through = evaluate(parse(entered.through), values)
-                values[name] = [*values[name], through * entering * to_base(entered.unit)[0]]
+                through, scale = _entrance(base, site)
+                values[name] = [*values[name], evaluate(through, values) * entering * scale]
     return [_rows(values[f"der({state.name})"], scales[state.name]) for state in base.states]
 
 

@@ -7,6 +7,7 @@ from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.screening import DECISIVE
 from otolith.discovery.sequential_test import SequentialTest
+from otolith.estimation.augmented import indices, site_of
 from otolith.estimation.objective import EXPLAINED
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
@@ -91,15 +92,22 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
     own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
     if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
-    return _data_fault_or_component(test)
+    return _data_fault_or_component(test, is_young=learned <= YOUNG_WINDOWS)
 
 
-def _data_fault_or_component(test: SequentialTest) -> WindowOutcome:
-    """Return the decision where neither parameters nor noise are accepted."""
+def _data_fault_or_component(test: SequentialTest, *, is_young: bool) -> WindowOutcome:
+    """Return the decision where neither parameters nor noise are accepted.
+
+    While the machine ``is_young``, its sensors are as little known as its components.
+    """
     best = test.best
     for kind, (decision, windows) in DATA_FAULTS.items():
-        if test.probability(kind) >= DATA_FAULT_PROBABILITY and test.leading >= windows:
-            return WindowOutcome(decision, next(item for item in test.hypotheses if item.type is kind))
+        if not test.explains:  # the cause may be one that is not among the hypotheses: no sensor is blamed for it
+            break
+        needed = COMPONENT_WINDOWS if is_young and kind is FaultType.SENSOR else windows
+        if test.probability(kind) >= DATA_FAULT_PROBABILITY and test.leading >= needed:
+            blamed = next(item for item in test.hypotheses if item.type is kind)
+            return WindowOutcome(WindowDecision.SUSPECTED if _is_below_noise(blamed) else decision, blamed)
     leads = best.type is FaultType.COMPONENT and test.leading >= COMPONENT_WINDOWS
     probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY
     alone = test.windows >= MAX_OPEN_WINDOWS or not test.alternatives(best)
@@ -108,6 +116,22 @@ def _data_fault_or_component(test: SequentialTest) -> WindowOutcome:
         if best.type is FaultType.COMPONENT:
             return WindowOutcome(WindowDecision.DISCOVERED, best)
     return WindowOutcome(WindowDecision.SUSPECTED, best)
+
+
+def _is_below_noise(hypothesis: TrackedHypothesis) -> bool:
+    """Whether a hypothesis states an offset of an output below the noise of one sample: that is no fault of its sensor.
+
+    In a short window, a small structure of another cause is as constant as an offset.
+    """
+    problem, slot = hypothesis.problem, len(hypothesis.problem.components) - 1
+    if hypothesis.type is not FaultType.SENSOR or slot < 0 or problem.components[slot].family != "constant":
+        return False
+    into = site_of(problem.base_model, problem.components[slot].site).into
+    offset = abs(float(hypothesis.posterior.prior().mean[indices(problem, slot)[0]]))
+    return any(
+        output.name == into and offset < noise
+        for output, noise in zip(problem.base_model.outputs, problem.noise, strict=False)
+    )
 
 
 def _all_moved(test: SequentialTest) -> TrackedHypothesis | None:

@@ -21,6 +21,7 @@ from otolith.estimation.problem import Problem
 from otolith.twin.augmentation import ELAPSED
 from otolith.twin.definition import Input
 from otolith.twin.kernel import Excitation, kernel_of
+from otolith_drivers.units import unit_text
 
 MOVE_SHARES = (0.1, 0.25, 0.5, 1.0)  # of the input's range; the smallest move that suffices is advised
 MAX_RECORDS = 200  # of a simulated experiment
@@ -68,7 +69,7 @@ def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[st
         enough = np.flatnonzero(reach <= required[index])
         best = int(enough[0]) if len(enough) else int(np.argmin(reach))
         if reach[best] <= MIN_REDUCTION * present[index]:
-            result = f"±{reach[best]:.2g} {parameter.unit}{OTHER_INPUTS}"
+            result = f"±{reach[best]:.2g} {unit_text(parameter.unit)}{OTHER_INPUTS}"
             advice[parameter.name] = f"{tried[best].text} would determine it to {result}"
     return advice
 
@@ -89,8 +90,8 @@ def moves(problem: Problem, situation: Situation) -> Iterator[Move]:
     for size in MOVE_SHARES:
         for column, moved in enumerate(problem.base_model.inputs):
             low, high = _ends(moved, float(situation.inputs[column]), size)
-            step = f"a step of {moved.name} from {low:.3g} to {high:.3g} {moved.unit}"
-            swing = f"swinging {moved.name} between {low:.3g} and {high:.3g} {moved.unit}"
+            step = f"a step of {moved.name} from {low:.3g} to {high:.3g} {unit_text(moved.unit)}"
+            swing = f"swinging {moved.name} between {low:.3g} and {high:.3g} {unit_text(moved.unit)}"
             swing += f" twice within {records * period:.3g} s"
             for text, curve in ((step, share >= 0.25), (swing, 0.5 - 0.5 * np.cos(4.0 * np.pi * share))):
                 inputs = np.tile(situation.inputs, (records, 1))

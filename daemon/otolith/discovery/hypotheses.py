@@ -21,6 +21,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.timing import delay_response, delayable
 from otolith.estimation.window_fit import Fit
+from otolith_drivers.units import equation_text, unit_text
 
 MAX_GAIN_OF_INFORMATION = 1e7  # ratio of prior to window uncertainty above which the twin all but diverges
 SIGNIFICANT = 4.0  # standard deviations: a component or a change nearer to zero is not significant
@@ -259,7 +260,7 @@ class HypothesisStep:
 
         None if the window contradicts the delay that it states, or a component leaves its physical range.
         """
-        posterior = self.predicted.update(self.evidence, self.fitted.fit.advance())
+        posterior = self.predicted.update(self.predicted.innovation(self.evidence), self.fitted.fit.advance())
         tracked = replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost).worse_by(deviance, misfit)
         if self.tracked.type is FaultType.COMPONENT and not is_possible(posterior.problem, posterior.prior().mean):
             return None
@@ -284,7 +285,7 @@ def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float, misfi
     own = predicted.remap_parameters(fitted.problem).set_prior(fitted.fit.prior)
     if not is_usable(fitted.hypothesis, own, evidence):
         return None
-    posterior = own.update(evidence, fitted.fit.advance())
+    posterior = own.update(own.innovation(evidence), fitted.fit.advance())
     tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, misfit, fitted.fit.cost)
     return tracked if fitted.type is not FaultType.TIMING else _with_delay(tracked, fitted.fit)
 
@@ -426,21 +427,21 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
         component = problem.components[-1]
         site = site_of(twin, component.site)
         error = float(values[indices(problem, len(problem.components) - 1)[0]])
-        unit = "" if site.unit == "1" else f" {site.unit}"
-        off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g}{unit}"
+        off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g} {unit_text(site.unit)}".rstrip()
         return f"{site.into} reads {off} off: look at the sensor and its scale"
     return "; ".join(
-        f"{component.site}: {equation(twin, component, values[indices(problem, slot)].tolist())}"
+        f"{component.site}: {equation_text(equation(twin, component, values[indices(problem, slot)].tolist()))}"
         for slot, component in enumerate(problem.components)
     )
 
 
 def describe_noise(problem: Problem) -> str:
     """Return which sensors are noisier than stated, with their noise."""
-    outputs = problem.base_model.outputs
+    twin = problem.base_model
+    units = {name: "" if unit == "1" else f" {unit_text(unit)}" for name, unit in twin.units().items()}
     return "; ".join(
-        f"{output.name} is noisier than stated: {noise:.2g} {output.unit} instead of {stated:.2g}"
-        for output, noise, stated in zip(outputs, problem.noise, problem.stated_noise, strict=False)
+        f"{name} is noisier than stated: {noise:.2g}{units[name]} instead of {stated:.2g}"
+        for name, noise, stated in zip(twin.signals, problem.levels, problem.stated_levels, strict=True)
         if noise > stated
     )
 

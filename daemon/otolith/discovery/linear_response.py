@@ -36,6 +36,8 @@ MIN_INDEPENDENCE = 1e-9  # of the two curves of a periodic component
 
 Guess = tuple[CandidateForm, float]
 """A form and its inner parameter."""
+Shape = tuple[float, int, float, float]
+"""Family code, source, inner parameter and phase of a component of unit amplitude."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,15 +60,19 @@ class BasisFunctions:
 
 def basis_functions(guesses: Iterable[Guess]) -> BasisFunctions:
     """Return one curve for each guess, or two a quarter turn apart where the phase is free."""
-    shapes: dict[tuple[float, int, float, float], int] = {}
+    shapes: dict[Shape, int] = {}
     curves = []
     for (site, model, source, _), inner in guesses:
         code = family_code(model.name)
-        for phase in model.phases:
-            curves.append((shapes.setdefault((code, source, inner, phase), len(shapes)), site))  # noqa: PERF401
-    families, source_indices, inners, phases = np.array(list(shapes), dtype=np.float64).reshape(-1, 4).T
+        curves += [(shapes.setdefault((code, source, inner, phase), len(shapes)), site) for phase in model.phases]
     of_curves, site_indices = np.array(curves, dtype=np.int64).reshape(-1, 2).T
-    return BasisFunctions(families, source_indices.astype(np.int64), inners, phases, of_curves, site_indices)
+    return BasisFunctions(*_columns(shapes), of_curves, site_indices)
+
+
+def _columns(shapes: Iterable[Shape]) -> tuple[Array, Indices, Array, Array]:
+    """Return family codes, sources, inner parameters and phases, each (shapes,)."""
+    families, source_indices, inners, phases = np.array(list(shapes), dtype=np.float64).reshape(-1, 4).T
+    return families, source_indices.astype(np.int64), inners, phases
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,17 +180,17 @@ class LinearResponse(ProjectedResponse):
         self._kernel = kernel_of(slotted)
         values, states = objective.parameters(self._guess[None, :free])[0], self._guess[2 * free :]
         parameters, initial = _padded(values, len(slotted.parameters)), _padded(states, len(slotted.states))
-        gain = np.pad(objective.innovation_model.gain, ((0, 0), (0, len(initial) - len(states)), (0, 0)))
+        gain = np.zeros((self.window.records, len(initial), len(self.problem.base_model.outputs)))
+        gain[:, : len(states)] = objective.innovation_model.gain
         excitation = replace(objective.excitation, inputs=input_matrix(slotted, self.window), gain=gain)
         linear = self._kernel.linearise(parameters, initial, excitation)
-        self.x = self._sources([state.name for state in slotted.states], linear.trajectory, states)
+        self.x = self._sources([state.name for state in slotted.states], linear.trajectory)
         self._linear = _without_angles(linear, len(states))
 
-    def _sources(self, state_names: list[str], trajectory: Array, initial: Array) -> Array:
+    def _sources(self, state_names: list[str], trajectory: Array) -> Array:
         """Return the sources (sources, records): nothing, states, time, predicted outputs, or inputs."""
-        twin, free, window = self.problem.base_model, len(self.problem.free), self.window
+        twin, window = self.problem.base_model, self.window
         outputs, inputs = [output.name for output in twin.outputs], [source.name for source in twin.inputs]
-        predicted = self.objective.predict(np.concatenate([self._guess[:free], initial])[None])[0]
         rows = []
         for source in sources(twin):
             if not source.symbol:
@@ -194,10 +200,18 @@ class LinearResponse(ProjectedResponse):
             elif source.name == "t":
                 rows.append(window.grid.offsets)
             elif source.name in outputs:
-                rows.append(predicted[:, outputs.index(source.name)])
+                rows.append(self._predicted[:, outputs.index(source.name)])
             else:
                 rows.append(self._input(inputs.index(source.name), window.column(source.name)))
         return np.array(rows)
+
+    @cached_property
+    def _predicted(self) -> Array:
+        """(records, outputs): the prediction at the guess."""
+        free = len(self.problem.free)
+        constant = np.concatenate([self._guess[:free], self._guess[2 * free :]])
+        predicted: Array = self.objective.predict(constant[None])[0]
+        return predicted
 
     def _input(self, index: int, values: Array) -> Array:
         """Return an input (records,); a constant where it varies by no more than its noise."""
@@ -211,21 +225,33 @@ class LinearResponse(ProjectedResponse):
         response is computed. The true gain over the estimate is χ² distributed with PROBES - 1 degrees of freedom,
         divided by PROBES; ``docs/explanation/discovery.md`` derives it.
         """
-        signals = self._adjoint_signals
+        signals = self._adjoint_signals[:, : len(self.problem.base_model.sites)]
         records, machine_sites, count = signals.shape
         width = float(frequencies[1] - frequencies[0]) if len(frequencies) > 1 else 1.0
         columns = signals.reshape(records, -1)
         with np.errstate(all="ignore"):
             sums = self._kernel.fourier_sums(self.x[source], columns, float(frequencies[0]), width, len(frequencies))
-            curves = np.stack([sums.imag, sums.real], axis=-1).reshape(-1, machine_sites, count, 2)  # sine and cosine
-            curves /= np.abs(curves[:, :, 1:]).max(axis=2, keepdims=True)  # gains are the same; no square overflows
-            along, probes = curves[:, :, 0], curves[:, :, 1:]
-            squares = np.einsum("fspi,fspj->fsij", probes, probes) / PROBES
-            determinant = squares[..., 0, 0] * squares[..., 1, 1] - squares[..., 0, 1] ** 2
-            adjugate = squares[..., 1, 1] * along[..., 0] ** 2 + squares[..., 0, 0] * along[..., 1] ** 2
-            adjugate -= 2.0 * squares[..., 0, 1] * along[..., 0] * along[..., 1]
-            gains = adjugate / determinant
+            sums = sums.reshape(-1, machine_sites, count)  # the real part is that of a cosine, the imaginary of a sine
+            sums /= np.abs(sums[:, :, 1:]).max(axis=2, keepdims=True)  # gains are the same; no square overflows
+            along, probes = sums[:, :, 0], sums[:, :, 1:]
+            size = (probes.real**2 + probes.imag**2).mean(axis=2)
+            skew = (probes**2).mean(axis=2)
+            gains = 2.0 * (size * np.abs(along) ** 2 - (skew.conj() * along**2).real) / (size**2 - np.abs(skew) ** 2)
         return np.where(np.isfinite(gains), gains, 0.0).T
+
+    def estimated_gains_of(self, shapes: list[Shape]) -> Array:
+        """Return about by how much χ² falls (shapes, sites) by each of the ``shapes`` at each site, sensors included.
+
+        The true gain over the estimate is χ² distributed with PROBES degrees of freedom, divided by PROBES.
+        """
+        signals = self._adjoint_signals
+        with np.errstate(all="ignore"):
+            families, source_indices, inners, phases = _columns(shapes)
+            curves = self._kernel.curves(families, self.x, source_indices, inners, phases)
+            products = np.tensordot(curves, signals, axes=(0, 0))
+            along, probes = products[..., 0], products[..., 1:]
+            gains = PROBES * along**2 / np.einsum("csp,csp->cs", probes, probes)
+        return np.where(np.isfinite(gains), gains, 0.0)
 
     @cached_property
     def _adjoint_signals(self) -> Array:
@@ -240,8 +266,7 @@ class LinearResponse(ProjectedResponse):
         probes = vectors[: len(self._basis)] - self._basis @ shared
         signals = np.column_stack([self._remainder, probes])
         model, present = self.objective.innovation_model, self.objective.present
-        adjoint = self._kernel.adjoint(self._linear, model, present, signals)
-        return np.ascontiguousarray(adjoint[:, : len(self.problem.base_model.sites)])
+        return self._kernel.adjoint(self._linear, model, present, signals)
 
     def score_parameters(self, names: list[str]) -> Array:
         """Return by how much χ² falls (parameters,) if each parameter moves alone."""

@@ -1,48 +1,93 @@
 """The hypothesis that sensors are noisier than the problem states.
 
 Each output has its own factor on the standard deviation of its noise: the root mean square of its whitened innovations.
-The hypothesis is compared by the full likelihood of the innovations, whose normalisation grows with the factor. So
-parameters or a component that explain a window up to the stated noise are better. Only white innovations count as
-noise: what follows a curve is no noise, however large.
+The noise of an input colours the innovations. It is at most what its signal shows from sample to sample, and the most
+likely level up to there. The hypothesis is compared by the full likelihood of the innovations, whose normalisation
+grows with the noise. So parameters or a component that explain a window up to the stated noise are better. Only
+innovations that are white with this noise count as noise: what follows a curve is no noise, however large.
 """
-
-from dataclasses import replace
 
 import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypothesis
+from otolith.discovery.linear_response import chi_square_of_parameters
+from otolith.discovery.screening import linearised
+from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
 
 # Thresholds: docs/reference/thresholds-discovery.md has the origin of each.
 MIN_NOISE_FACTOR = 1.3  # on a standard deviation: a smaller factor is left to the variance between windows
 MAX_NOISE_FACTOR = 6.0  # a sensor that is worse than this is faulty
+INPUT_SHARES = 0.5 ** (0.5 * np.arange(7.0))  # of what an input shows from sample to sample: its noise
+VISIBLE = 1.0  # in -2 log likelihood: an input's noise that changes the normalisation by less does not show
 WHITE_DEVIATIONS = 4.0  # of the autocorrelation at the first lags, in standard deviations of that of white noise
 WHITE_LAGS = 4
 ROUNDS = 4  # of fitting with the noise and estimating it
 STEPS = 25  # of Gauss-Newton in each
 
 
-def noisier_sensors(null: FittedHypothesis) -> FittedHypothesis | None:
-    """Return the hypothesis that sensors are noisier, fitted to the window of ``null``; None if they are not.
+def noisier_sensors(null: FittedHypothesis) -> list[FittedHypothesis]:
+    """Return the hypotheses that sensors are noisier, fitted to the window of ``null``: outputs alone, or inputs too.
 
     The innovations of a sensor that is not noisier must be as large as stated, and all must be white.
     """
-    problem, best = null.problem, null.fit
+    problems = [null.problem]
+    if (noisier := _with_noisier_inputs(null.fit)).levels != null.problem.levels:
+        problems.append(noisier)
+    fitted = (_fitted(problem, null) for problem in problems)
+    return [item for item in fitted if item is not None]
+
+
+def _fitted(problem: Problem, null: FittedHypothesis) -> FittedHypothesis | None:
+    """Return the hypothesis of the levels of ``problem``, with those of the outputs fitted; None if it has none."""
+    before, known = null.problem.levels, null.fit
+    if problem.levels != before:
+        known = fit(problem, known.window, known.prior, known.prior.mean, STEPS)
+    best = known
     factors = np.ones(len(problem.noise))
     for _ in range(ROUNDS):
         factors *= _noise_ratios(best)
         factors = np.where(factors < MIN_NOISE_FACTOR, 1.0, factors)
-        if (factors == 1.0).all() or (factors > MAX_NOISE_FACTOR).any():
+        if (factors > MAX_NOISE_FACTOR).any():
             return None
-        best = fit(_scaled(problem, factors), best.window, best.prior, best.prior.mean, STEPS)
-    if not is_white(best):
+        if (factors == 1.0).all():
+            best = known
+            break
+        inputs = problem.levels[: -len(factors)]
+        scaled = problem.with_levels((*inputs, *(np.array(problem.noise) * factors).tolist()))
+        best = fit(scaled, best.window, best.prior, best.prior.mean, STEPS)
+    signals = problem.base_model.signals
+    rows = zip(signals, best.problem.levels, before, strict=True)
+    noisy = [name for name, level, other in rows if level > other]
+    if not noisy or not is_white(best):
         return None
-    outputs = [output.name for output in problem.base_model.outputs]
-    noisy = [name for name, factor in zip(outputs, factors, strict=True) if factor > 1.0]
-    stated = FaultHypothesis(FaultType.NOISE, ", ".join(noisy), len(noisy), 2.0 ** len(outputs) - 1.0)
+    stated = FaultHypothesis(FaultType.NOISE, ", ".join(noisy), len(noisy), 2.0 ** len(signals) - 1.0)
     return FittedHypothesis(stated, best, normalisation(best, null.fit))
+
+
+def _with_noisier_inputs(null: Fit) -> Problem:
+    """Return the problem with the most likely noise of each input, if that pays for being one more value."""
+    best, least = null.problem, _deviance(linearised(null.problem, null.window, null.prior, null.parameters))
+    unseen = null.objective.innovation_model.log_determinant + VISIBLE
+    for at, source in enumerate(best.base_model.inputs):
+        differences, levels = np.abs(sample_differences(source.name, null.window)), best.levels
+        shown = MAD_TO_SD * median(differences) if len(differences) else 0.0
+        for level in (shown * INPUT_SHARES).tolist():
+            problem = null.problem.with_levels((*levels[:at], level, *levels[at + 1 :]))
+            trial = linearised(problem, null.window, null.prior, null.parameters)
+            if level <= MIN_NOISE_FACTOR * levels[at] or trial.objective.innovation_model.log_determinant <= unseen:
+                break
+            price = np.log(null.count) if best.levels[at] == levels[at] else 0.0
+            if _deviance(trial) + price < least:
+                best, least = problem, _deviance(trial)
+    return best
+
+
+def _deviance(trial: Fit) -> float:
+    """Return -2 log likelihood of a window around which the twin is linearised."""
+    return chi_square_of_parameters(trial) + trial.objective.innovation_model.log_determinant
 
 
 def normalisation(fitted: Fit, reference: Fit) -> float:
@@ -77,10 +122,3 @@ def _noise_ratios(fitted: Fit) -> Array:
     present = fitted.objective.present
     squares = np.where(present, _innovations(fitted) ** 2, 0.0).sum(axis=0)
     return np.asarray(np.sqrt(squares / np.maximum(present.sum(axis=0), 1)))
-
-
-def _scaled(problem: Problem, factors: Array) -> Problem:
-    """Return the problem with ``factors`` (outputs,) on the noise of the sensors."""
-    stated = problem.stated_noise or problem.noise
-    noise = tuple((np.array(problem.noise) * factors).tolist())
-    return replace(problem, noise=noise, stated_noise=stated)

@@ -4,7 +4,7 @@ All allowed forms are scored by the linear response, on a grid of their inner pa
 """
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, WindowEstimate, fit
 from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
-from otolith.twin.component_families import MIN_HUMP, ComponentFamily, SourceKind, SourceRange
+from otolith.twin.component_families import MIN_HUMP, ComponentFamily, SourceKind, SourceRange, family_code
 from otolith.twin.definition import Definition
 
 DECISIVE = 10.0  # in -2 log evidence: a Bayes factor of 150, "very strong" (R. E. Kass, A. E. Raftery, 1995)
@@ -172,6 +172,14 @@ def _beside_friction(
 
 def grid_guesses(response: ProjectedResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:
     """Return all forms with all inner parameters of their grids, which the sites of a machine share."""
+    grids = _grids(response, forms, fineness)
+    return [(form, inner) for form in forms for inner in grids[form.model.name, form.source]]
+
+
+def _grids(
+    response: ProjectedResponse, forms: list[CandidateForm], fineness: float
+) -> dict[tuple[str, int], list[float]]:
+    """Return the inner parameters of the grid of each family and source."""
     shapes = {(form.model.name, form.source): form for form in reversed(forms)}
     grids: dict[tuple[str, int], list[float]] = {}
     geometric: defaultdict[int, list[tuple[str, int]]] = defaultdict(list)
@@ -183,7 +191,7 @@ def grid_guesses(response: ProjectedResponse, forms: list[CandidateForm], finene
     for points, alike in geometric.items():
         rows = geometric_grids([shapes[shape].bounds for shape in alike], points, fineness)
         grids.update(zip(alike, rows.tolist(), strict=True))
-    return [(form, inner) for form in forms for inner in grids[form.model.name, form.source]]
+    return grids
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -305,24 +313,43 @@ def screen_fit(fitted: Fit) -> ScreeningResult:
         if len(form.model.phases) == 1 or source_kinds[form.source] is kind
     ]
     competing = CompetingForms.among(problem, forms)
-    spectral = [form for form in forms if len(form.model.phases) > 1]
-    others = [form for form in forms if len(form.model.phases) == 1]
-    guesses = grid_guesses(response, others, COARSE) + promising_lines(response, spectral, competing)
+    guesses = promising_guesses(response, forms, competing)
     gain = float(ScoredGuesses.of(response, guesses, competing).scores.max(initial=-np.inf)) - DECISIVE
     return ScreeningResult(gain, fitted, response)
 
 
-def promising_lines(response: ProjectedResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[Guess]:
-    """Return the spectral lines whose estimated gain is not far below what a search requires, those of largest gain.
+def promising_guesses(response: LinearResponse, forms: list[CandidateForm], competing: CompetingForms) -> list[Guess]:
+    """Return the guesses on a coarse grid whose estimated gain is not far below what a search requires.
 
-    A line that gains enough is left out with probability 4e-6 (:meth:`LinearResponse.estimated_gains`).
+    Of spectral lines, those of largest gain. A guess that gains enough is left out with probability 7e-6
+    (:meth:`LinearResponse.estimated_gains_of`), a line with 4e-6 (:meth:`LinearResponse.estimated_gains`).
     """
+
+    def least(form: CandidateForm) -> float:
+        return ESTIMATE_SHARE * (DECISIVE + _penalty(form, competing, response.objective.count))
+
     lines: list[tuple[float, Guess]] = []
-    for form, grid, gains in _spectra(response, forms, COARSE):
-        required = DECISIVE + _penalty(form, competing, response.objective.count)
-        lines += [(gains[at], (form, float(grid[at]))) for at in np.flatnonzero(gains > ESTIMATE_SHARE * required)]
+    for form, grid, gains in _spectra(response, [form for form in forms if len(form.model.phases) > 1], COARSE):
+        lines += [(gains[at], (form, float(grid[at]))) for at in np.flatnonzero(gains > least(form))]
     lines.sort(key=lambda line: -line[0])
-    return [guess for _, guess in lines[:MAX_LINES]]
+    return [*_promising_shapes(response, forms, least), *(guess for _, guess in lines[:MAX_LINES])]
+
+
+def _promising_shapes(
+    response: LinearResponse, forms: list[CandidateForm], least: Callable[[CandidateForm], float]
+) -> list[Guess]:
+    """Return the guesses of one curve on a coarse grid whose estimated gain is at ``least`` that of their form."""
+    at_site = {(form.site, form.model.name, form.source): form for form in forms if len(form.model.phases) == 1}
+    grids = _grids(response, list(at_site.values()), COARSE)
+    shapes = [(name, source, inner) for (name, source), values in grids.items() for inner in values]
+    gains = response.estimated_gains_of([(family_code(name), source, inner, 0.0) for name, source, inner in shapes])
+    guesses = []
+    for shape, site in np.argwhere(gains > ESTIMATE_SHARE * DECISIVE).tolist():
+        name, source, inner = shapes[shape]
+        form = at_site.get((site, name, source))
+        if form is not None and gains[shape, site] > least(form):
+            guesses.append((form, inner))
+    return guesses
 
 
 def highest_lines(response: ProjectedResponse, forms: list[CandidateForm], fineness: float) -> list[Guess]:

@@ -138,8 +138,7 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     proposals += _one_parameter_moved(problem, prior, screening.response)
     candidates = [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
     fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
-    noisier = noisier_sensors(fitted[0])
-    fitted += [] if noisier is None else [noisier]
+    fitted += noisier_sensors(fitted[0])
     fitted += late_signals(fitted[0], screening.response)
     if _convincing(fitted) is None:
         fitted += _several_moved(fitted)

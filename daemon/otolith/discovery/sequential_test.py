@@ -90,6 +90,8 @@ class SequentialTest:
     """-2 log likelihood of the same windows under the filter, relative to the best hypothesis; nothing is forgotten."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
+    is_explained: bool = True
+    """Whether a hypothesis explains a window that the filter does not expect; else the cause is none of them."""
 
     @property
     def best(self) -> TrackedHypothesis:
@@ -117,6 +119,11 @@ class SequentialTest:
         """Whether hypotheses of several causes explain the windows equally, or did so one window before."""
         return self.clear < CLEAR_WINDOWS or self.has_equal_causes
 
+    @property
+    def explains(self) -> bool:
+        """Whether the best hypothesis explains the last window up to the noise."""
+        return self.best.cost <= EXPLAINED
+
     def probability(self, kind: FaultType) -> float:
         """Return the probability of all hypotheses of one type."""
         return sum(share for share, item in zip(self.probabilities, self.hypotheses, strict=True) if item.type is kind)
@@ -131,6 +138,12 @@ class SequentialTest:
     def filter_probability(self) -> float:
         """Probability that the window that opened the test was itself wrong, so that the filter's posterior holds."""
         return float(WRONG_WINDOW / (WRONG_WINDOW + (1.0 - WRONG_WINDOW) * np.exp(0.5 * self.filter_deviance)))
+
+    @property
+    def wrong_probability(self) -> float:
+        """Probability that none of the hypotheses holds; one window alone is as likely to be wrong itself."""
+        is_sure = self.explains and self.settled > 1
+        return self.filter_probability if is_sure else max(self.filter_probability, WRONG_WINDOW)
 
     @property
     def rejects_filter(self) -> bool:
@@ -188,7 +201,7 @@ def continue_test(test: SequentialTest, predicted: Posterior, screening: Screeni
     Where the tracked hypotheses do not explain the window, a new search adds others: something may have begun since.
     """
     test = follow(test, screening.fitted.window)
-    if test.best.explains_all and test.best.cost <= EXPLAINED:
+    if test.best.explains_all and test.explains:
         return test
     return join(test, new_test(search(screening), predicted))
 
@@ -214,7 +227,12 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
     usable = [item for item in tracked if item is not None]
     onset = best.fit.window.start
     return SequentialTest(
-        predicted.problem, _sorted(usable), onset, last=last, null_reduced_chi_square=reduced_chi_square
+        predicted.problem,
+        _sorted(usable),
+        onset,
+        last=last,
+        null_reduced_chi_square=reduced_chi_square,
+        is_explained=best.fit.cost <= EXPLAINED,
     )
 
 

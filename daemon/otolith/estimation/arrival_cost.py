@@ -92,6 +92,8 @@ class MapObjective:
         self._objective = objective
         self._mean = prior.mean
         self._whitening = _whitening(prior.covariance)
+        self._prior_jacobian = np.zeros((len(prior.mean), len(self.low)))
+        self._prior_jacobian[:, : len(prior.mean)] = self._whitening
 
     def guess(self, parameters: Array, initial: Array) -> Array:
         """Return the guess of ``parameters`` (free,) and ``initial`` (states,) with the trends of the prior."""
@@ -101,10 +103,8 @@ class MapObjective:
         """Return the residuals of the window, then of the prior, and their derivatives."""
         residuals, jacobian = self._objective.linearise_with_trends(guess)
         count = len(self._mean)
-        prior_jacobian = np.zeros((count, len(guess)))
-        prior_jacobian[:, :count] = self._whitening
         prior_residuals = self._whitening @ (guess[:count] - self._mean)
-        return np.concatenate([residuals, prior_residuals]), np.vstack([jacobian, prior_jacobian])
+        return np.concatenate([residuals, prior_residuals]), np.concatenate([jacobian, self._prior_jacobian])
 
     def window_residuals(self, fit: FitResult) -> Array:
         """Return the residuals of the window without those of the prior."""

@@ -123,8 +123,8 @@ def time_offsets(problem: Problem, window: Window) -> dict[str, float]:
 def equation(twin: Definition, component: Component, values: Sequence[float]) -> str:
     """Return the component as text; ``values`` are amplitude, inner parameter and phase as far as it has them."""
     rest = [*values[1:], 0.0, 0.0]
-    phase = f"{'−' if rest[1] < 0.0 else '+'} {abs(rest[1]):.2f}"
+    phase = f"{'-' if rest[1] < 0.0 else '+'} {abs(rest[1]):.2f}"
     text = component.model.equation.format(a=f"{values[0]:.4g}", b=f"{rest[0]:.4g}", c=phase, x=component.source)
-    text = text.replace("−-", "")  # exp(−-0.1·x) is exp(0.1·x)
+    text = text.replace("--", "")  # exp(--0.1·x) is exp(0.1·x)
     unit = site_of(twin, component.site).unit
     return text if unit == "1" else f"{text} {unit}"

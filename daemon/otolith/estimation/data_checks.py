@@ -10,8 +10,11 @@
 - **Repeated records** are an old image that was read or sent again: every channel repeats bit for bit. Their errors are
   one and the same error, so only the first and the last of a run count; the first alone would be biased in the
   direction of motion. Coarse channels repeat by chance, and dropping those would bias them, so then all records count.
+- A channel is **saturated** where its samples pile up at their largest or least value, with noise, while its prediction
+  from all other data moves on beyond. This is looked for where a window contradicts the twin. The pile then counts
+  as missing; the twin must explain all that is left.
 
-All three look at measured samples only, each at its own time. A machine file turns each of them off for a signal.
+All of them look at measured samples only, each at its own time. A machine file turns each of them off for a signal.
 """
 
 from collections.abc import Iterator
@@ -24,12 +27,13 @@ from numpy.typing import NDArray
 from otolith.acquisition.quality import time_text
 from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array, Mask, Verdict, Window
-from otolith.estimation.imm_filter import nis_limit
-from otolith.estimation.objective import MIN_ADC_LEVELS, PENALTY, adc_step, rounding_variance
+from otolith.estimation.imm_filter import NIS_DEVIATE, nis_limit
+from otolith.estimation.objective import EXPLAINED, MIN_ADC_LEVELS, PENALTY, adc_step, rounding_variance
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.definition import Definition, Output
+from otolith_drivers.units import unit_text
 
 MIN_RECORDS = 5
 MAX_VALUE = 1e12  # magnitude of a value, in the unit of its signal
@@ -38,12 +42,16 @@ SPIKE_SHAPE = 0.35  # largest distance of the neighbours' share from that of a s
 MAX_SPIKE_SHARE = 0.05  # share of records above which the channel is rejected
 MAD_TO_SD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 SECOND_DIFFERENCE_SD = 1.2247  # standard deviation of the second difference of unit noise, the root of 3/2
+DIFFERENCE_ORDER = 4  # differences of this order remove what a cubic follows over five records
+DIFFERENCE_GAIN = np.sqrt(70.0)  # of white noise by these differences: √(1² + 4² + 6² + 4² + 1²)
 MIN_FROZEN_RUN = 5  # records of one value
 MAX_FROZEN_SHARE = 0.05  # share of records above which the channel is rejected
 FROZEN_MOVEMENT = 6.0  # standard deviations that the prediction must move while the channel stands still
 FROZEN_STEPS = 2.0  # steps of the converter that it must move beside that
 RESOLVED_NOISE = 2.0  # steps of a converter from which on noise can be distinguished from motion over coarse steps
 CHANCE = 1e-9  # probability of equal readings of a noisy sensor below which they are no chance
+PILE_WIDTH = 7.0  # standard deviations of the noise at a limit: range of a thousand normal values
+PILE_ROUNDS = 3  # of estimating this noise from the samples of the pile
 MIN_REPEATED_RUN = 10  # records
 COARSE_REPEATS = 0.3  # share of the other records in which a coarse sensor repeats its value
 COARSE_STEPS = 2.0  # least steps that a coarse sensor usually moves by
@@ -58,7 +66,9 @@ class FaultySensor:
 
     signal: str
     text: str
-    """What is wrong, since when, and the way out."""
+    """What is wrong."""
+    advice: str
+    """What to do if it is not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +138,8 @@ def drop_spikes(
         is_spike = spike_records(window.values[present, column], level, times[present])
         count = int(is_spike.sum())
         if count > MAX_SPIKE_SHARE * len(present):
-            way_out = f"look at its cable and its connector{_turned_off(name, Check.SPIKES)}"
-            faulty.append(FaultySensor(name, f"{name} spikes in {count} of {len(present)} records: {way_out}"))
+            text = f"{name} spikes in {count} of {len(present)} records"
+            faulty.append(FaultySensor(name, text, _turned_off(name, Check.SPIKES)))
         elif count:
             values[:, column] = _bridge(times, values[:, column], present, is_spike)
             missing[present[is_spike], column] = True
@@ -145,7 +155,7 @@ def _times(window: Window) -> Array:
 def _turned_off(name: str, check: Check) -> str:
     """Return how ``check`` is turned off for a signal."""
     others = ", ".join(f'"{other}"' for other in Check if other is not check)
-    return f"; without {check} in checks of {name} in [signals], as in checks = [{others}], it counts as measured"
+    return f"if these readings are right, write checks = [{others}] under {name} in [signals]"
 
 
 def spike_records(values: Array, noise: float, times: Array | None = None) -> Mask:
@@ -180,8 +190,10 @@ def spike_records(values: Array, noise: float, times: Array | None = None) -> Ma
 def median(values: Array) -> float:
     """Return the median of ``values`` (n,), which are finite, in a tenth of NumPy's time for a short window."""
     half = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, half)[half])
     low, high = np.partition(values, (half - 1, half))[half - 1 : half + 1].tolist()
-    return float(high if len(values) % 2 else 0.5 * (low + high))
+    return float(0.5 * (low + high))
 
 
 def _bridge(times: Array, values: Array, present: Indices, spikes: Mask) -> Array:
@@ -209,8 +221,75 @@ def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
             continue
         run = _frozen_run(predicted, window, name, runs)
         if run is not None:
-            faulty.append(FaultySensor(name, _frozen_sentence(window, output, run)))
+            faulty.append(FaultySensor(name, _frozen_sentence(window, output, run), _turned_off(name, Check.FROZEN)))
     return faulty
+
+
+def without_saturated(predicted: Posterior, window: Window) -> CheckedWindow | None:
+    """Return ``window``, which contradicts the twin, without the samples at the limits of a sensor, which is named.
+
+    None if such samples are not the cause.
+    """
+    problem = predicted.problem
+    outputs = (each for each in problem.base_model.outputs if (each.name, Check.FROZEN) not in problem.unchecked)
+    without = (_without_piles(predicted, window, output) for output in outputs)
+    return next((rest for rest in without if rest is not None), None)
+
+
+def _without_piles(predicted: Posterior, window: Window, output: Output) -> CheckedWindow | None:
+    """Return the window without the samples at the limits of a sensor if the twin explains all others, or None.
+
+    At a limit the prediction moves further than the samples spread. Where a machine has changed, both settle.
+    """
+    problem, name = predicted.problem, output.name
+    index = [each.name for each in problem.twin.outputs].index(name)
+    values, noise = window.column(name), problem.noise[index]
+    piles = [(side, run) for side in (1.0, -1.0) for run in _pile(side * values, ~window.missing_in(name), noise)]
+    if not piles:
+        return None
+    rest = _fit(predicted, problem, _without(window, name, np.concatenate([run for _, run in piles])))
+    if not rest.cost <= EXPLAINED:
+        return None
+    prediction, least = rest.objective.predict_with_trends(rest.result.guess)[0][:, index], FROZEN_MOVEMENT * noise
+    runs = [
+        run
+        for side, run in piles
+        if np.median(side * (prediction - values)[run]) > least
+        and np.ptp(prediction[run]) > max(least, np.ptp(values[run]))
+    ]
+    if not runs:
+        return None
+    records = np.concatenate(runs)
+    hidden, expected = _without(window, name, records), len(records) + NIS_DEVIATE * np.sqrt(2.0 * len(records))
+    at_rest = _disturbances(problem, window) if _may_rest(problem, window, name, runs) else ()
+    if any(_is_probable(predicted, each, window, hidden, expected) for each in (problem, *at_rest)):
+        return None
+    limit, when = float(np.median(values[runs[0]])), time_text(window.start + float(window.grid.offsets[runs[0][0]]))
+    text = (
+        f"{name} is clipped at {limit:.4g} {unit_text(output.unit)} from {when}: "
+        f"{len(records)} of {window.records} records do not count"
+    )
+    advice = f"look at the range of the sensor; {_turned_off(name, Check.FROZEN)}"
+    return CheckedWindow(hidden, faulty_sensors=(FaultySensor(name, text, advice),))
+
+
+def _pile(values: Array, measured: Mask, noise: float) -> list[Indices]:
+    """Return the records of each long run within the range of the noise below the largest of ``values`` (records,).
+
+    The noise at a limit may be larger than ``noise``: the second differences of the samples there show it.
+    """
+    present = np.flatnonzero(measured)
+    samples = values[present]
+    if len(samples) < MIN_FROZEN_RUN:
+        return []
+    second = np.abs(np.convolve(np.pad(samples, 1, mode="edge"), (-0.5, 1.0, -0.5), mode="valid"))
+    top, high = samples.max(), samples >= samples.max() - PILE_WIDTH * noise
+    for _ in range(PILE_ROUNDS):
+        deviation = max(noise, MAD_TO_SD * float(np.median(second[high])) / SECOND_DIFFERENCE_SD)
+        high = samples >= top - PILE_WIDTH * deviation
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], high, [False]]).astype(np.int8)))
+    runs = zip(edges[::2], edges[1::2], strict=True)
+    return [present[first:end] for first, end in runs if end - first >= MIN_FROZEN_RUN]
 
 
 def _constant_runs(values: Array, present: Indices) -> list[Indices]:
@@ -350,15 +429,16 @@ def _disturbances(problem: Problem, window: Window) -> Iterator[Problem]:
 
 
 def _frozen_sentence(window: Window, output: Output, run: _FrozenRun) -> str:
-    """Return which channel is frozen, at which value, when and for how long, and the way out."""
+    """Return which channel is frozen, at which value, and for how much of the window."""
     present = ~window.missing_in(output.name)
     values, times = window.column(output.name), window.grid.offsets[run.records]
     value = float(values[run.records[0]])
     kind = _frozen_or_clipped(values[present], value, run.excess)
-    length = f"{times[-1] - times[0]:.4g} s ({len(run.records)} samples)"
-    when = f"for {length} from {time_text(window.start + float(times[0]))}"
-    way_out = f"look at the sensor{_turned_off(output.name, Check.FROZEN)}"
-    return f"{output.name} is {kind} at {value:.6g} {output.unit} {when} while the twin moves on: {way_out}"
+    length, count = f"{times[-1] - times[0]:.4g} s", len(run.records)
+    when = f"for {length} ({count} samples) from {time_text(window.start + float(times[0]))}"
+    if count == np.count_nonzero(present):  # it may be so for longer: the finding has the time of the first window
+        when = f"throughout the window of {length} ({count} samples)"
+    return f"{output.name} is {kind} at {value:.6g} {unit_text(output.unit)} {when} while the twin moves on"
 
 
 def _frozen_or_clipped(values: Array, value: float, excess: float) -> str:
@@ -372,8 +452,9 @@ def drop_repeats(window: Window, twin: Definition, checked: frozenset[str] | Non
 
     Only outputs in ``checked`` become missing, all by default.
     """
-    outputs = np.isin(window.signals, [output.name for output in twin.outputs])
-    dropped = outputs if checked is None else outputs & np.isin(window.signals, list(checked))
+    sensors = {output.name for output in twin.outputs}
+    outputs = np.array([name in sensors for name in window.signals])
+    dropped = outputs if checked is None else outputs & np.array([name in checked for name in window.signals])
     repeated = repeated_records(window, outputs)
     count = int(repeated.sum())
     if not count or not dropped.any():
@@ -423,3 +504,23 @@ def _are_coarse(changes: Array) -> bool:
     steps = [column[column > 0.0] for column in changes.T]
     small = all(not len(column) or float(np.median(column)) <= COARSE_STEPS * float(column.min()) for column in steps)
     return small or bool((changes == 0.0).mean(axis=0).max() > COARSE_REPEATS)
+
+
+def sample_differences(signal: str, window: Window) -> Array:
+    """Return the differences of neighbouring samples, without what a cubic follows; of the noise's standard deviation.
+
+    At times that are not uniform they are divided differences (J. Stoer, R. Bulirsch, Introduction to Numerical
+    Analysis, section 2.1.3), normalised to the same gain for white noise.
+    """
+    present, values = ~window.missing_in(signal), window.column(signal)
+    if window.grid.period is not None and present.all():
+        return np.asarray(np.diff(values, DIFFERENCE_ORDER) / DIFFERENCE_GAIN)
+    values, times = values[present], window.grid.offsets[present]
+    if len(values) <= DIFFERENCE_ORDER:
+        return np.zeros(0)
+    neighbours = np.lib.stride_tricks.sliding_window_view(times, DIFFERENCE_ORDER + 1)
+    spacings = neighbours[:, :, None] - neighbours[:, None, :] + np.eye(DIFFERENCE_ORDER + 1)
+    weights = 1.0 / (spacings / np.ptp(neighbours, axis=1)[:, None, None]).prod(axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    around = np.lib.stride_tricks.sliding_window_view(values, DIFFERENCE_ORDER + 1)
+    return np.asarray((weights * (around - around[:, :1])).sum(axis=1))  # exactly zero if all five are equal

@@ -101,9 +101,9 @@ def _bounded_step(objective: LeastSquares, reached: FitResult, damping: float) -
     step = np.zeros(len(guess))
     while free.any():
         normal = jacobian[:, free].T @ jacobian[:, free]
-        weight = np.maximum(np.diag(normal), 1e-30)
-        root = np.sqrt(weight)
-        scaled = normal / np.outer(root, root) + damping * np.eye(len(weight))
+        root = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
+        scaled = normal / (root[:, None] * root)
+        scaled.flat[:: len(root) + 1] += damping
         step[free] = -np.linalg.solve(scaled, gradient[free] / root) / root
         beyond = free & ((guess + step < objective.low) | (guess + step > objective.high))
         if not beyond.any():

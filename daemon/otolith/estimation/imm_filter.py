@@ -166,13 +166,39 @@ def moment_match(posterior: ImmPosterior) -> tuple[Array, Array]:
     return mean, np.einsum("m,mij->ij", posterior.weight, spread)
 
 
-def nis(prediction: ImmPosterior, evidence: Evidence) -> float:
-    """Return the smallest normalised innovation squared of a window over the modes.
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovation:
+    """By how much the evidence of a window differs from its prediction, in each mode."""
 
-    Under the true mode it follows χ² with two degrees of freedom for each free parameter.
-    """
-    _, covariance, innovation = _innovation(prediction, evidence)
-    return float(np.einsum("mi,mij,mj->m", innovation, np.linalg.inv(covariance), innovation).min())
+    prediction: ImmPosterior
+    evidence: Evidence
+    root: Array
+    """(2 free, 2 free) square-root information of the window."""
+    covariance: Array
+    """(modes, 2 free, 2 free)."""
+    inverse: Array
+    """(modes, 2 free, 2 free) of the covariance."""
+    deviation: Array
+    """(modes, 2 free)."""
+    nis_of_mode: Array
+    """(modes,) normalised innovation squared."""
+
+    @property
+    def nis(self) -> float:
+        """The smallest normalised innovation squared over the modes.
+
+        Under the true mode it follows χ² with two degrees of freedom for each free parameter.
+        """
+        return float(self.nis_of_mode.min())
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether it is within what healthy windows reach."""
+        return self.nis <= nis_limit(float(len(self.root)))
+
+    def inflate_variance(self, reduced_chi_square: float) -> "Innovation":
+        """Return the same for a larger variance ratio: a window fitted neither those before nor those after it."""
+        return innovation_of(inflate_variance(self.prediction, reduced_chi_square), self.evidence)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,20 +235,30 @@ def nis_limit(degrees: float) -> float:
     return float(degrees * (1.0 - 2.0 / (9.0 * degrees) + NIS_DEVIATE * np.sqrt(2.0 / (9.0 * degrees))) ** 3)
 
 
-def update(prediction: ImmPosterior, evidence: Evidence) -> ImmPosterior:
+def innovation_of(prediction: ImmPosterior, evidence: Evidence) -> Innovation:
+    """Return the innovation of a window in each mode."""
+    inflation = np.sqrt(prediction.variance_ratio)
+    limited = _limited(evidence, np.sqrt(np.diagonal(prediction.covariance, axis1=1, axis2=2).max(axis=0)))
+    root = limited.sqrt_information / inflation
+    covariance = np.eye(len(root)) + root @ prediction.covariance @ root.T
+    inverse = np.linalg.inv(covariance)
+    deviation = limited.residual / inflation + (prediction.mean - limited.point) @ root.T
+    nis_of_mode = np.einsum("mi,mij,mj->m", deviation, inverse, deviation)
+    return Innovation(prediction, evidence, root, covariance, inverse, deviation, nis_of_mode)
+
+
+def update(innovation: Innovation) -> ImmPosterior:
     """Return the posterior after a window: Kalman update of each mode, then of the mode probabilities."""
-    root, innovation_covariance, innovation = _innovation(prediction, evidence)
-    inverse = np.linalg.inv(innovation_covariance)
-    gain = prediction.covariance @ root.T @ inverse
-    nis_of_mode = np.einsum("mi,mij,mj->m", innovation, inverse, innovation)
-    mean = prediction.mean - np.einsum("mij,mj->mi", gain, innovation)
+    prediction, root = innovation.prediction, innovation.root
+    gain = prediction.covariance @ root.T @ innovation.inverse
+    mean = prediction.mean - np.einsum("mij,mj->mi", gain, innovation.deviation)
     kept = np.eye(prediction.mean.shape[1]) - gain @ root  # Joseph form
     covariance = kept @ prediction.covariance @ kept.transpose(0, 2, 1) + gain @ gain.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    log_likelihood = -0.5 * (nis_of_mode + np.linalg.slogdet(innovation_covariance)[1])
+    log_likelihood = -0.5 * (innovation.nis_of_mode + np.linalg.slogdet(innovation.covariance)[1])
     weight = prediction.weight * np.exp(log_likelihood - log_likelihood.max())
     weight = np.maximum(weight / weight.sum(), MIN_MODE_WEIGHT)
-    ratio = _updated_ratio(prediction.variance_ratio, float(nis_of_mode.min()) / len(root))
+    ratio = _updated_ratio(prediction.variance_ratio, innovation.nis / len(root))
     return _recentre(ImmPosterior(prediction.level, mean, covariance, weight / weight.sum(), prediction.end, ratio))
 
 
@@ -238,16 +274,6 @@ def _limited(evidence: Evidence, sd: Array) -> Evidence:
     factors[: len(precision)] = MAX_PRECISION / np.maximum(precision, MAX_PRECISION)
     reduced = (directions * factors).T
     return Evidence(evidence.point, reduced @ evidence.sqrt_information, reduced @ evidence.residual)
-
-
-def _innovation(prediction: ImmPosterior, evidence: Evidence) -> tuple[Array, Array, Array]:
-    """Return the window's square-root information, and per mode the innovation's covariance and the innovation."""
-    inflation = np.sqrt(prediction.variance_ratio)
-    evidence = _limited(evidence, np.sqrt(np.diagonal(prediction.covariance, axis1=1, axis2=2).max(axis=0)))
-    root = evidence.sqrt_information / inflation
-    covariance = np.eye(len(root)) + root @ prediction.covariance @ root.T
-    innovation = evidence.residual / inflation + (prediction.mean - evidence.point) @ root.T
-    return root, covariance, innovation
 
 
 def _updated_ratio(variance_ratio: float, nis_per_degree: float) -> float:

@@ -7,6 +7,7 @@ from enum import StrEnum
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask
+from otolith_drivers.units import unit_text
 
 QUANTILE = 1.959964  # two-sided 95 % of the standard normal distribution
 MIN_SINGULAR = 1e-8  # relative singular value below which a direction is not observed
@@ -15,7 +16,6 @@ MAX_BLIND_SHARE = 1e-4  # share in an unobserved direction above which a paramet
 MIN_SENSITIVITY = 1e-9  # relative to the largest: a smaller sensitivity is none
 PUSHED = 2.0  # times the required interval: a wider one leaves open on which side of a bound the value lies
 PRESSED = 3.0  # standard deviations beyond a bound to which a further step would lead: the value lies beyond it
-AT_THE_BOUND = "at its bound {:.4g} {}: widen the bounds in [parameters], or check the equations of the twin"
 TRADED = 0.95  # correlation above which two parameters cannot be distinguished
 MIN_INFLATED_COST = 1.1  # cost above which the residual is tested for autocorrelation: noise alone hardly reaches it
 MAX_LAG = 0.25  # share of a window: largest lag of the autocorrelation
@@ -137,13 +137,19 @@ class AccuracyTarget:
     """How far beyond the bound a further step would lead, in standard deviations."""
 
 
+def at_its_bound(value: float, unit: str) -> str:
+    """Return the reason of a parameter at a bound, with the way out."""
+    bound = f"{value:.4g} {unit_text(unit)}".rstrip()
+    return f"at its bound {bound}: widen the bounds in [parameters], or check the equations of the twin"
+
+
 def classify(
     uncertainty: Information, index: int, names: Sequence[str], target: AccuracyTarget
 ) -> tuple[Identifiability, str]:
     """Return the identifiability of parameter ``index``, and the reason as a sentence."""
     reach = QUANTILE * uncertainty.sd[index]
     if target.at_bound and (reach <= PUSHED * target.half_width or target.pressure > PRESSED):
-        return Identifiability.AT_BOUND, AT_THE_BOUND.format(target.value, target.unit)
+        return Identifiability.AT_BOUND, at_its_bound(target.value, target.unit)
     if reach <= target.half_width:
         return Identifiability.DETERMINED, ""
     correlations = np.abs(uncertainty.correlation[index]).copy()
@@ -155,6 +161,7 @@ def classify(
         partners = f"it can be traded with {names[partner]} (correlation {correlations[partner]:.3f})"
         return Identifiability.TRADED, partners
     bound = "; its best value lies at its bound" if target.at_bound else ""
-    asked = f"±{target.half_width:.3g} {target.unit} is required"
-    weak = f"the window determines it to ±{reach:.3g} {target.unit} only, {asked}: too little excitation"
+    unit = unit_text(target.unit)
+    reached, asked = (f"{value:.3g} {unit}".rstrip() for value in (reach, target.half_width))
+    weak = f"the window determines it to ±{reached} only, ±{asked} is required: too little excitation"
     return Identifiability.WEAK, weak + bound

@@ -17,7 +17,7 @@ from otolith.estimation.augmented import time_offsets
 from otolith.estimation.problem import Problem
 from otolith.twin.augmentation import ELAPSED
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, InnovationModel, Kernel, NoiseModel, kernel_of
+from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, Indices, InnovationModel, Kernel, NoiseModel, kernel_of
 
 EXPLAINED = 1.5  # cost up to which the residual counts as noise
 INITIAL_STATE_REACH = 10.0  # standard deviations around the first record: least width of the bounds of a start
@@ -76,6 +76,8 @@ class Objective:
         self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
         self.count = max(float(self.present.sum()), 1.0)
         """Measured values of all outputs."""
+        self.is_complete = bool(self.present.all())
+        """Whether every output was measured in every record."""
         self.noise = self._noise_model(problem, window)
         lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
         if problem.components:  # a faulty sensor shows the first state far from where it is
@@ -84,19 +86,21 @@ class Objective:
         given = dict(problem.known) | (time_offsets(problem, window) if problem.components else {})
         self._template = np.array([given.get(parameter.name, parameter.nominal) for parameter in twin.parameters])
         order = [parameter.name for parameter in twin.parameters[: len(twin.parameters) - twin.settings]]
-        self._free_columns = [order.index(parameter.name) for parameter in problem.free]
-        self.free = len(self._free_columns)
-        self._state_columns = [len(order) + index for index in range(len(twin.states))]
-        self._trend_columns = [len(order) + len(twin.states) + column for column in self._free_columns]
+        self.free, self._states = len(problem.free), len(twin.states)
+        self._free_columns = np.array([order.index(parameter.name) for parameter in problem.free], dtype=np.int64)
+        state_columns = len(order) + np.arange(self._states)
+        self._trend_columns = len(order) + self._states + self._free_columns
+        self._columns = np.concatenate([self._free_columns, state_columns])
+        self._columns_with_trends = np.concatenate([self._free_columns, self._trend_columns, state_columns])
         low, high = problem.bounds
         self.low, self.high = np.concatenate([low, lowest]), np.concatenate([high, highest])
         states = (f"initial {state.name}" for state in twin.states)
         self.names = (*(parameter.label for parameter in problem.free), *states)
-        self._open_loop, self._states = problem.open_loop, len(twin.states)
+        self._open_loop = problem.open_loop
         self._max_substeps = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
         self._base = twin.base or twin
-        self._excitation = Excitation(input_matrix(twin, window), window.grid)
-        self._excitation = replace(self._excitation, measured=np.where(self.present, self.measured, np.nan))
+        measured = np.where(self.present, self.measured, np.nan)
+        self._excitation = Excitation(input_matrix(twin, window), window.grid, measured=measured)
         self.initial = self._first if initial is None else np.where(np.isnan(initial), self._first, initial)
         """(states,) around which the predictor was built."""
         self.set_predictor(start, self.initial, substeps)
@@ -167,7 +171,7 @@ class Objective:
 
         A prediction that diverges gives very large residuals and zero derivatives.
         """
-        return self._linearise(guess, [*self._free_columns, *self._state_columns])
+        return self._linearise(guess, self._columns)
 
     def linearise_with_trends(self, guess: Array) -> tuple[Array, Array]:
         """Return the same for a guess of parameters at the end, their trends per second, and the initial state.
@@ -176,16 +180,17 @@ class Objective:
         """
         free = self.free
         constant = np.concatenate([guess[:free], guess[2 * free :]])
-        columns = [*self._free_columns, *self._trend_columns, *self._state_columns]
-        residuals, jacobian = self._linearise(constant, columns)
+        residuals, jacobian = self._linearise(constant, self._columns_with_trends)
         return residuals + jacobian[:, free : 2 * free] @ guess[free : 2 * free], jacobian
 
-    def _linearise(self, guess: Array, columns: list[int]) -> tuple[Array, Array]:
+    def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
         with np.errstate(over="ignore", invalid="ignore"):
             prediction = self.kernel.sensitivities(parameters, initial, self._excitation, columns)
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
-            slopes = np.where(self.present[..., None], prediction.slopes, 0.0)
+            slopes = prediction.slopes
+            if not self.is_complete:
+                slopes = np.where(self.present[..., None], slopes, 0.0)
             jacobian = -np.matmul(self.whitening, slopes).reshape(len(residuals), -1)
         if all(np.abs(numbers).max(initial=0.0) <= PENALTY for numbers in (residuals, jacobian)):  # false for NaN
             return residuals, jacobian
@@ -214,8 +219,9 @@ class Objective:
     def residuals(self, predicted: Array) -> Array:
         """Return whitened innovations (particles, records, outputs), zero where nothing was measured."""
         innovations = np.where(self.present, self.measured - predicted, 0.0)
-        whitened: Array = np.einsum("rop,nrp->nro", self.whitening, innovations)
-        return whitened
+        of_outputs = np.ascontiguousarray(innovations.transpose(2, 0, 1))  # sums along records are many times faster
+        whitened = np.einsum("opr,pnr->onr", np.ascontiguousarray(self.whitening.transpose(1, 2, 0)), of_outputs)
+        return np.ascontiguousarray(whitened.transpose(1, 2, 0))
 
     def cost(self, guesses: Array) -> Array:
         """Return the cost (particles,) of guesses (particles, guess); PENALTY where a prediction is not finite."""
@@ -314,12 +320,15 @@ def adc_step(values: Array) -> float:
 
     Fewer than ``MIN_ADC_LEVELS`` show it if a level comes again: a sensor that fails jumps to another level once.
     """
-    levels = np.unique(values)
-    if len(levels) < 2 or (len(levels) < MIN_ADC_LEVELS and _runs(values) <= len(levels)):
+    ordered = np.sort(values)
+    rises = ordered[1:] != ordered[:-1]
+    steps = ordered[1:][rises] - ordered[:-1][rises]
+    levels = len(steps) + 1
+    if levels < 2 or (levels < MIN_ADC_LEVELS and _runs(values) <= levels):
         return 0.0
-    steps = np.diff(levels)
-    multiples = steps / steps.min()
-    return float(steps.min()) if np.abs(multiples - np.rint(multiples)).max() <= ADC_TOLERANCE else 0.0
+    least = float(steps.min())
+    multiples = steps / least
+    return least if np.abs(multiples - np.rint(multiples)).max() <= ADC_TOLERANCE else 0.0
 
 
 def _runs(values: Array) -> int:

@@ -14,7 +14,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.estimation import imm_filter
 from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
 from otolith.estimation.augmented import indices, source_of, without
-from otolith.estimation.imm_filter import ADDED_LEVEL, ImmPosterior
+from otolith.estimation.imm_filter import ADDED_LEVEL, ImmPosterior, Innovation
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import converter_steps
 from otolith.estimation.problem import Problem
@@ -104,13 +104,12 @@ class Posterior:
         """Return the parameters (free,) at which a fit starts: the mean, within the bounds."""
         return np.clip(self.prior().mean[: len(self.problem.free)], *self.problem.bounds)
 
-    def starts(self) -> list[Array]:
-        """Return the starts of a fit: one, or four with different phases where a phase is unknown."""
+    def with_phases(self, start: Array) -> list[Array]:
+        """Return the starts of a fit: ``start`` (free,), or four with different phases where a phase is unknown."""
         unknown, starts = self.unknown_phases(), []
         for turn in PHASE_OFFSETS if unknown else (0.0,):
-            start = self.start()
-            start[unknown] += turn
-            starts.append(start)
+            starts.append(start.copy())
+            starts[-1][unknown] += turn
         return starts
 
     def unknown_phases(self) -> list[int]:
@@ -120,13 +119,11 @@ class Posterior:
         sd = np.sqrt(self.belief.covariance[0].diagonal()[: len(problem.free)]) * problem.scale
         return [phase for phase in phases if sd[phase] > MAX_KNOWN_PHASE_SD]
 
-    def nis(self, evidence: Evidence) -> float:
-        """Return the normalised innovation squared of a window, of which this is the prediction."""
-        return imm_filter.nis(self.belief, self._relative(evidence))
-
-    def expects(self, evidence: Evidence) -> bool:
-        """Whether the normalised innovation squared of a window is within what healthy windows reach."""
-        return self.nis(evidence) <= imm_filter.nis_limit(2.0 * len(self.problem.free))
+    def innovation(self, evidence: Evidence) -> Innovation:
+        """Return the innovation of a window, of which this is the prediction."""
+        size = _size(self.problem)
+        relative = Evidence(evidence.point / size, evidence.sqrt_information * size, evidence.residual)
+        return imm_filter.innovation_of(self.belief, relative)
 
     def shifts(self, values: Array, sd: Array, length: float) -> Array:
         """Return by how many standard deviations a window of ``length`` (s) alone differs from the prediction (free,).
@@ -145,13 +142,9 @@ class Posterior:
         counted &= [not parameter.name.startswith("_") for parameter in self.problem.free]
         return np.where(counted, difference / np.sqrt(np.where(counted, variance, 1.0)), 0.0)
 
-    def update(self, evidence: Evidence, phase: PhaseAdvance) -> "Posterior":
-        """Return the posterior after a window, of which this is the prediction."""
-        return replace(self, belief=imm_filter.update(self.belief, self._relative(evidence)), phase=phase)
-
-    def inflate_variance(self, reduced_chi_square: float) -> "Posterior":
-        """Return the same with a larger variance ratio: a window fitted neither those before nor those after it."""
-        return replace(self, belief=imm_filter.inflate_variance(self.belief, reduced_chi_square))
+    def update(self, innovation: Innovation, phase: PhaseAdvance) -> "Posterior":
+        """Return the posterior after a window with that ``innovation``, which holds its prediction."""
+        return Posterior(self.problem, imm_filter.update(innovation), phase)
 
     def set_prior(self, prior: Prior) -> "Posterior":
         """Return the same modes, each with ``prior`` as its distribution."""
@@ -221,10 +214,6 @@ class Posterior:
             if is_trend and not 0.0 <= start - component.origin <= MAX_AGE:
                 posterior = posterior.without_slot(posterior.problem.components.index(component))
         return posterior
-
-    def _relative(self, evidence: Evidence) -> Evidence:
-        size = _size(self.problem)
-        return Evidence(evidence.point / size, evidence.sqrt_information * size, evidence.residual)
 
     def _propagate_phases(self, start: float, sample_period: float) -> ImmPosterior:
         problem, belief, phase = self.problem, self.belief, self.phase

@@ -1,6 +1,7 @@
 """The estimation problem of a machine: twin, known and free parameters, noise levels, components. Plain: it pickles."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -100,7 +101,7 @@ class Problem:
     noise: tuple[float, ...]
     """Standard deviation of the sensor of each output."""
     stated_noise: tuple[float, ...] = ()
-    """The same as the machine file states it, where the windows have shown that it is larger; empty otherwise."""
+    """:attr:`levels` as the machine file states them, where windows have shown that one is larger; empty otherwise."""
     steps: tuple[float, ...] = ()
     """Step of the converter of each output, as the windows have shown it; 0 or empty for none."""
     input_noise: tuple[float, ...] = ()
@@ -145,6 +146,25 @@ class Problem:
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Standard deviation of each input, then of the sensor of each output: in the order of the twin's signals."""
+        return (*(self.input_noise or (0.0,) * len(self.base_model.inputs)), *self.noise)
+
+    @property
+    def stated_levels(self) -> tuple[float, ...]:
+        """:attr:`levels` as the machine file states them."""
+        return self.stated_noise or self.levels
+
+    def with_levels(self, levels: Sequence[float]) -> "Problem":
+        """Return the problem with other :attr:`levels`."""
+        count = len(self.base_model.inputs)
+        inputs, outputs = tuple(levels[:count]), tuple(levels[count:])
+        stated = () if (*inputs, *outputs) == self.stated_levels else self.stated_levels
+        return replace(
+            self, noise=outputs, input_noise=inputs if self.input_noise or any(inputs) else (), stated_noise=stated
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

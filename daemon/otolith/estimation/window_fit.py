@@ -202,7 +202,8 @@ def estimate_window(predicted: Posterior, window: Window, search: Search = Searc
     If no swarm may search and a phase is unknown, the fit of least cost from four starting phases is returned.
     """
     problem, prior = predicted.problem, predicted.prior()
-    starts = predicted.starts() if search is Search.NEVER else [predicted.start()]
+    start = np.clip(prior.mean[: len(problem.free)], *problem.bounds)
+    starts = predicted.with_phases(start) if search is Search.NEVER else [start]
     return min((estimate(problem, window, prior, start, search) for start in starts), key=lambda item: item.cost)
 
 
@@ -320,8 +321,10 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
     objective, problem, result = both.fit.objective, both.fit.problem, both.fit.result
     configured = objective.predict(objective.guess(_without_amplitudes(problem, problem.nominal))[None])[0]
     predicted, last_state = objective.predict_with_trends(result.guess)
-    bare = _without_amplitudes(problem, result.guess)
-    estimated = objective.predict_with_trends(bare)[0] if problem.components else predicted
+    rmse_completed = rmse_estimated = tuple(map(float, objective.rmse(predicted)))
+    if problem.components:
+        bare = objective.predict_with_trends(_without_amplitudes(problem, result.guess))[0]
+        rmse_estimated = tuple(map(float, objective.rmse(bare)))
     return WindowEstimate(
         fit=both.fit,
         parameters=_parameter_estimates(both, outcome),
@@ -329,8 +332,8 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
         outcome=outcome,
         cost=both.cost,
         rmse_configured=tuple(map(float, objective.rmse(configured))),
-        rmse_estimated=tuple(map(float, objective.rmse(estimated))),
-        rmse_completed=tuple(map(float, objective.rmse(predicted))),
+        rmse_estimated=rmse_estimated,
+        rmse_completed=rmse_completed,
         predicted=predicted,
         last_state=last_state,
         advance=phase_advance(problem, both.fit.window, last_state),

@@ -65,5 +65,5 @@ def texts_in(language: Language) -> Texts:
 
 def _pattern(phrase: str) -> re.Pattern[str]:
     """Return the expression of a phrase: each name in braces is any text, and ``share`` is a number."""
-    expression = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.*?)", re.escape(phrase)).replace("<share>.*?", r"<share>[\d.]+")
+    expression = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.*?)", re.escape(phrase)).replace("<share>.*?", r"<share>[<>]?[\d.]+")
     return re.compile(expression, re.DOTALL)

@@ -18,7 +18,8 @@ from otolith.health.schema import (
     ReportDocument,
     Status,
 )
-from otolith.health.text import forecast_text, interval_text, value_text
+from otolith.health.text import forecast_text, interval_text, number_text, value_text
+from otolith_drivers.units import equation_text, unit_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
 RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine moves
@@ -132,7 +133,7 @@ def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, befor
             name=finding.subject,
             value=interval_text(value.value, value.sd, value.unit),
             change=f" ({deviation / quantity.nominal:+.1%})" if quantity.nominal else "",
-            stated=f"{quantity.nominal:.5g}",
+            stated=number_text(quantity.nominal),
         )
     persistence = UNDECIDED if finding.kind in (FindingKind.CLASS, FindingKind.MOVED) else Persistence()
     return Observation(finding.id, part, level, features, text, finding.advice, finding.since, numbers, persistence)
@@ -164,9 +165,8 @@ def _of_parameter(
         name=name,
         value=value_text(parameter),
         change=f" ({share}{against}{_at_temperature(quantity, texts)})" if share else "",
-        side=texts(limit.side),
-        limit=f"{limit.value:.4g}",
-        unit=unit,
+        side=texts(limit.side if limit.excess(referred[0]) > 0.0 else "still_near"),
+        limit=f"{number_text(limit.value, 4)} {unit_text(unit)}".rstrip(),
         expected=expected and f", {expected}",
         warming=_warming(quantity, deviation, texts),
     )
@@ -280,6 +280,6 @@ def _of_component(
     elif size > QUANTILE * amplitude.sd and not is_expected:
         level = Level(severity(plan.rules, features))
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
-    text = plan.texts("component", what=component.meaning, equation=component.equation, value=interval)
+    text = plan.texts("component", what=component.meaning, equation=equation_text(component.equation), value=interval)
     numbers = _numbers(size, amplitude.sd, amplitude.unit, limit)
     return Observation(key, quantity.part, level, features, text, since=component.onset, numbers=numbers)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
-from otolith.estimation.information import AT_THE_BOUND, QUANTILE, Identifiability, ParameterEstimate
+from otolith.estimation.information import QUANTILE, Identifiability, ParameterEstimate, at_its_bound
 from otolith.estimation.window_fit import AT_BOUND
 from otolith.health.schema import ParameterDocument, Status
 from otolith.twin.definition import Parameter
@@ -86,7 +86,7 @@ def publish(
     status = Status.INVALID if at_bound else _status(known_now, window, before, known=known, required=required)
     estimate, reason = window.estimate, window.reason
     if at_bound and not window.at_bound:
-        reason = "; ".join(filter(None, (AT_THE_BOUND.format(value, parameter.unit), reason)))
+        reason = "; ".join(filter(None, (at_its_bound(value, parameter.unit), reason)))
     elif estimate is not None and (window.accepted or window.at_bound):
         reason = "; ".join(filter(None, (estimate.reason, reason)))
     identifiability = None if estimate is None else estimate.identifiability

@@ -1,6 +1,9 @@
 """A report in words. Every text that shows a value, a component or a finding to a person is made here."""
 
+import math
+import re
 from collections.abc import Callable
+from decimal import Decimal
 
 from otolith.acquisition.quality import time_text
 from otolith.estimation.information import QUANTILE
@@ -16,21 +19,51 @@ from otolith.health.schema import (
     ReportDocument,
     Status,
 )
+from otolith_drivers.units import equation_text, unit_text
 
 UNKNOWN = "unknown"
 UNKNOWN_STATE = "UNKNOWN"
+PLAIN_NUMBERS = 1e-3, 1e5  # between which a number is read without a power of ten; engineering choice
+MAX_ZEROS = 6  # of decimals that an interval has beside its value; engineering choice
 UNITS_OF_TIME = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 """Length in s and name, the longest first; a duration is given in the longest of which it has at least two."""
 
 
+def number_text(value: float, digits: int = 5) -> str:
+    """A number with at most ``digits`` significant digits: ``6.5``, ``0.0014296``, ``14.296e-6``."""
+    return _scaled_text(value, digits, _exponent(value))
+
+
+def number_texts(value: float, half: float | None) -> tuple[str, str]:
+    """A value and half of its interval, in the same power of ten; without an interval its text is empty."""
+    exponent = _exponent(max(abs(value), half or 0.0))
+    return _scaled_text(value, 5, exponent), "" if half is None else _scaled_text(half, 2, exponent)
+
+
+def _exponent(value: float) -> int:
+    """A multiple of three, as in the prefixes of units; 0 for numbers that are read without it."""
+    is_plain = value == 0.0 or not math.isfinite(value) or PLAIN_NUMBERS[0] <= abs(value) < PLAIN_NUMBERS[1]
+    return 0 if is_plain else 3 * math.floor(math.log10(abs(value)) / 3.0)
+
+
+def _scaled_text(value: float, digits: int, exponent: int) -> str:
+    text = f"{value / 10.0**exponent:.{digits}g}"
+    if "e" in text:  # beside a number of another size
+        if abs(_exponent(value) - exponent) > MAX_ZEROS:
+            return number_text(value, digits)
+        text = f"{Decimal(text):f}"
+    return f"{text}e{exponent}" if exponent and text != "0" else text
+
+
 def half_width_text(sd: float) -> str:
     """Half of the 95 % interval of a normal distribution with standard deviation ``sd``."""
-    return f"{QUANTILE * sd:.2g}"
+    return number_text(QUANTILE * sd, 2)
 
 
 def interval_text(value: float, sd: float, unit: str) -> str:
-    """A value with its 95 % interval: ``5.9856 ohm ± 0.0075``."""
-    return f"{value:.5g} {unit} ± {half_width_text(sd)}"
+    """A value with its 95 % interval: ``5.9856 Ω ± 0.0075``."""
+    number, half = number_texts(value, QUANTILE * sd)
+    return " ".join(filter(None, (number, unit_text(unit), "±", half)))
 
 
 def value_text(parameter: ParameterDocument) -> str:
@@ -43,10 +76,10 @@ def value_text(parameter: ParameterDocument) -> str:
 def value_cells(parameter: ParameterDocument) -> tuple[str, str, str, str]:
     """The cells of a parameter in a table: value, half of the 95 % interval, unit, change against nominal."""
     if parameter.value is None or parameter.sd is None:
-        return UNKNOWN, "", parameter.unit, ""
+        return UNKNOWN, "", unit_text(parameter.unit), ""
     change = f"{parameter.value / parameter.nominal - 1:+.2%}" if parameter.nominal else ""
     change = "0.00%" if change in ("-0.00%", "+0.00%") else change
-    return f"{parameter.value:.5g}", half_width_text(parameter.sd), parameter.unit, change
+    return *number_texts(parameter.value, QUANTILE * parameter.sd), unit_text(parameter.unit), change
 
 
 def parameter_text(name: str, parameter: ParameterDocument) -> str:
@@ -59,7 +92,7 @@ def parameter_text(name: str, parameter: ParameterDocument) -> str:
 
 def component_text(component: ComponentDocument) -> str:
     """Site, equation and approval of a component that the twin lacks."""
-    return f"{component.meaning}: {component.equation} ({component.approval})"
+    return f"{component.meaning}: {equation_text(component.equation)} ({component.approval})"
 
 
 def finding_text(finding: FindingDocument) -> str:
@@ -67,7 +100,12 @@ def finding_text(finding: FindingDocument) -> str:
     return "; ".join(filter(None, [f"{finding.severity}: {finding.text}", finding.advice]))
 
 
-def event_text(event: EventDocument, when: Callable[[float], str] = time_text) -> str:
+def moment_text(seconds: float) -> str:
+    """A time of the data; that of an event, which is known to a window, has no fractions of a second."""
+    return re.sub(r"\.\d+ UTC$", " UTC", time_text(seconds))
+
+
+def event_text(event: EventDocument, when: Callable[[float], str] = moment_text) -> str:
     """State, part, condition, begin, values, certainty and advice; ``when`` turns Unix seconds into text."""
     texts = texts_in(event.language)
     part, condition = texts.translated(event.part), event.condition
@@ -81,8 +119,8 @@ def event_text(event: EventDocument, when: Callable[[float], str] = time_text) -
 
 
 def probability_text(event: EventDocument) -> str:
-    """How sure it is that the limit is passed; empty if the event has none."""
-    if (probability := event.evidence.probability) is None:
+    """How sure it is that the limit is passed; empty if the event has none, or its value is back inside."""
+    if (probability := event.evidence.probability) is None or probability < 0.5:
         return ""
     texts = texts_in(event.language)
     return texts("nearly_sure") if probability > 0.999 else texts("probability", share=f"{100.0 * probability:.3g}")
@@ -127,7 +165,7 @@ def state_word(part: PartDocument) -> str:
     return UNKNOWN_STATE if part.undetermined else part.state
 
 
-def headline(health: HealthDocument, when: Callable[[float], str] = time_text) -> str:
+def headline(health: HealthDocument, when: Callable[[float], str] = moment_text) -> str:
     """State of the machine, since when, and which parts are in it and why."""
     texts, parts = texts_in(health.language), health.parts.items()
     reasons = {name: part.reason for name, part in parts if part.state is health.state and part.reason}

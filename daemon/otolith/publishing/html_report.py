@@ -5,6 +5,7 @@ shows. Times are Unix seconds. Positions are in percent of a plot, from its left
 """
 
 import math
+import re
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,6 +15,7 @@ from itertools import pairwise
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
 
 from otolith import __version__
 from otolith.health import text
@@ -21,6 +23,7 @@ from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import ComponentDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.storage.history import DAY, HOUR, RESOLUTIONS, HistoryReader, HistorySample
+from otolith_drivers.units import equation_text, formula_text
 
 # Engineering choices, see docs/reference/thresholds-runtime.md.
 SILENT_WINDOWS = 3  # lengths of a window without a report until the state is NO DATA
@@ -35,6 +38,12 @@ LABEL_HEIGHT = 10.0  # percent of a plot
 MAX_TICKS = 5
 STEPS = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800, 345_600,
          604_800, 1_209_600, 2_592_000, 5_184_000, 10_368_000, 31_536_000, 63_072_000, 157_680_000)  # s  # fmt: skip
+WHOLE = re.compile(  # a date; a number with its interval and a short unit
+    r"(\d{4}-\d\d-\d\d(?: [\d:.]+)?"
+    r"|\d[\d.]*(?:e-?\d+)?(?: [^\s\d.,;()±]{1,11}(?= ±))?(?: ± [\d.e-]+)?(?: (?:%|°C|[ΩAVWNs]\b))?)"
+)
+UNBROKEN = Markup('<span class="whole">{}</span>')
+MAX_WHOLE = 26  # characters: a line of a phone in the type of a value; engineering choice
 TRUSTED = frozenset({Status.ESTIMATED, "adopted"})  # the others are drawn pale
 
 Span = tuple[float, float]
@@ -129,7 +138,7 @@ def html_report(
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     say = texts_in(latest.health.language if latest and latest.health else "en")
     own = {"when": lambda at: time.strftime("%F %T", time.localtime(at)), "words": say.translated}
-    environment.filters |= vars(text) | own
+    environment.filters |= vars(text) | own | {"whole": whole}
     template = environment.from_string((files(__package__) / "report.html").read_text(encoding="utf-8"))
     return template.render(
         say=say, machine=reader.machine, site=reader.site, latest=latest, is_silent=is_silent, silence=silence, now=now,
@@ -139,6 +148,15 @@ def html_report(
         findings=reader.findings(since), undetermined=_undetermined(reports), equations=_equations(latest, description),
         losses=_losses(reader.counters(since), since),
     )  # fmt: skip
+
+
+def whole(written: str) -> Markup:
+    """Return a text in which no line ends within a date, or a number and its unit; a long interval has its own."""
+    texts = [Markup.escape(part) for part in WHOLE.split(written)]
+    for index in range(1, len(texts), 2):  # what matches
+        parts = re.split(" (?=±)", texts[index]) if len(texts[index]) > MAX_WHOLE else [texts[index]]
+        texts[index] = Markup(" ").join(UNBROKEN.format(part) if set("- ") & set(part) else part for part in parts)
+    return Markup("").join(texts)
 
 
 def _axis(begin: float, now: float, latest: ReportDocument | None) -> Axis:
@@ -244,7 +262,7 @@ def _plot(axis: Axis, gaps: Sequence[Span], points: Sequence[HistorySample], cur
         changes = [index for index in range(1, len(run)) if trusted[index] is not trusted[index - 1]]
         for begin, end in pairwise((0, *changes, len(run))):
             lines.append((trusted[begin], line((row.time, row.mean) for row in run[begin : end + 1])))
-    marks = [Mark("nominal", stated, y(stated)), Mark("value", last, y(last))]
+    marks = [Mark("nominal", stated, y(stated)), Mark("value", points[-1].last, y(last))]
     marks += [Mark(level.name, value, y(value), (y(value), 100.0 - y(value)) if is_lower else (0.0, y(value)))
               for level, value, is_lower in shown]  # fmt: skip
     forecast = parameter.forecast if parameter else None
@@ -303,9 +321,9 @@ def _equations(latest: ReportDocument | None, description: Mapping[str, Any]) ->
             factor = f"({through}) * " if set("+-/") & set(through) else "" if through == "1" else f"{through} * "
             multiplied = f"({equations[into]}) * (1 + U{number})"
             equations[into] = multiplied if mode == "multiplicative" else f"{equations[into]} + {factor}U{number}"
-        lines.append(f"U{number} = {row.equation}")
+        lines.append(f"U{number} = {equation_text(row.equation)}")
     sides = {f"d{left[4:-1]}/dt" if left.startswith("der(") else left: right for left, right in equations.items()}
-    return [*(f"{left} = {right}" for left, right in sides.items()), *lines]
+    return [*(f"{left} = {formula_text(right)}" for left, right in sides.items()), *lines]
 
 
 def _losses(counters: Iterable[Mapping[str, Any]], since: float) -> Mapping[str, int]:

@@ -5,12 +5,10 @@ one ``send_columns`` call per entity, because each call costs a kilobyte. ``samp
 for a replay; the curves in ``signals`` are for the viewer, and most of the time they have the extremes only.
 """
 
-import importlib.abc
 import json
 import logging
 import math
 import re
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -38,9 +36,11 @@ from otolith.publishing.recording_layout import (
     limit_lines,
     near_values,
     operator_text,
+    quantity_text,
     report_text,
 )
 from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
+from otolith_drivers.refused_imports import keep_pandas_out
 from otolith_drivers.replay.packed_window import packed
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ def main(connection: Any, path: Path, source: RecordedMachine, folder: Recording
     """
     if not has_room(path):
         return
-    sys.meta_path.insert(0, _WithoutPandas())
+    keep_pandas_out()
     recording = RotatedRecording(path, source, folder, time.time())
     try:
         while (report := connection.recv()) is not None and recording.has_room(time.time()):
@@ -75,17 +75,6 @@ def main(connection: Any, path: Path, source: RecordedMachine, folder: Recording
             connection.send(recording.waiting)
     finally:
         recording.close()
-
-
-class _WithoutPandas(importlib.abc.MetaPathFinder):
-    """Refuses to import pandas, which pyarrow would do wherever it is installed: 34 MB for nothing.
-
-    None in ``sys.modules`` does not do: Cython takes it for the module, and the first column of Rerun is then lost.
-    """
-
-    def find_spec(self, name: str, *_: object) -> None:
-        if name == "pandas":
-            raise ModuleNotFoundError(name=name)
 
 
 def has_room(path: Path) -> bool:
@@ -183,13 +172,13 @@ class Recording:
         times = json.dumps({"sampling": source.sampling, "delays": dict(source.delays), "signals": units})
         self._stream.log(TIMES, rr.TextDocument(times), static=True)
         for signal in twin.inputs:
-            self._style(f"signals/{signal.name}", [f"{signal.name} measured [{signal.unit}]"], [MEASURED])
+            self._style(f"signals/{signal.name}", [quantity_text(f"{signal.name} measured", signal.unit)], [MEASURED])
         for output in twin.outputs:
-            names = [f"{output.name} measured [{output.unit}]", f"{output.name} twin [{output.unit}]"]
+            names = [quantity_text(f"{output.name} {kind}", output.unit) for kind in ("measured", "twin")]
             self._style(f"signals/{output.name}", names, [MEASURED, TWIN])
         self._style("residual", [f"{output.name} / noise" for output in twin.outputs], None)
         for parameter in source.parameters:
-            names = [*INTERVAL, f"{parameter.name} [{parameter.unit}]"]  # the last is drawn on top
+            names = [*INTERVAL, quantity_text(parameter.name, parameter.unit)]  # the last is drawn on top
             self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, TWIN])
             quantity = source.plan.parameters.get(parameter.name, MonitoredQuantity(nominal=parameter.nominal))
             self._limits[parameter.name], lines = quantity, limit_lines(quantity, source.plan.texts)
@@ -265,7 +254,7 @@ class Recording:
             # '/' and brackets have a meaning in the path of an entity.
             entity = "components/" + re.sub(r"\W+", "_", component.id)
             if entity not in self._styled:
-                what = f"{component.meaning}, {component.family} [{amplitude.unit}]"
+                what = quantity_text(f"{component.meaning}, {component.family}", amplitude.unit)
                 self._style(entity, [*INTERVAL, what], [LIMIT, LIMIT, MEASURED])
                 self._styled.add(entity)
             self._add_row(entity, end, amplitude.low, amplitude.high, amplitude.value)

@@ -6,12 +6,13 @@ import re
 import rerun as rr
 import rerun.blueprint as rrb
 
-from otolith.acquisition.quality import time_text
 from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level, MonitoredQuantity
 from otolith.health.schema import EventDocument, ReportDocument
-from otolith.health.text import event_text, headline, probability_text, state_word, value_text
+from otolith.health.text import event_text, headline, moment_text, number_text, probability_text, state_word, value_text
 from otolith.machine import RecordedMachine
+from otolith.twin.definition import Input, Output
+from otolith_drivers.units import equation_text, unit_text
 
 TIMELINE = "time"
 NEAR_LIMITS = 3.0  # times the distance of the nearest limit from the nominal value, up to which others are shown
@@ -29,7 +30,12 @@ def limit_lines(quantity: MonitoredQuantity, texts: Texts) -> list[tuple[str, fl
     """Return name, value and colour of the lines beside a parameter: its nominal value and its limits."""
     rows = [("nominal", quantity.nominal, LIMIT)]
     rows += [(str(row.level), row.value, STATES[row.level]) for row in quantity.limits]
-    return [(f"{texts.translated(name)} {value:.4g}", value, colour) for name, value, colour in rows]
+    return [(f"{texts.translated(name)} {number_text(value, 4)}", value, colour) for name, value, colour in rows]
+
+
+def quantity_text(name: str, unit: str) -> str:
+    """Return the name of a quantity with its unit in brackets, if it has one."""
+    return f"{name} [{symbol}]" if (symbol := unit_text(unit)) else name
 
 
 def near_values(quantity: MonitoredQuantity, value: float) -> list[float]:
@@ -49,7 +55,7 @@ def operator_text(document: ReportDocument) -> str:
     if health is None:
         return f"# {document.machine}"
     texts = texts_in(health.language)
-    lines = [f"# {texts.translated(state_word(health))}\n{texts('since', time=time_text(health.since))}"]
+    lines = [f"# {texts.translated(state_word(health))}\n{texts('since', time=moment_text(health.since))}"]
     lines += [_paragraph(event) for event in document.events if event.end is None]
     if len(lines) == 1:
         lines.append(_plain(health.reason or texts("all_well")))
@@ -61,7 +67,7 @@ def _paragraph(event: EventDocument) -> str:
     say = texts_in(event.language)
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
     what = _plain(f"{say.translated(event.state)}: {say.translated(event.part)}: {event.condition}")
-    what = f"## {what}\n{say('since', time=time_text(event.since))}"
+    what = f"## {what}\n{say('since', time=moment_text(event.since))}"
     advice = f"**{say('what_to_do')}: {_plain(event.advice)}**" if event.advice else ""
     return "  \n".join(filter(None, [what, advice, _plain(f"{event.text}{sure}")]))
 
@@ -85,7 +91,8 @@ def report_text(document: ReportDocument) -> str:
     if document.components:
         rows += ["", columns.format(say("component"), say("equation"), say("status"))]
         rows += [
-            f"| {row.meaning} | {row.equation} | {say(row.status)} {say(row.approval)} |" for row in document.components
+            f"| {say(row.meaning)} | {equation_text(row.equation)} | {say(row.status)} {say(row.approval)} |"
+            for row in document.components
         ]
     rows += [f"\n{event_text(event)}" for event in document.events if event.end is None]
     return "\n".join(rows)
@@ -112,7 +119,7 @@ def _operator(source: RecordedMachine) -> rrb.Container:
     estimates = [
         rrb.TimeSeriesView(
             contents=[f"/parameters/{row.name}", f"/limits/{row.name}"],
-            name=f"{row.name} [{row.unit}]: {say(row.meaning)}",
+            name=f"{quantity_text(row.name, row.unit)}: {say(row.meaning)}",
             axis_x=whole,
             plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
         )
@@ -138,12 +145,13 @@ def _operator(source: RecordedMachine) -> rrb.Container:
 def _engineer(source: RecordedMachine) -> rrb.Container:
     """Curves of signals and twin, residuals, the report and the log."""
     series, twin, texts = rrb.TimeSeriesView, source.twin, source.plan.texts
-    say = texts.translated
+    signals: tuple[Output | Input, ...] = (*twin.outputs, *twin.inputs)
+    names = {row.name: quantity_text(texts.translated(row.meaning), row.unit) for row in signals}
     outputs = [
-        series(origin=f"/signals/{row.name}", name=f"{say(row.meaning)} [{row.unit}]: {texts('measured_and_twin')}")
+        series(origin=f"/signals/{row.name}", name=f"{names[row.name]}: {texts('measured_and_twin')}")
         for row in twin.outputs
     ]
-    inputs = [series(origin=f"/signals/{row.name}", name=f"{say(row.meaning)} [{row.unit}]") for row in twin.inputs]
+    inputs = [series(origin=f"/signals/{row.name}", name=names[row.name]) for row in twin.inputs]
     residual = series(origin="/residual", name=texts("residuals"))
     words = (
         rrb.TextDocumentView(origin="/report", name=texts("report")),

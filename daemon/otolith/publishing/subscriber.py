@@ -145,11 +145,11 @@ class Subscriber:
         addresses = ", ".join(self._endpoints or self._sessions or local_sockets())
         if self.connected:
             reports = REPORT.under("*", self._machine)
-            return f"connected, waiting for {reports}, which the daemon may send to other readers only ({addresses})"
+            return f"connected, no report yet; if none comes, {reports} goes to other readers only ({addresses})"
         if addresses:
             return f"no daemon reached yet, or it refuses this reader; --connect sets where to look ({addresses})"
-        own = "no daemon of this user has a socket here, and no service that it may read"
-        return f"{own}: members of the group otolith may; --connect sets where to look"
+        own = "no daemon of this user runs here, and no service whose reports it may read (the group otolith may)"
+        return f"{own}; --connect sets where to look"
 
     def __enter__(self) -> Self:
         return self

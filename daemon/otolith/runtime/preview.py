@@ -27,6 +27,7 @@ from otolith.machine import MIN_WINDOW_RECORDS, LoadedMachine
 from otolith.runtime.replay import Replay, Stopped, open_recorded
 from otolith.runtime.worker import perform, warm_up
 from otolith_drivers.errors import counted
+from otolith_drivers.units import unit_text
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
 MAX_ANALYSED = 8  # windows whose information is computed
@@ -488,8 +489,8 @@ def short_lines(preview: Preview) -> Iterator[str]:
         yield from _wrapped(f"! {remark}")
     yield from _window_lines(preview.windows)
     expected = [
-        f"{name} undetermined" if accuracy.half_width is None else f"{name} ±{accuracy.half_width:.2g} {accuracy.unit}"
-        for name, accuracy in preview.windows.parameters.items()
+        f"{name} " + (f"±{row.half_width:.2g} {unit_text(row.unit)}".rstrip() if row.half_width else "undetermined")
+        for name, row in preview.windows.parameters.items()
         if preview.windows.analysed
     ]
     if expected:
@@ -512,7 +513,8 @@ def _accuracy_lines(windows: WindowPreview) -> Iterator[str]:
     yield f"  {'parameter':14}{'nominal':>24}{'95 % interval':>15}{'required':>12}{'determined':>13}"
     for name, accuracy in windows.parameters.items():
         expected = "none" if accuracy.half_width is None else f"±{accuracy.half_width:.2g}"
-        cells = f"{f'{accuracy.nominal:.5g} {accuracy.unit}':>24}{expected:>15}{f'±{accuracy.required:.2g}':>12}"
+        nominal = f"{accuracy.nominal:.5g} {unit_text(accuracy.unit)}".rstrip()
+        cells = f"{nominal:>24}{expected:>15}{f'±{accuracy.required:.2g}':>12}"
         yield f"  {name:14}{cells}{f'{accuracy.determined} of {windows.analysed}':>13}"
     for name, accuracy in windows.parameters.items():
         if accuracy.reason:

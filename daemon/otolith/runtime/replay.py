@@ -118,7 +118,8 @@ def _open_by_name(machine: LoadedMachine, data: Path, names: Sequence[str]) -> R
     data_format, units = format_of(data), signal_units(machine.file, machine.twin)
 
     def opened(wanted: Sequence[str]) -> Reader:
-        signals = tuple(Signal(name, units[name], data_format.Source()) for name in wanted)
+        ordinary = machine.twin.ordinary_range
+        signals = tuple(Signal(name, units[name], data_format.Source(), ordinary(name)) for name in wanted)
         return data_format.open_log(data, Setup(signals, machine.path.parent, machine.file.window.sample_period), None)
 
     needed = [name for name in names if name not in machine.observed]

@@ -62,7 +62,7 @@ class FilterRecord(StrictModel):
     variance_ratio: Annotated[float, Field(ge=1.0, le=MAX_VARIANCE_RATIO)]
     phase: PhaseAdvance | None
     noise: tuple[float, ...]
-    """Of the outputs; empty unless it was accepted as larger than the machine file states."""
+    """Of the inputs, which older files lack, then of the outputs; empty unless accepted as larger than stated."""
     steps: tuple[float, ...] = ()
     """See :attr:`otolith.estimation.problem.Problem.steps`."""
     shifts: tuple[tuple[float, ...], ...] = ()
@@ -119,7 +119,8 @@ def configuration_fingerprint(problem: Problem) -> str:
     """Return a hash of what the machine file states of parameters and noise, without what was learned."""
     free = [(item.name, item.nominal, item.low, item.high) for item in problem.free if not item.name.startswith("_")]
     known = [pair for pair in problem.known if not pair[0].startswith("_")]
-    noise = problem.stated_noise or problem.noise, problem.input_noise, problem.process_noise
+    stated = problem.with_levels(problem.stated_levels)
+    noise = stated.noise, stated.input_noise, stated.process_noise
     return _hash([free, known, noise, problem.open_loop])
 
 
@@ -160,7 +161,7 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
         end=belief.end,
         variance_ratio=belief.variance_ratio,
         phase=state.posterior.phase,
-        noise=problem.noise if problem.stated_noise else (),
+        noise=problem.levels if problem.stated_noise else (),
         steps=problem.steps,
         shifts=_sums(state, len(labels)),
         previous=tuple(state.previous.get(label, PreviousStatus()) for label in labels),
@@ -253,9 +254,14 @@ def _with_noise(problem: Problem, noise: tuple[float, ...]) -> Problem:
     """Return the problem with the ``noise`` that was accepted; empty for that of the machine file."""
     if not noise:
         return problem
-    ratios = [accepted / stated for accepted, stated in zip(noise, problem.noise, strict=True)]
+    stated, outputs = problem.levels, len(problem.noise)
+    noise = (*stated[:-outputs], *noise) if len(noise) == outputs else noise
+    _require(len(noise) == len(stated), "noise: of other signals")
+    ratios = [accepted / known for accepted, known in zip(noise[-outputs:], stated[-outputs:], strict=True)]
     _require(1.0 <= min(ratios) <= max(ratios) <= MAX_NOISE_RATIO, "noise: not plausible")
-    return replace(problem, noise=noise, stated_noise=problem.noise)
+    inputs = zip(noise[:-outputs], stated, strict=False)
+    _require(all(known <= accepted < np.inf for accepted, known in inputs), "noise: not plausible")
+    return problem.with_levels(noise)
 
 
 def _with_steps(problem: Problem, steps: tuple[float, ...]) -> Problem:

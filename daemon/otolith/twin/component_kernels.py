@@ -1,8 +1,8 @@
-"""Generated kernels of an augmented twin, for the search for components (docs/explanation/innovation-form.md).
+"""Generated kernels for the search for components (docs/explanation/innovation-form.md).
 
-``linearise`` is the linear time-varying system along a trajectory, ``curves`` are basis functions of components, and
-``respond`` runs curves through the system: all that a search by linear algebra needs. ``adjoint`` and ``spread`` score
-a whole spectrum of curves at the cost of a few.
+``linearise`` is the linear time-varying system of an augmented twin along a trajectory, ``curves`` are basis functions
+of components, and ``respond`` runs curves through the system: all that a search by linear algebra needs. ``adjoint``
+and ``spread`` score a whole spectrum of curves at the cost of a few. All but ``linearise`` are the same for all twins.
 """
 
 import sympy
@@ -239,7 +239,7 @@ def curves(family, x, sources, b, c):
 
 
 def component_functions() -> list[str]:
-    """``component(family, x, a, b, c)``; ``component_slopes``, which adds its derivatives; then ``curves``.
+    """``component(family, x, a, b, c)``; ``component_slopes``, which adds its derivatives.
 
     The derivatives by ``x``, ``a``, ``b`` and ``c`` share the exponentials of the component.
     """
@@ -248,7 +248,15 @@ def component_functions() -> list[str]:
     formulas = {family_code(row.name): sympy.sympify(row.formula, locals=known) for row in COMPONENT_FAMILIES}
     slopes = {code: [formula, *(sympy.diff(formula, by) for by in arguments)] for code, formula in formulas.items()}
     lines = _by_family("component", {code: [formula] for code, formula in formulas.items()})
-    return [*lines, *_by_family("component_slopes", slopes), *CURVES.strip().splitlines(), "", ""]
+    return [*lines, *_by_family("component_slopes", slopes)]
+
+
+def kernels_of_all_twins() -> list[str]:
+    """``curves``, ``respond``, ``adjoint`` and ``spread``, with what they call."""
+    lines = component_functions()
+    for kernel in (CURVES, RESPOND, ADJOINT, SPREAD):
+        lines += [*kernel.strip().splitlines(), "", ""]
+    return lines
 
 
 def _by_family(name: str, rows: dict[float, list[sympy.Expr]]) -> list[str]:

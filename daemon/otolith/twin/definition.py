@@ -1,5 +1,6 @@
 """A twin as its author wrote it: frozen, hashable and picklable dataclasses, nothing derived."""
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
@@ -77,6 +78,8 @@ class Input:
     low: float = -1.0
     """Lower end of the range in ordinary operation."""
     high: float = 1.0
+    has_range: bool = True
+    """Whether the twin states the range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +144,13 @@ class Definition:
     def unit_of(self, name: str) -> str:
         """Unit of a state, input, output, parameter or constant."""
         return self.units()[name]
+
+    def ordinary_range(self, name: str) -> tuple[float, float] | None:
+        """Range of an input in ordinary operation, infinite if it is not stated; None for another quantity."""
+        driven = next((item for item in self.inputs if item.name == name), None)
+        if driven is None:
+            return None
+        return (driven.low, driven.high) if driven.has_range else (-math.inf, math.inf)
 
     def units(self) -> dict[str, str]:
         """Every named quantity and its unit."""

@@ -9,7 +9,8 @@ Identification, 2nd ed., section 4.3). docs/explanation has the equations.
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,11 +35,14 @@ many as with equal steps."""
 RELATIVE_TOLERANCE = 1e-11
 """Of the largest value of an output: truncation error that is allowed in any case, as rounding errors are near it."""
 
+SHARED = frozenset({"curves", "respond", "adjoint", "spread"})
+"""Kernels that are the same for all twins: compiled once for all of them."""
+
 Indices = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots: what the kernels take is prepared once
 class Excitation:
     """What drives a twin through a window, and what corrects it."""
 
@@ -58,13 +62,30 @@ class Excitation:
         """Return an open-loop excitation by ``inputs`` (records, inputs), ``period`` s apart."""
         return cls(inputs, TimeGrid.uniform(len(inputs), period), substeps)
 
-    @property
+    @cached_property
     def counts(self) -> Indices:
         """(records,) steps of the integrator to the next record."""
         if self.grid.period is not None:
             return np.full(self.grid.records, self.substeps)
         shares = self.substeps * self.grid.steps / _longest(self.grid)
         return np.maximum(np.ceil(shares - WHOLE), 1.0).astype(np.int64)
+
+    @cached_property
+    def arguments(self) -> tuple[Array, Array, Indices, Array, Array]:
+        """Inputs, steps, counts, measurements and gain as the kernels take them; the last two are empty in open loop.
+
+        Raises:
+            ValueError: the inputs have another number of records than the grid.
+        """
+        inputs = np.ascontiguousarray(self.inputs, dtype=np.float64)
+        if len(inputs) != self.grid.records:
+            raise ValueError(f"{len(inputs)} records of inputs at {self.grid.records} times")
+        measured, gain = np.zeros((0, 0)), np.zeros((0, 0, 0))
+        if self.measured is not None and self.gain is not None:
+            measured = np.ascontiguousarray(self.measured, dtype=np.float64)
+            if self.gain.any():
+                gain = np.ascontiguousarray(self.gain, dtype=np.float64)
+        return inputs, np.ascontiguousarray(self.grid.steps), self.counts, measured, gain
 
     def until(self, record: int) -> "Excitation":
         """Return the same before ``record``; substeps keep their length."""
@@ -173,8 +194,6 @@ class Kernel:
 
     def __init__(self, definition: Definition) -> None:
         self.definition = definition
-        self._open_loop = np.zeros((0, len(definition.states), len(definition.outputs)))
-        self._unmeasured = np.zeros((0, len(definition.outputs)))
         self._compiled: set[str] = set()
 
     def simulate(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
@@ -182,7 +201,7 @@ class Kernel:
 
         The first record belongs to the initial state. A particle that diverges gets values that are not finite.
         """
-        predicted: Array = self._call("simulate", parameters, initial, *self._arguments(excitation))
+        predicted: Array = self._call("simulate", parameters, initial, *excitation.arguments)
         return predicted
 
     def sensitivities(
@@ -190,7 +209,7 @@ class Kernel:
         parameters: Array,
         initial: Array,
         excitation: Excitation,
-        columns: Sequence[int] | None = None,
+        columns: Sequence[int] | Indices | None = None,
         *,
         drifts: bool = False,
     ) -> Sensitivities:
@@ -204,7 +223,7 @@ class Kernel:
             columns = range(of_parameters * (1 + drifts) + len(self.definition.states))
         wanted = np.array(columns, dtype=np.int64)
         times = np.ascontiguousarray(excitation.grid.before_last)
-        drive = self._arguments(excitation)
+        drive = excitation.arguments
         return Sensitivities(*self._call("sensitivities", parameters, initial, *drive, times, wanted))
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
@@ -218,7 +237,7 @@ class Kernel:
         period = excitation.grid.period
         if period is None:
             raise ValueError("the difference equations of the paper need a uniform grid")
-        inputs, *_ = self._arguments(excitation)
+        inputs, *_ = excitation.arguments
         predicted: Array = self._call("euler", parameters, initial, inputs, period, max(1, round(period / step)))
         return predicted
 
@@ -229,7 +248,8 @@ class Kernel:
 
         Elements are not finite where the filter diverges.
         """
-        inputs, steps, counts, measured, _ = self._arguments(replace(excitation, gain=self._open_loop))
+        inputs, steps, counts, *_ = excitation.arguments
+        measured = np.ascontiguousarray(excitation.measured, dtype=np.float64)
         grid = (inputs, steps, counts, noise.parts(excitation.grid))
         variances = (noise.outputs**2, noise.states**2)
         of_inputs = (np.ascontiguousarray(noise.inputs), np.ascontiguousarray(noise.held_inputs))
@@ -237,7 +257,7 @@ class Kernel:
 
     def linearise(self, parameters: Array, initial: Array, excitation: Excitation) -> LinearisedModel:
         """The linear system along a window, exact but for the error of the integrator; (parameters,), (states,)."""
-        return LinearisedModel(*self._call("linearise", parameters, initial, *self._arguments(excitation)))
+        return LinearisedModel(*self._call("linearise", parameters, initial, *excitation.arguments))
 
     def curves(self, families: Array, x: Array, sources: Indices, inner: Array, phases: Array) -> Array:
         """(records, curves) of components of unit amplitude; ``x`` is (sources, records), all else (curves,)."""
@@ -296,54 +316,52 @@ class Kernel:
         if grid.period is None and grid.records > 1:
             limit *= 2 ** int(np.ceil(np.log2(_longest(grid) / _ordinary_step(grid)) - WHOLE))
         first, second = parameters[None], initial[None]
-        coarse = self.simulate(first, second, replace(excitation, substeps=count))
+        coarse = self.simulate(first, second, excitation)
         while count < limit:
-            fine = self._halved(first, second, replace(excitation, substeps=count))
+            fine = self._halved(first, second, excitation)
             with np.errstate(invalid="ignore"):
                 error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0  # of an order-4 method
                 allowed = np.maximum(tolerance, RELATIVE_TOLERANCE * np.abs(fine).max(axis=(0, 1), initial=0.0))
             if np.all(error <= allowed):
                 break
             count *= 2
-            uniform = grid.period is not None
-            coarse = fine if uniform else self.simulate(first, second, replace(excitation, substeps=count))
+            excitation = replace(excitation, substeps=count)
+            coarse = fine if grid.period is not None else self.simulate(first, second, excitation)
         return count
 
     def _halved(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
         """As :meth:`simulate`, with each substep halved."""
-        inputs, steps, counts, measured, gain = self._arguments(excitation)
+        inputs, steps, counts, measured, gain = excitation.arguments
         halved: Array = self._call("simulate", parameters, initial, inputs, steps, 2 * counts, measured, gain)
         return halved
-
-    def _arguments(self, excitation: Excitation) -> tuple[Array, Array, Indices, Array, Array]:
-        inputs, grid = np.ascontiguousarray(excitation.inputs, dtype=np.float64), excitation.grid
-        if len(inputs) != grid.records:
-            raise ValueError(f"{len(inputs)} records of inputs at {grid.records} times")
-        measured, gain = self._unmeasured, self._open_loop
-        if excitation.measured is not None and excitation.gain is not None:
-            measured = np.ascontiguousarray(excitation.measured, dtype=np.float64)
-            if excitation.gain.any():
-                gain = np.ascontiguousarray(excitation.gain, dtype=np.float64)
-        return inputs, np.ascontiguousarray(grid.steps), excitation.counts, measured, gain
 
     @cached_property
     def _module(self) -> Any:
         return kernel_cache.load(identity_of(self.definition), lambda: _source(self.definition))
 
     def _call(self, name: str, first: Array, second: Array, *rest: Any) -> Any:
-        function: Callable[..., Any] = getattr(self._module, name)
+        module, compiled = (_shared_module(), _shared_compiled) if name in SHARED else (self._module, self._compiled)
+        function: Callable[..., Any] = getattr(module, name)
         arguments = (np.ascontiguousarray(first), np.ascontiguousarray(second), *rest)
-        if name in self._compiled:
+        if name in compiled:
             return function(*arguments)
-        with kernel_cache.compiling(self._module, function, f"{self.definition.name}.{name}"):
+        with kernel_cache.compiling(module, function, f"{self.definition.name}.{name}"):
             try:
                 result = function(*arguments)
             except Exception:  # noqa: BLE001 - a truncated file of the cache raises errors of any type
-                kernel_cache.discard(self._module)
+                kernel_cache.discard(module)
                 # Other errors are raised again here.
                 result = function(*arguments)
-        self._compiled.add(name)
+        compiled.add(name)
         return result
+
+
+_shared_compiled: set[str] = set()
+
+
+@cache
+def _shared_module() -> Any:
+    return kernel_cache.load("kernels of all twins", lambda: _sources().shared_source())
 
 
 @lru_cache(maxsize=64)
@@ -368,11 +386,16 @@ def identity_of(definition: Definition) -> str:
     return hashlib.sha256(repr(mathematical).encode()).hexdigest()
 
 
-def _source(definition: Definition) -> str:
-    from otolith.twin.kernel_sources import kernel_source  # noqa: PLC0415 - loads SymPy; a cached kernel needs none
+def _sources() -> ModuleType:
+    from otolith.twin import kernel_sources  # noqa: PLC0415 - loads SymPy; a cached kernel needs none
 
+    return kernel_sources
+
+
+def _source(definition: Definition) -> str:
     try:
-        return kernel_source(definition)
+        text: str = _sources().kernel_source(definition)
     except Exception as error:  # SymPy raises errors of many types: each becomes one that names the twin
         text = f"twin {definition.name!r}: its equations cannot be turned into code: {type(error).__name__}: {error}"
         raise ConfigurationError(text) from error
+    return text

@@ -221,7 +221,7 @@ class _Reader:
 
     def _input(self, name: str, table: _InputTable) -> Input:
         bounds = self._bounds(("inputs", name, "range"), table.unit, table.range)
-        return Input(name, table.unit, table.meaning, table.hold, *bounds)
+        return Input(name, table.unit, table.meaning, table.hold, *bounds, has_range="range" in table.model_fields_set)
 
     def _output(self, name: str, table: _OutputTable) -> Output:
         noise = self._number(("outputs", name, "noise"), table.unit, table.noise, difference=True)

@@ -1,14 +1,10 @@
 """The CAN driver. Other packages import python-can from here."""
 
-import sys
+from otolith_drivers.refused_imports import import_refused
 
 # python-can imports asammdf, and with it pandas, wherever it is installed: 1 s and 140 MB in every process. Only the
-# reader of MF4 files needs it. python-can has no switch for it, so an import of it fails at once meanwhile.
-ASAMMDF = "asammdf"
-sys.modules.setdefault(ASAMMDF, None)  # type: ignore[arg-type]  # None makes an import fail
-import can  # noqa: E402 - after the line above
-
-if sys.modules[ASAMMDF] is None:
-    del sys.modules[ASAMMDF]
+# reader of MF4 files needs it. python-can has no switch for it.
+with import_refused("asammdf"):
+    import can
 
 __all__ = ["can"]

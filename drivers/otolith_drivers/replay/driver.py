@@ -11,13 +11,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict
 
-from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
+from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
 from otolith_drivers.common.reconnection import ThreadedDriver
 from otolith_drivers.config_files import StrictModel, validated
 from otolith_drivers.errors import ConfigurationError, DeviceError, OtolithError
@@ -45,7 +46,7 @@ class ReplayOptions(StrictModel):
 
 
 class ReplaySource(StrictModel):
-    """Keys that depend on the format: ``column`` and ``unit`` of a table, those of the CAN driver for a CAN log."""
+    """Keys that depend on the format: ``column``, ``unit`` and ``range`` of a table, or those of the CAN driver."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
@@ -85,7 +86,7 @@ def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Rea
         keys = {key: value for key, value in options.can.items() if key != "type"}
         can = validated(keys, CanOptions, ("driver", "can"))
     signals = tuple(
-        Signal(signal.name, signal.unit, validated(signal.source.model_dump(), kind.Source, ("signals", signal.name)))
+        replace(signal, source=validated(signal.source.model_dump(), kind.Source, ("signals", signal.name)))
         for signal in setup.signals
     )
     wanted = Setup(signals, setup.folder, setup.sample_period)

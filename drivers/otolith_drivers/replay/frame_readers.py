@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from otolith_drivers.canbus import ASAMMDF, can
+from otolith_drivers.canbus import can
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT
 from otolith_drivers.canbus.signals import CLASSIC_LENGTH
 from otolith_drivers.common.remote_clock import unix_time
@@ -156,7 +156,7 @@ class Mf4Frames:
         if not head.startswith(b"MDF ") or path.suffix.lower() == GZIP:
             kind = seen(head)
             raise ConfigurationError(f"{path}: is not an unpacked MF4 file{f' but {kind}' if kind else ''}")
-        if find_spec(ASAMMDF) is None:
+        if find_spec("asammdf") is None:
             raise ConfigurationError(f"{path}: an MF4 file needs the extra 'mf4': {installation_of('mf4')}")
         self._path = path
 
@@ -164,7 +164,7 @@ class Mf4Frames:
         """Number of each frame with the frame, or with the reason why there is none; can be iterated once."""
         from asammdf import MDF  # noqa: PLC0415 - slow to import
 
-        logging.getLogger(ASAMMDF).setLevel(logging.CRITICAL)
+        logging.getLogger("asammdf").setLevel(logging.CRITICAL)
         number = 0
         try:
             with MDF(self._path) as file:

@@ -11,23 +11,23 @@ import codecs
 import csv
 import io
 import re
-import sys
-import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple, TextIO
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import field_validator
 
 from otolith_drivers.base import Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, counted, nearest
+from otolith_drivers.refused_imports import keep_pandas_out
 from otolith_drivers.replay.coarse_times import EvenTimes
 from otolith_drivers.replay.formats import seen
+from otolith_drivers.replay.no_readings import NoReadings, Range
 from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows
 from otolith_drivers.units import factor
 
@@ -48,20 +48,7 @@ NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
 BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
 
 
-def _keep_pandas_out() -> None:
-    """Let pyarrow see a pandas that is too old, which it does not use; otherwise it would import pandas, with 45 MB.
-
-    It decides once, at its first conversion. Only the reader of MF4 logs needs pandas, which imports it itself.
-    """
-    if "pandas" not in sys.modules:
-        sys.modules["pandas"] = too_old = ModuleType("pandas")
-        too_old.__dict__["__version__"] = "0.1"
-        with warnings.catch_warnings(action="ignore"):
-            pa.array([0]).to_numpy()
-        del sys.modules["pandas"]
-
-
-_keep_pandas_out()
+keep_pandas_out()  # only the reader of MF4 logs needs it, which imports it itself
 
 
 class TableSource(StrictModel):
@@ -71,6 +58,15 @@ class TableSource(StrictModel):
     """Name of the column; without it, the name of the signal."""
     unit: str | None = None
     """Unit of the numbers in the column, if its header does not name it."""
+    range: Range | None = None
+    """In the unit of the column; a number outside is no reading."""
+
+    @field_validator("range")
+    @classmethod
+    def _is_increasing(cls, limits: Range | None) -> Range | None:
+        if limits is not None and not limits[0] < limits[1]:
+            raise ValueError(f"range {list(limits)}: the lower end comes first")
+        return limits
 
 
 Source = TableSource  # for readers.Format
@@ -82,6 +78,17 @@ class Column(NamedTuple):
     place: int
     scale: float = 1.0
     offset: float = 0.0
+
+    def scaled(self, numbers: Array) -> Array:
+        """The values of ``numbers`` in the unit of the signal; infinity for one that is too large."""
+        with np.errstate(over="ignore"):
+            values: Array = self.scale * numbers + self.offset
+        return values
+
+    def written(self, limits: Range) -> Range:
+        """The numbers in the column for ``limits`` in the unit of the signal."""
+        ends = sorted((limit - self.offset) / self.scale for limit in limits)
+        return ends[0], ends[1]
 
 
 class ColumnRequest(NamedTuple):
@@ -125,6 +132,8 @@ class TableCounts:
     """The decimal sign; empty until a chunk has one."""
     segment: str | None = None
     """Text of the present segment; None until a row has one."""
+    no_readings: dict[str, NoReadings] = field(default_factory=dict)
+    """Numbers of each signal that are left out."""
 
     @property
     def bad(self) -> int:
@@ -135,7 +144,8 @@ class TableCounts:
 def open_log(path: Path, setup: Setup, _: object = None) -> "TableReader":
     """See :meth:`otolith_drivers.replay.readers.Format.open_log`."""
     units = {signal.name: signal.unit for signal in setup.signals}
-    return TableReader(path, units, {signal.name: signal.source for signal in setup.signals})
+    ordinary = {signal.name: signal.ordinary for signal in setup.signals if signal.ordinary is not None}
+    return TableReader(path, units, {signal.name: signal.source for signal in setup.signals}, ordinary)
 
 
 class TableReader(Reader):
@@ -144,8 +154,16 @@ class TableReader(Reader):
     place = "line"
     is_table = True
 
-    def __init__(self, path: Path, units: Mapping[str, str], sources: Mapping[str, TableSource] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        units: Mapping[str, str],
+        sources: Mapping[str, TableSource] | None = None,
+        ordinary: Mapping[str, Range] | None = None,
+    ) -> None:
         """``units`` has the unit of each wanted signal, ``sources`` the column of a signal that has another name.
+
+        ``ordinary`` has the values of each input in ordinary operation, in its unit.
 
         Raises:
             ConfigurationError: the file is missing or no text, or a wanted column is missing.
@@ -164,6 +182,10 @@ class TableReader(Reader):
             data.close()
             raise
         self.ignored = self._header.ignored
+        for name, source in named.items():
+            limits = (ordinary or {}).get(name)
+            limits = limits and self._header.columns[name].written(limits)
+            self.counts.no_readings[name] = NoReadings(source.range, limits)
 
     @property
     def bad(self) -> int:
@@ -211,6 +233,8 @@ class TableReader(Reader):
     def warnings(self) -> list[str]:
         """See :meth:`otolith_drivers.replay.readers.Reader.warnings`."""
         lines = self._cut_off()
+        for name, no_readings in self.counts.no_readings.items():
+            lines += no_readings.warnings(name)
         if (coarse := self._times.text()) is not None:
             lines.insert(0, coarse)
         if self.counts.first_bad is None:
@@ -347,7 +371,7 @@ class _TableChunk:
         cells = cells if len(kept) == len(cells) else cells.take(pa.array(kept))
         texts = {name: pc.list_element(cells, column.place) for name, column in columns.items()}
         counts.decimal = counts.decimal or _decimal_sign(list(texts.values()))
-        times = _numbers(texts[TIME], columns[TIME], counts.decimal)
+        times = columns[TIME].scaled(_numbers(texts[TIME], counts.decimal))
         timed = self._timed(times, texts.pop(TIME), cells, kept)
         kept = kept[timed]
         if not len(kept):
@@ -355,8 +379,10 @@ class _TableChunk:
         values = {}
         for name, text in texts.items():
             text_of_rows = text.filter(pa.array(timed))
-            values[name] = _numbers(text_of_rows, columns[name], counts.decimal)
+            numbers = _numbers(text_of_rows, counts.decimal)
+            values[name] = columns[name].scaled(numbers)
             self._remove_bad_cells(name, values[name], text_of_rows, kept)
+            values[name][counts.no_readings[name].among(numbers)] = np.nan
         counts.rows += len(kept)
         marks = None
         if self._header.segment is not None:
@@ -443,8 +469,8 @@ def _decimal_sign(texts: list[pa.StringArray]) -> str:
     return "" if points == commas == 0 else "," if commas > points else "."
 
 
-def _numbers(texts: pa.StringArray, column: Column, decimal: str) -> Array:
-    """The numbers of a column in the unit of its signal: NaN for a blank cell, infinity for one that is no number.
+def _numbers(texts: pa.StringArray, decimal: str) -> Array:
+    """The numbers of a column: NaN for a blank cell, infinity for one that is no number.
 
     A cell with the other decimal sign is no number: the sign may separate thousands.
     """
@@ -456,6 +482,5 @@ def _numbers(texts: pa.StringArray, column: Column, decimal: str) -> Array:
     except pa.ArrowInvalid:
         known = pc.if_else(pc.match_substring_regex(texts, BLANK), "nan", "inf")
         numbers = pc.if_else(pc.match_substring_regex(texts, NUMBER), texts, known).cast(pa.float64())
-    with np.errstate(over="ignore"):  # an overflow gives infinity, which counts as no number
-        scaled: Array = column.scale * numbers.to_numpy() + column.offset
-    return scaled
+    array: Array = numbers.to_numpy()
+    return array

@@ -23,6 +23,7 @@ from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay.readers import Rows
 from tests.drivers.logs import BEGUN, UNITS, frames_of, live, opened, samples_of, written
+from tests.waiting import PATIENCE
 
 SUFFIXES = [".log", ".asc", ".blf", ".trc"]
 PACKED = [*SUFFIXES, *(f"{suffix}.gz" for suffix in SUFFIXES)]
@@ -257,4 +258,4 @@ def test_can_log_with_a_zero_size_blf_object_ends(tmp_path: Path, frames: list[c
         done.set()
 
     threading.Thread(target=check, daemon=True).start()
-    assert done.wait(10.0)
+    assert done.wait(PATIENCE)

@@ -80,8 +80,9 @@ def _decision(record: "ComponentRecord", decisions: "OperatorDecisions") -> str:
 def _equation(machine: "LoadedMachine", record: "ComponentRecord") -> str:
     from otolith.estimation.augmented import equation
     from otolith.health.text import half_width_text
+    from otolith_drivers.units import equation_text
 
-    text = equation(machine.twin, record.adopted.component, record.values)
+    text = equation_text(equation(machine.twin, record.adopted.component, record.values))
     return f"{text} (amplitude ± {half_width_text(record.deviations[0])})"
 
 
@@ -217,12 +218,14 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
 def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windows: int, *, approve_all: bool) -> None:
     from otolith.cli.commissioning.noise import identified_record, noise_lines
+    from otolith.commissioning.identification import explains_no_window
     from otolith_drivers.errors import OtolithError
 
     record = identified_record(machine, data, windows)
     identified = record.noise_beside(machine) if record.offered else record.noise
     components = tuple(record_of(item) for item in record.offered)
-    state = None if components else _replayed(machine, data)
+    is_useless = bool(components) or explains_no_window(machine.problem, record.noise, record.windows[0])
+    state = None if is_useless else _replayed(machine, data)
     if state is None or not state.adopted:  # the file's noise levels may have hidden a component
         state = _replayed(replace(machine, problem=identified.applied(machine.problem)), data, components)
     click.echo("\n".join(noise_lines(machine, identified)))
@@ -356,8 +359,9 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
     from otolith.health.baseline import baselines
     from otolith.health.limits import Level
     from otolith.health.prognosis import MIN_POINTS
-    from otolith.health.text import interval_text
+    from otolith.health.text import interval_text, number_text
     from otolith_drivers.errors import ConfigurationError
+    from otolith_drivers.units import unit_text
 
     limited = {name: row for name, row in machine.plan.parameters.items() if row.limits}
     kept = {name: item for name, item in baselines(histories).items() if name in limited}
@@ -371,7 +375,7 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
         click.echo(f"baseline {name} = {text}, mean of {item.windows} estimates until {local_time(item.end)}", err=True)
         level, limit = limited[name].level(item.value, item.sd, Level.OK)
         if limit is not None:
-            beyond = f"{level} {limit.side} {limit.value:.5g} {limited[name].unit}"
+            beyond = f"{level} {limit.side} {number_text(limit.value)} {unit_text(limited[name].unit)}"
             click.echo(f"{name}: beyond its limit {beyond}; if the machine is not healthy, undo it: --clear", err=True)
     for name in limited.keys() - kept.keys():
         click.echo(f"{name} has fewer than {MIN_POINTS} estimates: its limits stay as they were", err=True)

@@ -259,6 +259,8 @@ def _bundles(reader: "HistoryReader", since: float) -> "dict[int | None, Path]":
 def _table(samples: "Sequence[HistorySample]", width: int) -> object:
     """A row for each parameter: last value and interval, change and range of the means, and their curve."""
     from otolith.cli.operation.live_table import parameter_table, sparkline
+    from otolith.health.text import number_text, number_texts
+    from otolith_drivers.units import unit_text
 
     has_range = width >= WIDTH_WITH_RANGE
     words = max(len(sample.name) for sample in samples) + max(len(sample.unit) for sample in samples)
@@ -274,11 +276,11 @@ def _table(samples: "Sequence[HistorySample]", width: int) -> object:
             bins.setdefault(int((sample.time - first) / max(last - first, 1.0) * (length - 1)), []).append(sample.mean)
         curve = sparkline(tuple(sum(values) / len(values) for _, values in sorted(bins.items())))
         end, begin = row[-1], row[0].mean
-        half = "" if end.low is None or end.high is None else f"{0.5 * (end.high - end.low):.2g}"
+        reach = None if end.low is None or end.high is None else 0.5 * (end.high - end.low)
         change = f"{row[-1].mean / begin - 1.0:+.2%}" if begin else ""
         low, high = min(sample.min for sample in row), max(sample.max for sample in row)
-        limits = (f"{low:.5g}", f"{high:.5g}") if has_range else ()
-        table.add_row(name, f"{end.last:.5g}", half, unit, change, *limits, curve)
+        limits = (number_text(low), number_text(high)) if has_range else ()
+        table.add_row(name, *number_texts(end.last, reach), unit_text(unit), change, *limits, curve)
     return table
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 
 from rich import box
 from rich.console import Console, ConsoleOptions, Group, OverflowMethod, RenderableType, RenderResult
+from rich.segment import Segment
+from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
@@ -17,12 +19,23 @@ from otolith.health.diagnosis import FindingKind
 from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
-from otolith.health.text import event_text, forecast_text, headline, interval_text, state_word, value_cells, value_text
+from otolith.health.text import (
+    duration_text,
+    event_text,
+    forecast_text,
+    headline,
+    interval_text,
+    state_word,
+    value_cells,
+    value_text,
+)
+from otolith_drivers.units import equation_text
 
 HISTORY = 200  # windows that the curve of a parameter can show
-OTHER_COLUMNS = 72  # characters that the table needs beside the curve; a narrower terminal has lines instead
+WIDTH_WITH_COMPONENTS = 72  # characters of a terminal whose table of components has columns; engineering choice
 WIDTH_WITH_LINES = 60  # characters of a terminal whose tables have lines; a narrower one has no room for them
 SILENT_WINDOWS = 3  # lengths of a window without a report until a warning; engineering choice, no test
+BORDER = " │ "  # between the columns of a table
 BARS = "▁▂▃▄▅▆▇█"
 STYLES = {
     Status.ESTIMATED: "green",
@@ -49,15 +62,31 @@ class _Machine:
         """Return its lines and tables; ``in_short`` without components, messages and counters."""
         document, silence = self.document, time.monotonic() - self.received
         texts = texts_of(document)
-        parts: list[RenderableType] = []
+        head = [title(document)] if in_short else []
         if silence > SILENT_WINDOWS * (document.window.end - document.window.start):
-            parts.append(Text(f"{texts('no_report_for', seconds=f'{silence:.0f}')}: {state}", style="bold red"))
+            silent = texts("silent", time=local_time(document.window.end), duration=duration_text(silence))
+            return [*head, Text(f"{silent}: {state}", style="bold red"), _Grey(Group(*self._parts(width, in_short)))]
+        return [*head, *self._parts(width, in_short)]
+
+    def _parts(self, width: int, in_short: bool) -> list[RenderableType]:
+        document, texts = self.document, texts_of(self.document)
         table = _parameters(document.parameters, self.histories, width, texts)
         if in_short:
-            return [title(document), *parts, *state_lines(document), table, Text()]
-        parts += [*state_lines(document), *_title_lines(document, texts), table]
+            return [*state_lines(document), table, Text()]
+        parts: list[RenderableType] = [*state_lines(document), *_title_lines(document, texts), table]
         parts += [_components(document, width, texts)] if document.components else []
         return [*parts, *_messages(document, texts), *_counters(document, texts)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Grey:
+    """What was last known: it may be wrong by now."""
+
+    shown: RenderableType
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        segments = Segment.remove_color(console.render(self.shown, options))
+        return Segment.apply_style(segments, post_style=Style(dim=True, bold=False))
 
 
 class LiveTable:
@@ -169,15 +198,18 @@ def _parameters(
     parameters: Mapping[str, ParameterDocument], histories: Mapping[str, deque[float]], width: int, texts: Texts
 ) -> RenderableType:
     """A table of parameters; in a narrow terminal lines, as its columns would split words and numbers."""
-    length, say = width - OTHER_COLUMNS, texts.translated
-    if length < 0:
+    say = texts.translated
+    rows = [(name, *map(say, value_cells(row)), say(row.status)) for name, row in parameters.items()]
+    titles = map(say, (*VALUE_COLUMNS, "status"))
+    longest = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
+    length = width - sum(longest) - len(BORDER) * (len(longest) + 1) - 1
+    if length < -len(BORDER):
         return Group(*(_parameter_line(name, row, say) for name, row in parameters.items()))
-    curve = ("history",) if length > len("history") else ()  # below, numbers need the room
+    curve = ("history",) if length >= len(say("history")) else ()
     table = parameter_table("status", *curve, width=width, texts=texts)
-    for name, parameter in parameters.items():
-        status = Text(say(parameter.status), style=STYLES[parameter.status])
-        cells = [sparkline(tuple(histories.get(name, ()))[-length:], _scale(parameter)) for _ in curve]
-        table.add_row(name, *map(say, value_cells(parameter)), status, *cells)
+    for (*cells, word), (name, parameter) in zip(rows, parameters.items(), strict=True):
+        curves = [sparkline(tuple(histories.get(name, ()))[-length:], _scale(parameter)) for _ in curve]
+        table.add_row(*cells, Text(word, style=STYLES[parameter.status]), *curves)
     return table
 
 
@@ -195,10 +227,10 @@ def _components(document: ReportDocument, width: int, texts: Texts) -> Renderabl
         amplitude = component.values["amplitude"]
         text = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
         status = f"{say(component.status)}, {say(component.approval)}"
-        cells = component.meaning, component.equation, text, local_time(component.onset), status
+        cells = say(component.meaning), equation_text(component.equation), text, local_time(component.onset), status
         table.add_row(*cells)
         lines.append(Text("{}: {}: {}, {}, {}".format(*cells)))
-    return Group(*lines) if width < OTHER_COLUMNS else table
+    return Group(*lines) if width < WIDTH_WITH_COMPONENTS else table
 
 
 def _messages(document: ReportDocument, texts: Texts) -> list[Text]:
@@ -208,10 +240,11 @@ def _messages(document: ReportDocument, texts: Texts) -> list[Text]:
     for name, parameter in document.parameters.items():
         if expected := forecast_text(parameter, document.window.end, texts.language):
             lines.append(Text(f"{name}: {expected} (80 %)", style="bold yellow"))
-        if parameter.reason and not bad:
-            lines.append(Text(f"{name}: {parameter.reason}", style="yellow"))
-        if parameter.advice:
-            lines.append(Text(f"{name}: {parameter.advice}", style="cyan"))
+    for key, style in (("reason", "yellow"), ("advice", "cyan"))[bool(bad) :]:
+        names: dict[str, list[str]] = {}
+        for name, parameter in document.parameters.items():
+            names.setdefault(getattr(parameter, key) or "", []).append(name)
+        lines += [Text(f"{', '.join(own)}: {text}", style=style) for text, own in names.items() if text]
     for finding in (finding for finding in document.findings if finding.kind is FindingKind.OPEN):
         lines.append(Text(f"{texts('open_test')}: {finding.text}", style="magenta"))
         if finding.advice:
