@@ -1,6 +1,7 @@
 """A daemon that is killed, stopped or started twice, with real processes and files."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -182,7 +183,8 @@ def test_a_state_that_windows_contradict_is_not_saved(healthy: OwnMachine, monke
     service._supervisor.finished += 1
     state = service._supervisor.state
     before = state.previous["R_a"]
-    state.previous["R_a"] = type(before)(known=True, status=Status.INVALID)
+    refuted = type(before)(known=True, status=Status.INVALID)
+    state.previous["R_a"] = refuted
     service._save(1e6)
     assert requested == []
     state.previous["R_a"] = before
@@ -191,6 +193,12 @@ def test_a_state_that_windows_contradict_is_not_saved(healthy: OwnMachine, monke
     assert requested == [state]
     service._save(1e6 + 61.0)
     assert requested == [state, state]
+    service._save(1e6 + 62.0)
+    service._supervisor.state = replace(state, previous={**state.previous, "R_a": refuted})
+    service._save(math.inf)  # at the end: the last state that nothing contradicts
+    assert requested == [state, state, state]
+    service._save(math.inf)
+    assert requested == [state, state, state]
 
 
 def test_an_event_is_saved_at_once(healthy: OwnMachine, monkeypatch: pytest.MonkeyPatch) -> None:

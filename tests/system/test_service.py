@@ -18,6 +18,7 @@ import pytest
 from otolith.adaptation.state import ComponentRecord, OperatorDecisions
 from otolith.discovery.adopted import AdoptedComponent, Approval
 from otolith.estimation.problem import Component
+from otolith.health.schema import Status
 from otolith.machine import RecordedMachine, find_twin, load_machine
 from otolith.publishing import recorder
 from otolith.runtime.service import STALL_TIMEOUT, Service
@@ -184,6 +185,7 @@ def test_components_are_saved_and_decisions_apply_at_run_time(
     store.components_path.unlink()
     store.save_decisions(OperatorDecisions(approved=frozenset({FRICTION.key})))
     running.wait_for(lambda reports: reports[-1].components[0].approval is Approval.APPROVED)
+    running.wait_for(lambda reports: all(each.status is not Status.INVALID for each in reports[-1].parameters.values()))
     code, seconds = running.stop()
     assert (code, seconds < within(3.0)) == (0, True)
     assert [record.adopted.component.key for record in store.components()] == [FRICTION.key]  # saved again at the end

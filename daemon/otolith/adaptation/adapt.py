@@ -29,7 +29,7 @@ from otolith.discovery.screening import screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, open_test
 from otolith.estimation.augmented import slot_of
-from otolith.estimation.data_checks import CheckedWindow, check_window, without_saturated
+from otolith.estimation.data_checks import CheckedWindow, FaultySensor, check_window, without_saturated
 from otolith.estimation.imm_filter import Innovation, ParameterCusum
 from otolith.estimation.information import QUANTILE, Identifiability, information
 from otolith.estimation.objective import EXPLAINED, Objective
@@ -73,14 +73,15 @@ def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWind
     search = Search.NEVER if some_parameter_is_determined(state.previous) else Search.FROM_BOUNDS
     estimated = estimate_window(predicted, checked.window, search)
     innovation = predicted.innovation(estimated.evidence)
+    clipped: tuple[FaultySensor, ...] = ()
     if not _is_expected(innovation, estimated) and (rest := without_saturated(predicted, checked.window)) is not None:
-        again = estimate_window(predicted, rest.window, search)
-        result = _decide(state, predicted, again, predicted.innovation(again.evidence))
-        return replace(result, faulty_sensors=rest.faulty_sensors)
+        window, sensor = rest
+        estimated, clipped = estimate_window(predicted, window, search), (sensor,)
+        innovation = predicted.innovation(estimated.evidence)
     gap = unbridged_gap(estimated) if checked.window.bridge_error is not None else ""
     if gap:
         return _reject(state, predicted, replace(checked, bad=(gap,)))
-    return _decide(state, predicted, estimated, innovation)
+    return replace(_decide(state, predicted, estimated, innovation), faulty_sensors=clipped)
 
 
 def _is_expected(innovation: Innovation, estimated: WindowEstimate) -> bool:
@@ -147,7 +148,7 @@ def _apply_decision(
     state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, test: SequentialTest
 ) -> WindowResult:
     """Return the result of a window that the filter does not expect, or that shows what the twin lacks."""
-    test = replace(test, quiet=0, is_explained=test.is_explained or test.explains)
+    test = replace(test, quiet=0, has_explained=test.has_explained or test.explains)
     outcome = decide(test, state.learned)
     if outcome.update is PosteriorUpdate.HYPOTHESIS:
         return _adopt_hypothesis(state, estimated, test, outcome)
@@ -170,7 +171,7 @@ def _update_filter_beside(
     filter is one of the hypotheses. Hypotheses that explain no window have no evidence to lose.
     """
     result = _update_filter(state, innovation, estimated)
-    if test.accepts_filter or test.best.type is FaultType.NOTHING or not test.is_explained:
+    if test.accepts_filter or test.best.type is FaultType.NOTHING or not test.has_explained:
         return result
     return _with_mixture(replace(result, test=replace(test, quiet=test.quiet + 1)), state.problem)
 

@@ -130,7 +130,7 @@ def _is_below_noise(hypothesis: TrackedHypothesis) -> bool:
     offset = abs(float(hypothesis.posterior.prior().mean[indices(problem, slot)[0]]))
     return any(
         output.name == into and offset < noise
-        for output, noise in zip(problem.base_model.outputs, problem.noise, strict=False)
+        for output, noise in zip(problem.base_model.outputs, problem.noise, strict=True)
     )
 
 

@@ -74,14 +74,15 @@ def _with_noisier_inputs(null: Fit) -> Problem:
     for at, source in enumerate(best.base_model.inputs):
         differences, levels = np.abs(sample_differences(source.name, null.window)), best.levels
         shown = MAD_TO_SD * median(differences) if len(differences) else 0.0
-        for level in (shown * INPUT_SHARES).tolist():
+        shares = shown * INPUT_SHARES
+        for level in shares[shares > MIN_NOISE_FACTOR * levels[at]].tolist():
             problem = null.problem.with_levels((*levels[:at], level, *levels[at + 1 :]))
             trial = linearised(problem, null.window, null.prior, null.parameters)
-            if level <= MIN_NOISE_FACTOR * levels[at] or trial.objective.innovation_model.log_determinant <= unseen:
+            if trial.objective.innovation_model.log_determinant <= unseen:
                 break
             price = np.log(null.count) if best.levels[at] == levels[at] else 0.0
-            if _deviance(trial) + price < least:
-                best, least = problem, _deviance(trial)
+            if (deviance := _deviance(trial)) + price < least:
+                best, least = problem, deviance
     return best
 
 

@@ -90,8 +90,8 @@ class SequentialTest:
     """-2 log likelihood of the same windows under the filter, relative to the best hypothesis; nothing is forgotten."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
-    is_explained: bool = True
-    """Whether a hypothesis explains a window that the filter does not expect; else the cause is none of them."""
+    has_explained: bool = True
+    """Whether a hypothesis has explained a window that the filter did not expect; else the cause is none of them."""
 
     @property
     def best(self) -> TrackedHypothesis:
@@ -232,7 +232,7 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
         onset,
         last=last,
         null_reduced_chi_square=reduced_chi_square,
-        is_explained=best.fit.cost <= EXPLAINED,
+        has_explained=best.fit.cost <= EXPLAINED,
     )
 
 

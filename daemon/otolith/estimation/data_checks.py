@@ -62,13 +62,13 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class FaultySensor:
-    """A sensor whose samples make the window unusable."""
+    """A sensor of which samples are wrong."""
 
     signal: str
     text: str
     """What is wrong."""
     advice: str
-    """What to do if it is not."""
+    """What to do about it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +225,7 @@ def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
     return faulty
 
 
-def without_saturated(predicted: Posterior, window: Window) -> CheckedWindow | None:
+def without_saturated(predicted: Posterior, window: Window) -> tuple[Window, FaultySensor] | None:
     """Return ``window``, which contradicts the twin, without the samples at the limits of a sensor, which is named.
 
     None if such samples are not the cause.
@@ -236,7 +236,7 @@ def without_saturated(predicted: Posterior, window: Window) -> CheckedWindow | N
     return next((rest for rest in without if rest is not None), None)
 
 
-def _without_piles(predicted: Posterior, window: Window, output: Output) -> CheckedWindow | None:
+def _without_piles(predicted: Posterior, window: Window, output: Output) -> tuple[Window, FaultySensor] | None:
     """Return the window without the samples at the limits of a sensor if the twin explains all others, or None.
 
     At a limit the prediction moves further than the samples spread. Where a machine has changed, both settle.
@@ -270,7 +270,7 @@ def _without_piles(predicted: Posterior, window: Window, output: Output) -> Chec
         f"{len(records)} of {window.records} records do not count"
     )
     advice = f"look at the range of the sensor; {_turned_off(name, Check.FROZEN)}"
-    return CheckedWindow(hidden, faulty_sensors=(FaultySensor(name, text, advice),))
+    return hidden, FaultySensor(name, text, advice)
 
 
 def _pile(values: Array, measured: Mask, noise: float) -> list[Indices]:

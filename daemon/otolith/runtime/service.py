@@ -78,6 +78,7 @@ class Service:
         self._notes: tuple[str, ...] = ()
         self._saved: tuple[str, ...] = ()
         self._saved_at = -math.inf
+        self._unsaved: AdaptationState | None = None  # the last state that no window contradicts
         self._described: MonitoringPlan | None = None  # by the history
         state = initial_state(file.machine.name, file.machine.site, machine.problem, machine.plan)
         self._supervisor = Supervisor(state, longest * period, self._evidence.add)
@@ -297,14 +298,16 @@ class Service:
     def _save(self, now: float) -> None:
         """Request a save if components or open events have changed, or the last save is ``SAVE_INTERVAL`` ago.
 
-        A state that windows contradict is not saved: it might not be restored as what it was.
+        A state that windows contradict is not saved: it might not be restored as what it was. The one before it is.
         """
-        state = self._supervisor.state
-        keys = _keys(state)
-        is_due = keys != self._saved or now - self._saved_at >= SAVE_INTERVAL
-        if self._supervisor.finished and state.is_valid and is_due:
-            self._writer.save(state)
-            self._saved, self._saved_at = keys, now
+        if self._supervisor.finished and self._supervisor.state.is_valid:
+            self._unsaved = self._supervisor.state
+        if self._unsaved is None:
+            return
+        keys = _keys(self._unsaved)
+        if keys != self._saved or now - self._saved_at >= SAVE_INTERVAL:
+            self._writer.save(self._unsaved)
+            self._saved, self._saved_at, self._unsaved = keys, now, None
 
     def _feed_watchdog(self, now: float) -> None:
         """Feed systemd's watchdog as long as windows, good or bad, are being finished, or kernels compiled."""
