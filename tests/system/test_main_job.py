@@ -21,7 +21,7 @@ from otolith.acquisition.window import Array, Verdict
 from otolith.cli.demo import compare
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running, is_estimated
-from tests.waiting import EXACT, PATIENCE, within
+from tests.waiting import EXACT, PATIENCE, wait_for, within
 
 CAN_LISTENER = """
 import can, cantools, json, sys
@@ -146,6 +146,7 @@ def test_a_killed_worker_is_restarted(running: Running) -> None:
 
 def test_a_killed_recorder_changes_nothing_else(running: Running) -> None:
     before = running.wait_for(lambda reports: len(reports) >= 2)[-1].counters
+    wait_for(lambda: running.recording.exists() and running.recording.stat().st_size > 0)
     running.child("recorder").kill()
     reports = running.wait_for(lambda reports: len(reports) >= 5)
     last = reports[-1].counters

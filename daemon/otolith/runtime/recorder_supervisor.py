@@ -34,6 +34,7 @@ class RecorderSupervisor:
         self._planned_starts = 1
         self._progress_at = 0.0
         self._problem = ""
+        self._first: tuple[object, ...] | None = None  # arguments of the process, until it is spawned
         self.dropped = 0
         """Windows that were not recorded."""
 
@@ -50,6 +51,8 @@ class RecorderSupervisor:
     def start(self, now: float) -> None:
         """Start the recorder with a new file, if the disk has room.
 
+        The first process is spawned for the first window: it would take time from the worker, which starts as well.
+
         Raises:
             ServiceError: the folder cannot be created or is not writable.
         """
@@ -63,7 +66,11 @@ class RecorderSupervisor:
                 self._pause(f"recording pauses until {path.parent} has {math.ceil(missing / 1e6)} MB more free")
                 return
         writable(path.parent)
-        self._process.start(path, self._machine.recorded(self._machine.driver.sampling), folder)
+        arguments = (path, self._machine.recorded(self._machine.driver.sampling), folder)
+        if self._process.starts:
+            self._process.start(*arguments)
+        else:
+            self._first = arguments
         self._progress_at, self._problem = now, ""
         log.info("recording to %s", path)
 
@@ -71,7 +78,7 @@ class RecorderSupervisor:
         """Go on with a new file and the changed machine file; the old one is finished in up to ``seconds``."""
         self._process.stop(seconds)
         self._unanswered = self._unwritten = 0
-        self._machine = machine
+        self._machine, self._first = machine, None
         if self.is_enabled:
             self._planned_starts += self._process.starts >= self._planned_starts
             self._try_to_start(now)
@@ -90,6 +97,9 @@ class RecorderSupervisor:
 
     def offer(self, report: Report, now: float) -> None:
         """Give the recorder a window, without waiting."""
+        if self._first is not None:
+            self._process.start(*self._first)
+            self._first = None
         if not (self._process.alive and self._process.offer(report)):
             self.dropped += 1
             return
@@ -99,6 +109,8 @@ class RecorderSupervisor:
 
     def poll(self, now: float) -> None:
         """Read answers, kill a recorder that hangs, and restart one that has ended."""
+        if self._first is not None:
+            return
         for waiting in self._process.replies():
             self._unanswered, self._unwritten, self._progress_at = max(0, self._unanswered - 1), waiting, now
         if self._process.alive and self._unanswered and now - self._progress_at > RECORDER_TIMEOUT:
