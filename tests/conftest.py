@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from otolith import kernel_cache
 from otolith.acquisition.window import Window
 from otolith.cli.common import shipped_directory
 from otolith_drivers.plant.dc_motor import MotorScenario
@@ -28,7 +27,6 @@ FIRST_PORT, LAST_PORT, PORTS = 10_000, 32_000, 400  # PORTS: ports of each proce
 # The time of an example depends on the load of the computer; the same examples in every run.
 settings.register_profile("otolith", deadline=None, derandomize=True)
 settings.load_profile("otolith")
-MAX_KERNELS = 512  # in the cache while tests run: with fewer, each run would compile again what the last has removed
 SIGNALS = {"V_a": "ArmatureVoltage", "T_load": "LoadTorque", "i": "ArmatureCurrent", "omega": "RotorSpeed"}
 
 
@@ -64,11 +62,7 @@ SLOWEST = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the progress display in the process that distributes the tests, if there are several.
-
-    All tests together use more kernels than a computer with a few machines keeps.
-    """
-    kernel_cache.MAX_KERNELS = MAX_KERNELS
+    """Register the progress display in the process that distributes the tests, if there are several."""
     if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
         config.pluginmanager.register(Progress(config))
 

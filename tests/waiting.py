@@ -1,8 +1,8 @@
 """Waiting for conditions, and the durations that tests promise.
 
 A computer that is busy with something else must not fail a test. A test waits for a condition with a deadline that only
-a hang reaches. A test that asserts a duration is marked ``timed`` and takes its limit from `within`: ``make test``
-allows five times the limit, and ``make test-full`` repeats these tests one by one with the limit itself.
+a hang reaches. A test that asserts a duration is marked ``timed`` and takes its limit from `within`. ``make test-full``
+runs these tests one by one with the limit itself; whoever runs one beside other work has five times the limit.
 """
 
 import os

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 from otolith_drivers.errors import ServiceError
 from otolith_drivers.user_dirs import cache_directory
 
-MAX_KERNELS = 64  # folders in the cache, at most 3 MB each; the least recently used beyond are removed
+MAX_BYTES = 200_000_000  # of the cache: the least recently used kernels beyond are removed
 GENERATOR = sorted((Path(__file__).parent / "twin").glob("*.py"))
 LIBRARIES = ("numba", "llvmlite", "numpy", "sympy")
 
@@ -134,8 +134,10 @@ def _import(name: str, file: Path) -> ModuleType:
 
 def _remove_old(store: Path, keep: Path) -> None:
     folders = sorted((path for path in store.iterdir() if path.is_dir()), key=lambda path: path.stat().st_mtime)
-    for folder in folders[:-MAX_KERNELS]:
-        if folder != keep:
+    size = 0
+    for folder in reversed(folders):
+        size += sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        if size > MAX_BYTES and folder != keep:
             shutil.rmtree(folder, ignore_errors=True)
             (store / f"{folder.name}.lock").unlink(missing_ok=True)
 

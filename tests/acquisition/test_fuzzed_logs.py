@@ -369,7 +369,7 @@ def replayed(log: Log, folder: Path, work: Work) -> list[Window]:
 
 
 @given(log=logs())
-@settings(max_examples=100, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
 def test_any_log_gives_finite_reports_at_a_bounded_cost(log: Log, tmp_path_factory: Folders, work: Work) -> None:
     replayed(log, tmp_path_factory.mktemp("log"), work)
 

@@ -67,6 +67,7 @@ def window(random: np.random.Generator, index: int, missing: float, hidden: floa
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("missing", [0.0, 0.8])
 def test_95_percent_intervals_cover_the_truth_at_random_times(missing: float) -> None:
     random, windows = np.random.default_rng(31), 600

@@ -68,6 +68,7 @@ def test_a_drift_from_before_the_first_window_is_covered_and_no_step() -> None:
     assert coverage([window.parameters["D_l"] for window in reports]).reaches(0.9)
 
 
+@pytest.mark.full
 def test_estimates_without_trends_of_a_parameter_on_a_fast_ramp_are_no_step() -> None:
     at = 7
     ramp = Change(ramps={"D_l": -0.03}, since=at * TWO_MASS.records * TWO_MASS.period)

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.full  # they test the benchmarks, not the product
+
 ROOT = Path(__file__).parents[2]
 TIMINGS = {"bench_discovery": "", "bench_kernels": "casadi", "bench_window": ""}
 COMPARED = {

@@ -33,16 +33,12 @@ from otolith.machine import library_twins
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.units import to_base
 
+pytestmark = pytest.mark.full  # they test the benchmarks, not the product
+
 ROOT = Path(__file__).parents[2]
 PLANTS = {**LIBRARY_PLANTS, "lab_motor": LAB_MOTOR, "one_mass": ONE_MASS, "reversing": REVERSING_MOTOR}
-SHORT = ("dc_motor", "pump", "reversing")
 OF_THE_NOISE = 0.03  # difference between plant and twin: far below what a window shows
 SITES = {(name, site) for name in LIBRARY_PLANTS for site in (own.name for own in twin_of(PLANTS[name]).sites)}
-
-
-def each(short: set[Any], every: set[Any]) -> list[Any]:
-    """Parameters of a test; those that compile further kernels are for the long run."""
-    return [own if own in short else pytest.param(own, marks=pytest.mark.full) for own in sorted(every)]
 
 
 def predicted(problem: Problem, plant: Plant, rows: Mapping[str, Array], values: Mapping[str, float]) -> Array:
@@ -75,7 +71,7 @@ def test_every_twin_of_the_library_has_a_machine() -> None:
     assert set(LIBRARY_PLANTS) == set(library_twins())
 
 
-@pytest.mark.parametrize("name", each(set(SHORT), set(PLANTS)))
+@pytest.mark.parametrize("name", sorted(PLANTS))
 def test_a_machine_is_that_of_its_twin(name: str) -> None:
     plant = PLANTS[name]
     problem, rows = problem_of(plant), recorded(plant)
@@ -83,7 +79,7 @@ def test_a_machine_is_that_of_its_twin(name: str) -> None:
     assert difference(problem, rows, predicted(problem, plant, rows, true)) < OF_THE_NOISE
 
 
-@pytest.mark.parametrize("place", each({("dc_motor", "shaft"), ("pump", "head")}, SITES))
+@pytest.mark.parametrize("place", sorted(SITES))
 def test_a_term_enters_the_machine_where_it_enters_the_twin(place: tuple[str, str]) -> None:
     name, site = place
     plant = PLANTS[name]
@@ -103,11 +99,7 @@ MOVED_PAIRS = [trial for trial in classes.trials(6, 6) if trial.is_class and tri
 
 @pytest.mark.parametrize(
     "trial",
-    [
-        trial if trial.case.plant.name in SHORT else pytest.param(trial, marks=pytest.mark.full)
-        for trial in MOVED_PAIRS
-        if trial.case.after.gains
-    ],
+    [trial for trial in MOVED_PAIRS if trial.case.after.gains],
     ids=lambda trial: trial.case.name,
 )
 def test_what_a_wrong_sensor_shows_is_what_the_twin_predicts_with_moved_parameters(trial: Trial) -> None:
@@ -173,19 +165,16 @@ def test_calibration_prints_a_table() -> None:
     assert sum(own["count"] for own in document["decisions"]) == 1
 
 
-@pytest.mark.full
 def test_interchangeable_changes_are_stated_as_classes() -> None:
     pairs = ("k_v /", "T_load", "K, J, T_c", "brush drop", "R_a, L_a")
     assert [own["truth"] for own in run("classes", *pairs, "--runs", "3", "--healthy", "6") if not own["met"]] == []
 
 
-@pytest.mark.full
 def test_steps_of_parameters_are_followed() -> None:
     machines = ("dc_motor:", "servo_axis:", "two_mass:")
     assert [own["case"] for own in run("steps", *machines, "--runs", "2", "--healthy", "6") if not own["met"]] == []
 
 
-@pytest.mark.full
 def test_nothing_is_adopted_on_healthy_machines() -> None:
     documents = run("healthy", "dc_motor", "--runs", "2", "--windows", "22")
     assert sum(own["adopted"] for own in documents) == 0

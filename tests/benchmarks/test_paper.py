@@ -38,10 +38,12 @@ from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.plant.scenario import load_scenario
 from otolith_drivers.user_dirs import state_directory
 
+pytestmark = pytest.mark.full  # they test the benchmarks, not the product
+
 BEYOND_ONSET = 200.0  # s: the parameters drift from 160 s on
 SHORT = 20.0  # s: the motor turns from 10 s on
 LENGTHS = (2.0, 10.0)
-DRIFTING = ("armature-resistance", "bearing-wear", pytest.param("hydraulic-fluid-visible", marks=pytest.mark.full))
+DRIFTING = ("armature-resistance", "bearing-wear", "hydraulic-fluid-visible")
 PLOTTED = "armature-resistance"
 
 
@@ -161,19 +163,6 @@ def limit_of_damping(seconds: float) -> Limit:
     return limit
 
 
-def test_limiting_noise_of_damping_to_an_order_of_magnitude(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(studies, "BISECTIONS", 2)
-    limit = limit_of_damping(2 * studies.LENGTH)
-    assert limit.alone.kept is not None
-    assert limit.alone.lost is not None
-    assert limit.together.lost is not None
-    assert limit.unaided.lost is not None
-    assert 0.1 < limit.alone.kept < 7.0 < limit.alone.lost < 100.0  # damping contributes 7 Pa
-    assert limit.unaided.lost <= limit.together.lost >= limit.alone.lost
-    assert f"alone at {limit.alone.lost:.3g} Pa" in limit_in_words(limit)
-
-
-@pytest.mark.full
 def test_limiting_noise_of_damping() -> None:
     limit = limit_of_damping(SHORT / 2)
     assert limit.alone.kept is not None
@@ -184,6 +173,7 @@ def test_limiting_noise_of_damping() -> None:
     assert limit.together.lost > limit.alone.lost
     assert limit.unaided.lost is not None
     assert limit.unaided.lost <= limit.together.lost
+    assert f"alone at {limit.alone.lost:.3g} Pa" in limit_in_words(limit)
 
 
 def test_jobs_follow_the_options() -> None:

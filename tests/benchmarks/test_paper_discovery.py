@@ -21,6 +21,8 @@ from rich.console import Console
 from otolith.cli.common import shipped_directory
 from otolith_drivers.plant.scenario import load_scenario
 
+pytestmark = pytest.mark.full  # they test the benchmarks, not the product
+
 SHORT = 20.0  # s
 
 

@@ -5,6 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.full  # they test the benchmarks, not the product
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -75,6 +75,7 @@ def commissioned(data: Path, kept_files: dict[str, bytes]) -> tuple[str, str]:
     return kept_files[STDOUT].decode(), kept_files[STDERR].decode()
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("commissioned")
 def test_components_of_other_signals_are_not_restored() -> None:
     """Correcting a wrong unit must drop the components that it caused."""
@@ -257,6 +258,7 @@ def test_reset_works_where_the_saved_state_is_damaged() -> None:
     assert store().decisions().resets.keys() == {"*"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("share", "replays"), [(1.0, 2), (0.05, 1)])
 def test_commission_replays_with_the_levels_of_the_file_unless_they_explain_no_window(
     share: float, replays: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -107,6 +107,7 @@ def test_reports_equal_those_of_windows_without_a_file(
     assert (counters.received, counters.windows) == (4 * len(rows), 5)
 
 
+@pytest.mark.full
 def test_two_runs_print_the_same_bytes(tmp_path: Path, rows: Lines) -> None:
     arguments = ["replay", str(MACHINE), str(written(tmp_path, rows))]
     program = (
@@ -178,6 +179,7 @@ def test_ctrl_c_ends_a_replay_with_the_reports_so_far(tmp_path: Path, rows: Line
     assert "Traceback" not in errors
 
 
+@pytest.mark.full
 def test_memory_does_not_grow_with_the_file(tmp_path: Path, rows: Lines) -> None:
     """A hundred thousand rows are 6 MB of text; as cells they would be some 40 MB. Bad windows, to save time."""
     text = "\n".join(f"{index * PERIOD:.3f},,{','.join(rows[index % 1000][2:5])}" for index in range(100_000))

@@ -66,6 +66,7 @@ def deviation(signal: SignalDelay, truth: float) -> float:
     return abs(signal.value - truth) / signal.sd
 
 
+@pytest.mark.full
 def test_the_delay_of_a_source_with_jitter_is_its_mean(tmp_path: Path) -> None:
     """The speed comes over another bus: 20 ms late with a jitter of 5 ms; the jitter is noise of the speed."""
     schedule, random = Schedule(omega=Timing(0.01)), np.random.default_rng(11)
@@ -111,6 +112,7 @@ def test_signals_that_are_not_late_get_no_delay(tmp_path: Path, schedule: Schedu
         assert signal.sd < MS
 
 
+@pytest.mark.full
 def test_two_late_signals_are_identified(tmp_path: Path) -> None:
     truth = {"omega": 20 * MS, "i": 5 * MS}
     problem, windows = cut(tmp_path, ROWS, recorded(ROWS, 8).delayed(truth))
@@ -128,10 +130,10 @@ def test_an_early_signal_makes_all_others_late(tmp_path: Path) -> None:
         assert deviation(signal, 15 * MS) < 3.3
 
 
-@pytest.mark.parametrize("count", [10, pytest.param(60, marks=pytest.mark.full)])
-def test_intervals_hold_the_truth(tmp_path: Path, count: int) -> None:
+@pytest.mark.full
+def test_intervals_hold_the_truth(tmp_path: Path) -> None:
     """Each recording has another motor, another late signal and another delay."""
-    random = np.random.default_rng(10)
+    random, count = np.random.default_rng(10), 60
     held, named = [], []
     for seed in range(count):
         name, delay = ("omega", "i", "V_a")[seed % 3], float(random.uniform(2 * MS, 40 * MS))
@@ -144,10 +146,10 @@ def test_intervals_hold_the_truth(tmp_path: Path, count: int) -> None:
     assert np.mean(named) >= 0.95 - share
 
 
-@pytest.mark.parametrize("recordings", [1, pytest.param(5, marks=pytest.mark.full)])
-def test_intervals_hold_delays_of_whole_steps(tmp_path: Path, recordings: int) -> None:
+@pytest.mark.full
+def test_intervals_hold_delays_of_whole_steps(tmp_path: Path) -> None:
     """The slope of i jumps where V_a does: at these delays the likelihood has another curvature on each side."""
-    cases = [(name, delay) for name in ("omega", "i", "V_a") for delay in (0.0, 10 * MS, 35 * MS)] * recordings
+    cases = [(name, delay) for name in ("omega", "i", "V_a") for delay in (0.0, 10 * MS, 35 * MS)] * 5
     held = []
     for seed, (name, delay) in enumerate(cases, 300):
         problem, windows = cut(tmp_path, ROWS, recorded(ROWS, seed, 9.0).delayed({name: delay}))

@@ -35,6 +35,7 @@ def inside(problem: Problem, window: Window, machine: Ageing) -> list[bool]:
     return [abs(row.value - value) <= QUANTILE * row.sd for row, value in zip(rows, truth, strict=True)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("machine", LOADED, ids=lambda machine: machine.plant.name)
 def test_identified_noise_makes_intervals_right_under_load_noise(machine: Ageing) -> None:
     """Of 96 windows: 95 % less two of its standard deviations, 2.2 % each."""

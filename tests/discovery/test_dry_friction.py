@@ -28,6 +28,7 @@ def test_dry_friction_of_a_reversing_motor_is_one_component(rounding: float) -> 
     assert component.values["amplitude"].value == pytest.approx(-0.004, rel=0.03)
 
 
+@pytest.mark.full
 def test_dry_friction_on_the_load_of_two_masses_stays_alone_for_a_minute() -> None:
     """A hump of 0.02 N*m was adopted beside 0.3 N*m, as the friction rounds off below 0.02 rad/s."""
     state, documents = initial_state("m", "here", two_mass.problem("J_l", "D_l")), []

@@ -182,7 +182,7 @@ def axis(noise: float, *, friction: bool) -> Problem:
 
 @pytest.mark.parametrize("friction", [True, False], ids=["friction in the twin", "not in the twin"])
 @pytest.mark.parametrize("steps", [64, 512, 4096])
-@pytest.mark.parametrize("stated", [0.29, 0.5])
+@pytest.mark.parametrize("stated", [0.29, pytest.param(0.5, marks=pytest.mark.full)])
 @pytest.mark.parametrize("forces", ["sine", "square"])
 def test_stuck_axis_with_coarse_encoder_is_not_frozen(forces: str, stated: float, steps: int, friction: bool) -> None:
     """``stated`` is the noise of the machine file in steps of the encoder."""

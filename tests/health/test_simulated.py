@@ -38,6 +38,7 @@ def motor(name: str) -> MotorScenario:
     return scenario
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_healthy_motor_has_no_event(seed: int) -> None:
     documents = reports(motor("demo").model_copy(update={"faults": (), "seed": seed}), 300)

@@ -131,6 +131,7 @@ def test_a_recording_optimised_by_rerun_is_read(
     assert reports(better, capsys) == reports(recording, capsys)
 
 
+@pytest.mark.full
 def test_an_unclosed_recording_is_read_a_torn_one_repaired(
     tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -226,6 +227,7 @@ def check_damaged(tmp_path: Path, scenario: MotorScenario, changes: list[tuple[f
         assert str(path) in str(error)  # noqa: PT017 - either is right
 
 
+@pytest.mark.full
 @SHORT
 @given(DAMAGE, st.floats(0.0, 1.0))
 def test_a_damaged_recording_is_refused_or_read(

@@ -222,6 +222,7 @@ level = { into = "der(h)", mode = "additive", unit = "m/s", meaning = "inflow" }
 """
 
 
+@pytest.mark.full
 def test_a_first_start_with_an_empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Daemon and 'otolith compile' with a twin that is new on this computer, and small."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -82,6 +82,7 @@ def numbers_of(reader: HistoryReader) -> list[int]:
     return [number for text in texts if (number := ReportDocument.from_json(text).sequence) is not None]
 
 
+@pytest.mark.full
 def test_a_simulated_month_stays_within_its_size(opened: Callable[..., Simulated]) -> None:
     history = opened(Bounds(20 * MEGABYTE, 3650, 8760))  # by age alone, the reports would take 40 MB
     noise, length, batch = np.random.default_rng(1), 240.0, list[ReportDocument]()

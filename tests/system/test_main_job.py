@@ -153,9 +153,8 @@ def test_a_killed_recorder_changes_nothing_else(running: Running) -> None:
     assert before is not None
     assert last is not None
     assert (last.windows_missed, last.worker_restarts, last.lost) == (before.windows_missed, 0, 0)
+    wait_for(lambda: len(list((running.folder / "state").rglob("*.rrd"))) == 1)  # the second recorder writes another
     running.stop()
-    second = list((running.folder / "state").rglob("*.rrd"))
-    assert len(second) == 1
     assert running.recording.stat().st_size > 0
 
 
@@ -200,6 +199,7 @@ def test_ctrl_c_ends_every_process_within_three_seconds(own_machine: OwnMachine,
     assert set(Path("/dev/shm").iterdir()) <= shared  # noqa: S108
 
 
+@pytest.mark.timed
 def test_demo_estimates_what_was_injected(tmp_path: Path, own_machine: OwnMachine) -> None:
     command = [sys.executable, "-m", "otolith", "demo", "--duration", "20", "--json"]
     command += ["--machine", str(own_machine.machine), "--scenario", str(own_machine.scenario)]
@@ -212,6 +212,7 @@ def test_demo_estimates_what_was_injected(tmp_path: Path, own_machine: OwnMachin
     assert Path(verdict["recording"]).is_relative_to(tmp_path)
 
 
+@pytest.mark.full
 def test_demo_is_exit_code_one_for_a_wrong_estimate(own_machine: OwnMachine) -> None:
     text = own_machine.machine.read_text(encoding="utf-8")
     for name in ("K_t", "K_e"):  # a single wrong constant is named, and the estimates stay right

@@ -76,6 +76,7 @@ def test_the_daemons_recording_replays_to_the_same_reports(transport: str, tmp_p
     assert compared >= 3
 
 
+@pytest.mark.full
 def test_a_real_time_replay_estimates_as_the_fast_one(
     tmp_path: Path, scenario: MotorScenario, own_machine: OwnMachine
 ) -> None:

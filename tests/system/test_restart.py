@@ -150,6 +150,7 @@ def test_a_file_that_is_refused_is_published_and_kept_with_the_decisions(start: 
     assert store.decisions().rejected == {"shaft/Coulomb/omega"}
 
 
+@pytest.mark.full
 def test_unreadable_decisions_do_not_cost_the_learned_state(start: Start, store: StateStore) -> None:
     first = start()
     first.wait_for(lambda reports: bool(reports) and is_estimated(reports[-1]))

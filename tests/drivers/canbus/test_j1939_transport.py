@@ -56,6 +56,7 @@ def taken(assembler: Assembler, frames: list[Frame], begin: float = 0.0, step: f
 messages = st.binary(min_size=MIN_BYTES, max_size=200) | st.binary(min_size=MAX_BYTES, max_size=MAX_BYTES)
 
 
+@pytest.mark.full
 @given(st.lists(messages, min_size=1, max_size=4), st.data())
 def test_messages_of_several_nodes_are_put_together_however_their_frames_interleave(
     contents: list[bytes], data: st.DataObject
