@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.discovery.ambiguity import interchangeable, mixture, probabilities, without_duplicates
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
+from otolith.discovery.sequential_test import interchangeable, mixture, probabilities, without_duplicates
 from otolith.estimation.augmented import augment
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Component

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from otolith.health.baseline import Baseline
+from otolith.health.prognosis import Baseline
 from otolith.machine import load_machine
 from otolith.runtime.service import Reload, Service, reloaded
 from otolith.storage.state_store import store_of

@@ -8,8 +8,16 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import AdaptationState
-from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives_of
-from otolith.discovery.decision import ACCEPTED, COMPONENT_PROBABILITY, COMPONENT_WINDOWS, WindowDecision
+from otolith.discovery.decision import (
+    ACCEPTED,
+    COMPONENT_PROBABILITY,
+    COMPONENT_WINDOWS,
+    AdoptedComponent,
+    Alternative,
+    Approval,
+    WindowDecision,
+    alternatives_of,
+)
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
 from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_noise
 from otolith.discovery.sequential_test import SequentialTest
