@@ -13,7 +13,7 @@ ENTRY_POINT_GROUP = "otolith.drivers"
 DRIVERS: dict[str, str] = {
     "can": "otolith_drivers.canbus.driver",
     "modbus": "otolith_drivers.modbus.driver",
-    "mqtt": "otolith_drivers.mqtt.driver",
+    "mqtt": "otolith_drivers.mqtt",
     "opcua": "otolith_drivers.opcua.driver",
     "plant": "otolith_drivers.plant.driver",
     "replay": "otolith_drivers.replay.driver",
