@@ -26,7 +26,7 @@ BREACHES = {
     "a driver imports the daemon": ("drivers/otolith_drivers/base.py", "import otolith.machine"),
     "the plant imports the twin": ("drivers/otolith_drivers/plant/dc_motor.py", "import otolith.twin.model"),
     "adapt reads a clock": ("daemon/otolith/adaptation/adapt.py", "import time"),
-    "estimation opens a file": ("daemon/otolith/estimation/particle_swarm.py", "import pathlib"),
+    "estimation opens a file": ("daemon/otolith/estimation/minimisers.py", "import pathlib"),
     "health publishes": ("daemon/otolith/health/status.py", "import zenoh"),
     "the twin imports the estimation": ("daemon/otolith/twin/definition.py", "import otolith.estimation.problem"),
     "acquisition imports publishing": ("daemon/otolith/acquisition/ring.py", "import otolith.publishing.recorder"),

@@ -35,8 +35,8 @@ from otolith.commissioning.likelihood import (
 )
 from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
 from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
+from otolith.estimation.minimisers import search_parameters
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
 
