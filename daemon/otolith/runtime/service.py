@@ -28,9 +28,9 @@ from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
 from otolith.health.limits import MonitoringPlan
 from otolith.health.schema import CountersDocument, Report, ReportDocument
+from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
-from otolith.publishing.connection import absent_sources, driver_document, with_absent_sources
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.event_command import EventCommand
