@@ -8,9 +8,8 @@ import pytest
 
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
 from otolith.discovery.sequential_test import interchangeable, mixture, probabilities, without_duplicates
-from otolith.estimation.augmented import augment
 from otolith.estimation.information import QUANTILE
-from otolith.estimation.problem import Component
+from otolith.estimation.problem import Component, augment
 from tests.discovery.test_sequential_test import BARE, PERIODIC, hypothesis
 
 OFFSET = Component("sensor of i", "constant", "t", amplitude=0.01)

@@ -12,10 +12,9 @@ import numpy as np
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis, describe_hypothesis
 from otolith.discovery.screening import DECISIVE
 from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS, SequentialTest
-from otolith.estimation.augmented import indices, site_of, slot_of
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Component
+from otolith.estimation.problem import Component, indices, site_of, slot_of
 
 MAX_COST = 4.0  # RMSE in units of the noise above which no hypothesis is accepted
 STEP_WINDOWS, STEP_PROBABILITY = 2, 0.8  # windows that must agree on a moved parameter, and its probability

@@ -11,7 +11,6 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior
-from otolith.estimation.augmented import amplitude_indices
 from otolith.estimation.information import (
     MIN_SINGULAR,
     AccuracyTarget,
@@ -34,7 +33,7 @@ from otolith.estimation.minimisers import (
 )
 from otolith.estimation.objective import EXPLAINED, PENALTY, Objective
 from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Problem, amplitude_indices
 from otolith.estimation.timing import shifted
 
 AT_BOUND = 1e-4  # share of the width of the bounds

@@ -78,7 +78,7 @@ def _decision(record: "ComponentRecord", decisions: "OperatorDecisions") -> str:
 
 
 def _equation(machine: "LoadedMachine", record: "ComponentRecord") -> str:
-    from otolith.estimation.augmented import equation
+    from otolith.estimation.problem import equation
     from otolith.health.text import half_width_text
     from otolith_drivers.units import equation_text
 
