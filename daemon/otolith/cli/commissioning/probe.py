@@ -360,10 +360,10 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
     import asyncio
 
     from otolith.cli.commissioning.probe_view import stdout_console
+    from otolith_drivers.base import find_driver
     from otolith_drivers.config_files import validated
-    from otolith_drivers.registry import find
 
-    find("opcua")  # names the extra that is missing
+    find_driver("opcua")  # names the extra that is missing
     from otolith_drivers.opcua.connection import OpcuaOptions
 
     given = {name: value for name, value in keys.items() if value is not None}
