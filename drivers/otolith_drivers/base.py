@@ -191,5 +191,5 @@ def find_driver(name: str) -> DriverType:
             missing = f"driver {name!r} needs the extra {name!r}"
             raise ConfigurationError(f"{missing}: {installation_of(name)} ({error})") from error
         raise ConfigurationError(f"driver {name!r} cannot be loaded: {error}") from error
-    text = f"unknown driver {name!r}: {nearest(name, known_drivers())}; a package that brings its own must be installed here"
-    raise ConfigurationError(text)
+    text = f"unknown driver {name!r}: {nearest(name, known_drivers())}"
+    raise ConfigurationError(f"{text}; a package that brings its own must be installed here")
