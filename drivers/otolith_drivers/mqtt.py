@@ -23,9 +23,8 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
 from otolith_drivers.common.credentials import CredentialOptions, certificate, certificate_and_key, password
-from otolith_drivers.common.periods import PeriodEstimator
+from otolith_drivers.common.message_times import ArrivalClock, PeriodEstimator, unix_time
 from otolith_drivers.common.reconnection import PassingFault, Reconnection, ThreadedDriver, cause_of
-from otolith_drivers.common.remote_clock import ArrivalClock, unix_time
 from otolith_drivers.common.scaled import Conversion, ScaledSource
 from otolith_drivers.errors import ConfigurationError, counted, shown
 from otolith_drivers.units import Quantity

@@ -1,7 +1,7 @@
 """The OPC UA driver: subscribes to variables of a server, and reconnects after every fault. It can only read.
 
 The time of a sample is the source's time stamp, which is on the server's clock. That clock is compared with this
-computer's by the times in the answers, so the error of the times is bounded (see ``common/remote_clock.py``).
+computer's by the times in the answers, so the error of the times is bounded (see ``common/message_times.py``).
 
 A server sends a value when it, its status or its time stamp changes; nothing means that nothing has changed. So a value
 that stays is repeated at the time of the message (*held*), and once more one sample period before it changes. The way
@@ -19,9 +19,8 @@ from typing import Any
 from asyncua import Client, ua
 
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
-from otolith_drivers.common.periods import PeriodEstimator
+from otolith_drivers.common.message_times import ExchangeClock, PeriodEstimator, unix_time
 from otolith_drivers.common.reconnection import PassingFault, Reconnection, ThreadedDriver
-from otolith_drivers.common.remote_clock import ExchangeClock, unix_time
 from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.errors import counted
 from otolith_drivers.opcua.connection import (

@@ -7,7 +7,7 @@ import pytest
 from asyncua import ua
 
 from otolith_drivers.base import Sample, Signal
-from otolith_drivers.common.remote_clock import ArrivalClock, ExchangeClock
+from otolith_drivers.common.message_times import ArrivalClock, ExchangeClock
 from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.opcua.connection import OpcuaSource
 from otolith_drivers.opcua.driver import OVERFLOW, Readings
