@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console, ConsoleOptions, Group, OverflowMethod, RenderableType, RenderResult
@@ -32,9 +33,10 @@ from otolith.health.text import (
     value_cells,
     value_text,
 )
-from otolith.publishing.subscriber import Subscriber
-from otolith.publishing.zenoh_config import Connection
 from otolith_drivers.units import equation_text
+
+if TYPE_CHECKING:
+    from otolith.publishing.zenoh_config import Connection
 
 HISTORY = 200  # windows that the curve of a parameter can show
 WIDTH_WITH_COMPONENTS = 72  # characters of a terminal whose table of components has columns; engineering choice
@@ -303,12 +305,14 @@ def sparkline(values: tuple[float, ...], scale: tuple[float, float] | None = Non
 
 
 def watch_reports(
-    connection: Connection, machine: str, *, as_json: bool, after: int | None, stopped: Callable[[], bool]
+    connection: "Connection", machine: str, *, as_json: bool, after: int | None, stopped: Callable[[], bool]
 ) -> None:
     """Show reports until ``stopped``; wait for a daemon that is not there yet.
 
     As JSON each report is printed once and in order, beginning after the sequence number ``after``.
     """
+    from otolith.publishing.subscriber import Subscriber
+
     texts: queue.Queue[str] = queue.Queue(MAX_QUEUED)
     ended = threading.Event()
 
