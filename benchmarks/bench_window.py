@@ -16,8 +16,8 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.minimisers import search_parameters
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Search, estimate
 from otolith.machine import find_twin, load_machine

@@ -17,8 +17,8 @@ LINTER = Path(sys.executable).with_name("lint-imports")
 SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root).rglob("*.py"))
 MAX_FILE_LINES = 600
 # Room for history, security, recordings, several sources and their commands: beyond it something must be replaced.
-MAX_SOURCE_LINES = 33_703
-MAX_MODULES = 192  # in daemon and drivers
+MAX_SOURCE_LINES = 33_605
+MAX_MODULES = 171  # in daemon and drivers
 MAX_MODULES_IN_A_FOLDER = 12
 MAX_LAYERS = 13
 
@@ -26,7 +26,7 @@ BREACHES = {
     "a driver imports the daemon": ("drivers/otolith_drivers/base.py", "import otolith.machine"),
     "the plant imports the twin": ("drivers/otolith_drivers/plant/dc_motor.py", "import otolith.twin.model"),
     "adapt reads a clock": ("daemon/otolith/adaptation/adapt.py", "import time"),
-    "estimation opens a file": ("daemon/otolith/estimation/particle_swarm.py", "import pathlib"),
+    "estimation opens a file": ("daemon/otolith/estimation/minimisers.py", "import pathlib"),
     "health publishes": ("daemon/otolith/health/status.py", "import zenoh"),
     "the twin imports the estimation": ("daemon/otolith/twin/definition.py", "import otolith.estimation.problem"),
     "acquisition imports publishing": ("daemon/otolith/acquisition/ring.py", "import otolith.publishing.recorder"),

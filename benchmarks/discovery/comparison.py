@@ -15,7 +15,7 @@ from benchmarks.discovery.setting import prior, problem, search_and_rank
 from benchmarks.discovery.truth import SHAFT, WINDING, Truth, same
 from benchmarks.discovery.typical import TYPICAL, Answer, Recorded, Typical, error_of, record
 from otolith.discovery.hypotheses import FaultType, FittedHypothesis
-from otolith.estimation.augmented import indices
+from otolith.estimation.problem import indices
 
 NOISES = (0.0, 0.01, 0.02, 0.05, 0.10)  # of each signal's standard deviation
 SENSORS = {

@@ -10,7 +10,7 @@ from benchmarks.discovery.setting import RankedHypotheses, problem, search_and_r
 from benchmarks.discovery.truth import same
 from otolith.discovery.hypotheses import FaultType, FittedHypothesis
 from otolith.discovery.screening import DECISIVE
-from otolith.estimation.augmented import indices
+from otolith.estimation.problem import indices
 
 BAYES_FACTOR_150 = 2.0 * math.log(150.0)  # in -2 log evidence: decides between two hypotheses
 QUANTILE_95 = 1.96  # standard deviations on either side of which 95 % lie

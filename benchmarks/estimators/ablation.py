@@ -18,9 +18,8 @@ from benchmarks.command_line import show_progress
 from benchmarks.estimators.cases import BOUNDS_FACTOR, Case, cases, start, windows
 from otolith.acquisition.window import Array, Window
 from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.gauss_newton import gauss_newton
+from otolith.estimation.minimisers import gauss_newton, search_parameters
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Search, estimate
 

@@ -10,10 +10,9 @@ from typing import Any
 
 from otolith.machine_file import MachineFile, SignalTable, check_name
 from otolith.twin.definition import Definition
-from otolith_drivers.base import Driver, DriverType, Setup, Signal
+from otolith_drivers.base import Driver, DriverType, Setup, Signal, find_driver
 from otolith_drivers.config_files import Context, SourceFile, validate
 from otolith_drivers.errors import ConfigurationError, nearest
-from otolith_drivers.registry import find
 from otolith_drivers.several_sources import NamedSource, SeveralSources
 
 TEMPERATURE_UNIT = "K"
@@ -146,7 +145,7 @@ def _driver_config(
         kind = table.get("type")
         if not isinstance(kind, str):
             raise ValueError('missing: write type = "can" or another driver')  # noqa: TRY004 - a fault of the file
-        module = find(kind)
+        module = find_driver(kind)
     written = {key: value for key, value in table.items() if key not in ("type", "name")}
     options = validate(written, module.Options, source, under=place)
     units = signal_units(file, twin)

@@ -11,8 +11,7 @@ from otolith.acquisition.alignment import MAX_DROPPED_SAMPLES, CyclicSeries, ali
 from otolith.acquisition.quality import QualityLimits, assess_quality
 from otolith.acquisition.records import Records, make_records
 from otolith.acquisition.samples import Series, SignalPlan
-from otolith.acquisition.time_grid import GridSpan
-from otolith.acquisition.window import Array, Quality, Verdict
+from otolith.acquisition.window import Array, GridSpan, Quality, Verdict
 from otolith_drivers.base import Sampling
 from tests.acquisition.series import ramp
 

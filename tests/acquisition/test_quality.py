@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from otolith.acquisition.quality import CALENDAR, QualityLimits, time_text
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.samples import SignalPlan
-from otolith.acquisition.time_grid import GridSpan
-from otolith.acquisition.window import Array, Quality, Verdict
+from otolith.acquisition.window import Array, GridSpan, Quality, Verdict
 from otolith.acquisition.windower import Windower
 from otolith.machine_file import WindowTable
 from otolith_drivers.base import Sampling

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from otolith.acquisition.playback import Playback
 from otolith.acquisition.records import EARLY, ON_GRID, Records, lies_on_grid, make_records, phase_of_grid
 from otolith.acquisition.samples import Series, SignalPlan, finite_samples, merge_equal_times
-from otolith.acquisition.time_grid import GridSpan
-from otolith.acquisition.window import Array, Verdict, Window
+from otolith.acquisition.window import Array, GridSpan, Verdict, Window
 from otolith_drivers.base import Sampling
 from otolith_drivers.replay.readers import Rows
 from tests.acquisition.series import ramp

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array, BridgeError, Quality, Verdict, Window
+from otolith.acquisition.window import Array, BridgeError, Quality, TimeGrid, Verdict, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.estimation.arrival_cost import initial_prior

@@ -22,9 +22,8 @@ from otolith.commissioning.consistency import consistency_test
 from otolith.commissioning.identification import DOUBTFUL, IdentifiedNoise, identify_noise
 from otolith.commissioning.likelihood import Likelihood
 from otolith.commissioning.structure import remaining_structure
-from otolith.estimation.augmented import augment
 from otolith.estimation.information import Identifiability
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Problem, augment
 from otolith.health.schema import ParameterDocument, ReportDocument, Status
 from otolith.machine import find_twin
 

@@ -27,8 +27,7 @@ from benchmarks.changes.observe import Case, observe
 from benchmarks.changes.plants import HEALTHY, Change, Plant, Term, generator, simulate
 
 from otolith.acquisition.window import Array
-from otolith.estimation.augmented import augment
-from otolith.estimation.problem import Component, Problem
+from otolith.estimation.problem import Component, Problem, augment
 from otolith.machine import library_twins
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.units import to_base

@@ -15,10 +15,10 @@ from click.testing import CliRunner, Result
 
 from otolith.cli.commissioning.noise import HealthyRecord, noise_lines, structure_lines
 from otolith.cli.main import cli
+from otolith.commissioning.consistency import Band, Whiteness
 from otolith.commissioning.delays import IdentifiedDelays
 from otolith.commissioning.identification import IdentifiedNoise, NoiseLevel
 from otolith.commissioning.structure import Structure
-from otolith.commissioning.whiteness import Band, Whiteness
 from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.runtime.preview import EvenSpread

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array, Quality, Verdict, Window
+from otolith.acquisition.window import Array, Quality, TimeGrid, Verdict, Window
 from otolith.commissioning import identification as text
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise, observable_states, sample_noise
 from otolith.estimation.problem import Problem

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Window
+from otolith.commissioning.consistency import Whiteness
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise
-from otolith.commissioning.whiteness import Whiteness
 from otolith.estimation.problem import Problem
 from otolith.machine import find_twin
 

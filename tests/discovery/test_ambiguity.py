@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.discovery.ambiguity import interchangeable, mixture, probabilities, without_duplicates
 from otolith.discovery.hypotheses import FaultType, TrackedHypothesis
-from otolith.estimation.augmented import augment
+from otolith.discovery.sequential_test import interchangeable, mixture, probabilities, without_duplicates
 from otolith.estimation.information import QUANTILE
-from otolith.estimation.problem import Component
+from otolith.estimation.problem import Component, augment
 from tests.discovery.test_sequential_test import BARE, PERIODIC, hypothesis
 
 OFFSET = Component("sensor of i", "constant", "t", amplitude=0.01)

@@ -6,8 +6,7 @@ from benchmarks.discovery.motor import Faults, simulate_motor, windows
 
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
-from otolith.estimation.augmented import equation
-from otolith.estimation.problem import Component
+from otolith.estimation.problem import Component, equation
 from tests.discovery import two_mass
 from tests.discovery.test_search import TWIN, initial, run
 

@@ -8,9 +8,8 @@ import pytest
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis, is_usable, prune
 from otolith.discovery.sequential_test import FitSummary, SequentialTest, join
 from otolith.estimation.arrival_cost import Evidence, Prior
-from otolith.estimation.augmented import augment
 from otolith.estimation.posterior import PhaseAdvance, Posterior
-from otolith.estimation.problem import Component, Problem
+from otolith.estimation.problem import Component, Problem, augment
 from otolith.machine import find_twin
 
 TWIN = find_twin("dc_motor")

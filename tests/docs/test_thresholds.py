@@ -18,7 +18,7 @@ SOURCES = {
     "estimation": [DAEMON / "estimation"],
     "health": [DAEMON / "health", DAEMON / "adaptation"],
     "modbus": [DRIVERS / "modbus"],
-    "mqtt": [DRIVERS / "mqtt"],
+    "mqtt": [DRIVERS],
     "opcua": [DRIVERS / "opcua"],
     "plant": [DRIVERS / "plant"],
     "replay": [DRIVERS / "replay"],

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import can
 
+from otolith_drivers import mqtt as mqtt_driver
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
 from otolith_drivers.conformance import Rig
 from otolith_drivers.modbus import driver as modbus_driver
-from otolith_drivers.mqtt import driver as mqtt_driver
 from otolith_drivers.opcua import driver as opcua_driver
 from otolith_drivers.plant import driver as plant_driver
 from otolith_drivers.replay import driver as replay_driver

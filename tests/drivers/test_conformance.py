@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from otolith_drivers import conformance, registry
+from otolith_drivers import base, conformance
 from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling
 from otolith_drivers.conformance import CONTRACT, Rig, close_ends_everything_within_a_second
 from tests.conftest import OwnMachine
@@ -17,7 +17,7 @@ from tests.waiting import PATIENCE, within
 
 @pytest.mark.timed
 @pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("name", sorted(registry.DRIVERS))
+@pytest.mark.parametrize("name", sorted(base.DRIVERS))
 def test_driver_keeps_the_contract(
     name: str, check: Callable[[Rig], None], own_machine: OwnMachine, monkeypatch: pytest.MonkeyPatch
 ) -> None:

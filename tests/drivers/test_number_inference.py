@@ -11,8 +11,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from otolith_drivers.modbus.options import LineOptions
-from otolith_drivers.modbus.probe import Block, Words
-from otolith_drivers.modbus.probe_numbers import Number, Place, modbus_signal_lines, numbers_of
+from otolith_drivers.modbus.probe import Block, Number, Place, Words, modbus_signal_lines, numbers_of
 from otolith_drivers.modbus.protocol import ORDERS, Order, TypeName, is_float, orders_of
 from otolith_drivers.number_inference import FRAMES, REGISTERS, Layout, LayoutVerdict, Part, parts
 from tests.drivers.registers import registers

@@ -13,7 +13,7 @@ import pytest
 from otolith.acquisition.window import Window
 from otolith.estimation.information import Identifiability
 from otolith.health.schema import ParameterDocument, Status
-from otolith.publishing.connection import absent_sources, driver_document, with_absent_sources
+from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith_drivers import conformance
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sample, Sampling
 from otolith_drivers.conformance import CONTRACT, Rig

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.samples import Check
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Array, TimeGrid, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.discovery.decision import WindowDecision

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.samples import Check
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Array, TimeGrid, Window
 from otolith.estimation.data_checks import check_window, drop_repeats, drop_spikes, repeated_records, spike_records
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem

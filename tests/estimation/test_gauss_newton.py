@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from otolith.acquisition.window import Array
-from otolith.estimation.gauss_newton import gauss_newton
+from otolith.estimation.minimisers import gauss_newton
 
 
 class Linear:

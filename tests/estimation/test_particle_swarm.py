@@ -10,8 +10,8 @@ from pymoo.core.problem import Problem as PymooProblem
 from pymoo.optimize import minimize
 
 from otolith.acquisition.window import Array, Window
+from otolith.estimation.minimisers import particle_swarm, search_parameters, spread_starts
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import particle_swarm, search_parameters, spread_starts
 from otolith.estimation.problem import Problem, SwarmOptions
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of

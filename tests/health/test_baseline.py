@@ -8,10 +8,9 @@ from click.testing import CliRunner
 
 from otolith.adaptation.state import OperatorDecisions, apply_decisions, initial_state
 from otolith.cli.main import cli
-from otolith.health.baseline import Baseline, baselines, with_baseline, with_baselines
 from otolith.health.events import HealthState, assess
 from otolith.health.limits import Level, Limit, MonitoredQuantity
-from otolith.health.prognosis import MIN_POINTS, History
+from otolith.health.prognosis import MIN_POINTS, Baseline, History, baselines, with_baseline, with_baselines
 from otolith.health.schema import ForecastDocument
 from otolith.machine import load_machine
 from otolith.storage.state_store import StateStore

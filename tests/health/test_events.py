@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Verdict
-from otolith.discovery.adopted import Approval
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.decision import Approval, WindowDecision
 from otolith.health.diagnosis import FindingKind
 from otolith.health.events import HealthState, assess
 from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity, MonitoringPlan

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from otolith.health.baseline import Baseline
+from otolith.health.prognosis import Baseline
 from otolith.machine import load_machine
-from otolith.runtime.reload import Reload, reloaded
-from otolith.runtime.service import Service
+from otolith.runtime.service import Reload, Service, reloaded
 from otolith.storage.state_store import store_of
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from otolith.runtime.systemd import Notifier
+from otolith.runtime.service import Notifier
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from otolith.adaptation.state import (
     initial_state,
     restore_components,
 )
-from otolith.discovery.adopted import AdoptedComponent
+from otolith.discovery.decision import AdoptedComponent
 from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.storage import state_store

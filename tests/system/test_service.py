@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from otolith.adaptation.state import ComponentRecord, OperatorDecisions
-from otolith.discovery.adopted import AdoptedComponent, Approval
+from otolith.discovery.decision import AdoptedComponent, Approval
 from otolith.estimation.problem import Component
 from otolith.health.schema import Status
 from otolith.machine import RecordedMachine, find_twin, load_machine

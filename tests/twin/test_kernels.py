@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, TimeGrid
 from otolith.machine import find_twin
 from otolith.machine import library_twins as library
 from otolith.twin.definition import Definition

@@ -16,8 +16,15 @@ from hypothesis import strategies as st
 
 from otolith.machine import LIBRARY, find_twin, load_twin
 from otolith.machine import library_twins as library
-from otolith.twin.dimensions import describe, dimension_of, infer_dimension
-from otolith.twin.expressions import FUNCTIONS, ExpressionError, names_in, parse
+from otolith.twin.expressions import (
+    FUNCTIONS,
+    ExpressionError,
+    describe,
+    dimension_of,
+    infer_dimension,
+    names_in,
+    parse,
+)
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith.twin.kernel_sources import kernel_source
 from otolith.twin.language import read_twin

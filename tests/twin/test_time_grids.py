@@ -6,8 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, TimeGrid
 from otolith.machine import find_twin
 from otolith.twin.augmentation import augmented_model
 from otolith.twin.kernel import Excitation, InnovationModel, NoiseModel, kernel_of

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith.acquisition.samples import Series, interval_of, merge_equal_times
-from otolith.acquisition.time_grid import GridSpan
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, GridSpan
 
 Indices = NDArray[np.int64]
 

@@ -11,8 +11,7 @@ import numpy as np
 from otolith.acquisition.alignment import CyclicSeries
 from otolith.acquisition.records import Records
 from otolith.acquisition.samples import SignalPlan
-from otolith.acquisition.time_grid import GridSpan, TimeGrid
-from otolith.acquisition.window import Mask, Quality, Verdict
+from otolith.acquisition.window import GridSpan, Mask, Quality, TimeGrid, Verdict
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 CALENDAR = (1e8, 1e11)  # s: a time between them is Unix time and shown as a date

@@ -22,8 +22,7 @@ from otolith.acquisition.bridging import (
     lost_samples,
 )
 from otolith.acquisition.samples import Check, Interval, Series, SignalPlan, interval_of, stale_repeats
-from otolith.acquisition.time_grid import GridSpan, TimeGrid
-from otolith.acquisition.window import Array, BridgeError, Mask
+from otolith.acquisition.window import Array, BridgeError, GridSpan, Mask, TimeGrid
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 ON_GRID = 1e-3  # sample periods: distance of a true time from the grid that is rounding

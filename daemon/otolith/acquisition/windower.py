@@ -18,8 +18,7 @@ from otolith.acquisition.quality import QualityLimits, assess_quality
 from otolith.acquisition.records import EARLY, ON_GRID, lies_on_grid, make_records, phase_of_grid
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.samples import Series, SignalPlan, finite_samples, has_equal_times, merge_equal_times
-from otolith.acquisition.time_grid import GridSpan
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Array, GridSpan, Window
 
 # Thresholds: docs/reference/thresholds-acquisition.md has the origin of each.
 GRACE_PERIOD = 0.1  # s after its end that a window waits for late samples, at least,

@@ -14,27 +14,29 @@ from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
 from otolith.adaptation.state import AdaptationState, with_posterior
-from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
-from otolith.discovery.ambiguity import mixture
 from otolith.discovery.decision import (
     MAX_COST,
     UPDATES,
+    AdoptedComponent,
     PosteriorUpdate,
     WindowDecision,
     WindowOutcome,
+    adopt,
+    count_fading,
     decide,
+    keep_present,
+    with_approvals,
 )
 from otolith.discovery.hypotheses import FaultType
 from otolith.discovery.screening import screen_window
 from otolith.discovery.search import with_threshold_test
-from otolith.discovery.sequential_test import SequentialTest, continue_test, open_test
-from otolith.estimation.augmented import slot_of
+from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
 from otolith.estimation.data_checks import CheckedWindow, FaultySensor, check_window, without_saturated
 from otolith.estimation.imm_filter import Innovation, ParameterCusum
 from otolith.estimation.information import QUANTILE, Identifiability, information
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Problem, WindowExcitation, next_records
+from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of
 from otolith.estimation.window_fit import Search, WindowEstimate, estimate, estimate_window
 from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report

@@ -8,19 +8,26 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import AdaptationState
-from otolith.discovery.adopted import AdoptedComponent, Alternative, Approval, alternatives_of
-from otolith.discovery.decision import ACCEPTED, COMPONENT_PROBABILITY, COMPONENT_WINDOWS, WindowDecision
+from otolith.discovery.decision import (
+    ACCEPTED,
+    COMPONENT_PROBABILITY,
+    COMPONENT_WINDOWS,
+    AdoptedComponent,
+    Alternative,
+    Approval,
+    WindowDecision,
+    alternatives_of,
+)
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
 from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_noise
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.augmented import equation, indices, site_of, source_of
 from otolith.estimation.data_checks import FaultySensor
 from otolith.estimation.imm_filter import ParameterCusum
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Component, Problem
+from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of
 from otolith.estimation.window_fit import WindowEstimate
 from otolith.health.diagnosis import FindingKind
 from otolith.health.schema import (

@@ -222,7 +222,7 @@ def watch(connect: tuple[str, ...], credentials: "Credentials", machine: str, as
     """
     if after is not None and not as_json:
         raise click.UsageError("--after needs --json")
-    from otolith.cli.operation.watch import watch_reports
+    from otolith.cli.operation.live_table import watch_reports
     from otolith.publishing.zenoh_config import Connection
 
     stop = StopSignal()

@@ -16,10 +16,12 @@ from otolith.acquisition.window import Array, Mask, Verdict, Window
 from otolith.commissioning.consistency import (
     MAX_OUTLYING_SHARE,
     OUTLYING,
+    Whiteness,
     consistency_test,
     inflate_process_noise,
     outlyingness,
     sqrt_information,
+    whiteness,
 )
 from otolith.commissioning.likelihood import (
     Fits,
@@ -31,11 +33,10 @@ from otolith.commissioning.likelihood import (
     backward_elimination,
     with_levels,
 )
-from otolith.commissioning.whiteness import Whiteness, whiteness
 from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
 from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
+from otolith.estimation.minimisers import search_parameters
 from otolith.estimation.objective import Objective
-from otolith.estimation.particle_swarm import search_parameters
 from otolith.estimation.problem import Problem
 from otolith.twin.definition import Definition
 

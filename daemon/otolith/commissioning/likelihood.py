@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.gauss_newton import FitResult, gauss_newton
+from otolith.estimation.minimisers import FitResult, gauss_newton
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array
+from otolith.acquisition.window import Array, TimeGrid
 from otolith.discovery.hypotheses import TrackedHypothesis
 from otolith.discovery.screening import DECISIVE
 from otolith.estimation.arrival_cost import Prior

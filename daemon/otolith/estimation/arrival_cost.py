@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
-from otolith.estimation.gauss_newton import FitResult
+from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
 

@@ -13,8 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.augmented import time_offsets
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Problem, time_offsets
 from otolith.twin.augmentation import ELAPSED
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, Indices, InnovationModel, Kernel, NoiseModel, kernel_of

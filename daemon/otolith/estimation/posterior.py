@@ -13,11 +13,10 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.estimation import imm_filter
 from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
-from otolith.estimation.augmented import indices, source_of, without
 from otolith.estimation.imm_filter import ADDED_LEVEL, ImmPosterior, Innovation
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import converter_steps
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Problem, indices, source_of, without
 
 START_TOLERANCE = 0.5  # mean steps by which a window may start early or late and still follow its predecessor
 MAX_KNOWN_PHASE_SD = 1.0  # rad: a phase less certain than this counts as unknown

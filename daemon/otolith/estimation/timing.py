@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array, BridgeError, Mask, Window
+from otolith.acquisition.window import Array, BridgeError, Mask, TimeGrid, Window
 from otolith.estimation.objective import Objective
 from otolith.twin.definition import Definition
 from otolith.twin.kernel import Excitation

@@ -11,8 +11,6 @@ import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
 from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior
-from otolith.estimation.augmented import amplitude_indices
-from otolith.estimation.gauss_newton import MAX_STEPS, FitResult, continued, gauss_newton
 from otolith.estimation.information import (
     MIN_SINGULAR,
     AccuracyTarget,
@@ -24,10 +22,18 @@ from otolith.estimation.information import (
     inflation_of,
     information,
 )
+from otolith.estimation.minimisers import (
+    MAX_STEPS,
+    FitResult,
+    SwarmResult,
+    continued,
+    gauss_newton,
+    search_parameters,
+    spread_starts,
+)
 from otolith.estimation.objective import EXPLAINED, PENALTY, Objective
-from otolith.estimation.particle_swarm import SwarmResult, search_parameters, spread_starts
 from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
-from otolith.estimation.problem import Problem
+from otolith.estimation.problem import Problem, amplitude_indices
 from otolith.estimation.timing import shifted
 
 AT_BOUND = 1e-4  # share of the width of the bounds

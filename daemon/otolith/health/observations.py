@@ -3,9 +3,8 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from otolith.discovery.adopted import Approval
-from otolith.discovery.ambiguity import MAX_OPEN_WINDOWS
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.decision import Approval, WindowDecision
+from otolith.discovery.sequential_test import MAX_OPEN_WINDOWS
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingFeatures, FindingKind, severity
 from otolith.health.language import Texts

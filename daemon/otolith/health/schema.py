@@ -10,8 +10,7 @@ from typing import Literal
 from pydantic import Field
 
 from otolith.acquisition.window import Array, Verdict, Window
-from otolith.discovery.adopted import Approval
-from otolith.discovery.decision import WindowDecision
+from otolith.discovery.decision import Approval, WindowDecision
 from otolith.discovery.hypotheses import FaultType
 from otolith.estimation.information import Identifiability, Outcome
 from otolith.health.diagnosis import FindingKind

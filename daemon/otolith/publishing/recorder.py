@@ -41,7 +41,7 @@ from otolith.publishing.recording_layout import (
 )
 from otolith.storage.recording_files import EVENT_MARGIN, FILE_MODE, MIN_FREE_SHARE, RecordingFolder, shortage_of
 from otolith_drivers.refused_imports import keep_pandas_out
-from otolith_drivers.replay.packed_window import packed
+from otolith_drivers.replay.recording import packed
 
 log = logging.getLogger(__name__)
 

@@ -11,12 +11,15 @@ import logging
 import math
 import os
 import signal
+import socket
 import sys
 import time
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from otolith.acquisition.quality import time_text
 from otolith.acquisition.ring import Rings
@@ -25,16 +28,14 @@ from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
 from otolith.health.limits import MonitoringPlan
 from otolith.health.schema import CountersDocument, Report, ReportDocument
+from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
-from otolith.publishing.connection import absent_sources, driver_document, with_absent_sources
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
 from otolith.runtime.event_command import EventCommand
 from otolith.runtime.process import SIGNALS
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
-from otolith.runtime.reload import reloaded
-from otolith.runtime.systemd import Notifier
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
@@ -55,6 +56,90 @@ STALL_TIMEOUT = 30.0  # s without a finished window, beyond three window lengths
 MIN_PERIOD_CHANGE = 0.01  # share of the sample period by which the achieved period must differ for a new grid
 SAVE_INTERVAL = 60.0  # s between two saves of what was learned
 SUMMARY_INTERVAL = 3600.0  # s between two lines in the log about a window; events are logged at once
+Key = tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Reload:
+    """What a changed machine file changes in a running daemon: limits and recording. The rest needs a restart."""
+
+    machine: LoadedMachine
+    """The machine to go on with."""
+    limits: bool
+    recording: bool
+    needs_restart: tuple[str, ...]
+    """Keys of the file that were changed and that a running daemon does not take over."""
+
+    @property
+    def text(self) -> str:
+        """What has changed, in words."""
+        changed = " and ".join(name for name in ("limits", "recording") if getattr(self, name)) or "nothing"
+        line = f"{self.machine.path}: reloaded, {changed} changed"
+        return f"{line}; only a restart takes over {', '.join(self.needs_restart)}" if self.needs_restart else line
+
+
+def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
+    """Return ``running`` with what it can take over from ``new``.
+
+    Limits may be percentages of values, so they are taken over only with the parameters they belong to.
+    """
+    old, file = running.file, new.file
+    changed = list(_differences(old.model_dump(), file.model_dump()))
+    recording = any(key[0] == "recording" for key in changed)
+    limits = [key for key in changed if _is_limit(key)]
+    rest = [key for key in changed if key[0] != "recording" and not _is_limit(key)]
+    if new.twin != running.twin and not any(key[0] == "twin" for key in rest):
+        rest.append(("twin", "file"))
+    update: dict[str, Any] = {"recording": file.recording}
+    if any(key[0] in {"twin", "parameters"} for key in rest):
+        rest, limits = [*rest, *limits], []
+    if limits:
+        update |= {"parameters": file.parameters, "components": file.components}
+    machine = replace(running, file=old.model_copy(update=update), plan=new.plan if limits else running.plan)
+    return Reload(machine, bool(limits), recording, tuple(".".join(key) for key in rest))
+
+
+def _is_limit(key: Key) -> bool:
+    return key[0] == "components" or (key[0] == "parameters" and key[-1] in {"watch", "act"})
+
+
+def _differences(old: Any, new: Any, key: Key = ()) -> Iterator[Key]:
+    """The keys at which two tables differ; a table that one of them lacks is compared with an empty one."""
+    if isinstance(old, Mapping) or isinstance(new, Mapping):
+        before, after = (value if isinstance(value, Mapping) else {} for value in (old, new))
+        for name in dict.fromkeys((*before, *after)):
+            yield from _differences(before.get(name), after.get(name), (*key, str(name)))
+    elif old != new:
+        yield key
+
+
+class Notifier:
+    """Notifications to systemd, sd_notify(3), without its C library. Without systemd it sends nothing."""
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        path = environment.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + path[1:] if path.startswith("@") else path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if path else None
+        microseconds, pid = environment.get("WATCHDOG_USEC"), environment.get("WATCHDOG_PID")
+        for_us = pid in (None, str(os.getpid()))
+        self.watchdog = float(microseconds) / 1e6 if for_us and microseconds and microseconds.isdigit() else None
+        """Timeout of systemd's watchdog in s, or None if there is no watchdog."""
+
+    def send(self, *assignments: str) -> None:
+        """Send assignments such as ``READY=1``; line breaks in them become spaces."""
+        if self._socket is None:
+            return
+        text = "\n".join(" ".join(assignment.split()) for assignment in assignments)
+        try:  # MSG_DONTWAIT: a full queue must not block; a dropped message is repeated by the next one
+            self._socket.sendmsg([text.encode()], [], socket.MSG_DONTWAIT, self._address)
+        except OSError:
+            return
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
 
 class Service:

@@ -16,7 +16,6 @@ from pydantic import BaseModel, Field
 from otolith.acquisition.window import Array
 from otolith.adaptation.state import AdaptationState, ComponentRecord, cleared, component_records, restore_components
 from otolith.estimation.arrival_cost import MAX_TREND
-from otolith.estimation.augmented import augment, indices
 from otolith.estimation.imm_filter import (
     HIGHEST_LEVEL,
     MAX_VARIANCE_RATIO,
@@ -25,7 +24,7 @@ from otolith.estimation.imm_filter import (
     moment_match,
 )
 from otolith.estimation.posterior import PhaseAdvance, Posterior
-from otolith.estimation.problem import UNLIMITED, Problem
+from otolith.estimation.problem import UNLIMITED, Problem, augment, indices
 from otolith.health.events import HealthState
 from otolith.health.prognosis import is_plausible
 from otolith.health.status import PreviousStatus

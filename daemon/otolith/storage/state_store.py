@@ -17,8 +17,7 @@ from typing import TypeVar
 from pydantic import Field, ValidationError
 
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
-from otolith.health.baseline import Baseline
-from otolith.health.prognosis import History
+from otolith.health.prognosis import Baseline, History
 from otolith.machine import LoadedMachine
 from otolith.storage.learned_state import (
     VERSION,

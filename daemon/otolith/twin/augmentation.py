@@ -9,7 +9,7 @@ from functools import lru_cache
 
 from otolith.twin.component_families import SourceKind
 from otolith.twin.definition import Definition, Input, Output, Parameter, Role, Site, StateVariable
-from otolith.twin.dimensions import dimension_of
+from otolith.twin.expressions import dimension_of
 
 MAX_COMPONENTS = 3
 """Component slots of an augmented twin. Engineering choice: compile time grows with each slot."""

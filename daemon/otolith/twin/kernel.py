@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from otolith import kernel_cache
-from otolith.acquisition.time_grid import TimeGrid
-from otolith.acquisition.window import Array, Mask
+from otolith.acquisition.window import Array, Mask, TimeGrid
 from otolith.twin.definition import Definition
 from otolith_drivers.errors import ConfigurationError
 

@@ -14,8 +14,18 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.twin.definition import Constant, Definition, Input, Output, Parameter, Role, Site, StateVariable
-from otolith.twin.dimensions import Dimension, describe, dimension_of, dimensionless, infer_dimension
-from otolith.twin.expressions import ExpressionError, check_known, check_name, names_in, parse
+from otolith.twin.expressions import (
+    Dimension,
+    ExpressionError,
+    check_known,
+    check_name,
+    describe,
+    dimension_of,
+    dimensionless,
+    infer_dimension,
+    names_in,
+    parse,
+)
 from otolith_drivers.config_files import Limits, Location, SourceFile, StrictModel, expect, validate
 from otolith_drivers.config_files import parse as parse_toml
 from otolith_drivers.errors import ConfigurationError, nearest

@@ -20,7 +20,7 @@ from otolith_drivers.base import Signal
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT
 from otolith_drivers.canbus.options import CLASSIC_BITS, MAX_PDOS, OBJECT, MappedObject, PdoTable
 from otolith_drivers.canbus.signals import CanSource, SignalRequest, request_for
-from otolith_drivers.common.periods import PeriodEstimator, period_text
+from otolith_drivers.common.message_times import PeriodEstimator, period_text
 from otolith_drivers.config_files import content
 from otolith_drivers.errors import ConfigurationError, nearest
 

@@ -42,7 +42,7 @@ from otolith_drivers.canbus.signals import (
     request_bits,
     request_from_databases,
 )
-from otolith_drivers.common.periods import PeriodEstimator, period_text
+from otolith_drivers.common.message_times import PeriodEstimator, period_text
 from otolith_drivers.common.reconnection import PassingFault
 from otolith_drivers.errors import ConfigurationError, nearest
 

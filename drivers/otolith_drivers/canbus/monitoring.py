@@ -15,7 +15,7 @@ from cantools.database import Signal as CanSignal
 
 from otolith_drivers.canbus.options import ChecksumKind, ChecksumTable
 from otolith_drivers.canbus.signals import RawReader, raw_reader
-from otolith_drivers.common.periods import PeriodEstimator
+from otolith_drivers.common.message_times import PeriodEstimator
 
 # Thresholds; docs/reference/thresholds-canbus.md gives the origin of each.
 MIN_COUNTER_RUN = 9  # steps of one in a row before a signal is used as a counter because of its name

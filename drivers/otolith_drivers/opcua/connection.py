@@ -20,8 +20,8 @@ from cryptography.hazmat.primitives import hashes
 from pydantic import BeforeValidator, Field, model_validator
 
 from otolith_drivers.common.credentials import CredentialOptions, certificate, certificate_and_key, password
+from otolith_drivers.common.message_times import ExchangeClock, unix_time
 from otolith_drivers.common.reconnection import cause_of
-from otolith_drivers.common.remote_clock import ExchangeClock, unix_time
 from otolith_drivers.common.scaled import ScaledSource
 from otolith_drivers.errors import nearest
 from otolith_drivers.units import Quantity

@@ -20,18 +20,22 @@ from otolith_drivers.canbus import can
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.errors import ConfigurationError, counted
-from otolith_drivers.replay.formats import (
+from otolith_drivers.replay.frame_readers import CandumpLines, Mf4Frames, SavvyCanLines, SqliteFrames
+from otolith_drivers.replay.readers import (
     CANDUMP,
     CANDUMP_LOG,
     DIFFERENCES,
+    MAX_TIME,
     PYTHON_CAN,
     SAVVYCAN,
+    DataFile,
+    Reader,
+    Rows,
     head_of,
     seen,
+    suffix_of,
     text_log,
 )
-from otolith_drivers.replay.frame_readers import CandumpLines, Mf4Frames, SavvyCanLines, SqliteFrames
-from otolith_drivers.replay.readers import MAX_TIME, DataFile, Reader, Rows, suffix_of
 
 # Engineering choices, guarded by the tests with garbage and damaged logs in test_can_log.py.
 MAX_LINE = 4096  # characters; a CAN FD frame with 64 bytes needs some 300

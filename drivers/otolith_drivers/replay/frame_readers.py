@@ -14,9 +14,9 @@ from typing import Any
 from otolith_drivers.canbus import can
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT
 from otolith_drivers.canbus.signals import CLASSIC_LENGTH
-from otolith_drivers.common.remote_clock import unix_time
+from otolith_drivers.common.message_times import unix_time
 from otolith_drivers.errors import ConfigurationError, installation_of, some_names
-from otolith_drivers.replay.formats import GZIP, seen
+from otolith_drivers.replay.readers import GZIP, seen
 
 STANDARD_DIGITS = 3  # of an identifier of 11 bits
 ERROR_FLAG = 1 << 29  # in the identifier that candump prints for an error frame

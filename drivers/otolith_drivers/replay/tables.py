@@ -25,10 +25,8 @@ from otolith_drivers.base import Setup
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError, counted, nearest
 from otolith_drivers.refused_imports import keep_pandas_out
-from otolith_drivers.replay.coarse_times import EvenTimes
-from otolith_drivers.replay.formats import seen
-from otolith_drivers.replay.no_readings import NoReadings, Range
-from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows
+from otolith_drivers.replay.cleaning import EvenTimes, NoReadings, Range
+from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows, seen
 from otolith_drivers.units import factor
 
 # Engineering choice: small in memory, large against pyarrow's overhead per chunk. Guarded by test_replay.py (memory)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from otolith_drivers.canbus.decoder import FrameDecoder
 from otolith_drivers.canbus.monitoring import COUNTER_NAMES, OTHER_COUNTER_NAMES
-from otolith_drivers.common.periods import PeriodEstimator
+from otolith_drivers.common.message_times import PeriodEstimator
 from otolith_drivers.errors import ConfigurationError
 from tests.drivers.can_frames import dbc, decoder, frame
 

@@ -23,7 +23,7 @@ from otolith_drivers.common import reconnection
 from otolith_drivers.errors import ConfigurationError, DeviceError
 from otolith_drivers.opcua import driver as opcua
 from otolith_drivers.opcua.connection import certificate_warnings
-from otolith_drivers.opcua.readings import MAX_AGE
+from otolith_drivers.opcua.driver import MAX_AGE
 from tests.conftest import free_port
 from tests.drivers.certificates import certificate
 from tests.drivers.opcua_server import opcua_server, server_of_this_process

@@ -7,10 +7,10 @@ import pytest
 from asyncua import ua
 
 from otolith_drivers.base import Sample, Signal
-from otolith_drivers.common.remote_clock import ArrivalClock, ExchangeClock
+from otolith_drivers.common.message_times import ArrivalClock, ExchangeClock
 from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.opcua.connection import OpcuaSource
-from otolith_drivers.opcua.readings import OVERFLOW, Readings
+from otolith_drivers.opcua.driver import OVERFLOW, Readings
 
 BEGUN = 1_700_000_000.0  # s, of the server's clock; the local one is 0 then
 INTERVAL, PERIOD = 0.05, 0.01  # s

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from otolith_drivers.replay.coarse_times import EvenTimes
+from otolith_drivers.replay.cleaning import EvenTimes
 from otolith_drivers.replay.readers import Array, Rows
 
 ROWS = 6000

@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import frame_readers
-from otolith_drivers.replay.formats import HEAD, OTHERS, TEXT_LOGS, seen, text_log
-from otolith_drivers.replay.readers import Rows, holds_frames
+from otolith_drivers.replay.readers import HEAD, OTHERS, TEXT_LOGS, Rows, holds_frames, seen, text_log
 from tests.drivers.logs import frames_of, live, opened, samples_of
 
 Frames = list[can.Message]

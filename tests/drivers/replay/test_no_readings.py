@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otolith_drivers.base import Setup, Signal
-from otolith_drivers.replay.no_readings import NoReadings, is_sentinel_number
+from otolith_drivers.replay.cleaning import NoReadings, is_sentinel_number
 from otolith_drivers.replay.readers import Array, Reader
 from otolith_drivers.replay.tables import TableReader, TableSource, open_log
 

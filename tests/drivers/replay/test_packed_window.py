@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith_drivers.replay.packed_window import HEADER, MAX_RECORDS, packed, unpacked
+from otolith_drivers.replay.recording import HEADER, MAX_RECORDS, packed, unpacked
 
 WORDS = st.integers(-(2**63), 2**63 - 1)
 WINDOWS = st.integers(0, 30).flatmap(

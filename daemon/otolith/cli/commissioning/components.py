@@ -78,7 +78,7 @@ def _decision(record: "ComponentRecord", decisions: "OperatorDecisions") -> str:
 
 
 def _equation(machine: "LoadedMachine", record: "ComponentRecord") -> str:
-    from otolith.estimation.augmented import equation
+    from otolith.estimation.problem import equation
     from otolith.health.text import half_width_text
     from otolith_drivers.units import equation_text
 
@@ -245,7 +245,7 @@ def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windo
 def record_of(structure: "Structure") -> "ComponentRecord":
     """Return what a state is given of a structure, so that it is in the twin from the first window on."""
     from otolith.adaptation.state import ComponentRecord
-    from otolith.discovery.adopted import AdoptedComponent
+    from otolith.discovery.decision import AdoptedComponent
     from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 
     component = structure.component
@@ -356,9 +356,8 @@ def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Map
     Raises:
         ConfigurationError: no parameter with limits has enough estimates.
     """
-    from otolith.health.baseline import baselines
     from otolith.health.limits import Level
-    from otolith.health.prognosis import MIN_POINTS
+    from otolith.health.prognosis import MIN_POINTS, baselines
     from otolith.health.text import interval_text, number_text
     from otolith_drivers.errors import ConfigurationError
     from otolith_drivers.units import unit_text

@@ -65,7 +65,7 @@ class HealthyRecord:
     def noise_beside(self, machine: "LoadedMachine") -> "IdentifiedNoise":
         """The noise levels with the structure in the twin."""
         from otolith.commissioning.identification import identify_noise
-        from otolith.estimation.augmented import augment
+        from otolith.estimation.problem import augment
 
         with progress_line("noise beside the structure") as show:
             wider = augment(machine.problem, [item.component for item in self.offered])
@@ -180,7 +180,7 @@ def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
 
 def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") -> Iterator[str]:
     """What all windows show and the twin lacks, as comments."""
-    from otolith.estimation.augmented import equation
+    from otolith.estimation.problem import equation
     from otolith.health.text import half_width_text
 
     for item in structure:
@@ -206,7 +206,7 @@ def _repeat(machine: "LoadedMachine", item: "Structure") -> str:
     """The period of a periodic component in the unit of its source."""
     from math import pi
 
-    from otolith.estimation.augmented import source_of
+    from otolith.estimation.problem import source_of
 
     unit = source_of(machine.twin, item.component.source).unit
     return f"{2.0 * pi / item.component.inner:.4g} {unit}"

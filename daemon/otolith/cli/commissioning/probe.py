@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from otolith.cli.commissioning.probe_view import DeviceProbe
     from otolith_drivers.canbus.bus import BusOptions
     from otolith_drivers.canbus.probe import Picture
-    from otolith_drivers.modbus.probe import Answer
-    from otolith_drivers.modbus.probe_numbers import Place
+    from otolith_drivers.modbus.probe import Answer, Place
     from otolith_drivers.opcua.connection import OpcuaOptions, Variable
 
 NOTHING_THERE = 1  # exit code
@@ -120,7 +119,7 @@ def modbus(
     from otolith.cli.commissioning.probe_view import modbus_document, show_device, stdout_console
     from otolith_drivers.config_files import validated
     from otolith_drivers.modbus.options import LineOptions
-    from otolith_drivers.modbus.probe_numbers import Place
+    from otolith_drivers.modbus.probe import Place
 
     if device is not None and device[0] != device[1] and not scan:
         raise click.BadParameter("a range of devices needs --scan", param_hint="--device")
@@ -197,8 +196,7 @@ def _read(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> 
     """
     from otolith.cli.commissioning.probe_view import DeviceProbe
     from otolith_drivers.modbus.options import HIGHEST_ADDRESS
-    from otolith_drivers.modbus.probe import ProbeClient, opened, speeds, survey, watch
-    from otolith_drivers.modbus.probe_numbers import numbers_of
+    from otolith_drivers.modbus.probe import ProbeClient, numbers_of, opened, speeds, survey, watch
 
     with progress_line("opening") as show, opened(place.options, show) as line:
         client = ProbeClient(line, place.options, place.device, place.table)
@@ -362,10 +360,10 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
     import asyncio
 
     from otolith.cli.commissioning.probe_view import stdout_console
+    from otolith_drivers.base import find_driver
     from otolith_drivers.config_files import validated
-    from otolith_drivers.registry import find
 
-    find("opcua")  # names the extra that is missing
+    find_driver("opcua")  # names the extra that is missing
     from otolith_drivers.opcua.connection import OpcuaOptions
 
     given = {name: value for name, value in keys.items() if value is not None}

@@ -17,7 +17,6 @@ from otolith_drivers.canbus import probe as canbus
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.errors import counted, some_names
 from otolith_drivers.modbus import probe as modbus
-from otolith_drivers.modbus import probe_numbers
 from otolith_drivers.modbus.client import FUNCTION_CODES
 from otolith_drivers.modbus.protocol import BUSY_CODES, EXCEPTIONS, LETTERS, TypeName
 from otolith_drivers.number_inference import LayoutVerdict, number_text
@@ -87,7 +86,7 @@ def _table(fixed: tuple[str, ...], names: Sequence[str], rows: Sequence[Row]) ->
 class DeviceProbe:
     """What was read from a Modbus device."""
 
-    place: probe_numbers.Place
+    place: modbus.Place
     registers: tuple[int, int]
     """Addresses (on the wire) of the first and the last register asked for."""
     survey: modbus.Survey
@@ -95,7 +94,7 @@ class DeviceProbe:
     speeds: list[modbus.Speed]
     seconds: float
     """Time spent reading."""
-    numbers: list[probe_numbers.Number]
+    numbers: list[modbus.Number]
 
     @property
     def single(self) -> bool:
@@ -103,7 +102,7 @@ class DeviceProbe:
         return self.registers[0] == self.registers[1]
 
     @property
-    def requested(self) -> list[probe_numbers.Number]:
+    def requested(self) -> list[modbus.Number]:
         """The numbers asked for; with a single register only the one that begins there."""
         return [number for number in self.numbers if not self.single or number.address == self.registers[0]]
 
@@ -125,7 +124,7 @@ def show_device(probe: DeviceProbe, console: Console, *, wide: bool) -> None:
     for line in _speed_lines(probe):
         console.print(line)
     console.print()
-    kinds = probe_numbers.COLUMNS + probe_numbers.WIDE_COLUMNS if wide else probe_numbers.COLUMNS
+    kinds = modbus.COLUMNS + modbus.WIDE_COLUMNS if wide else modbus.COLUMNS
     fixed, rows = ("register", "raw"), list(_register_rows(probe, kinds))
     if probe.single:
         fixed, rows = ("type", "order"), _type_rows(probe)
@@ -140,8 +139,8 @@ def show_device(probe: DeviceProbe, console: Console, *, wide: bool) -> None:
 
 def _modbus_lines(probe: DeviceProbe) -> list[str]:
     """The tables ``[driver]`` and ``[signals]``."""
-    driver = probe_numbers.modbus_driver_lines(probe.place, probe.survey)
-    return [*driver, "", *probe_numbers.modbus_signal_lines(probe.place, probe.requested)]
+    driver = modbus.modbus_driver_lines(probe.place, probe.survey)
+    return [*driver, "", *modbus.modbus_signal_lines(probe.place, probe.requested)]
 
 
 def _speed_lines(probe: DeviceProbe) -> list[str]:
@@ -169,7 +168,7 @@ def _register_rows(probe: DeviceProbe, kinds: Sequence[TypeName]) -> Iterator[Ro
                 at += zeros
                 continue
             row = {"register": label, "raw": f"{words[-1, at]:04X}"}
-            for reading in probe_numbers.readings_at(probe_numbers.bytes_of(words), at, kinds):
+            for reading in modbus.readings_at(modbus.bytes_of(words), at, kinds):
                 usable = not reading.fault and math.isfinite(reading.latest)
                 row[reading.layout.name] = number_text(reading.latest, reading.layout) if usable else "·"
             part = numbers[address].part if address in numbers else None
@@ -187,7 +186,7 @@ def _type_rows(probe: DeviceProbe) -> list[Row]:
         return []
     part = next((number.part for number in probe.requested), None)
     rows = []
-    for reading in probe_numbers.readings_at(probe_numbers.bytes_of(probe.readings[block]), 0, LETTERS):
+    for reading in modbus.readings_at(modbus.bytes_of(probe.readings[block]), 0, LETTERS):
         layout, step = reading.layout, reading.high - reading.low
         inferred = part is not None and part.layout is not None and part.layout.name == layout.name
         mark = MARKS.get(part.verdict, "") if part is not None and inferred else ""
@@ -223,7 +222,7 @@ def modbus_document(probe: DeviceProbe) -> dict[str, Any]:
                 "raw": f"{words[-1, at]:04X}",
                 "values": {
                     reading.layout.name: _finite(reading.latest)
-                    for reading in probe_numbers.readings_at(probe_numbers.bytes_of(words), at, LETTERS)
+                    for reading in modbus.readings_at(modbus.bytes_of(words), at, LETTERS)
                 },
             }
             for block, words in probe.readings.items()
@@ -234,7 +233,7 @@ def modbus_document(probe: DeviceProbe) -> dict[str, Any]:
     }
 
 
-def _number_document(place: probe_numbers.Place, number: probe_numbers.Number) -> dict[str, Any]:
+def _number_document(place: modbus.Place, number: modbus.Number) -> dict[str, Any]:
     layout, part = number.part.layout, number.part
     return {
         "register": place.shown(number.address),

@@ -1,20 +1,24 @@
-"""The live table of machines in a terminal, drawn from their published reports."""
+"""``otolith watch``: reports of daemons in other processes, as a stream or as a live table in a terminal."""
 
+import queue
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console, ConsoleOptions, Group, OverflowMethod, RenderableType, RenderResult
+from rich.live import Live
 from rich.segment import Segment
 from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
 from otolith.acquisition.window import Verdict
-from otolith.cli.common import local_time
+from otolith.cli.common import drain, local_time
 from otolith.health.diagnosis import FindingKind
 from otolith.health.language import Texts, texts_in
 from otolith.health.limits import Level
@@ -30,6 +34,9 @@ from otolith.health.text import (
     value_text,
 )
 from otolith_drivers.units import equation_text
+
+if TYPE_CHECKING:
+    from otolith.publishing.zenoh_config import Connection
 
 HISTORY = 200  # windows that the curve of a parameter can show
 WIDTH_WITH_COMPONENTS = 72  # characters of a terminal whose table of components has columns; engineering choice
@@ -47,6 +54,10 @@ STYLES = {
 LEVEL_STYLES = {Level.OK: "bold green", Level.NO_DATA: "bold dim", Level.WATCH: "bold yellow", Level.ACT: "bold red"}
 VALUE_COLUMNS = ("parameter", "value", "± 95 %", "unit", "change")
 RIGHT = {"value", "± 95 %", "change"}
+# Engineering choices without a test of their own.
+MAX_QUEUED = 100  # reports that wait for a slow terminal; later ones come from the history
+PAUSE = 0.2  # s; how late a stop is noticed
+PATIENCE = 5.0  # s without a report until the stream prints what it waits for
 
 
 @dataclass(slots=True)
@@ -291,3 +302,51 @@ def sparkline(values: tuple[float, ...], scale: tuple[float, float] | None = Non
         return BARS[3] * len(values)
     heights = (int((value - low) / (high - low) * len(BARS)) for value in values)
     return "".join(BARS[min(max(height, 0), len(BARS) - 1)] for height in heights)
+
+
+def watch_reports(
+    connection: "Connection", machine: str, *, as_json: bool, after: int | None, stopped: Callable[[], bool]
+) -> None:
+    """Show reports until ``stopped``; wait for a daemon that is not there yet.
+
+    As JSON each report is printed once and in order, beginning after the sequence number ``after``.
+    """
+    from otolith.publishing.subscriber import Subscriber
+
+    texts: queue.Queue[str] = queue.Queue(MAX_QUEUED)
+    ended = threading.Event()
+
+    def receive(text: str) -> None:
+        while not (stopped() or ended.is_set()):  # meanwhile the history keeps the reports for a slow reader
+            try:
+                texts.put(text, timeout=PAUSE)
+            except queue.Full:
+                continue
+            return
+
+    with Subscriber(connection, receive, machine, after=after) as subscriber:
+        try:
+            if as_json:
+                _stream(texts, subscriber.state, stopped)
+                return
+            table = LiveTable(subscriber.state)
+            with Live(table, console=Console(), refresh_per_second=5):
+                while not stopped():
+                    for text in drain(texts, PAUSE):
+                        table.add(text)
+        finally:
+            ended.set()
+
+
+def _stream(texts: "queue.Queue[str]", state: Callable[[], str], stopped: Callable[[], bool]) -> None:
+    """Print reports as lines; print the state to standard error when it changes while no report comes."""
+    latest, printed = time.monotonic(), ""
+    while not stopped():
+        lines = drain(texts, PAUSE)
+        sys.stdout.writelines(f"{line}\n" for line in lines)
+        sys.stdout.flush()
+        if lines:
+            latest = time.monotonic()
+        elif time.monotonic() - latest > PATIENCE and state() != printed:
+            printed = state()
+            sys.stderr.write(f"{printed}\n")

@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from otolith_drivers import mqtt
 from otolith_drivers.base import Sample, Sampling, Setup, Signal
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.mqtt import driver as mqtt
-from otolith_drivers.mqtt.topics import MAX_PAYLOAD, Messages, at
+from otolith_drivers.mqtt import MAX_PAYLOAD, Messages, at
 from tests.conftest import free_port
 from tests.drivers.certificates import certificate
 from tests.drivers.mqtt_broker import broker_of_this_process, mqtt_broker, publisher

@@ -1,1 +1,0 @@
-"""MQTT: a client that subscribes to topics of a broker and never publishes."""
