@@ -22,7 +22,7 @@ INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative
 MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
 MAX_TREND = 1.0  # 1/s: bound of a trend, relative to the parameter's size
 MIN_STATE_SINGULAR = 1e-10  # relative singular value below which a window does not determine the initial state
-MIN_SINGULAR = 1e-12  # relative singular value below which a direction has no uncertainty to speak of
+MIN_SINGULAR = 1e-12  # relative singular value below which a direction is not determined, and has no curvature
 
 
 @dataclass(frozen=True, slots=True, eq=False)

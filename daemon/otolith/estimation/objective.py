@@ -59,8 +59,9 @@ def open_loop(kernel: Kernel, excitation: Excitation, noise: NoiseModel) -> Inno
 class Objective:
     """Whitened innovations and cost of guesses over one window.
 
-    A guess holds the free parameters, then the initial state. The first record is as noisy as any other, so the initial
-    state is a nuisance parameter, estimated along with the rest.
+    A guess (free + states,) holds the free parameters, then the initial state. The first record is as noisy as any
+    other, so the initial state is a nuisance parameter, estimated along with the rest. A guess with trends
+    (2 free + states,) holds parameters at the end of the window, their trends per second, and the initial state.
     """
 
     def __init__(
@@ -85,13 +86,8 @@ class Objective:
             lowest, highest = lowest - wider, highest + wider
         given = dict(problem.known) | (time_offsets(problem, window) if problem.components else {})
         self._template = np.array([given.get(parameter.name, parameter.nominal) for parameter in twin.parameters])
-        order = [parameter.name for parameter in twin.parameters[: len(twin.parameters) - twin.settings]]
         self.free, self._states = len(problem.free), len(twin.states)
-        self._free_columns = np.array([order.index(parameter.name) for parameter in problem.free], dtype=np.int64)
-        state_columns = len(order) + np.arange(self._states)
-        self._trend_columns = len(order) + self._states + self._free_columns
-        self._columns = np.concatenate([self._free_columns, state_columns])
-        self._columns_with_trends = np.concatenate([self._free_columns, self._trend_columns, state_columns])
+        self._choose_columns(problem)
         low, high = problem.bounds
         self.low, self.high = np.concatenate([low, lowest]), np.concatenate([high, highest])
         states = (f"initial {state.name}" for state in twin.states)
@@ -104,6 +100,16 @@ class Objective:
         self.initial = self._first if initial is None else np.where(np.isnan(initial), self._first, initial)
         """(states,) around which the predictor was built."""
         self.set_predictor(start, self.initial, substeps)
+
+    def _choose_columns(self, problem: Problem) -> None:
+        """Set the columns of :meth:`Kernel.sensitivities`: of the guess alone, of the trends, and of both."""
+        twin = problem.twin
+        names = [parameter.name for parameter in twin.parameters[: len(twin.parameters) - twin.settings]]
+        self._free_columns = np.array([names.index(parameter.name) for parameter in problem.free], dtype=np.int64)
+        state_columns = len(names) + np.arange(self._states)
+        self._trend_columns = len(names) + self._states + self._free_columns
+        self._columns = np.concatenate([self._free_columns, state_columns])
+        self._columns_with_trends = np.concatenate([self._free_columns, self._trend_columns, state_columns])
 
     def set_predictor(self, parameters: Array, initial: Array, substeps: int = 1) -> None:
         """Compute at least ``substeps`` sub-steps, gain and whitening around ``parameters`` (free,) and ``initial``."""
@@ -160,6 +166,10 @@ class Objective:
         """Return the guess (free + states,) of ``parameters`` (free,) that starts at the first record."""
         return np.concatenate([parameters, self._first])
 
+    def without_trends(self, guess: Array) -> Array:
+        """Return the guess (free + states,) that a ``guess`` with trends contains."""
+        return np.concatenate([guess[: self.free], guess[2 * self.free :]])
+
     def parameters(self, guesses: Array) -> Array:
         """Return all parameters of the twin (particles, parameters) for guesses (particles, free, ...)."""
         parameters = np.repeat(self._template[None, :], len(guesses), axis=0)
@@ -174,14 +184,10 @@ class Objective:
         return self._linearise(guess, self._columns)
 
     def linearise_with_trends(self, guess: Array) -> tuple[Array, Array]:
-        """Return the same for a guess of parameters at the end, their trends per second, and the initial state.
-
-        A trend enters to first order: within a window it moves a parameter by little.
-        """
-        free = self.free
-        constant = np.concatenate([guess[:free], guess[2 * free :]])
-        residuals, jacobian = self._linearise(constant, self._columns_with_trends)
-        return residuals + jacobian[:, free : 2 * free] @ guess[free : 2 * free], jacobian
+        """Return the same for a guess with trends, which enter to first order: they move a parameter by little."""
+        trends = slice(self.free, 2 * self.free)
+        residuals, jacobian = self._linearise(self.without_trends(guess), self._columns_with_trends)
+        return residuals + jacobian[:, trends] @ guess[trends], jacobian
 
     def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]

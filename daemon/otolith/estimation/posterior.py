@@ -89,9 +89,10 @@ class Posterior:
         return Prior(mean * size, covariance * np.outer(size, size))
 
     def held(self, predicted: "Posterior") -> Prior:
-        """Return what is known at the end of a window that adds nothing; ``predicted`` is the prediction of it.
+        """Return what is known at the end of a window that does not update it; ``predicted`` is its prediction.
 
-        Values stay; what the trends would have added counts as uncertainty. The phases of components advance.
+        Values stay, and what their trends would have added is added to the uncertainty. Values of components, whose
+        phases advance, are those of the prediction.
         """
         before, after = self.prior(), predicted.prior()
         mean, kept = after.mean.copy(), [not free.name.startswith("_") for free in self.problem.free]
@@ -128,9 +129,9 @@ class Posterior:
     def shifts(self, values: Array, sd: Array, length: float) -> Array:
         """Return by how many standard deviations a window of ``length`` (s) alone differs from the prediction (free,).
 
-        ``values`` and ``sd`` (free,) are its estimates, without trends, so that they hold in its middle. While nothing
-        happens a shift is a standard normal deviate, or less. Values of components do not count, nor does less than a
-        parameter drifts in the window: the filter lags behind a drift that accelerates, and follows it.
+        ``values`` and ``sd`` (free,) are its estimates without trends, which hold in its middle. For a healthy machine
+        a shift is a standard normal deviate, or smaller. It is zero for values of components, and where the difference
+        is no larger than the drift within the window: the filter lags behind a drift that accelerates.
         """
         prior = self.prior()
         before, trend = np.split(prior.mean, 2)
