@@ -68,7 +68,7 @@ def _fitted(problem: Problem, null: FittedHypothesis) -> FittedHypothesis | None
 
 
 def _with_noisier_inputs(null: Fit) -> Problem:
-    """Return the problem with the most likely noise of each input, if that pays for being one more value."""
+    """Return the problem with the most likely noise of each input, if its gain exceeds the penalty of one value."""
     best, least = null.problem, _deviance(linearised(null.problem, null.window, null.prior, null.parameters))
     unseen = null.objective.innovation_model.log_determinant + VISIBLE
     for at, source in enumerate(best.base_model.inputs):
@@ -80,8 +80,8 @@ def _with_noisier_inputs(null: Fit) -> Problem:
             trial = linearised(problem, null.window, null.prior, null.parameters)
             if trial.objective.innovation_model.log_determinant <= unseen:
                 break
-            price = np.log(null.count) if best.levels[at] == levels[at] else 0.0
-            if (deviance := _deviance(trial)) + price < least:
+            penalty = np.log(null.count) if best.levels[at] == levels[at] else 0.0
+            if (deviance := _deviance(trial)) + penalty < least:
                 best, least = problem, deviance
     return best
 
