@@ -235,11 +235,12 @@ def _cells(data: _Data, onset: Array, exponent: Array, *, is_constant: bool = Fa
     moment = np.stack([np.broadcast_to((ones * values).sum(2), (len(rows), count)), (shapes * values).sum(2)], axis=2)
     covariance = np.linalg.inv(precision)
     mean = np.einsum("tcij,tcj->tci", covariance, moment)
-    misfit = (values * values).sum(2) - (mean * moment).sum(2)
-    scale, shape = FACTOR_SHAPE + 0.5 * np.maximum(misfit, 0.0), FACTOR_SHAPE + 0.5 * points
-    log_weight = 0.5 * (np.log(np.linalg.det(prior)) - np.log(np.linalg.det(precision))) - shape * np.log(scale)
+    residual = (values * values).sum(2) - (mean * moment).sum(2)
+    # The factor on the variances has an inverse gamma posterior of this scale and order.
+    scale, order = FACTOR_SHAPE + 0.5 * np.maximum(residual, 0.0), FACTOR_SHAPE + 0.5 * points
+    log_weight = 0.5 * (np.log(np.linalg.det(prior)) - np.log(np.linalg.det(precision))) - order * np.log(scale)
     log_weight -= 0.5 * np.log(data.innovation).sum(1)[:, None] + math.log(log_weight.size)
-    covariance = covariance * (scale / (shape - 1.0))[..., None, None]
+    covariance = covariance * (scale / (order - 1.0))[..., None, None]
     mean[..., 0] += data.origin
     onset, exponent = (np.tile(each, len(rows)) for each in (onset, exponent))
     return _Cells(log_weight.ravel(), onset, exponent, mean.reshape(-1, 2), covariance.reshape(-1, 2, 2))
