@@ -46,14 +46,14 @@ MIN_GAP_SHARE = 0.05  # of a window: a shorter gap is not named; engineering cho
 
 def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Report]:
     """Return the state after ``window``, and the report of it."""
-    state = with_posterior(state, state.posterior.without_expired(window.start))
+    posterior = state.posterior.without_expired(window.start)
+    if posterior is not state.posterior:
+        state = with_posterior(state, posterior)
     state, predicted, checked = _predict_and_check(state, window)
     result = _estimate(state, predicted, checked) if checked.is_usable else _reject(state, predicted, checked)
-    result = replace(
-        result,
-        notes=(*checked.notes, *(sensor.text for sensor in result.faulty_sensors)),
-        adopted=with_approvals(result.adopted, state.approved),
-    )
+    result = replace(result, notes=(*checked.notes, *(sensor.text for sensor in result.faulty_sensors)))
+    if result.adopted:
+        result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)
     health, document = assess(state.plan, state.health, report.document)
     return _next_state(state, result, previous, health), replace(report, document=document)

@@ -181,7 +181,8 @@ class LinearResponse(ProjectedResponse):
         slotted = augmented_model(self.problem.base_model)
         self._kernel = kernel_of(slotted)
         values, states = objective.parameters(self._guess[None])[0], self._guess[free:]
-        parameters, initial = _padded(values, len(slotted.parameters)), _padded(states, len(slotted.states))
+        parameters = np.pad(values, (0, len(slotted.parameters) - len(values)))
+        initial = np.pad(states, (0, len(slotted.states) - len(states)))
         gain = np.zeros((self.window.records, len(initial), len(self.problem.base_model.outputs)))
         gain[:, : len(states)] = objective.innovation_model.gain
         excitation = replace(objective.excitation, inputs=input_matrix(slotted, self.window), gain=gain)
@@ -324,12 +325,6 @@ def chi_square_of_parameters(fitted: Fit) -> float:
     """Return χ² that parameters, trends and initial state leave, with the prior, linearised where ``fitted`` began."""
     _, residuals, jacobian = fitted.result.first
     return float(residuals @ residuals) - float(((orthonormal_basis(jacobian).T @ residuals) ** 2).sum())
-
-
-def _padded(values: Array, length: int) -> Array:
-    padded = np.zeros(length)
-    padded[: len(values)] = values
-    return padded
 
 
 def _without_angles(linear: LinearisedModel, states: int) -> LinearisedModel:

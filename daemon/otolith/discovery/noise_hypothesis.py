@@ -104,7 +104,7 @@ def is_white(fitted: Fit) -> bool:
     American Statistical Association 65, 1970).
     """
     present = fitted.objective.present
-    for innovations, measured in zip(_innovations(fitted).T, present.T, strict=True):
+    for innovations, measured in zip(fitted.innovations.T, present.T, strict=True):
         values = innovations[measured]
         power, count = float(values @ values), len(values)
         for lag in range(1, min(WHITE_LAGS, count - 1) + 1):
@@ -113,13 +113,8 @@ def is_white(fitted: Fit) -> bool:
     return True
 
 
-def _innovations(fitted: Fit) -> Array:
-    """Return the whitened innovations (records, outputs)."""
-    return fitted.map_objective.window_residuals(fitted.result).reshape(fitted.objective.measured.shape)
-
-
 def _noise_ratios(fitted: Fit) -> Array:
     """Return the root mean square (outputs,) of the whitened innovations."""
     present = fitted.objective.present
-    squares = np.where(present, _innovations(fitted) ** 2, 0.0).sum(axis=0)
+    squares = np.where(present, fitted.innovations**2, 0.0).sum(axis=0)
     return np.asarray(np.sqrt(squares / np.maximum(present.sum(axis=0), 1)))

@@ -173,14 +173,14 @@ class Innovation:
 
     prediction: ImmPosterior
     evidence: Evidence
-    root: Array
-    """(2 free, 2 free) square-root information of the window."""
+    sqrt_information: Array
+    """(2 free, 2 free) of the window: R of ``docs/explanation/filter.md``."""
     covariance: Array
-    """(modes, 2 free, 2 free)."""
+    """(modes, 2 free, 2 free): S."""
     inverse: Array
     """(modes, 2 free, 2 free) of the covariance."""
-    deviation: Array
-    """(modes, 2 free)."""
+    value: Array
+    """(modes, 2 free): ν."""
     nis_of_mode: Array
     """(modes,) normalised innovation squared."""
 
@@ -195,7 +195,7 @@ class Innovation:
     @property
     def is_expected(self) -> bool:
         """Whether it is within what healthy windows reach."""
-        return self.nis <= nis_limit(float(len(self.root)))
+        return self.nis <= nis_limit(float(len(self.sqrt_information)))
 
     def inflate_variance(self, reduced_chi_square: float) -> "Innovation":
         """Return the same with a larger variance ratio; see :func:`inflate_variance`."""
@@ -244,16 +244,16 @@ def innovation_of(prediction: ImmPosterior, evidence: Evidence) -> Innovation:
     root = limited.sqrt_information / inflation
     covariance = np.eye(len(root)) + root @ prediction.covariance @ root.T
     inverse = np.linalg.inv(covariance)
-    deviation = limited.residual / inflation + (prediction.mean - limited.point) @ root.T
-    nis_of_mode = np.einsum("mi,mij,mj->m", deviation, inverse, deviation)
-    return Innovation(prediction, evidence, root, covariance, inverse, deviation, nis_of_mode)
+    value = limited.residual / inflation + (prediction.mean - limited.point) @ root.T
+    nis_of_mode = np.einsum("mi,mij,mj->m", value, inverse, value)
+    return Innovation(prediction, evidence, root, covariance, inverse, value, nis_of_mode)
 
 
 def update(innovation: Innovation) -> ImmPosterior:
     """Return the posterior after a window: Kalman update of each mode, then of the mode probabilities."""
-    prediction, root = innovation.prediction, innovation.root
+    prediction, root = innovation.prediction, innovation.sqrt_information
     gain = prediction.covariance @ root.T @ innovation.inverse
-    mean = prediction.mean - np.einsum("mij,mj->mi", gain, innovation.deviation)
+    mean = prediction.mean - np.einsum("mij,mj->mi", gain, innovation.value)
     kept = np.eye(prediction.mean.shape[1]) - gain @ root  # Joseph form
     covariance = kept @ prediction.covariance @ kept.transpose(0, 2, 1) + gain @ gain.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))

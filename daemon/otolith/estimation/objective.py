@@ -96,7 +96,8 @@ class Objective:
         self._max_substeps = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
         self._base = twin.base or twin
         measured = np.where(self.present, self.measured, np.nan)
-        self._excitation = Excitation(input_matrix(twin, window), window.grid, measured=measured)
+        self.excitation = Excitation(input_matrix(twin, window), window.grid, measured=measured)
+        """Inputs, measurements, gain and sub-steps of the predictor."""
         self.initial = self._first if initial is None else np.where(np.isnan(initial), self._first, initial)
         """(states,) around which the predictor was built."""
         self.set_predictor(start, self.initial, substeps)
@@ -114,7 +115,7 @@ class Objective:
     def set_predictor(self, parameters: Array, initial: Array, substeps: int = 1) -> None:
         """Compute at least ``substeps`` sub-steps, gain and whitening around ``parameters`` (free,) and ``initial``."""
         full = self.parameters(parameters[None])[0]
-        uncorrected = replace(self._excitation, gain=None, substeps=substeps)
+        uncorrected = replace(self.excitation, gain=None, substeps=substeps)
         while True:
             model = self._innovation_model(full, initial, uncorrected)
             corrected = replace(uncorrected, gain=model.gain)
@@ -123,12 +124,12 @@ class Objective:
                 break
             uncorrected = replace(uncorrected, substeps=needed)
         self.innovation_model = model
-        self._excitation = corrected
+        self.excitation = corrected
 
     def is_resolved(self, parameters: Array, initial: Array) -> bool:
         """Whether the sub-steps of the predictor suffice at ``parameters`` (free,) and ``initial`` (states,)."""
-        needed = self._substeps(self.parameters(parameters[None])[0], initial, self._excitation)
-        return needed <= self._excitation.substeps
+        needed = self._substeps(self.parameters(parameters[None])[0], initial, self.excitation)
+        return needed <= self.excitation.substeps
 
     def _substeps(self, full: Array, initial: Array, excitation: Excitation) -> int:
         return self.kernel.substeps(full, initial, excitation, TRUNCATION * self.noise.outputs, self._max_substeps)
@@ -148,11 +149,6 @@ class Objective:
         return model._replace(gain=np.pad(model.gain, ((0, 0), (0, extra), (0, 0)))) if extra else model
 
     @property
-    def excitation(self) -> Excitation:
-        """Inputs, measurements, gain and sub-steps of the predictor."""
-        return self._excitation
-
-    @property
     def whitening(self) -> Array:
         """(records, outputs, outputs) matrices that make each innovation's covariance the identity."""
         return self.innovation_model.whitening
@@ -160,7 +156,7 @@ class Objective:
     @property
     def integrator_steps(self) -> int:
         """Steps of the integrator in one prediction."""
-        return int(self._excitation.counts.sum())
+        return int(self.excitation.counts.sum())
 
     def guess(self, parameters: Array) -> Array:
         """Return the guess (free + states,) of ``parameters`` (free,) that starts at the first record."""
@@ -192,7 +188,7 @@ class Objective:
     def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
         with np.errstate(over="ignore", invalid="ignore"):
-            prediction = self.kernel.sensitivities(parameters, initial, self._excitation, columns)
+            prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
             slopes = prediction.slopes
             if not self.is_complete:
@@ -205,20 +201,20 @@ class Objective:
     def predict(self, guesses: Array) -> Array:
         """Return one-step predictions (particles, records, outputs), in the units of the twin."""
         initial = guesses[:, self.free :]
-        return self.kernel.simulate(self.parameters(guesses), initial, self._excitation)
+        return self.kernel.simulate(self.parameters(guesses), initial, self.excitation)
 
     def predict_with_trends(self, guess: Array) -> tuple[Array, Array]:
         """Return prediction (records, outputs) and last state (states,) for a guess with trends."""
         free = self.free
         parameters = self.parameters(guess[None])[0]
-        prediction = self.kernel.sensitivities(parameters, guess[2 * free :], self._excitation, self._trend_columns)
+        prediction = self.kernel.sensitivities(parameters, guess[2 * free :], self.excitation, self._trend_columns)
         with np.errstate(over="ignore", invalid="ignore"):  # where the twin diverges
             trends = prediction.slopes @ guess[free : 2 * free]
             return prediction.outputs + trends, prediction.last
 
     def simulate(self, guess: Array) -> Array:
         """Return the open-loop simulation (records, outputs) from the initial state of ``guess`` (guess,)."""
-        uncorrected = replace(self._excitation, gain=None)
+        uncorrected = replace(self.excitation, gain=None)
         simulated: Array = self.kernel.simulate(self.parameters(guess[None]), guess[None, self.free :], uncorrected)[0]
         return simulated
 

@@ -175,18 +175,17 @@ class Posterior:
     def remap_parameters(self, problem: Problem) -> "Posterior":
         """Return what is known for another choice of free parameters; new ones have the initial prior."""
         labels, count = [free.label for free in self.problem.free], len(problem.free)
-        kept = [at for at, free in enumerate(problem.free) if free.label in labels]
-        before = [labels.index(problem.free[at].label) for at in kept]  # slots may have changed places
+        new = [at for at, free in enumerate(problem.free) if free.label in labels]
+        old = [labels.index(problem.free[at].label) for at in new]  # slots may have changed places
         level = np.full(count, ADDED_LEVEL)
-        level[kept] = self.belief.level[0][before]
-        kept = [*kept, *(count + at for at in kept)]  # and their trends
-        before = [*before, *(len(labels) + at for at in before)]
-        ratio = _size(self.problem)[before] / _size(problem)[kept]
+        level[new] = self.belief.level[0][old]
+        new, old = [*new, *(count + at for at in new)], [*old, *(len(labels) + at for at in old)]  # and their trends
+        ratio = _size(self.problem)[old] / _size(problem)[new]
         old_mean, old_covariance = imm_filter.moment_match(self.belief)
         mean, covariance = imm_filter.moment_match(Posterior.initial(problem).belief)
-        mean[kept] = old_mean[before] * ratio
-        covariance[kept, :] = covariance[:, kept] = 0.0
-        covariance[np.ix_(kept, kept)] = old_covariance[np.ix_(before, before)] * np.outer(ratio, ratio)
+        mean[new] = old_mean[old] * ratio
+        covariance[new, :] = covariance[:, new] = 0.0
+        covariance[np.ix_(new, new)] = old_covariance[np.ix_(old, old)] * np.outer(ratio, ratio)
         modes = imm_filter.equal_modes(level, mean, covariance, self.belief.end, self.belief.variance_ratio)
         return replace(self, problem=problem, belief=modes)
 

@@ -62,8 +62,13 @@ class Fit:
     @property
     def window_chi_square(self) -> float:
         """χ² of the window alone."""
-        residuals = self.map_objective.window_residuals(self.result)
+        residuals = self.innovations.ravel()
         return float(residuals @ residuals)
+
+    @property
+    def innovations(self) -> Array:
+        """(records, outputs) whitened: the residuals without those of the prior."""
+        return self.result.residuals[: -len(self.prior.mean)].reshape(self.objective.measured.shape)
 
     @property
     def count(self) -> float:
@@ -92,8 +97,8 @@ class Fit:
 
     def evidence(self) -> Evidence:
         """Return the evidence of the window; standard deviations are inflated by the unexplained residual."""
-        residuals = self.map_objective.window_residuals(self.result).reshape(self.objective.measured.shape)
-        return self.map_objective.evidence(self.result, inflation_of(residuals, self.objective.present, self.cost))
+        inflation = inflation_of(self.innovations, self.objective.present, self.cost)
+        return self.map_objective.evidence(self.result, inflation)
 
     def linearised_at_end(self) -> "Fit":
         """Return the window linearised at the end of this fit, with a predictor made there."""

@@ -1,6 +1,6 @@
 """When a parameter passes its limits, from the history of its estimates.
 
-Meta-models of the paper (Table 1) are compared: a constant, a line, and an exponential that accelerates or levels off.
+Three models of the paper (Table 1) are compared: a constant, a line, and an exponential that accelerates or levels off.
 Line and exponential begin at an unknown onset:
 
     value(t) = c + d·φ(t),   φ = s or (exp(x·s) - 1)/(exp(x) - 1),   s = (t - onset)/(now - onset), 0 before the onset
@@ -150,7 +150,7 @@ def span(history: History) -> float:
 
 
 def find_trend(history: History, change: float) -> Trend | str:
-    """Return the trend of a history, or why there is none; ``change`` is one that would not be surprising."""
+    """Return the trend of a history, or why there is none; ``change`` is the standard deviation of its prior."""
     if len(history) < MIN_POINTS:
         return f"too short: {len(history)} of {MIN_POINTS} estimates"
     data = _Data.of(history, change)

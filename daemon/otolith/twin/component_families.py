@@ -151,7 +151,7 @@ def _has_rates(x: SourceRange) -> bool:
 
 
 def _coulomb_transitions(x: SourceRange) -> tuple[float, float]:
-    """Widths of the transition around zero; with a step a machine at rest would never come to rest."""
+    """Widths of the transition around zero; with a step the simulated speed would oscillate around zero."""
     width = COULOMB_TRANSITION * _largest(x)
     return width, WIDEST_TRANSITION * width
 
