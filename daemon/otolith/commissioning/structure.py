@@ -73,6 +73,8 @@ class PooledResponse(ProjectedResponse):
 
     def __init__(self, fits: Sequence[Fit]) -> None:
         """``fits`` are linearised at the same parameters."""
+        from scipy.linalg import block_diag  # noqa: PLC0415 - only noise identification needs SciPy
+
         self.parts = [LinearResponse(fitted) for fitted in fits]
         first = self.parts[0]
         self.problem, self.window, self.objective = first.problem, first.window, first.objective
@@ -82,7 +84,7 @@ class PooledResponse(ProjectedResponse):
         """(windows,) rows of the residual at which the windows end."""
         free, rows = len(first.problem.free), list(map(_rows_of_window, fits))
         self._start = fits[0].parameters
-        self._states = _block_diagonal([orthonormal_basis(jacobian[:, 2 * free :]) for _, jacobian in rows])
+        self._states: Array = block_diag(*(orthonormal_basis(jacobian[:, 2 * free :]) for _, jacobian in rows))
         self._innovations = self._without_states(np.concatenate([residuals for residuals, _ in rows]))
         by_parameters = np.vstack([jacobian[:, :free] for _, jacobian in rows])
         self._parameters = self._without_states(by_parameters)
@@ -211,16 +213,6 @@ def _rows_of_window(fitted: Fit) -> tuple[Array, Array]:
     _, residuals, jacobian = fitted.result.first
     count = len(residuals) - len(fitted.prior.mean)
     return residuals[:count], jacobian[:count]
-
-
-def _block_diagonal(blocks: Sequence[Array]) -> Array:
-    """Return the matrix with ``blocks`` along its diagonal."""
-    whole = np.zeros((sum(len(block) for block in blocks), sum(block.shape[1] for block in blocks)))
-    row = column = 0
-    for block in blocks:
-        whole[row : row + len(block), column : column + block.shape[1]] = block
-        row, column = row + len(block), column + block.shape[1]
-    return whole
 
 
 def remaining_structure(

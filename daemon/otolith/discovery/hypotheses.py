@@ -134,18 +134,16 @@ def with_candidate(
     base: Problem, prior: Prior, candidate: Candidate, before: FittedHypothesis | None = None
 ) -> Proposal:
     """Return the hypothesis of ``base`` with one more component; ``before`` is a fit of ``base`` to start from."""
-    wider = augment(base, [candidate.component])
-    extended = extend_prior(prior, base, wider)
-    start = extended.mean.copy()
-    if before is not None:
-        order = [parameter.name for parameter in wider.free]
-        for value, parameter in zip(before.fit.parameters, base.free, strict=True):
-            start[order.index(parameter.name)] = value
-    added = len(wider.free) - len(base.free) + (0 if before is None else before.hypothesis.added)
-    alternatives = candidate.competing * (1.0 if before is None else before.hypothesis.alternatives)
     kind = FaultType.SENSOR if candidate.of_sensor else FaultType.COMPONENT
-    stated = FaultHypothesis(kind, _names(wider), added, alternatives)
-    return Proposal(stated, wider, extended, start)
+    alone = with_components(base, prior, [candidate.component], candidate.competing, kind)
+    if before is None:
+        return alone
+    start, order = alone.start.copy(), [parameter.name for parameter in alone.problem.free]
+    for value, parameter in zip(before.fit.parameters, base.free, strict=True):
+        start[order.index(parameter.name)] = value
+    own, others = alone.hypothesis, before.hypothesis
+    both = replace(own, added=own.added + others.added, alternatives=own.alternatives * others.alternatives)
+    return replace(alone, hypothesis=both, start=start)
 
 
 def is_possible(problem: Problem, values: Array) -> bool:
@@ -165,11 +163,17 @@ def is_possible(problem: Problem, values: Array) -> bool:
     return True
 
 
-def with_components(base: Problem, prior: Prior, components: Sequence[Component], alternatives: float) -> Proposal:
-    """Return the hypothesis of ``base`` with several more components of the machine, all at once."""
+def with_components(
+    base: Problem,
+    prior: Prior,
+    components: Sequence[Component],
+    alternatives: float,
+    kind: FaultType = FaultType.COMPONENT,
+) -> Proposal:
+    """Return the hypothesis of ``base`` with several more components, all at once."""
     wider = augment(base, components)
     extended = extend_prior(prior, base, wider)
-    stated = FaultHypothesis(FaultType.COMPONENT, _names(wider), len(wider.free) - len(base.free), alternatives)
+    stated = FaultHypothesis(kind, _names(wider), len(wider.free) - len(base.free), alternatives)
     return Proposal(stated, wider, extended, extended.mean)
 
 
