@@ -125,6 +125,7 @@ def _threshold_gain(response: LinearResponse) -> float:
     for fitted in fit_hypotheses(proposals, response.window):
         count = fitted.fit.count
         variance_factor = residual_variance_factor([fitted.chi_square], count)
+        # The initial prior leaves all parameters free, so that the penalty counts them beside those of the component.
         penalty = fitted.deviance(count, 1.0) - fitted.chi_square + len(problem.free) * np.log(count)
         best = max(best, (response.chi_square - fitted.chi_square) / variance_factor - penalty)
     return best

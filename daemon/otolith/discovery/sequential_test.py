@@ -345,11 +345,8 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     If the filter alone explains the window, but not the leading hypothesis, what opened the test has ended.
     """
     old, new = test.last, fresh.last
-    gain = (
-        (old.chi_square - new.chi_square) / residual_variance_factor([new.chi_square], old.count)
-        + old.penalty
-        - new.penalty
-    )
+    variance_factor = residual_variance_factor([new.chi_square], old.count)
+    gain = (old.chi_square - new.chi_square) / variance_factor + old.penalty - new.penalty  # of the window alone
     if fresh.best.type is FaultType.NOTHING and fresh.best.cost <= EXPLAINED < test.best.cost:
         return fresh
     if gain <= DECISIVE:
