@@ -16,14 +16,7 @@ from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_r
 from otolith.adaptation.state import AdaptationState, with_posterior
 from otolith.discovery.adopted import AdoptedComponent, adopt, count_fading, keep_present, with_approvals
 from otolith.discovery.ambiguity import mixture
-from otolith.discovery.decision import (
-    MAX_COST,
-    UPDATES,
-    PosteriorUpdate,
-    WindowDecision,
-    WindowOutcome,
-    decide,
-)
+from otolith.discovery.decision import MAX_COST, UPDATES, PosteriorUpdate, WindowDecision, WindowOutcome, decide
 from otolith.discovery.hypotheses import FaultType
 from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
@@ -255,10 +248,7 @@ def _adopt_hypothesis(
 
 
 def _replace_posterior(
-    decision: WindowDecision,
-    posterior: Posterior,
-    estimated: WindowEstimate,
-    adopted: tuple[AdoptedComponent, ...],
+    decision: WindowDecision, posterior: Posterior, estimated: WindowEstimate, adopted: tuple[AdoptedComponent, ...]
 ) -> WindowResult:
     """Return the result with another posterior, and the window estimated again under it."""
     problem, prior = posterior.problem, posterior.prior()

@@ -113,10 +113,7 @@ def identify_delays(
 
 
 def identify_delays_and_noise(
-    problem: Problem,
-    windows: Sequence[Window],
-    declared: Mapping[str, float],
-    progress: Progress = lambda _: None,
+    problem: Problem, windows: Sequence[Window], declared: Mapping[str, float], progress: Progress = lambda _: None
 ) -> tuple[IdentifiedDelays, IdentifiedNoise]:
     """Return the delays as :func:`identify_delays`, and the noise levels of windows without them.
 

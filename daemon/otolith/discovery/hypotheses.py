@@ -164,11 +164,7 @@ def is_possible(problem: Problem, values: Array) -> bool:
 
 
 def with_components(
-    base: Problem,
-    prior: Prior,
-    components: Sequence[Component],
-    alternatives: float,
-    kind: FaultType = FaultType.COMPONENT,
+    base: Problem, prior: Prior, components: Sequence[Component], alternatives: float, kind: FaultType
 ) -> Proposal:
     """Return the hypothesis of ``base`` with several more components, all at once."""
     wider = augment(base, components)

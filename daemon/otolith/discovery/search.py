@@ -356,7 +356,7 @@ def _sub_structures(whole: FittedHypothesis, fitted: list[FittedHypothesis]) -> 
     smaller = [[component for component in added if component is not lacking] for lacking in added]
     alternatives = whole.hypothesis.alternatives ** (1.0 - 1.0 / max(len(added), 1))
     proposals = [
-        with_components(null.problem, null.fit.prior, rest, alternatives)
+        with_components(null.problem, null.fit.prior, rest, alternatives, FaultType.COMPONENT)
         for rest in smaller
         if frozenset((*known, *(component.key for component in rest))) not in present
     ]

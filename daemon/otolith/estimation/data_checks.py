@@ -218,12 +218,10 @@ class _Channel:
 
     @property
     def name(self) -> str:
-        """Signal of the sensor."""
         return self.output.name
 
     @property
     def index(self) -> int:
-        """Which output of the twin it is."""
         return [output.name for output in self.predicted.problem.twin.outputs].index(self.name)
 
     @property

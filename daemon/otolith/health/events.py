@@ -240,18 +240,11 @@ def _raised(
     """Return a new event, not described yet, that the first to the last of ``windows`` agree on."""
     first, last = windows
     start = min(first.start, first.start if observed.since is None else observed.since)
+    evidence = EvidenceDocument(windows=(first.index, last.index))
     return EventDocument(
-        id=f"{observed.key}@{start:.1f}",
-        part=observed.part,
-        state=level,
-        change=EventChange.RAISED,
-        start=start,
-        since=start,
-        condition="",
-        text="",
-        evidence=EvidenceDocument(windows=(first.index, last.index)),
-        language=plan.language,
-    )
+        id=f"{observed.key}@{start:.1f}", part=observed.part, state=level, change=EventChange.RAISED,
+        start=start, since=start, condition="", text="", evidence=evidence, language=plan.language,
+    )  # fmt: skip
 
 
 def _persistent(level: Level, recent: Sequence[Level], persistence: Persistence) -> tuple[Level, int]:
