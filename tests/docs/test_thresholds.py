@@ -28,6 +28,7 @@ SOURCES = {
 }
 PAGES = sorted((ROOT / "docs" / "reference").glob("thresholds-*.md"))
 CODE = re.compile(r"`([^`]+)`")
+NUMBER = re.compile(r"-?\d[\d ]*(?:\.\d+)?(?:e-?\d+)?")
 
 
 def rows(page: Path) -> list[list[str]]:
@@ -57,6 +58,38 @@ def test_every_threshold_exists(page: Path) -> None:
     named = {name.rpartition(".")[2] for row in rows(page) for name in CODE.findall(row[0])}
     assert named
     assert {name for name in named if name.isupper() or "_" in name} <= known
+
+
+def values(folders: list[Path]) -> dict[str, set[float | None]]:
+    """The values of the constants of modules, by name; None stands for one that is not a plain number."""
+    known: dict[str, set[float | None]] = {}
+    for path in (path for folder in folders for path in folder.glob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if not isinstance(node, ast.Assign):
+                continue
+            target, value = node.targets[0], node.value
+            pairs = [(target, value)]
+            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+                pairs = list(zip(target.elts, value.elts, strict=True))
+            for name, number in pairs:
+                is_number = isinstance(number, ast.Constant) and isinstance(number.value, int | float)
+                known.setdefault(ast.unparse(name), set()).add(float(ast.literal_eval(number)) if is_number else None)
+    return known
+
+
+def stated(cell: str) -> set[float]:
+    """The numbers in a cell, also in a thousandth or a millionth of the unit of the code."""
+    plain = {float(text.replace(" ", "")) for text in NUMBER.findall(cell)}
+    plain |= {float(int(text, 0)) for text in re.findall(r"0[xo][0-9A-F]+", cell)}
+    return {round(scale * number, 15) for number in plain for scale in (1.0, 1e-3, 1e-6)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_threshold_has_the_value_of_the_code(page: Path) -> None:
+    known = values(SOURCES[page.stem.removeprefix("thresholds-")])
+    named = [(name.rpartition(".")[2], row[1]) for row in rows(page) for name in CODE.findall(row[0])]
+    wrong = {name: cell for name, cell in named if not known.get(name, {None}) & {None, *stated(cell)}}
+    assert wrong == {}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -6,7 +6,7 @@ Time arrives with the window and randomness with the seed. Every run is therefor
 can move between processes.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from otolith.discovery.decision import (
     with_approvals,
 )
 from otolith.discovery.hypotheses import FaultType
-from otolith.discovery.screening import screen_window
+from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
 from otolith.estimation.data_checks import CheckedWindow, FaultySensor, check_window, without_saturated
@@ -51,17 +51,8 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     posterior = state.posterior.without_expired(window.start)
     if posterior is not state.posterior:
         state = with_posterior(state, posterior)
-    posterior = state.posterior.with_steps(window)
-    predicted = posterior.predict(window)
-    checked = check_window(window, predicted)
-    if posterior is not state.posterior:
-        if checked.is_usable:
-            test = None if state.test is None else state.test.with_steps(posterior.problem.steps)
-            state = replace(state, posterior=posterior, test=test)
-        else:  # steps between faulty values are none of a converter
-            predicted = state.posterior.predict(window)
-    act = _estimate if checked.is_usable else _reject
-    result = act(state, predicted, checked)
+    state, predicted, checked = _predict_and_check(state, window)
+    result = _estimate(state, predicted, checked) if checked.is_usable else _reject(state, predicted, checked)
     result = replace(result, notes=(*checked.notes, *(sensor.text for sensor in result.faulty_sensors)))
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
@@ -70,25 +61,57 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     return _next_state(state, result, previous, health), replace(report, document=document)
 
 
+def _predict_and_check(state: AdaptationState, window: Window) -> tuple[AdaptationState, Posterior, CheckedWindow]:
+    """Return the state with the converter steps that ``window`` shows, its prediction, and the checked window.
+
+    If the data are faulty, the state keeps its steps: differences between faulty values are none of a converter.
+    """
+    posterior = state.posterior.with_steps(window)
+    predicted = posterior.predict(window)
+    checked = check_window(window, predicted)
+    if posterior is state.posterior:
+        return state, predicted, checked
+    if not checked.is_usable:
+        return state, state.posterior.predict(window), checked
+    test = None if state.test is None else state.test.with_steps(posterior.problem.steps)
+    return replace(state, posterior=posterior, test=test), predicted, checked
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _TestedEstimate:
+    """The estimate of a window, tested against its prediction."""
+
+    predicted: Posterior
+    estimated: WindowEstimate
+    innovation: Innovation
+
+    @classmethod
+    def of(cls, predicted: Posterior, window: Window, search: Search = Search.NEVER) -> "_TestedEstimate":
+        """Estimate from ``window`` under its prediction, and compare the two."""
+        estimated = estimate_window(predicted, window, search)
+        return cls(predicted, estimated, predicted.innovation(estimated.evidence))
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether the twin explains the window, and its prediction agrees with it."""
+        return self.estimated.cost <= EXPLAINED and self.innovation.is_expected
+
+
 def _estimate(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
-    """Return the result of a window whose data are usable, unless a gap leaves nothing to determine."""
+    """Return the result of a window whose data are usable, unless a gap leaves nothing to determine.
+
+    If the window is not expected because a sensor is saturated, the other samples are estimated from.
+    """
     search = Search.NEVER if some_parameter_is_determined(state.previous) else Search.FROM_BOUNDS
-    estimated = estimate_window(predicted, checked.window, search)
-    innovation = predicted.innovation(estimated.evidence)
-    clipped: tuple[FaultySensor, ...] = ()
-    if not _is_expected(innovation, estimated) and (rest := without_saturated(predicted, checked.window)) is not None:
+    tested = _TestedEstimate.of(predicted, checked.window, search)
+    saturated: tuple[FaultySensor, ...] = ()
+    if not tested.is_expected and (rest := without_saturated(predicted, checked.window)) is not None:
         window, sensor = rest
-        estimated, clipped = estimate_window(predicted, window, search), (sensor,)
-        innovation = predicted.innovation(estimated.evidence)
-    gap = unbridged_gap(estimated) if checked.window.bridge_error is not None else ""
+        tested, saturated = _TestedEstimate.of(predicted, window, search), (sensor,)
+    gap = unbridged_gap(tested.estimated) if checked.window.bridge_error is not None else ""
     if gap:
         return _reject(state, predicted, replace(checked, bad=(gap,)))
-    return replace(_decide(state, predicted, estimated, innovation), faulty_sensors=clipped)
-
-
-def _is_expected(innovation: Innovation, estimated: WindowEstimate) -> bool:
-    """Whether the twin explains the window, and its prediction agrees with it."""
-    return estimated.cost <= EXPLAINED and innovation.is_expected
+    return replace(_decide(state, tested), faulty_sensors=saturated)
 
 
 def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow) -> WindowResult:
@@ -99,98 +122,110 @@ def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow
     return replace(result, faulty_sensors=checked.faulty_sensors)
 
 
-def _decide(
-    state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, innovation: Innovation
-) -> WindowResult:
-    """Test the estimate against the prediction, and screen the window for what the twin lacks.
+def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
+    """Screen the window for what the twin lacks, and return the result of the update that follows.
 
-    An expected window without such a sign updates the filter. Otherwise, or while a test is open, hypotheses are
-    compared, and the update follows the decision.
+    A window that is expected and shows nothing that the twin lacks updates the filter. Otherwise, or while a test is
+    open, hypotheses are compared, and the update follows the decision.
     """
-    screening = screen_window(predicted, estimated, determined=some_parameter_is_determined(state.previous))
+    screening = screen_window(
+        tested.predicted, tested.estimated, determined=some_parameter_is_determined(state.previous)
+    )
     if screening.needs_threshold_test:
         screening = with_threshold_test(screening)
-    is_expected = _is_expected(innovation, estimated)
-    shifts = _shifts(state, predicted, estimated)
-    moved = shifts.moved
-    is_calm = is_expected and not screening.is_positive
-    test = None if state.test is None else continue_test(state.test, predicted, screening).with_filter(estimated.fit)
-    if test is not None and test.best.type is FaultType.NOTHING and not is_expected:
-        test = None  # the window shows something else than what opened the test
-    if test is not None:
-        if is_calm and not moved and not test.rejects_filter:
-            result = _update_filter_beside(state, innovation, estimated, test)
-        else:
-            result = _apply_decision(state, predicted, estimated, test)
-    elif is_calm:
-        if moved:
-            result = _follow_shifts(state, predicted.reset_parameters(moved), estimated)
-        else:
-            result = _update_filter(state, innovation, estimated)
+    is_calm = tested.is_expected and not screening.is_positive
+    shifts = _shifts(state, tested)
+    test = _continued_test(state, tested, screening)
+    if test is None and is_calm:
+        moved = shifts.moved
+        result = _follow_shifts(state, tested, moved) if moved else _update_filter(state, tested)
         return replace(result, shifts=shifts)
+    if test is None:
+        result = _open_test(state, tested, screening)
+    elif is_calm and not shifts.moved and not test.rejects_filter:
+        result = _update_filter_beside(state, tested, test)
     else:
-        state, test = replace(state, test=None), open_test(predicted, screening)
-        if is_expected and test.is_null_possible:
-            result = _update_filter(state, innovation, estimated)
-        else:
-            result = _apply_decision(state, predicted, estimated, test)
+        result = _apply_decision(state, tested, test)
     return replace(result, searched=True, shifts=shifts)
 
 
-def _shifts(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> ParameterCusum:
+def _continued_test(
+    state: AdaptationState, tested: _TestedEstimate, screening: ScreeningResult
+) -> SequentialTest | None:
+    """Return the open test after the window; None if there is none, or if the window shows something else."""
+    if state.test is None:
+        return None
+    test = continue_test(state.test, tested.predicted, screening).with_filter(tested.estimated.fit)
+    return None if test.best.type is FaultType.NOTHING and not tested.is_expected else test
+
+
+def _open_test(state: AdaptationState, tested: _TestedEstimate, screening: ScreeningResult) -> WindowResult:
+    """Return the result of a window that opens a test, unless it is expected and the null hypothesis is possible."""
+    state, test = replace(state, test=None), open_test(tested.predicted, screening)
+    if tested.is_expected and test.is_null_possible:
+        return _update_filter(state, tested)
+    return _apply_decision(state, tested, test)
+
+
+def _shifts(state: AdaptationState, tested: _TestedEstimate) -> ParameterCusum:
     """Return the sums of shifts after a window; estimates without trends are biased where a parameter drifts fast."""
+    estimated = tested.estimated
     if estimated.drifts:
         return state.shifts
     values = np.array([own.value for own in estimated.parameters])
     sd = np.array([own.sd for own in estimated.parameters])
-    return state.shifts.after(predicted.shifts(values, sd, estimated.fit.window.grid.length))
+    return state.shifts.after(tested.predicted.shifts(values, sd, estimated.fit.window.grid.length))
 
 
-def _apply_decision(
-    state: AdaptationState, predicted: Posterior, estimated: WindowEstimate, test: SequentialTest
-) -> WindowResult:
-    """Return the result of a window that the filter does not expect, or that shows what the twin lacks."""
+def _apply_decision(state: AdaptationState, tested: _TestedEstimate, test: SequentialTest) -> WindowResult:
+    """Return the result of a window that the filter does not expect, or that shows what the twin lacks.
+
+    ``state`` has no test if this window opened ``test``.
+    """
     test = replace(test, quiet=0, has_explained=test.has_explained or test.explains)
-    outcome = decide(test, state.learned)
+    outcome, estimated = decide(test, state.learned), tested.estimated
     if outcome.update is PosteriorUpdate.HYPOTHESIS:
         return _adopt_hypothesis(state, estimated, test, outcome)
     if outcome.update is PosteriorUpdate.NONE:
-        return _keep_posterior(state, predicted, estimated, test, outcome.decision)
+        result = WindowResult.unchanged(state, tested.predicted, outcome.decision, estimate=estimated, test=test)
+        return _with_mixture(result, state.problem) if outcome.decision in OPEN else result
     if estimated.cost > MAX_COST:  # the null hypothesis leads, but does not explain the whole window
-        return WindowResult.unchanged(state, predicted, WindowDecision.REFUSED, estimate=estimated)
+        return WindowResult.unchanged(state, tested.predicted, WindowDecision.REFUSED, estimate=estimated)
     if state.test is None:  # a change in the last records is left to the next window: nothing else was compared
-        return WindowResult.unchanged(state, predicted, WindowDecision.SUSPECTED, estimate=estimated)
-    return _update_filter(state, predicted.innovation(estimated.evidence), estimated)
+        return WindowResult.unchanged(state, tested.predicted, WindowDecision.SUSPECTED, estimate=estimated)
+    return _update_filter(state, tested)
 
 
-def _update_filter_beside(
-    state: AdaptationState, innovation: Innovation, estimated: WindowEstimate, test: SequentialTest
-) -> WindowResult:
+def _update_filter_beside(state: AdaptationState, tested: _TestedEstimate, test: SequentialTest) -> WindowResult:
     """Update the filter with a window that shows nothing of what opened the test.
 
     The window that opened it may have been wrong, so that the filter goes on. But windows of a machine at rest are no
     evidence against its hypotheses: it is closed only when windows are decisive evidence for the filter. Until then the
     filter is one of the hypotheses. Hypotheses that explain no window have no evidence to lose.
     """
-    result = _update_filter(state, innovation, estimated)
+    result = _update_filter(state, tested)
     if test.accepts_filter or test.best.type is FaultType.NOTHING or not test.has_explained:
         return result
     return _with_mixture(replace(result, test=replace(test, quiet=test.quiet + 1)), state.problem)
 
 
-def _update_filter(state: AdaptationState, innovation: Innovation, estimated: WindowEstimate) -> WindowResult:
+def _update_filter(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
     """Return the result of a window that updates the filter; a faded component that it does not need is removed."""
+    innovation, estimated = tested.innovation, tested.estimated
     if state.test is not None and state.test.quiet == 0:  # the windows before were wrong for an unknown reason
         innovation = innovation.inflate_variance(state.test.null_reduced_chi_square)
-    posterior, before = state.posterior.update(innovation, estimated.advance), estimated.fit.prior
+    posterior, before = tested.predicted.update(innovation, estimated.advance), estimated.fit.prior
     result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), (), estimate=estimated)
     return _without_faded(state, result, estimated) if state.adopted else result
 
 
-def _follow_shifts(state: AdaptationState, predicted: Posterior, estimated: WindowEstimate) -> WindowResult:
-    """Return the result of a window that, with those before, shows a change; ``predicted`` forgets what has moved."""
-    again = estimate_window(predicted, estimated.fit.window)
-    result = _update_filter(state, predicted.innovation(again.evidence), again)
+def _follow_shifts(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:
+    """Return the result of a window that, with those before, shows a change of the parameters at ``moved``.
+
+    What was known of them is replaced by the initial prior.
+    """
+    again = _TestedEstimate.of(tested.predicted.reset_parameters(moved), tested.estimated.fit.window)
+    result = _update_filter(state, again)
     if result.decision is WindowDecision.FADED:
         return result
     return replace(result, decision=WindowDecision.STEPPED, before=result.after)
@@ -222,27 +257,12 @@ def _adopt_hypothesis(
 
 
 def _replace_posterior(
-    decision: WindowDecision,
-    posterior: Posterior,
-    estimated: WindowEstimate,
-    adopted: tuple[AdoptedComponent, ...],
+    decision: WindowDecision, posterior: Posterior, estimated: WindowEstimate, adopted: tuple[AdoptedComponent, ...]
 ) -> WindowResult:
     """Return the result with another posterior, and the window estimated again under it."""
     problem, prior = posterior.problem, posterior.prior()
     again = estimate(problem, estimated.fit.window, prior, posterior.start())
     return WindowResult(decision, posterior, prior, prior, keep_present(adopted, problem.components), estimate=again)
-
-
-def _keep_posterior(
-    state: AdaptationState,
-    predicted: Posterior,
-    estimated: WindowEstimate,
-    test: SequentialTest,
-    decision: WindowDecision,
-) -> WindowResult:
-    """Return the result of a window that leaves the test open: the posterior stays, the mixture is published."""
-    result = WindowResult.unchanged(state, predicted, decision, estimate=estimated, test=test)
-    return _with_mixture(result, state.problem) if decision in OPEN else result
 
 
 def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:

@@ -371,43 +371,46 @@ def _findings(
 
     ``undecided`` is the test if it is still open, and ``experiment`` what would decide it.
     """
-    decision = result.decision
     findings = [
         _component_finding(component)
         for component in components
         if component.approval is Approval.OPEN and component.status is ComponentStatus.ADOPTED
     ]
     if noisier_since is not None:
-        noisier = describe_noise(result.posterior.problem)
-        findings.append(
-            FindingDocument(
-                id="noise",
-                kind=FindingKind.NOISE,
-                severity=Severity.WARNING,
-                condition=NOISE_CONDITION,
-                text=noisier,
-                since=noisier_since,
-                advice=NOISE_ADVICE,
-            )
-        )
+        findings.append(_noise_finding(result.posterior.problem, noisier_since))
     if undecided is not None and undecided.best.type is not FaultType.NOTHING:
-        kind, subject = _kind_and_subject(decision, undecided)
-        stated = f"{undecided.best.type}: " if undecided.explains else ""
-        condition = AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION
-        findings.append(
-            FindingDocument(
-                id=f"{kind}/{subject}" if subject else "undecided",
-                kind=kind,
-                subject=subject,
-                severity=Severity.FAULT if decision in DATA_FAULTS else Severity.WARNING,
-                condition=condition if undecided.explains else NOT_EXPLAINED,
-                text=stated + _hypotheses_text(undecided),
-                since=undecided.onset,
-                advice="; ".join(filter(None, (experiment, _machine_file_advice(undecided)))),
-                value=_moved_value(undecided, subject) if kind is FindingKind.MOVED else None,
-            )
-        )
+        findings.append(_open_finding(undecided, result.decision, experiment))
     return tuple(findings)
+
+
+def _noise_finding(problem: Problem, since: float) -> FindingDocument:
+    return FindingDocument(
+        id="noise",
+        kind=FindingKind.NOISE,
+        severity=Severity.WARNING,
+        condition=NOISE_CONDITION,
+        text=describe_noise(problem),
+        since=since,
+        advice=NOISE_ADVICE,
+    )
+
+
+def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: str) -> FindingDocument:
+    """Return the finding of a test that is still open after ``decision``."""
+    kind, subject = _kind_and_subject(decision, test)
+    stated = f"{test.best.type}: " if test.explains else ""
+    condition = AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION
+    return FindingDocument(
+        id=f"{kind}/{subject}" if subject else "undecided",
+        kind=kind,
+        subject=subject,
+        severity=Severity.FAULT if decision in DATA_FAULTS else Severity.WARNING,
+        condition=condition if test.explains else NOT_EXPLAINED,
+        text=stated + _hypotheses_text(test),
+        since=test.onset,
+        advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),
+        value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,
+    )
 
 
 def _share(probability: float) -> str:

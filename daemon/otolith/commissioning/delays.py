@@ -113,10 +113,7 @@ def identify_delays(
 
 
 def identify_delays_and_noise(
-    problem: Problem,
-    windows: Sequence[Window],
-    declared: Mapping[str, float],
-    progress: Progress = lambda _: None,
+    problem: Problem, windows: Sequence[Window], declared: Mapping[str, float], progress: Progress = lambda _: None
 ) -> tuple[IdentifiedDelays, IdentifiedNoise]:
     """Return the delays as :func:`identify_delays`, and the noise levels of windows without them.
 
@@ -262,7 +259,7 @@ class _Search:
         return refined, [*active, added]
 
     def _simplified(self, point: _Point, active: list[int]) -> tuple[_Point, list[int]]:
-        """Return the same against the signal for which the fewest others have a significant delay.
+        """Return the delays against the signal for which the fewest others have a significant one, if that is fewer.
 
         What three of four signals have in common is a delay of the fourth. A delay that no longer exceeds its
         uncertainty is dropped, as it would not be added.
@@ -271,14 +268,16 @@ class _Search:
         with np.errstate(divide="ignore", invalid="ignore"):
             differences = point.delays - point.delays[:, None]
             significant = (differences != 0.0) & ~(differences**2 <= self._threshold * variances)
-        least = min(range(len(self.names)), key=lambda index: (significant[index].sum(), index in active))
-        fewer = np.flatnonzero(significant[least]).tolist()
+        reference = min(range(len(self.names)), key=lambda index: (significant[index].sum(), index in active))
+        fewer = np.flatnonzero(significant[reference]).tolist()
         if len(fewer) >= len(active):
             return point, active
-        delays = np.where(significant[least], differences[least], 0.0)
+        delays = np.where(significant[reference], differences[reference], 0.0)
         simple = self._refined(self._again(point, delays), fewer)
-        is_subset = least not in active
-        return (simple, fewer) if is_subset or simple.deviance - point.deviance <= self._threshold else (point, active)
+        only_drops = reference not in active  # delays that are not significant
+        if only_drops or simple.deviance - point.deviance <= self._threshold:
+            return simple, fewer
+        return point, active
 
     def _variances(self, point: _Point, active: list[int]) -> Array:
         """Return the variances (signals, signals) of the differences between two delays; zero if both are given."""

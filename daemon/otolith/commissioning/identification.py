@@ -226,34 +226,46 @@ class _ConsistentLevels:
 def _without_outlying(
     guess: _InitialGuess, best: LikelihoodPoint, progress: Progress
 ) -> tuple[_InitialGuess, LikelihoodPoint, _ConsistentLevels]:
-    """The same without the few windows that no noise of the others explains, and what :func:`_make_consistent` returns.
+    """Return the arguments without the few windows that no noise of the others explains, and their consistent levels.
 
-    One window in which the machine sticks, or somebody touches it, would otherwise be explained by process noise that
-    hides what the other windows show.
+    One window in which the machine sticks, or somebody touches it, would otherwise be explained by process noise. That
+    noise would be too large for the other windows.
     """
-    likelihood, outlying = guess.variances.likelihood, list[FittedWindow]()
+    width, starts = guess.variances.likelihood.width, list[float]()
     made = _make_consistent(guess, best, progress)
     limit = int(MAX_OUTLYING_SHARE * len(guess.fits))
-    while len(outlying) < limit:
-        scores = [outlyingness(best.fits, index, likelihood.width) for index in range(len(best.fits))]
+    while len(starts) < limit:
+        scores = [outlyingness(best.fits, index, width) for index in range(len(best.fits))]
         index = int(np.argmax(scores))
         if made.consistency.factor == 1.0 and scores[index] < OUTLYING:
             break
-        first = [*guess.fits[:index], *guess.fits[index + 1 :]]
-        progress(f"without the window at {best.fits[index].window.start:g} s")
-        # From the first fits, as those at levels that this window has spoilt may be at another minimum.
-        others = backward_elimination(guess.variances, first, progress)
-        made_of_others = _make_consistent(guess, others, progress)
-        fits = likelihood.refit(made_of_others.levels, [best.fits[index], *others.fits])
-        if outlyingness(fits, 0, likelihood.width) < OUTLYING:
+        start = best.fits[index].window.start
+        progress(f"without the window at {start:g} s")
+        trial = _without_window(guess, best, index, progress)
+        if trial is None:
             break
-        outlying.append(fits[0])
-        guess, best, made = replace(guess, fits=first), others, made_of_others
-    if outlying:
-        starts = ", ".join(f"{round(start, 6) + 0.0:g} s" for start in sorted(fit.window.start for fit in outlying))
-        remark = EXCLUDED_OUTLYING.format(len(outlying), len(outlying) + len(guess.fits), starts)
+        guess, best, made = trial
+        starts.append(start)
+    if starts:
+        times = ", ".join(f"{round(start, 6) + 0.0:g} s" for start in sorted(starts))
+        remark = EXCLUDED_OUTLYING.format(len(starts), len(starts) + len(guess.fits), times)
         guess = replace(guess, remarks=(*guess.remarks, remark))
     return guess, best, made
+
+
+def _without_window(
+    guess: _InitialGuess, best: LikelihoodPoint, index: int, progress: Progress
+) -> tuple[_InitialGuess, LikelihoodPoint, _ConsistentLevels] | None:
+    """Return what the other windows give without window ``index``; None if their noise explains it as well."""
+    likelihood = guess.variances.likelihood
+    # From the first fits, as those at levels that this window made too large may be at another minimum.
+    first = [*guess.fits[:index], *guess.fits[index + 1 :]]
+    others = backward_elimination(guess.variances, first, progress)
+    made = _make_consistent(guess, others, progress)
+    fits = likelihood.refit(made.levels, [best.fits[index], *others.fits])
+    if outlyingness(fits, 0, likelihood.width) < OUTLYING:
+        return None
+    return replace(guess, fits=first), others, made
 
 
 def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Progress) -> _ConsistentLevels:

@@ -73,6 +73,8 @@ class PooledResponse(ProjectedResponse):
 
     def __init__(self, fits: Sequence[Fit]) -> None:
         """``fits`` are linearised at the same parameters."""
+        from scipy.linalg import block_diag  # noqa: PLC0415 - only noise identification needs SciPy
+
         self.parts = [LinearResponse(fitted) for fitted in fits]
         first = self.parts[0]
         self.problem, self.window, self.objective = first.problem, first.window, first.objective
@@ -80,24 +82,18 @@ class PooledResponse(ProjectedResponse):
         self.count = sum(part.count for part in self.parts)
         self.ends = np.cumsum([fitted.objective.measured.size for fitted in fits])
         """(windows,) rows of the residual at which the windows end."""
-        free, rows = len(first.problem.free), int(self.ends[-1])
-        states = [fitted.result.first[2][: -len(fitted.prior.mean), 2 * free :] for fitted in fits]
-        residuals = [fitted.result.first[1][: -len(fitted.prior.mean)] for fitted in fits]
-        shared = [fitted.result.first[2][: -len(fitted.prior.mean), :free] for fitted in fits]
-        own = [orthonormal_basis(slopes) for slopes in states]
-        self._basis = np.zeros((rows, sum(basis.shape[1] for basis in own)))
-        column = 0
-        for end, basis in zip(self.ends, own, strict=True):
-            self._basis[end - len(basis) : end, column : column + basis.shape[1]] = basis
-            column += basis.shape[1]
-        self._remainder = np.concatenate(residuals)
-        self._remainder = self._remainder - self._basis @ (self._basis.T @ self._remainder)
-        self._states, self._start = self._basis, fits[0].parameters
-        self._parameters, self._components = self._without_states(np.vstack(shared)), np.zeros((rows, 0))
-        self._innovations = self._remainder
-        self.explain(np.vstack(shared))
+        free, rows = len(first.problem.free), list(map(_rows_of_window, fits))
+        self._start = fits[0].parameters
+        self._states: Array = block_diag(*(orthonormal_basis(jacobian[:, 2 * free :]) for _, jacobian in rows))
+        self._innovations = self._without_states(np.concatenate([residuals for residuals, _ in rows]))
+        by_parameters = np.vstack([jacobian[:, :free] for _, jacobian in rows])
+        self._parameters = self._without_states(by_parameters)
+        self._components = np.zeros((len(self._innovations), 0))
+        self._basis, self._remainder = self._states, self._innovations
+        self.explain(by_parameters)
 
     def _without_states(self, columns: Array) -> Array:
+        """Return ``columns`` (residuals, ...) without what the initial states of the windows explain."""
         return columns - self._states @ (self._states.T @ columns)
 
     def is_within_bounds(self, guess: ScoredGuess) -> bool:
@@ -212,6 +208,13 @@ class PooledResponse(ProjectedResponse):
         return products / np.maximum(information, np.finfo(float).tiny), information
 
 
+def _rows_of_window(fitted: Fit) -> tuple[Array, Array]:
+    """Return residuals and Jacobian at the start of a fit, without the rows of the prior."""
+    _, residuals, jacobian = fitted.result.first
+    count = len(residuals) - len(fitted.prior.mean)
+    return residuals[:count], jacobian[:count]
+
+
 def remaining_structure(
     problem: Problem, noise: IdentifiedNoise, windows: Sequence[Window], progress: Progress = lambda _: None
 ) -> list[Structure]:
@@ -230,15 +233,24 @@ def remaining_structure(
     fits = [one for one in fits if one.cost <= EXPLAINED]
     if len(fits) < MIN_WINDOWS:
         return []
-    problem = with_levels(problem, levels)
     progress("structure of all windows")
-    pooled = PooledResponse(_at_common_parameters(problem, fits, likelihood.width))
+    pooled = PooledResponse(_at_common_parameters(with_levels(problem, levels), fits, likelihood.width))
+    return _structures(pooled, _pooled_forms(pooled))
+
+
+def _pooled_forms(pooled: PooledResponse) -> list[CandidateForm]:
+    """Return the forms that windows at different times show alike."""
+    # Not-a-number between two windows: no change of a source from record to record spans them.
     separated = np.hstack([np.pad(part.x, ((0, 0), (0, 1)), constant_values=np.nan) for part in pooled.parts])
-    alike = (form for form in allowed_forms(problem, separated) if _is_alike(problem, form))
-    allowed = [form for form in map(pooled.with_cycles, alike) if form.bounds[0] <= form.bounds[1]]
+    alike = (form for form in allowed_forms(pooled.problem, separated) if _is_alike(pooled.problem, form))
+    return [form for form in map(pooled.with_cycles, alike) if form.bounds[0] <= form.bounds[1]]
+
+
+def _structures(pooled: PooledResponse, allowed: list[CandidateForm]) -> list[Structure]:
+    """Return the structures, one at a time: each is projected out before the next one is searched for."""
     structures: list[Structure] = []
     while len(structures) < MAX_COMPONENTS:
-        guesses = best_guesses(pooled, allowed, CompetingForms.among(problem, allowed))
+        guesses = best_guesses(pooled, allowed, CompetingForms.among(pooled.problem, allowed))
         best = max((guess.score for guess in guesses), default=0.0)
         threshold = max(DECISIVE, MIN_SHARE * best)
         likely = [guess for guess in guesses if guess.score > threshold and guess.is_readable]
@@ -287,36 +299,44 @@ def _is_alike(problem: Problem, form: CandidateForm) -> bool:
 
 def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, CandidateForm] | None:
     """Return the structure of a guess, which is then projected out, or None if the windows do not agree on it."""
-    from scipy.special import stdtrit  # noqa: PLC0415 - only noise identification needs SciPy
-
-    form = guess.form
-    values, information = pooled.amplitudes_of_windows((form, guess.inner), guess.amplitudes)
-    shares = information / information.sum()
-    mean = float(shares @ values)
-    sd = float(np.sqrt((shares**2 * (values - mean) ** 2).sum()))
-    effective = 1.0 / float((shares**2).sum())
-    if pooled.is_restarted(form) and not pooled.stands_out((form, guess.inner)):
-        return None
-    if effective <= 2.0 or abs(mean) < sd * float(stdtrit(effective - 1.0, 1.0 - SIGNIFICANCE)):
+    form, inner = guess.form, guess.inner
+    is_restarted, periodic = pooled.is_restarted(form), len(form.model.phases) > 1
+    sd = _amplitude_sd(*pooled.amplitudes_of_windows((form, inner), guess.amplitudes))
+    if sd is None or (is_restarted and not pooled.stands_out((form, inner))):
         return None
     pooled.add_component(pooled.columns(guess))
-    first, second = guess.amplitudes
-    periodic = len(form.model.phases) > 1
+    first, second = map(float, guess.amplitudes)
     twin = pooled.problem.base_model
     component = Component(
         sites(twin)[form.site].name,
         form.model.name,
         sources(twin)[form.source].name,
-        float(np.hypot(first, second)) if periodic else float(first),
-        guess.inner,
+        float(np.hypot(first, second)) if periodic else first,
+        inner,
         float(np.arctan2(second, first)) if periodic else 0.0,
         *form.bounds,
         origin=pooled.window.start,
     )
-    span = float(np.ptp(pooled.parts[0].x[form.source] if pooled.is_restarted(form) else pooled.x[form.source]))
-    inner_sd = np.sqrt(12.0 / max(guess.score, 1.0)) / span if periodic else UNCERTAIN_SHAPE * guess.inner
-    at_bound = not periodic and form.model.inner is not None and _is_at_bound(guess.inner, form.bounds)
-    return Structure(component, sd, float(inner_sd), guess.score, pooled.is_restarted(form), at_bound), form
+    span = float(np.ptp(pooled.parts[0].x[form.source] if is_restarted else pooled.x[form.source]))
+    inner_sd = np.sqrt(12.0 / max(guess.score, 1.0)) / span if periodic else UNCERTAIN_SHAPE * inner
+    at_bound = not periodic and form.model.inner is not None and _is_at_bound(inner, form.bounds)
+    return Structure(component, sd, float(inner_sd), guess.score, is_restarted, at_bound), form
+
+
+def _amplitude_sd(values: Array, information: Array) -> float | None:
+    """Return the standard deviation of the weighted mean of the amplitudes ``values`` (windows,), from their scatter.
+
+    None if the mean is not significant by Student's t test: the windows do not agree on an amplitude.
+    """
+    from scipy.special import stdtrit  # noqa: PLC0415 - only noise identification needs SciPy
+
+    shares = information / information.sum()
+    mean = float(shares @ values)
+    sd = float(np.sqrt((shares**2 * (values - mean) ** 2).sum()))
+    effective = 1.0 / float((shares**2).sum())  # number of windows
+    if effective <= 2.0 or abs(mean) < sd * float(stdtrit(effective - 1.0, 1.0 - SIGNIFICANCE)):
+        return None
+    return sd
 
 
 def _is_at_bound(value: float, bounds: tuple[float, float]) -> bool:

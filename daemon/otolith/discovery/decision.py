@@ -66,7 +66,7 @@ UPDATES = {
     WindowDecision.REFUSED: PosteriorUpdate.NONE,
 }
 DATA_FAULTS = {FaultType.SENSOR: (WindowDecision.SENSOR, 0), FaultType.TIMING: (WindowDecision.TIMING, TIMING_WINDOWS)}
-"""For each type of hypothesis that blames the data: its decision, and how many windows must agree."""
+"""For each type of hypothesis about faulty data: its decision, and how many windows must agree."""
 ACCEPTED = frozenset(decision for decision, update in UPDATES.items() if update is not PosteriorUpdate.NONE)
 
 
@@ -107,16 +107,16 @@ def decide(test: SequentialTest, learned: int) -> WindowOutcome:
 def _data_fault_or_component(test: SequentialTest, *, is_young: bool) -> WindowOutcome:
     """Return the decision where neither parameters nor noise are accepted.
 
-    While the machine ``is_young``, its sensors are as little known as its components.
+    If ``is_young``, few windows have updated the filter, and sensors are as little known as components.
     """
     best = test.best
     for kind, (decision, windows) in DATA_FAULTS.items():
-        if not test.explains:  # the cause may be one that is not among the hypotheses: no sensor is blamed for it
+        if not test.explains:  # the cause may be none of the hypotheses
             break
         needed = COMPONENT_WINDOWS if is_young and kind is FaultType.SENSOR else windows
         if test.probability(kind) >= DATA_FAULT_PROBABILITY and test.leading >= needed:
-            blamed = next(item for item in test.hypotheses if item.type is kind)
-            return WindowOutcome(WindowDecision.SUSPECTED if _is_below_noise(blamed) else decision, blamed)
+            accepted = next(item for item in test.hypotheses if item.type is kind)
+            return WindowOutcome(WindowDecision.SUSPECTED if _is_below_noise(accepted) else decision, accepted)
     leads = best.type is FaultType.COMPONENT and test.leading >= COMPONENT_WINDOWS
     probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY
     alone = test.windows >= MAX_OPEN_WINDOWS or not test.alternatives(best)

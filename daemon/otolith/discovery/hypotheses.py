@@ -133,25 +133,23 @@ def with_candidate(
     base: Problem, prior: Prior, candidate: Candidate, before: FittedHypothesis | None = None
 ) -> Proposal:
     """Return the hypothesis of ``base`` with one more component; ``before`` is a fit of ``base`` to start from."""
-    wider = augment(base, [candidate.component])
-    extended = extend_prior(prior, base, wider)
-    start = extended.mean.copy()
-    if before is not None:
-        order = [parameter.name for parameter in wider.free]
-        for value, parameter in zip(before.fit.parameters, base.free, strict=True):
-            start[order.index(parameter.name)] = value
-    added = len(wider.free) - len(base.free) + (0 if before is None else before.hypothesis.added)
-    alternatives = candidate.competing * (1.0 if before is None else before.hypothesis.alternatives)
     kind = FaultType.SENSOR if candidate.of_sensor else FaultType.COMPONENT
-    stated = FaultHypothesis(kind, _names(wider), added, alternatives)
-    return Proposal(stated, wider, extended, start)
+    alone = with_components(base, prior, [candidate.component], candidate.competing, kind)
+    if before is None:
+        return alone
+    start, order = alone.start.copy(), [parameter.name for parameter in alone.problem.free]
+    for value, parameter in zip(before.fit.parameters, base.free, strict=True):
+        start[order.index(parameter.name)] = value
+    own, others = alone.hypothesis, before.hypothesis
+    both = replace(own, added=own.added + others.added, alternatives=own.alternatives * others.alternatives)
+    return replace(alone, hypothesis=both, start=start)
 
 
 def is_possible(problem: Problem, values: Array) -> bool:
     """Whether the components of ``problem`` lie within their physical ranges where the free parameters are ``values``.
 
-    At the end of its range a component stands for something else. Beside dry friction, a hump at rest that is as narrow
-    as its range allows stands for how the friction rounds off.
+    A component at a bound of its range describes another effect. Beside dry friction, a hump at rest that is as narrow
+    as its range allows describes only how the friction is rounded off.
     """
     friction = {(item.site, item.source) for item in problem.components if item.model.threshold_like}
     for slot, component in enumerate(problem.components):
@@ -164,11 +162,13 @@ def is_possible(problem: Problem, values: Array) -> bool:
     return True
 
 
-def with_components(base: Problem, prior: Prior, components: Sequence[Component], alternatives: float) -> Proposal:
-    """Return the hypothesis of ``base`` with several more components of the machine, all at once."""
+def with_components(
+    base: Problem, prior: Prior, components: Sequence[Component], alternatives: float, kind: FaultType
+) -> Proposal:
+    """Return the hypothesis of ``base`` with several more components, all at once."""
     wider = augment(base, components)
     extended = extend_prior(prior, base, wider)
-    stated = FaultHypothesis(FaultType.COMPONENT, _names(wider), len(wider.free) - len(base.free), alternatives)
+    stated = FaultHypothesis(kind, _names(wider), len(wider.free) - len(base.free), alternatives)
     return Proposal(stated, wider, extended, extended.mean)
 
 
@@ -322,20 +322,19 @@ class DelayScore:
 
 def delay_score(fitted: Fit, signal: str) -> DelayScore:
     """Return the step of the delay of ``signal``, with what parameters, trends and initial state explain left out."""
-    twin, free, guess = fitted.problem.base_model, len(fitted.problem.free), fitted.result.guess
-    column = delay_response(fitted.objective, np.concatenate([guess[:free], guess[2 * free :]]))[
-        :, delayable(twin).index(signal)
-    ]
+    free, index = len(fitted.problem.free), delayable(fitted.problem.base_model).index(signal)
     jacobian, residuals = fitted.result.jacobian, fitted.result.residuals
-    whole = np.concatenate([column, np.zeros(len(residuals) - len(column))])
+    of_window = delay_response(fitted.objective, fitted.guess)[:, index]
+    response = np.concatenate([of_window, np.zeros(len(residuals) - len(of_window))])  # that of the prior is zero
     basis = orthonormal_basis(jacobian)
-    left = whole - basis @ (basis.T @ whole)
-    size = float(left @ left)
-    if size <= MIN_DELAY_SHARE * float(whole @ whole):
+    projected = response - basis @ (basis.T @ response)
+    size = float(projected @ projected)
+    if size <= MIN_DELAY_SHARE * float(response @ response):
         return DelayScore(0.0, 0.0, (0.0,) * free)
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
-    shift = -np.linalg.lstsq(jacobian / scale, whole, rcond=None)[0] / scale
-    return DelayScore(-float(left @ residuals) / size, size / max(fitted.cost, 1.0) ** 2, tuple(shift[:free].tolist()))
+    shift = -np.linalg.lstsq(jacobian / scale, response, rcond=None)[0] / scale
+    step, information = -float(projected @ residuals) / size, size / max(fitted.cost, 1.0) ** 2
+    return DelayScore(step, information, tuple(shift[:free].tolist()))
 
 
 def complexity_penalty(predicted: Posterior, evidence: Evidence) -> float:

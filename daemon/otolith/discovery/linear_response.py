@@ -129,28 +129,29 @@ class ProjectedResponse(ABC):
     def score_responses(self, responses: Array, pairs: Array) -> ScoreStatistics:
         """Return the statistics of ``responses`` (residuals, curves).
 
-        ``pairs`` (guesses, 2) holds the two curves of each guess, or its one curve twice. The amplitudes solve the
-        normal equations of one or two curves after projection.
+        ``pairs`` (guesses, 2) holds the two curves of each guess, or its one curve twice. The amplitudes a solve the
+        normal equations N a = b of one or two curves after projection, and the gain is bᵀ a.
         """
         with np.errstate(all="ignore"):
-            along = self._remainder @ responses
-            shared = self._basis.T @ responses
+            products = self._remainder @ responses  # b of each curve
+            in_basis = self._basis.T @ responses
             whole = np.einsum("rc,rc->c", responses, responses)
-            own = whole - np.einsum("bc,bc->c", shared, shared)
-            own = np.where(own > MIN_REMAINDER * whole, own, np.inf)
+            squares = whole - np.einsum("bc,bc->c", in_basis, in_basis)  # diagonal of N
+            squares = np.where(squares > MIN_REMAINDER * whole, squares, np.inf)
             first, second = pairs.T
             single = first == second
-            cross = np.zeros(len(pairs))
             one, two = first[~single], second[~single]
+            cross = np.zeros(len(pairs))  # off the diagonal of N
             cross[~single] = np.einsum("rg,rg->g", responses[:, one], responses[:, two])
-            cross[~single] -= np.einsum("bg,bg->g", shared[:, one], shared[:, two])
-            other = np.where(single, np.inf, own[second])
-            independence = 1.0 - cross**2 / (own[first] * other)
-            one = (along[first] - cross / other * along[second]) / (own[first] * independence)
-            two = np.where(single, 0.0, (along[second] - cross / own[first] * along[first]) / (other * independence))
-            gain = one * along[first] + two * along[second]
-        valid = np.isfinite(gain) & np.isfinite(one) & np.isfinite(two) & (independence > MIN_INDEPENDENCE)
-        amplitudes = np.where(valid[:, None], np.column_stack([one, two]), 0.0)
+            cross[~single] -= np.einsum("bg,bg->g", in_basis[:, one], in_basis[:, two])
+            n_11, n_22 = squares[first], np.where(single, np.inf, squares[second])
+            b_1, b_2 = products[first], products[second]
+            independence = 1.0 - cross**2 / (n_11 * n_22)
+            a_1 = (b_1 - cross / n_22 * b_2) / (n_11 * independence)
+            a_2 = np.where(single, 0.0, (b_2 - cross / n_11 * b_1) / (n_22 * independence))
+            gain = a_1 * b_1 + a_2 * b_2
+        valid = np.isfinite(gain) & np.isfinite(a_1) & np.isfinite(a_2) & (independence > MIN_INDEPENDENCE)
+        amplitudes = np.where(valid[:, None], np.column_stack([a_1, a_2]), 0.0)
         return ScoreStatistics(np.where(valid, gain, 0.0), amplitudes)
 
 
@@ -161,7 +162,8 @@ class LinearResponse(ProjectedResponse):
         """Linearise where ``fitted`` started."""
         self.problem, self.window, self.objective = fitted.problem, fitted.window, fitted.objective
         self.count = self.objective.count
-        self._guess, residuals, jacobian = fitted.result.first
+        start, residuals, jacobian = fitted.result.first
+        self._guess = self.objective.without_trends(start)
         self._project(residuals, jacobian, len(residuals) - len(fitted.prior.mean))
         self._linearise_slots()
 
@@ -178,8 +180,9 @@ class LinearResponse(ProjectedResponse):
         free, objective = len(self.problem.free), self.objective
         slotted = augmented_model(self.problem.base_model)
         self._kernel = kernel_of(slotted)
-        values, states = objective.parameters(self._guess[None, :free])[0], self._guess[2 * free :]
-        parameters, initial = _padded(values, len(slotted.parameters)), _padded(states, len(slotted.states))
+        values, states = objective.parameters(self._guess[None])[0], self._guess[free:]
+        parameters = np.pad(values, (0, len(slotted.parameters) - len(values)))
+        initial = np.pad(states, (0, len(slotted.states) - len(states)))
         gain = np.zeros((self.window.records, len(initial), len(self.problem.base_model.outputs)))
         gain[:, : len(states)] = objective.innovation_model.gain
         excitation = replace(objective.excitation, inputs=input_matrix(slotted, self.window), gain=gain)
@@ -208,9 +211,7 @@ class LinearResponse(ProjectedResponse):
     @cached_property
     def _predicted(self) -> Array:
         """(records, outputs): the prediction at the guess."""
-        free = len(self.problem.free)
-        constant = np.concatenate([self._guess[:free], self._guess[2 * free :]])
-        predicted: Array = self.objective.predict(constant[None])[0]
+        predicted: Array = self.objective.predict(self._guess[None])[0]
         return predicted
 
     def _input(self, index: int, values: Array) -> Array:
@@ -233,10 +234,10 @@ class LinearResponse(ProjectedResponse):
             sums = self._kernel.fourier_sums(self.x[source], columns, float(frequencies[0]), width, len(frequencies))
             sums = sums.reshape(-1, machine_sites, count)  # the real part is that of a cosine, the imaginary of a sine
             sums /= np.abs(sums[:, :, 1:]).max(axis=2, keepdims=True)  # gains are the same; no square overflows
-            along, probes = sums[:, :, 0], sums[:, :, 1:]
-            size = (probes.real**2 + probes.imag**2).mean(axis=2)
-            skew = (probes**2).mean(axis=2)
-            gains = 2.0 * (size * np.abs(along) ** 2 - (skew.conj() * along**2).real) / (size**2 - np.abs(skew) ** 2)
+            b, probes = sums[:, :, 0], sums[:, :, 1:]
+            size = (probes.real**2 + probes.imag**2).mean(axis=2)  # trace of S
+            skew = (probes**2).mean(axis=2)  # S₁₁ - S₂₂ + 2i·S₁₂
+            gains = 2.0 * (size * np.abs(b) ** 2 - (skew.conj() * b**2).real) / (size**2 - np.abs(skew) ** 2)  # bᵀS⁻¹b
         return np.where(np.isfinite(gains), gains, 0.0).T
 
     def estimated_gains_of(self, shapes: list[Shape]) -> Array:
@@ -249,8 +250,8 @@ class LinearResponse(ProjectedResponse):
             families, source_indices, inners, phases = _columns(shapes)
             curves = self._kernel.curves(families, self.x, source_indices, inners, phases)
             products = np.tensordot(curves, signals, axes=(0, 0))
-            along, probes = products[..., 0], products[..., 1:]
-            gains = PROBES * along**2 / np.einsum("csp,csp->cs", probes, probes)
+            b, probes = products[..., 0], products[..., 1:]
+            gains = PROBES * b**2 / np.einsum("csp,csp->cs", probes, probes)
         return np.where(np.isfinite(gains), gains, 0.0)
 
     @cached_property
@@ -275,9 +276,8 @@ class LinearResponse(ProjectedResponse):
 
     def score_delays(self) -> ScoreStatistics:
         """Return by how much χ² falls if each output, then each input, is late alone; amplitudes are in seconds."""
-        free, twin = len(self.problem.free), self.problem.base_model
-        guess = np.concatenate([self._guess[:free], self._guess[2 * free :]])
-        columns = -delay_response(self.objective, guess)[:, : len(twin.outputs) + len(twin.inputs)]
+        twin = self.problem.base_model
+        columns = -delay_response(self.objective, self._guess)[:, : len(twin.outputs) + len(twin.inputs)]
         one = np.arange(columns.shape[1])
         return self.score_responses(columns, np.column_stack([one, one]))
 
@@ -292,7 +292,7 @@ class LinearResponse(ProjectedResponse):
             step = (parameters.T @ responses) * amplitudes / (size**2)[:, None]
             difference = (1.0 - cosine**2) * (response_size * amplitudes) ** 2
         order = [parameter.name for parameter in self.problem.twin.parameters]
-        values = self.objective.parameters(self._guess[None, : len(self.problem.free)])[0]
+        values = self.objective.parameters(self._guess[None])[0]
         now = values[[order.index(name) for name in names]][:, None]
         low = np.array([[parameter.low] for parameter in parameters_of_twin])
         high = np.array([[parameter.high] for parameter in parameters_of_twin])
@@ -302,7 +302,7 @@ class LinearResponse(ProjectedResponse):
     @property
     def parameters(self) -> dict[str, float]:
         """The values of the twin's parameters around which it is linearised."""
-        values = self.objective.parameters(self._guess[None, : len(self.problem.free)])[0]
+        values = self.objective.parameters(self._guess[None])[0]
         return dict(zip((parameter.name for parameter in self.problem.twin.parameters), values.tolist(), strict=True))
 
     def responses(self, curves: BasisFunctions) -> Array:
@@ -314,9 +314,8 @@ class LinearResponse(ProjectedResponse):
     def _parameter_responses(self, names: list[str]) -> Array:
         """Return how each parameter changes the whitened innovations (residuals, parameters)."""
         objective, order = self.objective, [parameter.name for parameter in self.problem.twin.parameters]
-        free = len(self.problem.free)
-        parameters = objective.parameters(self._guess[None, :free])[0]
-        wanted, initial = [order.index(name) for name in names], self._guess[2 * free :]
+        parameters = objective.parameters(self._guess[None])[0]
+        wanted, initial = [order.index(name) for name in names], self._guess[objective.free :]
         slopes = objective.kernel.sensitivities(parameters, initial, objective.excitation, wanted).slopes
         columns = np.where(objective.present[..., None], slopes, 0.0)
         return np.asarray(np.matmul(objective.whitening, columns).reshape(-1, len(names)))
@@ -326,12 +325,6 @@ def chi_square_of_parameters(fitted: Fit) -> float:
     """Return χ² that parameters, trends and initial state leave, with the prior, linearised where ``fitted`` began."""
     _, residuals, jacobian = fitted.result.first
     return float(residuals @ residuals) - float(((orthonormal_basis(jacobian).T @ residuals) ** 2).sum())
-
-
-def _padded(values: Array, length: int) -> Array:
-    padded = np.zeros(length)
-    padded[: len(values)] = values
-    return padded
 
 
 def _without_angles(linear: LinearisedModel, states: int) -> LinearisedModel:

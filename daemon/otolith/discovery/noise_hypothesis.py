@@ -68,7 +68,7 @@ def _fitted(problem: Problem, null: FittedHypothesis) -> FittedHypothesis | None
 
 
 def _with_noisier_inputs(null: Fit) -> Problem:
-    """Return the problem with the most likely noise of each input, if that pays for being one more value."""
+    """Return the problem with the most likely noise of each input, if its gain exceeds the penalty of one value."""
     best, least = null.problem, _deviance(linearised(null.problem, null.window, null.prior, null.parameters))
     unseen = null.objective.innovation_model.log_determinant + VISIBLE
     for at, source in enumerate(best.base_model.inputs):
@@ -80,8 +80,8 @@ def _with_noisier_inputs(null: Fit) -> Problem:
             trial = linearised(problem, null.window, null.prior, null.parameters)
             if trial.objective.innovation_model.log_determinant <= unseen:
                 break
-            price = np.log(null.count) if best.levels[at] == levels[at] else 0.0
-            if (deviance := _deviance(trial)) + price < least:
+            penalty = np.log(null.count) if best.levels[at] == levels[at] else 0.0
+            if (deviance := _deviance(trial)) + penalty < least:
                 best, least = problem, deviance
     return best
 
@@ -104,7 +104,7 @@ def is_white(fitted: Fit) -> bool:
     American Statistical Association 65, 1970).
     """
     present = fitted.objective.present
-    for innovations, measured in zip(_innovations(fitted).T, present.T, strict=True):
+    for innovations, measured in zip(fitted.innovations.T, present.T, strict=True):
         values = innovations[measured]
         power, count = float(values @ values), len(values)
         for lag in range(1, min(WHITE_LAGS, count - 1) + 1):
@@ -113,13 +113,8 @@ def is_white(fitted: Fit) -> bool:
     return True
 
 
-def _innovations(fitted: Fit) -> Array:
-    """Return the whitened innovations (records, outputs)."""
-    return fitted.map_objective.window_residuals(fitted.result).reshape(fitted.objective.measured.shape)
-
-
 def _noise_ratios(fitted: Fit) -> Array:
     """Return the root mean square (outputs,) of the whitened innovations."""
     present = fitted.objective.present
-    squares = np.where(present, _innovations(fitted) ** 2, 0.0).sum(axis=0)
+    squares = np.where(present, fitted.innovations**2, 0.0).sum(axis=0)
     return np.asarray(np.sqrt(squares / np.maximum(present.sum(axis=0), 1)))

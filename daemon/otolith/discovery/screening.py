@@ -207,13 +207,12 @@ class ScoredGuesses:
     @classmethod
     def of(cls, response: ProjectedResponse, guesses: list[Guess], competing: CompetingForms) -> "ScoredGuesses":
         """Score ``guesses`` by the linear response."""
-        statistics = response.score(guesses)
-        count = response.count
-        forms = {id(form): form for form, _ in guesses}  # far fewer than guesses
-        row_of = {key: (float(_parameter_count(form)), competing.of(form)) for key, form in forms.items()}
-        parameters, counts = np.array([row_of[id(form)] for form, _ in guesses]).reshape(-1, 2).T
+        statistics, count = response.score(guesses), response.count
+        forms = {id(form): form for form, _ in guesses}  # there are far fewer than guesses, and to compare them is slow
+        of_form = {key: (float(_parameter_count(form)), competing.of(form)) for key, form in forms.items()}
+        parameters, competitors = np.array([of_form[id(form)] for form, _ in guesses]).reshape(-1, 2).T
         variance_factor = max((response.chi_square - float(statistics.gain.max(initial=0.0))) / count, 1.0)
-        scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * counts)
+        scores = statistics.gain / variance_factor - parameters * np.log(count) - 2.0 * np.log(3.0 * competitors)
         return cls(guesses, statistics.amplitudes, np.asarray(scores))
 
     def __getitem__(self, index: int) -> ScoredGuess:

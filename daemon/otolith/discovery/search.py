@@ -77,9 +77,10 @@ def fit_hypotheses(proposals: Iterable[Proposal], window: Window, far_worse: flo
 
 
 def explained_again(fitted: FittedHypothesis, item: Proposal, window: Window, before: Posterior) -> FittedHypothesis:
-    """Return the fit of a hypothesis that explained the window ``before``, or the same from its last state, if better.
+    """Return ``fitted``, or a fit that starts at the last state ``before`` the window, if that is better.
 
-    A state that is not measured starts at its nominal value, which may lie in the valley of another minimum.
+    It is for a hypothesis that explained the window before. A state that is not measured starts at its nominal value,
+    from which the fit may reach a local minimum.
     """
     if before.phase is None or not before.phase.last_state or item.problem.delays:
         return fitted
@@ -124,13 +125,29 @@ def _threshold_gain(response: LinearResponse) -> float:
     for fitted in fit_hypotheses(proposals, response.window):
         count = fitted.fit.count
         variance_factor = residual_variance_factor([fitted.chi_square], count)
+        # The initial prior leaves all parameters free, so that the penalty counts them beside those of the component.
         penalty = fitted.deviance(count, 1.0) - fitted.chi_square + len(problem.free) * np.log(count)
         best = max(best, (response.chi_square - fitted.chi_square) / variance_factor - penalty)
     return best
 
 
 def search(screening: ScreeningResult) -> list[FittedHypothesis]:
-    """Return hypotheses of all types, fitted to the screened window; the first one is that nothing has happened."""
+    """Return hypotheses of all types, fitted to the screened window; the first one is that nothing has happened.
+
+    Simple hypotheses come first: one cause each. Several causes are searched for only where these do not explain the
+    window convincingly.
+    """
+    fitted = _single_causes(screening)
+    if _convincing(fitted) is None:
+        fitted += _several_moved(fitted)
+    fitted += _several_components(fitted)
+    if screening.always_lacking or _convincing(fitted) is None:
+        fitted += _always_lacking(fitted[0])
+    return _without_local_minima(fitted)
+
+
+def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
+    """Fit the null hypothesis, and those of one cause: parameters, a component or sensor, noise, a delay."""
     problem, prior, window = screening.fitted.problem, screening.fitted.prior, screening.fitted.window
     proposals = [nothing_happened(problem, prior)]
     if len(problem.free) > 1:
@@ -138,18 +155,23 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     proposals += _one_parameter_moved(problem, prior, screening.response)
     candidates = [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
     fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
-    fitted += noisier_sensors(fitted[0])
-    fitted += late_signals(fitted[0], screening.response)
-    if _convincing(fitted) is None:
-        fitted += _several_moved(fitted)
-    components = [item for item in fitted if item.type is FaultType.COMPONENT]
-    best = min(components, key=_chi_square, default=None)
-    while best is not None and len(best.problem.components) < MAX_COMPONENTS and _convincing(fitted) in (None, best):
+    return [*fitted, *noisier_sensors(fitted[0]), *late_signals(fitted[0], screening.response)]
+
+
+def _several_components(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
+    """Fit further components beside the best one, one more at a time, and what each combination has without one.
+
+    It ends when one more component gains nothing decisive, or another hypothesis explains the window convincingly.
+    """
+    more: list[FittedHypothesis] = []
+    best = min((item for item in fitted if item.type is FaultType.COMPONENT), key=_chi_square, default=None)
+    while best is not None and len(best.problem.components) < MAX_COMPONENTS:
+        if _convincing([*fitted, *more]) not in (None, best):
+            break
         best = _with_another_component(best)
-        fitted += [] if best is None else [best, *_sub_structures(best, fitted)]
-    if screening.always_lacking or _convincing(fitted) is None:
-        fitted += _always_lacking(fitted[0])
-    return _without_local_minima(fitted)
+        if best is not None:
+            more += [best, *_sub_structures(best, [*fitted, *more])]
+    return more
 
 
 def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
@@ -167,14 +189,12 @@ def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothes
         own = zip(item.problem.free, item.fit.parameters, strict=True)
         start = np.array([values.get(free.label, value) for free, value in own])
         proposals.append(Proposal(item.hypothesis, item.problem, item.fit.prior, start))
-    refitted = {
-        id(old): new for old, new in zip(unexplained, fit_hypotheses(proposals, fitted[0].fit.window), strict=True)
-    }
-    return [min(item, refitted.get(id(item), item), key=_chi_square) for item in fitted]
+    refitted = dict(zip(unexplained, fit_hypotheses(proposals, fitted[0].fit.window), strict=True))
+    return [min(item, refitted.get(item, item), key=_chi_square) for item in fitted]
 
 
 def late_signals(null: FittedHypothesis, response: LinearResponse) -> list[FittedHypothesis]:
-    """Return the hypotheses that one signal is late or early against all others, for those that would explain most."""
+    """Return the hypotheses that one signal is late or early against all others, for the signals of largest gain."""
     gains = response.score_delays().gain
     least = max(MIN_LATE_SHARE * gains.max(initial=0.0), DECISIVE)
     return [
@@ -185,26 +205,17 @@ def late_signals(null: FittedHypothesis, response: LinearResponse) -> list[Fitte
 
 
 def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
-    """Fit the delay of one signal: the best of a grid, then Gauss-Newton."""
-    problem, prior, window = null.problem, null.fit.prior, null.fit.window
-    names = delayable(problem.base_model)
-    stated = FaultHypothesis(FaultType.TIMING, f"{names[index]} is late", 1, float(len(names)))
+    """Fit the delay of one signal: the best of a grid, then Gauss-Newton steps of the delay."""
+    window, names = null.fit.window, delayable(null.problem.base_model)
     limit = largest_delay(window.grid.length)
+    stated = FaultHypothesis(FaultType.TIMING, f"{names[index]} is late", 1, float(len(names)))
 
     def proposal(delay: float) -> Proposal:
-        late = replace(problem, delays=((names[index], float(np.clip(delay, -limit, limit))),))
-        return Proposal(stated, late, prior, prior.mean)
+        late = replace(null.problem, delays=((names[index], float(np.clip(delay, -limit, limit))),))
+        return Proposal(stated, late, null.fit.prior, null.fit.prior.mean)
 
     delays = np.sort(trial_delays(window.sample_period, limit)).tolist()
-
-    @cache
-    def unexplained(at: int) -> float:
-        fitted = linearised(proposal(delays[at]).problem, window, prior, prior.mean)
-        return chi_square_of_parameters(fitted) / fitted.count
-
-    at = min(range(0, len(delays), 2), key=unexplained)
-    at = min(range(max(at - 1, 0), min(at + 2, len(delays))), key=unexplained)
-    (best,) = fit_hypotheses([proposal(delays[at])], window)
+    (best,) = fit_hypotheses([_best_of_grid([proposal(delay) for delay in delays], window)], window)
     for _ in range(DELAY_STEPS):
         ((_, delay),), score = best.problem.delays, delay_score(best.fit, names[index])
         if score.step**2 * score.information < MIN_DELAY_GAIN:
@@ -214,6 +225,23 @@ def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
             break
         best = trial
     return best
+
+
+def _best_of_grid(proposals: list[Proposal], window: Window) -> Proposal:
+    """Return the delay that leaves least per measured value.
+
+    Every second one is tried, then the neighbours of the best. Parameters are not fitted: what they explain to first
+    order is projected out.
+    """
+
+    @cache
+    def unexplained(at: int) -> float:
+        item = proposals[at]
+        fitted = linearised(item.problem, window, item.prior, item.start)
+        return chi_square_of_parameters(fitted) / fitted.count
+
+    at = min(range(0, len(proposals), 2), key=unexplained)
+    return proposals[min(range(max(at - 1, 0), min(at + 2, len(proposals))), key=unexplained)]
 
 
 def _chi_square(fitted: FittedHypothesis) -> float:
@@ -328,7 +356,7 @@ def _sub_structures(whole: FittedHypothesis, fitted: list[FittedHypothesis]) -> 
     smaller = [[component for component in added if component is not lacking] for lacking in added]
     alternatives = whole.hypothesis.alternatives ** (1.0 - 1.0 / max(len(added), 1))
     proposals = [
-        with_components(null.problem, null.fit.prior, rest, alternatives)
+        with_components(null.problem, null.fit.prior, rest, alternatives, FaultType.COMPONENT)
         for rest in smaller
         if frozenset((*known, *(component.key for component in rest))) not in present
     ]
@@ -391,10 +419,8 @@ def find_onset(predicted: Posterior, window: Window) -> int:
 
 def _first_far_off(fitted: FittedHypothesis, window: Window, record: int) -> int:
     """Return the first record from ``record`` on that is far from the one-step prediction of the fit."""
-    guess, free = fitted.fit.result.guess, len(fitted.problem.free)
-    objective = Objective(fitted.problem, window, guess[:free])
-    constant = np.concatenate([guess[:free], guess[2 * free :]])
-    squared = (objective.residuals(objective.predict(constant[None]))[0] ** 2).max(axis=1)
+    objective = Objective(fitted.problem, window, fitted.fit.parameters)
+    squared = (objective.residuals(objective.predict(fitted.fit.guess[None]))[0] ** 2).max(axis=1)
     late = np.flatnonzero((squared > FAR_OFF) & (np.arange(window.records) >= record))
     return int(late[0]) if len(late) else window.records
 

@@ -51,14 +51,15 @@ DIVERGED = 1e12  # χ² of a twin that explains nothing
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
 MIN_WEIGHT = 0.05  # of a hypothesis whose own interval the published one contains
 WRONG_WINDOW = 0.5  # probability that the window that opened a test is itself wrong
+ALWAYS_TRACKED = (FaultType.NOTHING, FaultType.PARAMETER)
 
 
 def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
     """Return the indices of the hypotheses that explain the windows equally well, grouped by type and place.
 
     Their misfits are at most ``DECISIVE`` above the least. The best of each group comes first. A component is in a
-    group only if nothing with fewer values explains the windows as well: otherwise evidence must pay for its values.
-    The null hypothesis is contained in all others, so it is in no group.
+    group only if nothing with fewer values explains the windows as well. Otherwise its deviance decides, with the
+    complexity penalty. The null hypothesis is contained in all others, so it is in no group.
     """
     others = [at for at, item in enumerate(hypotheses) if item.type is not FaultType.NOTHING]
     least = min((hypotheses[at].misfit for at in others), default=0.0)
@@ -159,9 +160,10 @@ class SequentialTest:
     """Consecutive windows, up to the last, that the filter expected, and that did not confirm the test."""
     cusum_against_filter: float = -MAX_WINDOW_EVIDENCE
     """Cumulative sum of the evidence against the filter, in -2 log likelihood, of the windows after the one that opened
-    the test: they alone must pay for the complexity of a hypothesis. See :meth:`with_filter`."""
+    the test. It starts below zero, because it must exceed the complexity penalty of a hypothesis. See
+    :meth:`with_filter`."""
     filter_deviance: float = 0.0
-    """-2 log likelihood of the same windows under the filter, relative to the best hypothesis; nothing is forgotten."""
+    """-2 log likelihood of the same windows under the filter, relative to the best hypothesis: a sum without decay."""
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
     has_explained: bool = True
@@ -241,7 +243,7 @@ class SequentialTest:
         """Return the test after its last window, of which the filter leaves ``filtered``.
 
         The evidence against the filter is a cumulative sum (E. S. Page, Biometrika 41, 1954) with decisive evidence as
-        its reference value. It falls in windows that give less, so that it is forgotten if it does not go on.
+        its reference value: it falls in windows that give less.
         """
         last = self.last
         more = (filtered.chi_square - last.chi_square) / residual_variance_factor([last.chi_square], last.count)
@@ -281,31 +283,31 @@ def continue_test(test: SequentialTest, predicted: Posterior, screening: Screeni
 
 
 def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> SequentialTest:
-    """Return a test of the ``fitted`` hypotheses; the first one is the null hypothesis."""
-    fitted = [*fitted[:1], *(item for item in fitted[1:] if item.chi_square < DIVERGED)]
-    count = fitted[0].fit.count
+    """Return a test of the ``fitted`` hypotheses; the first one is the null hypothesis.
+
+    The null hypothesis and those of moved parameters are tracked however improbable they are.
+    """
+    null = fitted[0]
+    fitted = [null, *(item for item in fitted[1:] if item.chi_square < DIVERGED)]
+    count = null.fit.count
     variance_factor = residual_variance_factor([item.unexplained for item in fitted], count)
-    deviances = [item.deviance(count, variance_factor) for item in fitted]
-    order = np.argsort(deviances, kind="stable").tolist()
-    least = deviances[order[0]]
-    least_misfit = min(item.chi_square for item in fitted)
-    misfits = [(item.chi_square - least_misfit) / variance_factor for item in fitted]
-    kept = [at for at in order if deviances[at] <= least + MAX_DEVIANCE][:MAX_HYPOTHESES]
-    always = (FaultType.NOTHING, FaultType.PARAMETER)
-    kept += [at for at in order if fitted[at].type in always and at not in kept]
-    first = [[min(value, MAX_FIRST_EVIDENCE) for value in (deviances[at] - least, misfits[at])] for at in kept]
-    tracked = [track(fitted[at], predicted, *evidence) for at, evidence in zip(kept, first, strict=True)]
-    best = fitted[order[0]]
-    last = FitSummary(best.chi_square, least - best.chi_square / variance_factor, count)
-    reduced_chi_square = max(fitted[0].chi_square / max(count, 1.0), 1.0)
-    usable = [item for item in tracked if item is not None]
-    onset = best.fit.window.start
+    deviances = {item: item.deviance(count, variance_factor) for item in fitted}
+    ordered = sorted(fitted, key=lambda item: deviances[item])
+    best = ordered[0]
+    least, least_chi_square = deviances[best], min(item.chi_square for item in fitted)
+    kept = [item for item in ordered if deviances[item] <= least + MAX_DEVIANCE][:MAX_HYPOTHESES]
+    kept += [item for item in ordered if item.type in ALWAYS_TRACKED and item not in kept]
+    tracked = []
+    for item in kept:
+        deviance = min(deviances[item] - least, MAX_FIRST_EVIDENCE)
+        misfit = min((item.chi_square - least_chi_square) / variance_factor, MAX_FIRST_EVIDENCE)
+        tracked.append(track(item, predicted, deviance, misfit))
     return SequentialTest(
         predicted.problem,
-        _sorted(usable),
-        onset,
-        last=last,
-        null_reduced_chi_square=reduced_chi_square,
+        _sorted([item for item in tracked if item is not None]),
+        best.fit.window.start,
+        last=FitSummary(best.chi_square, least - best.chi_square / variance_factor, count),
+        null_reduced_chi_square=max(null.chi_square / max(count, 1.0), 1.0),
         has_explained=best.fit.cost <= EXPLAINED,
     )
 
@@ -317,47 +319,56 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     if not steps:
         return test
     steps, last = _with_deviances(steps)
-    least, least_misfit = min(step.deviance for step in steps), min(step.misfit for step in steps)
-    updated = [
-        (
-            step.updated(
-                min(step.deviance - least, MAX_WINDOW_EVIDENCE), min(step.misfit - least_misfit, MAX_WINDOW_EVIDENCE)
-            ),
-            step.deviance,
-        )
-        for step in steps
-    ]
-    kept = [(item, deviance) for item, deviance in updated if item is not None]
-    if not kept:
+    tracked, deviances = _updated(steps)
+    if not tracked:
         return test
-    tracked = [item for item, _ in kept]
     if test.windows >= PRUNED_AFTER:
-        tracked = prune(tracked, [deviance for _, deviance in kept])
+        tracked = prune(tracked, deviances)
     filter_deviance = test.filter_deviance - min(item.deviance for item in tracked)
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     if test.windows > MAX_OPEN_WINDOWS:
         hypotheses = without_duplicates(hypotheses, interchangeable(hypotheses))
-    leading = test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1
-    followed = replace(test, hypotheses=_screened(hypotheses, steps), leading=leading, settled=test.settled + 1)
-    followed = replace(followed, last=last, filter_deviance=filter_deviance)
+    followed = replace(
+        test,
+        hypotheses=_screened(hypotheses, steps),
+        leading=test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1,
+        settled=test.settled + 1,
+        last=last,
+        filter_deviance=filter_deviance,
+    )
     return replace(followed, clear=0 if followed.has_equal_causes else test.clear + 1)
+
+
+def _updated(steps: Sequence[HypothesisStep]) -> tuple[list[TrackedHypothesis], list[float]]:
+    """Return the hypotheses after a window, without those that it excludes, and their deviances in it."""
+    least, least_misfit = min(step.deviance for step in steps), min(step.misfit for step in steps)
+    tracked, deviances = [], []
+    for step in steps:
+        deviance = min(step.deviance - least, MAX_WINDOW_EVIDENCE)
+        item = step.updated(deviance, min(step.misfit - least_misfit, MAX_WINDOW_EVIDENCE))
+        if item is not None:
+            tracked.append(item)
+            deviances.append(step.deviance)
+    return tracked, deviances
 
 
 def _steps(test: SequentialTest, window: Window) -> list[HypothesisStep]:
     """Return each hypothesis with its prediction, its fit and its evidence; a twin that diverges is dropped."""
     predicted = [item.posterior.predict(window) for item in test.hypotheses]
-    proposals = []
-    for item, posterior in zip(test.hypotheses, predicted, strict=True):
-        prior = posterior.prior()
-        proposals.append(Proposal(replace(item.hypothesis, added=0), posterior.problem, prior, prior.mean))
+    proposals = [_continued(item, posterior) for item, posterior in zip(test.hypotheses, predicted, strict=True)]
     fitted = [
         explained_again(own, proposal, window, item.posterior) if own.fit.cost > EXPLAINED >= item.cost else own
         for own, proposal, item in zip(fit_hypotheses(proposals, window), proposals, test.hypotheses, strict=True)
     ]
     rows = list(zip(test.hypotheses, predicted, fitted, strict=True))
-    rows = [row for row in rows if row[2].chi_square < DIVERGED] or rows[:1]
-    steps = [HypothesisStep(item, posterior, fitted, fitted.fit.evidence()) for item, posterior, fitted in rows]
-    return _with_noise(steps)
+    finite = [row for row in rows if row[2].chi_square < DIVERGED] or rows[:1]
+    return _with_noise([HypothesisStep(item, posterior, own, own.fit.evidence()) for item, posterior, own in finite])
+
+
+def _continued(item: TrackedHypothesis, predicted: Posterior) -> Proposal:
+    """Return a tracked hypothesis, to be fitted under its prediction: it adds no value any more."""
+    prior = predicted.prior()
+    return Proposal(replace(item.hypothesis, added=0), predicted.problem, prior, prior.mean)
 
 
 def _with_noise(steps: list[HypothesisStep]) -> list[HypothesisStep]:
@@ -408,11 +419,8 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     If the filter alone explains the window, but not the leading hypothesis, what opened the test has ended.
     """
     old, new = test.last, fresh.last
-    gain = (
-        (old.chi_square - new.chi_square) / residual_variance_factor([new.chi_square], old.count)
-        + old.penalty
-        - new.penalty
-    )
+    variance_factor = residual_variance_factor([new.chi_square], old.count)
+    gain = (old.chi_square - new.chi_square) / variance_factor + old.penalty - new.penalty  # of the window alone
     if fresh.best.type is FaultType.NOTHING and fresh.best.cost <= EXPLAINED < test.best.cost:
         return fresh
     if gain <= DECISIVE:

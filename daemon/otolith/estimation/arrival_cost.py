@@ -22,7 +22,7 @@ INITIAL_TREND_SD = 1e-3  # 1/s: standard deviation of an unknown trend, relative
 MOVED_TREND_SD = 1e-2  # 1/s: the same of a parameter that has moved: it may go on moving
 MAX_TREND = 1.0  # 1/s: bound of a trend, relative to the parameter's size
 MIN_STATE_SINGULAR = 1e-10  # relative singular value below which a window does not determine the initial state
-MIN_SINGULAR = 1e-12  # relative singular value below which a direction has no uncertainty to speak of
+MIN_SINGULAR = 1e-12  # relative singular value below which a direction is not determined, and has no curvature
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,10 +106,6 @@ class MapObjective:
         prior_residuals = self._whitening @ (guess[:count] - self._mean)
         return np.concatenate([residuals, prior_residuals]), np.concatenate([jacobian, self._prior_jacobian])
 
-    def window_residuals(self, fit: FitResult) -> Array:
-        """Return the residuals of the window without those of the prior."""
-        return fit.residuals[: -len(self._mean)]
-
     def evidence(self, fit: FitResult, inflation: float) -> Evidence:
         """Return the evidence of the window around ``fit``; ``inflation`` multiplies its standard deviations."""
         count = len(self._mean)
@@ -118,9 +114,10 @@ class MapObjective:
         curvature = second_order_change(self._objective, fit.guess[constant], fit.jacobian[:, constant])
         columns = np.column_stack([jacobian[:, :count], residuals, curvature])
         columns = eliminate_states(columns, jacobian[:, count:] * (self.high - self.low)[count:])
-        basis, triangle = np.linalg.qr(columns[:, :count])
-        rest = basis.T @ columns[:, count:]
-        root, residual = _with_noise(triangle / inflation, rest[:, 0] / inflation, rest[:, 1:])
+        basis, root = np.linalg.qr(columns[:, :count])
+        rotated = basis.T @ columns[:, count:]
+        residual, noise = rotated[:, 0], rotated[:, 1:]
+        root, residual = _with_noise(root / inflation, residual / inflation, noise)
         return Evidence(fit.guess[:count], root, residual)
 
 

@@ -208,20 +208,62 @@ def _bridge(times: Array, values: Array, present: Indices, spikes: Mask) -> Arra
     return bridged
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Channel:
+    """The samples of a sensor in a window, beside the prediction of the window."""
+
+    predicted: Posterior
+    window: Window
+    output: Output
+
+    @property
+    def name(self) -> str:
+        return self.output.name
+
+    @property
+    def index(self) -> int:
+        return [output.name for output in self.predicted.problem.twin.outputs].index(self.name)
+
+    @property
+    def values(self) -> Array:
+        """(records,)."""
+        return self.window.column(self.name)
+
+    @property
+    def present(self) -> Indices:
+        """(samples,) records with a sample."""
+        return np.flatnonzero(~self.window.missing_in(self.name))
+
+    def without(self, records: Indices) -> Window:
+        """Return the window with the signal missing in ``records``."""
+        missing = self.window.missing.copy()
+        missing[records, self.window.signals.index(self.name)] = True
+        return replace(self.window, missing=missing)
+
+    def prediction(self, fitted: Fit) -> Array:
+        """Return what a fit predicts of the sensor (records,)."""
+        return np.asarray(fitted.objective.predict_with_trends(fitted.result.guess)[0][:, self.index])
+
+
+def _checked_channels(predicted: Posterior, window: Window) -> Iterator[_Channel]:
+    """Yield the sensors that the machine file lets be checked for frozen readings."""
+    problem = predicted.problem
+    for output in problem.base_model.outputs:
+        if (output.name, Check.FROZEN) not in problem.unchecked:
+            yield _Channel(predicted, window, output)
+
+
 def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
     """Return the channels that keep a value which their prediction makes improbable."""
-    problem, faulty = predicted.problem, []
-    for output in problem.base_model.outputs:
-        name = output.name
-        if (name, Check.FROZEN) in problem.unchecked:
+    faulty = []
+    for channel in _checked_channels(predicted, window):
+        runs = _constant_runs(channel.values, channel.present)
+        if _samples_in(runs) <= MAX_FROZEN_SHARE * len(channel.present):
             continue
-        present = np.flatnonzero(~window.missing_in(name))
-        runs = _constant_runs(window.column(name), present)
-        if _samples_in(runs) <= MAX_FROZEN_SHARE * len(present):
-            continue
-        run = _frozen_run(predicted, window, name, runs)
+        run = _frozen_run(channel, runs)
         if run is not None:
-            faulty.append(FaultySensor(name, _frozen_sentence(window, output, run), _turned_off(name, Check.FROZEN)))
+            advice = _turned_off(channel.name, Check.FROZEN)
+            faulty.append(FaultySensor(channel.name, _frozen_sentence(channel, run), advice))
     return faulty
 
 
@@ -230,27 +272,24 @@ def without_saturated(predicted: Posterior, window: Window) -> tuple[Window, Fau
 
     None if such samples are not the cause.
     """
-    problem = predicted.problem
-    outputs = (each for each in problem.base_model.outputs if (each.name, Check.FROZEN) not in problem.unchecked)
-    without = (_without_piles(predicted, window, output) for output in outputs)
+    without = (_without_piles(channel) for channel in _checked_channels(predicted, window))
     return next((rest for rest in without if rest is not None), None)
 
 
-def _without_piles(predicted: Posterior, window: Window, output: Output) -> tuple[Window, FaultySensor] | None:
+def _without_piles(channel: _Channel) -> tuple[Window, FaultySensor] | None:
     """Return the window without the samples at the limits of a sensor if the twin explains all others, or None.
 
     At a limit the prediction moves further than the samples spread. Where a machine has changed, both settle.
     """
-    problem, name = predicted.problem, output.name
-    index = [each.name for each in problem.twin.outputs].index(name)
-    values, noise = window.column(name), problem.noise[index]
-    piles = [(side, run) for side in (1.0, -1.0) for run in _pile(side * values, ~window.missing_in(name), noise)]
+    problem, values = channel.predicted.problem, channel.values
+    noise = problem.noise[channel.index]
+    piles = [(side, run) for side in (1.0, -1.0) for run in _pile(side * values, channel.present, noise)]
     if not piles:
         return None
-    rest = _fit(predicted, problem, _without(window, name, np.concatenate([run for _, run in piles])))
-    if not rest.cost <= EXPLAINED:
+    others = _fit(channel.predicted, problem, channel.without(np.concatenate([run for _, run in piles])))
+    if not others.cost <= EXPLAINED:
         return None
-    prediction, least = rest.objective.predict_with_trends(rest.result.guess)[0][:, index], FROZEN_MOVEMENT * noise
+    prediction, least = channel.prediction(others), FROZEN_MOVEMENT * noise
     runs = [
         run
         for side, run in piles
@@ -260,25 +299,30 @@ def _without_piles(predicted: Posterior, window: Window, output: Output) -> tupl
     if not runs:
         return None
     records = np.concatenate(runs)
-    hidden, expected = _without(window, name, records), len(records) + NIS_DEVIATE * np.sqrt(2.0 * len(records))
-    at_rest = _disturbances(problem, window) if _may_rest(problem, window, name, runs) else ()
-    if any(_is_probable(predicted, each, window, hidden, expected) for each in (problem, *at_rest)):
+    reduced, expected = channel.without(records), len(records) + NIS_DEVIATE * np.sqrt(2.0 * len(records))
+    if _are_probable(channel, problem, runs, reduced, expected):
         return None
-    limit, when = float(np.median(values[runs[0]])), time_text(window.start + float(window.grid.offsets[runs[0][0]]))
+    return reduced, _clipped_sensor(channel, runs)
+
+
+def _clipped_sensor(channel: _Channel, runs: list[Indices]) -> FaultySensor:
+    """Return the finding that a sensor is clipped in ``runs``."""
+    window, name = channel.window, channel.name
+    limit = float(np.median(channel.values[runs[0]]))
+    when = time_text(window.start + float(window.grid.offsets[runs[0][0]]))
     text = (
-        f"{name} is clipped at {limit:.4g} {unit_text(output.unit)} from {when}: "
-        f"{len(records)} of {window.records} records do not count"
+        f"{name} is clipped at {limit:.4g} {unit_text(channel.output.unit)} from {when}: "
+        f"{_samples_in(runs)} of {window.records} records do not count"
     )
-    advice = f"look at the range of the sensor; {_turned_off(name, Check.FROZEN)}"
-    return hidden, FaultySensor(name, text, advice)
+    return FaultySensor(name, text, f"look at the range of the sensor; {_turned_off(name, Check.FROZEN)}")
 
 
-def _pile(values: Array, measured: Mask, noise: float) -> list[Indices]:
+def _pile(values: Array, present: Indices, noise: float) -> list[Indices]:
     """Return the records of each long run within the range of the noise below the largest of ``values`` (records,).
 
-    The noise at a limit may be larger than ``noise``: the second differences of the samples there show it.
+    Those ``present`` count. The noise at a limit may be larger than ``noise``: the second differences of the samples
+    there show it.
     """
-    present = np.flatnonzero(measured)
     samples = values[present]
     if len(samples) < MIN_FROZEN_RUN:
         return []
@@ -313,36 +357,39 @@ class _FrozenRun:
     """How far the prediction is above the value of the runs: the median over all of them."""
 
 
-def _frozen_run(predicted: Posterior, window: Window, name: str, runs: list[Indices]) -> _FrozenRun | None:
+def _frozen_run(channel: _Channel, runs: list[Indices]) -> _FrozenRun | None:
     """Return the longest of the ``runs`` in which a channel is frozen, or None if it is not.
 
     It is frozen if the prediction moves while the channel does not, and either the noise is lacking that it shows at
     other times, or the twin does not explain the readings. A machine that dry friction holds at rest may look alike:
     then no disturbance of a state may explain them either.
     """
-    problem, present = predicted.problem, ~window.missing_in(name)
-    index = [output.name for output in problem.twin.outputs].index(name)
-    values, noise = window.column(name)[present], problem.noise[index]
+    values, noise = channel.values[channel.present], channel.predicted.problem.noise[channel.index]
     step = _step(values)
-    known = problem.steps[index] if problem.steps else 0.0
-    lacking = step**2 / 12.0 - rounding_variance(values, noise, known)
-    if lacking > 0.0:  # the objective leaves so few levels out
-        with_rounding = float(np.sqrt(noise**2 + lacking))
-        problem = replace(problem, noise=(*problem.noise[:index], with_rounding, *problem.noise[index + 1 :]))
-    hidden = _without(window, name, np.concatenate([run[1:] for run in runs]))
-    rest = _fit(predicted, problem, hidden)
-    prediction = rest.objective.predict_with_trends(rest.result.guess)[0][:, index]
+    problem = _with_rounding(channel, step)
+    reduced = channel.without(np.concatenate([run[1:] for run in runs]))
+    prediction = channel.prediction(_fit(channel.predicted, problem, reduced))
     movement = FROZEN_MOVEMENT * noise + FROZEN_STEPS * step
     moving = [run for run in runs if np.ptp(prediction[run[0] : run[-1] + 1]) > movement]  # false for not-a-number
-    if _samples_in(moving) <= MAX_FROZEN_SHARE * present.sum():
+    if _samples_in(moving) <= MAX_FROZEN_SHARE * len(values):
         return None
-    if not _lacks_noise(window, name, noise, runs):
+    if not _lacks_noise(channel, runs):
         rounding = _samples_in(runs) * 0.25 * step**2 / (noise**2 + step**2 / 12.0)
-        at_rest = _disturbances(problem, window) if _may_rest(problem, window, name, moving) else ()
-        if any(_is_probable(predicted, each, window, hidden, rounding) for each in (problem, *at_rest)):
+        if _are_probable(channel, problem, moving, reduced, rounding):
             return None
-    excess = np.concatenate([prediction[run] - window.column(name)[run] for run in moving])
+    excess = np.concatenate([prediction[run] - channel.values[run] for run in moving])
     return _FrozenRun(max(moving, key=len), float(np.median(excess)))
+
+
+def _with_rounding(channel: _Channel, step: float) -> Problem:
+    """Return the problem with the noise of rounding to ``step``, where the objective leaves it out: on few levels."""
+    problem, index = channel.predicted.problem, channel.index
+    noise, known = problem.noise[index], problem.steps[index] if problem.steps else 0.0
+    lacking = step**2 / 12.0 - rounding_variance(channel.values[channel.present], noise, known)
+    if not lacking > 0.0:
+        return problem
+    with_rounding = float(np.sqrt(noise**2 + lacking))
+    return replace(problem, noise=(*problem.noise[:index], with_rounding, *problem.noise[index + 1 :]))
 
 
 def _step(values: Array) -> float:
@@ -351,52 +398,51 @@ def _step(values: Array) -> float:
     return float(np.diff(levels).min()) if 1 < len(levels) < MIN_ADC_LEVELS else adc_step(values)
 
 
-def _without(window: Window, name: str, records: Indices) -> Window:
-    """Return the window with a signal missing in ``records``."""
-    missing = window.missing.copy()
-    missing[records, window.signals.index(name)] = True
-    return replace(window, missing=missing)
-
-
 def _fit(predicted: Posterior, problem: Problem, window: Window, start: Array | None = None) -> Fit:
     return fit(problem, window, predicted.prior(), predicted.start() if start is None else start)
 
 
-def _is_probable(predicted: Posterior, problem: Problem, window: Window, hidden: Window, rounding: float) -> bool:
-    """Whether the readings of ``window`` that ``hidden`` lacks are probable given all others.
+def _are_probable(channel: _Channel, problem: Problem, runs: list[Indices], reduced: Window, rounding: float) -> bool:
+    """Whether the readings that ``reduced`` lacks are probable, for the machine as it is or one held at rest."""
+    at_rest = _disturbances(problem, channel.window) if _may_rest(channel, problem, runs) else ()
+    return any(_is_probable(channel, each, reduced, rounding) for each in (problem, *at_rest))
+
+
+def _is_probable(channel: _Channel, problem: Problem, reduced: Window, rounding: float) -> bool:
+    """Whether the readings that ``reduced`` lacks are probable given all others.
 
     The least χ² of prior and window grows by their normalised innovation squared if they are added, whose covariance
     has the uncertainty of parameters, initial state, process noise, sensor and quantisation. Equal readings have no
     noise: they count as one for each unknown, and ``rounding`` is the most that quantisation adds. If the twin does not
     explain the other readings, its errors are larger by as much.
     """
-    rest = _fit(predicted, problem, hidden)
-    if not rest.chi_square < PENALTY:
+    predicted = channel.predicted
+    others = _fit(predicted, problem, reduced)
+    if not others.chi_square < PENALTY:
         return True  # a twin that diverges predicts nothing
     unknowns = len(problem.free) + len(problem.twin.states)
-    limit = rest.chi_square + max(rest.cost, 1.0) ** 2 * (nis_limit(unknowns) + rounding)
-    starts = (rest.parameters, predicted.start())  # either may lead into a local minimum
-    chi_squares = (_fit(predicted, problem, window, start).chi_square for start in starts)
+    limit = others.chi_square + max(others.cost, 1.0) ** 2 * (nis_limit(unknowns) + rounding)
+    starts = (others.parameters, predicted.start())  # either may lead into a local minimum
+    chi_squares = (_fit(predicted, problem, channel.window, start).chi_square for start in starts)
     return any(chi_square <= limit or not chi_square < PENALTY for chi_square in chi_squares)
 
 
-def _may_rest(problem: Problem, window: Window, name: str, runs: list[Indices]) -> bool:
+def _may_rest(channel: _Channel, problem: Problem, runs: list[Indices]) -> bool:
     """Whether a machine at rest could give the ``runs``: a position rests anywhere, a state of its own only at zero."""
-    twin = problem.base_model
-    equation = dict(twin.equations).get(f"der({name})", "").strip()
-    if name not in [state.name for state in twin.states] or equation in [state.name for state in twin.states]:
+    states = [state.name for state in problem.base_model.states]
+    rate = dict(problem.base_model.equations).get(f"der({channel.name})", "").strip()
+    if channel.name not in states or rate in states:
         return True
-    noise = problem.noise[[output.name for output in twin.outputs].index(name)]
-    return any(abs(window.column(name)[run[0]]) <= FROZEN_MOVEMENT * noise for run in runs)
+    return any(abs(channel.values[run[0]]) <= FROZEN_MOVEMENT * problem.noise[channel.index] for run in runs)
 
 
-def _lacks_noise(window: Window, name: str, noise: float, runs: list[Indices]) -> bool:
-    """Whether the ``noise`` of a sensor, as far as it shows outside the ``runs``, makes these improbable even at rest.
+def _lacks_noise(channel: _Channel, runs: list[Indices]) -> bool:
+    """Whether the noise of a sensor, as far as it shows outside the ``runs``, makes these improbable even at rest.
 
     Noise of standard deviation s stays within a step of the converter with a probability of at most erf(step / (√8 s)).
     A speed may be exactly zero at rest, as some sensors have a dead band there.
     """
-    values, present = window.column(name), np.flatnonzero(~window.missing_in(name))
+    values, present = channel.values, channel.present
     outside = ~np.isin(present, np.concatenate(runs))
     samples = values[present]
     second = samples[1:-1] - 0.5 * (samples[:-2] + samples[2:])
@@ -404,8 +450,8 @@ def _lacks_noise(window: Window, name: str, noise: float, runs: list[Indices]) -
     levels = np.unique(samples)
     if len(second) < MIN_FROZEN_RUN or len(levels) < MIN_ADC_LEVELS:
         return False
-    step = float(np.diff(levels).min())
-    deviation = min(noise, MAD_TO_SD * float(np.median(np.abs(second))) / SECOND_DIFFERENCE_SD)
+    step, stated = float(np.diff(levels).min()), channel.predicted.problem.noise[channel.index]
+    deviation = min(stated, MAD_TO_SD * float(np.median(np.abs(second))) / SECOND_DIFFERENCE_SD)
     if deviation < RESOLVED_NOISE * step:
         return False
     count = _samples_in([run for run in runs if values[run[0]] != 0.0])
@@ -428,17 +474,16 @@ def _disturbances(problem: Problem, window: Window) -> Iterator[Problem]:
             yield replace(problem, process_noise=changed, open_loop=False)
 
 
-def _frozen_sentence(window: Window, output: Output, run: _FrozenRun) -> str:
+def _frozen_sentence(channel: _Channel, run: _FrozenRun) -> str:
     """Return which channel is frozen, at which value, and for how much of the window."""
-    present = ~window.missing_in(output.name)
-    values, times = window.column(output.name), window.grid.offsets[run.records]
-    value = float(values[run.records[0]])
-    kind = _frozen_or_clipped(values[present], value, run.excess)
+    window, times = channel.window, channel.window.grid.offsets[run.records]
+    value = float(channel.values[run.records[0]])
+    kind = _frozen_or_clipped(channel.values[channel.present], value, run.excess)
     length, count = f"{times[-1] - times[0]:.4g} s", len(run.records)
     when = f"for {length} ({count} samples) from {time_text(window.start + float(times[0]))}"
-    if count == np.count_nonzero(present):  # it may be so for longer: the finding has the time of the first window
+    if count == len(channel.present):  # it may be so for longer: the finding has the time of the first window
         when = f"throughout the window of {length} ({count} samples)"
-    return f"{output.name} is {kind} at {value:.6g} {unit_text(output.unit)} {when} while the twin moves on"
+    return f"{channel.name} is {kind} at {value:.6g} {unit_text(channel.output.unit)} {when} while the twin moves on"
 
 
 def _frozen_or_clipped(values: Array, value: float, excess: float) -> str:

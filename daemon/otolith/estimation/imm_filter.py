@@ -133,9 +133,10 @@ def predict(posterior: ImmPosterior, end: float) -> ImmPosterior:
 
 
 def _spread_of_decay(mean: Array, elapsed: float) -> Array:
-    """Return the covariance (modes, 2 free, 2 free) of that a trend decays over ``elapsed`` s, or goes on.
+    """Return the covariance (modes, 2 free, 2 free) of the unknown decay of the trends over ``elapsed`` s.
 
-    A fast ramp decays by more than the process noise adds in a window. Without it the filter lags behind the ramp.
+    The process model lets a trend decay, but it may also go on. The trend of a fast ramp would decay by more than the
+    process noise adds in a window, and the filter would lag behind the ramp.
     """
     free = mean.shape[1] // 2
     trend, elapsed = mean[:, free:], min(elapsed, TREND_MEMORY)
@@ -172,14 +173,14 @@ class Innovation:
 
     prediction: ImmPosterior
     evidence: Evidence
-    root: Array
-    """(2 free, 2 free) square-root information of the window."""
+    sqrt_information: Array
+    """(2 free, 2 free) of the window: R of ``docs/explanation/filter.md``."""
     covariance: Array
-    """(modes, 2 free, 2 free)."""
+    """(modes, 2 free, 2 free): S."""
     inverse: Array
     """(modes, 2 free, 2 free) of the covariance."""
-    deviation: Array
-    """(modes, 2 free)."""
+    value: Array
+    """(modes, 2 free): ν."""
     nis_of_mode: Array
     """(modes,) normalised innovation squared."""
 
@@ -194,10 +195,10 @@ class Innovation:
     @property
     def is_expected(self) -> bool:
         """Whether it is within what healthy windows reach."""
-        return self.nis <= nis_limit(float(len(self.root)))
+        return self.nis <= nis_limit(float(len(self.sqrt_information)))
 
     def inflate_variance(self, reduced_chi_square: float) -> "Innovation":
-        """Return the same for a larger variance ratio: a window fitted neither those before nor those after it."""
+        """Return the same with a larger variance ratio; see :func:`inflate_variance`."""
         return innovation_of(inflate_variance(self.prediction, reduced_chi_square), self.evidence)
 
 
@@ -205,7 +206,7 @@ class Innovation:
 class ParameterCusum:
     """CUSUM test of the innovations of parameters, upwards and downwards (E. S. Page, Biometrika 41, 1954).
 
-    They show a change that no single window shows. The innovation test of one window misses a step of a few standard
+    It detects a change that no single window shows. The innovation test of one window misses a step of a few standard
     deviations, and the filter would follow it slowly, with an interval that excludes both values.
     """
 
@@ -220,9 +221,10 @@ class ParameterCusum:
 
     @property
     def moved(self) -> list[int]:
-        """Indices of the parameters that have moved: none until one has done so by more than its windows scatter.
+        """Indices of the parameters that have moved: none unless the sum of one exceeds the limit.
 
-        The windows have shifted others along with it, which count from a smaller sum on.
+        A change also shifts parameters that are correlated with the one that has moved. They count as moved from a
+        share of the limit on.
         """
         if self.sums is None or not (self.sums > SHIFT_LIMIT).any():
             return []
@@ -242,16 +244,16 @@ def innovation_of(prediction: ImmPosterior, evidence: Evidence) -> Innovation:
     root = limited.sqrt_information / inflation
     covariance = np.eye(len(root)) + root @ prediction.covariance @ root.T
     inverse = np.linalg.inv(covariance)
-    deviation = limited.residual / inflation + (prediction.mean - limited.point) @ root.T
-    nis_of_mode = np.einsum("mi,mij,mj->m", deviation, inverse, deviation)
-    return Innovation(prediction, evidence, root, covariance, inverse, deviation, nis_of_mode)
+    value = limited.residual / inflation + (prediction.mean - limited.point) @ root.T
+    nis_of_mode = np.einsum("mi,mij,mj->m", value, inverse, value)
+    return Innovation(prediction, evidence, root, covariance, inverse, value, nis_of_mode)
 
 
 def update(innovation: Innovation) -> ImmPosterior:
     """Return the posterior after a window: Kalman update of each mode, then of the mode probabilities."""
-    prediction, root = innovation.prediction, innovation.root
+    prediction, root = innovation.prediction, innovation.sqrt_information
     gain = prediction.covariance @ root.T @ innovation.inverse
-    mean = prediction.mean - np.einsum("mij,mj->mi", gain, innovation.deviation)
+    mean = prediction.mean - np.einsum("mij,mj->mi", gain, innovation.value)
     kept = np.eye(prediction.mean.shape[1]) - gain @ root  # Joseph form
     covariance = kept @ prediction.covariance @ kept.transpose(0, 2, 1) + gain @ gain.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
@@ -282,7 +284,10 @@ def _updated_ratio(variance_ratio: float, nis_per_degree: float) -> float:
 
 
 def inflate_variance(posterior: ImmPosterior, reduced_chi_square: float) -> ImmPosterior:
-    """Return the same with a larger variance ratio: a window fitted neither those before nor those after it."""
+    """Return the same with a larger variance ratio, after a window that agreed with none before and none after it.
+
+    ``reduced_chi_square`` is that of the window under the null hypothesis.
+    """
     factor = float(np.clip(reduced_chi_square / MAX_NIS_PER_DEGREE, 1.0, MAX_INFLATION))
     return replace(posterior, variance_ratio=posterior.variance_ratio * factor)
 

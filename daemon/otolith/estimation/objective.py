@@ -58,8 +58,9 @@ def open_loop(kernel: Kernel, excitation: Excitation, noise: NoiseModel) -> Inno
 class Objective:
     """Whitened innovations and cost of guesses over one window.
 
-    A guess holds the free parameters, then the initial state. The first record is as noisy as any other, so the initial
-    state is a nuisance parameter, estimated along with the rest.
+    A guess (free + states,) holds the free parameters, then the initial state. The first record is as noisy as any
+    other, so the initial state is a nuisance parameter, estimated along with the rest. A guess with trends
+    (2 free + states,) holds parameters at the end of the window, their trends per second, and the initial state.
     """
 
     def __init__(
@@ -84,13 +85,8 @@ class Objective:
             lowest, highest = lowest - wider, highest + wider
         given = dict(problem.known) | (time_offsets(problem, window) if problem.components else {})
         self._template = np.array([given.get(parameter.name, parameter.nominal) for parameter in twin.parameters])
-        order = [parameter.name for parameter in twin.parameters[: len(twin.parameters) - twin.settings]]
         self.free, self._states = len(problem.free), len(twin.states)
-        self._free_columns = np.array([order.index(parameter.name) for parameter in problem.free], dtype=np.int64)
-        state_columns = len(order) + np.arange(self._states)
-        self._trend_columns = len(order) + self._states + self._free_columns
-        self._columns = np.concatenate([self._free_columns, state_columns])
-        self._columns_with_trends = np.concatenate([self._free_columns, self._trend_columns, state_columns])
+        self._choose_columns(problem)
         low, high = problem.bounds
         self.low, self.high = np.concatenate([low, lowest]), np.concatenate([high, highest])
         states = (f"initial {state.name}" for state in twin.states)
@@ -99,15 +95,26 @@ class Objective:
         self._max_substeps = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
         self._base = twin.base or twin
         measured = np.where(self.present, self.measured, np.nan)
-        self._excitation = Excitation(input_matrix(twin, window), window.grid, measured=measured)
+        self.excitation = Excitation(input_matrix(twin, window), window.grid, measured=measured)
+        """Inputs, measurements, gain and sub-steps of the predictor."""
         self.initial = self._first if initial is None else np.where(np.isnan(initial), self._first, initial)
         """(states,) around which the predictor was built."""
         self.set_predictor(start, self.initial, substeps)
 
+    def _choose_columns(self, problem: Problem) -> None:
+        """Set the columns of :meth:`Kernel.sensitivities`: of the guess alone, of the trends, and of both."""
+        twin = problem.twin
+        names = [parameter.name for parameter in twin.parameters[: len(twin.parameters) - twin.settings]]
+        self._free_columns = np.array([names.index(parameter.name) for parameter in problem.free], dtype=np.int64)
+        state_columns = len(names) + np.arange(self._states)
+        self._trend_columns = len(names) + self._states + self._free_columns
+        self._columns = np.concatenate([self._free_columns, state_columns])
+        self._columns_with_trends = np.concatenate([self._free_columns, self._trend_columns, state_columns])
+
     def set_predictor(self, parameters: Array, initial: Array, substeps: int = 1) -> None:
         """Compute at least ``substeps`` sub-steps, gain and whitening around ``parameters`` (free,) and ``initial``."""
         full = self.parameters(parameters[None])[0]
-        uncorrected = replace(self._excitation, gain=None, substeps=substeps)
+        uncorrected = replace(self.excitation, gain=None, substeps=substeps)
         while True:
             model = self._innovation_model(full, initial, uncorrected)
             corrected = replace(uncorrected, gain=model.gain)
@@ -116,12 +123,12 @@ class Objective:
                 break
             uncorrected = replace(uncorrected, substeps=needed)
         self.innovation_model = model
-        self._excitation = corrected
+        self.excitation = corrected
 
     def is_resolved(self, parameters: Array, initial: Array) -> bool:
         """Whether the sub-steps of the predictor suffice at ``parameters`` (free,) and ``initial`` (states,)."""
-        needed = self._substeps(self.parameters(parameters[None])[0], initial, self._excitation)
-        return needed <= self._excitation.substeps
+        needed = self._substeps(self.parameters(parameters[None])[0], initial, self.excitation)
+        return needed <= self.excitation.substeps
 
     def _substeps(self, full: Array, initial: Array, excitation: Excitation) -> int:
         return self.kernel.substeps(full, initial, excitation, TRUNCATION * self.noise.outputs, self._max_substeps)
@@ -141,11 +148,6 @@ class Objective:
         return model._replace(gain=np.pad(model.gain, ((0, 0), (0, extra), (0, 0)))) if extra else model
 
     @property
-    def excitation(self) -> Excitation:
-        """Inputs, measurements, gain and sub-steps of the predictor."""
-        return self._excitation
-
-    @property
     def whitening(self) -> Array:
         """(records, outputs, outputs) matrices that make each innovation's covariance the identity."""
         return self.innovation_model.whitening
@@ -153,11 +155,15 @@ class Objective:
     @property
     def integrator_steps(self) -> int:
         """Steps of the integrator in one prediction."""
-        return int(self._excitation.counts.sum())
+        return int(self.excitation.counts.sum())
 
     def guess(self, parameters: Array) -> Array:
         """Return the guess (free + states,) of ``parameters`` (free,) that starts at the first record."""
         return np.concatenate([parameters, self._first])
+
+    def without_trends(self, guess: Array) -> Array:
+        """Return the guess (free + states,) that a ``guess`` with trends contains."""
+        return np.concatenate([guess[: self.free], guess[2 * self.free :]])
 
     def parameters(self, guesses: Array) -> Array:
         """Return all parameters of the twin (particles, parameters) for guesses (particles, free, ...)."""
@@ -173,19 +179,15 @@ class Objective:
         return self._linearise(guess, self._columns)
 
     def linearise_with_trends(self, guess: Array) -> tuple[Array, Array]:
-        """Return the same for a guess of parameters at the end, their trends per second, and the initial state.
-
-        A trend enters to first order: within a window it moves a parameter by little.
-        """
-        free = self.free
-        constant = np.concatenate([guess[:free], guess[2 * free :]])
-        residuals, jacobian = self._linearise(constant, self._columns_with_trends)
-        return residuals + jacobian[:, free : 2 * free] @ guess[free : 2 * free], jacobian
+        """Return the same for a guess with trends, which enter to first order: they move a parameter by little."""
+        trends = slice(self.free, 2 * self.free)
+        residuals, jacobian = self._linearise(self.without_trends(guess), self._columns_with_trends)
+        return residuals + jacobian[:, trends] @ guess[trends], jacobian
 
     def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
         with np.errstate(over="ignore", invalid="ignore"):
-            prediction = self.kernel.sensitivities(parameters, initial, self._excitation, columns)
+            prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
             slopes = prediction.slopes
             if not self.is_complete:
@@ -198,20 +200,20 @@ class Objective:
     def predict(self, guesses: Array) -> Array:
         """Return one-step predictions (particles, records, outputs), in the units of the twin."""
         initial = guesses[:, self.free :]
-        return self.kernel.simulate(self.parameters(guesses), initial, self._excitation)
+        return self.kernel.simulate(self.parameters(guesses), initial, self.excitation)
 
     def predict_with_trends(self, guess: Array) -> tuple[Array, Array]:
         """Return prediction (records, outputs) and last state (states,) for a guess with trends."""
         free = self.free
         parameters = self.parameters(guess[None])[0]
-        prediction = self.kernel.sensitivities(parameters, guess[2 * free :], self._excitation, self._trend_columns)
+        prediction = self.kernel.sensitivities(parameters, guess[2 * free :], self.excitation, self._trend_columns)
         with np.errstate(over="ignore", invalid="ignore"):  # where the twin diverges
             trends = prediction.slopes @ guess[free : 2 * free]
             return prediction.outputs + trends, prediction.last
 
     def simulate(self, guess: Array) -> Array:
         """Return the open-loop simulation (records, outputs) from the initial state of ``guess`` (guess,)."""
-        uncorrected = replace(self._excitation, gain=None)
+        uncorrected = replace(self.excitation, gain=None)
         simulated: Array = self.kernel.simulate(self.parameters(guess[None]), guess[None, self.free :], uncorrected)[0]
         return simulated
 

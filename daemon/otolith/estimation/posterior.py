@@ -88,9 +88,10 @@ class Posterior:
         return Prior(mean * size, covariance * np.outer(size, size))
 
     def held(self, predicted: "Posterior") -> Prior:
-        """Return what is known at the end of a window that adds nothing; ``predicted`` is the prediction of it.
+        """Return what is known at the end of a window that does not update it; ``predicted`` is its prediction.
 
-        Values stay; what the trends would have added counts as uncertainty. The phases of components advance.
+        Values stay, and what their trends would have added is added to the uncertainty. Values of components, whose
+        phases advance, are those of the prediction.
         """
         before, after = self.prior(), predicted.prior()
         mean, kept = after.mean.copy(), [not free.name.startswith("_") for free in self.problem.free]
@@ -127,9 +128,9 @@ class Posterior:
     def shifts(self, values: Array, sd: Array, length: float) -> Array:
         """Return by how many standard deviations a window of ``length`` (s) alone differs from the prediction (free,).
 
-        ``values`` and ``sd`` (free,) are its estimates, without trends, so that they hold in its middle. While nothing
-        happens a shift is a standard normal deviate, or less. Values of components do not count, nor does less than a
-        parameter drifts in the window: the filter lags behind a drift that accelerates, and follows it.
+        ``values`` and ``sd`` (free,) are its estimates without trends, which hold in its middle. For a healthy machine
+        a shift is a standard normal deviate, or smaller. It is zero for values of components, and where the difference
+        is no larger than the drift within the window: the filter lags behind a drift that accelerates.
         """
         prior = self.prior()
         before, trend = np.split(prior.mean, 2)
@@ -173,18 +174,17 @@ class Posterior:
     def remap_parameters(self, problem: Problem) -> "Posterior":
         """Return what is known for another choice of free parameters; new ones have the initial prior."""
         labels, count = [free.label for free in self.problem.free], len(problem.free)
-        kept = [at for at, free in enumerate(problem.free) if free.label in labels]
-        before = [labels.index(problem.free[at].label) for at in kept]  # slots may have changed places
+        new = [at for at, free in enumerate(problem.free) if free.label in labels]
+        old = [labels.index(problem.free[at].label) for at in new]  # slots may have changed places
         level = np.full(count, ADDED_LEVEL)
-        level[kept] = self.belief.level[0][before]
-        kept = [*kept, *(count + at for at in kept)]  # and their trends
-        before = [*before, *(len(labels) + at for at in before)]
-        ratio = _size(self.problem)[before] / _size(problem)[kept]
+        level[new] = self.belief.level[0][old]
+        new, old = [*new, *(count + at for at in new)], [*old, *(len(labels) + at for at in old)]  # and their trends
+        ratio = _size(self.problem)[old] / _size(problem)[new]
         old_mean, old_covariance = imm_filter.moment_match(self.belief)
         mean, covariance = imm_filter.moment_match(Posterior.initial(problem).belief)
-        mean[kept] = old_mean[before] * ratio
-        covariance[kept, :] = covariance[:, kept] = 0.0
-        covariance[np.ix_(kept, kept)] = old_covariance[np.ix_(before, before)] * np.outer(ratio, ratio)
+        mean[new] = old_mean[old] * ratio
+        covariance[new, :] = covariance[:, new] = 0.0
+        covariance[np.ix_(new, new)] = old_covariance[np.ix_(old, old)] * np.outer(ratio, ratio)
         modes = imm_filter.equal_modes(level, mean, covariance, self.belief.end, self.belief.variance_ratio)
         return replace(self, problem=problem, belief=modes)
 

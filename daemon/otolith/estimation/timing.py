@@ -4,7 +4,7 @@ Each sample moves in time with its value; nothing measured is interpolated. Inpu
 their hold. ``docs/explanation/delays.md`` has the equations.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -42,33 +42,37 @@ def shifted(twin: Definition, window: Window, delays: Mapping[str, float]) -> Wi
     """
     if not any(delays.values()):
         return window
-    length, tolerance = window.grid.length, SAME_RECORD_STEPS * window.sample_period
+    tolerance = SAME_RECORD_STEPS * window.sample_period
     of_inputs = [delays.get(driven.name, 0.0) for driven in twin.inputs]
-    start, end = max([0.0, *(-delay for delay in of_inputs)]), length - max([0.0, *of_inputs])
-    distinct = sorted({delays.get(signal, 0.0) for signal in window.signals})
-    times = np.sort(np.concatenate([window.grid.offsets - delay for delay in distinct]))
-    times = times[(times >= start - tolerance) & (times < end - tolerance)]
+    start, end = max([0.0, *(-delay for delay in of_inputs)]), window.grid.length - max([0.0, *of_inputs])
+    times = _record_times(window, {delays.get(signal, 0.0) for signal in window.signals}, (start, end))
     if not len(times):
         return window
-    times = times[np.concatenate([[True], np.diff(times) > tolerance])]
     grid = _grid(times, end, tolerance)
     values, missing, errors = [], [], []
-    holds = {driven.name: driven.hold for driven in twin.inputs}
+    ramps = {driven.name for driven in twin.inputs if driven.hold == "foh"}
     for signal in window.signals:
-        own = window.grid.offsets - delays.get(signal, 0.0)
-        before = np.clip(np.searchsorted(own, times + tolerance, side="right") - 1, 0, len(own) - 1)
-        fresh = (np.abs(times - own[before]) <= tolerance) & ~window.missing_in(signal)[before]
+        sampled = window.grid.offsets - delays.get(signal, 0.0)
+        before = np.clip(np.searchsorted(sampled, times + tolerance, side="right") - 1, 0, len(sampled) - 1)
+        is_between = np.abs(times - sampled[before]) > tolerance  # two samples of the signal
         value = window.column(signal)[before]
-        if holds.get(signal) == "foh":
-            value = np.where(
-                np.abs(times - own[before]) > tolerance, np.interp(times, own, window.column(signal)), value
-            )
+        if signal in ramps:
+            value = np.where(is_between, np.interp(times, sampled, window.column(signal)), value)
         values.append(value)
-        missing.append(~fresh)
+        missing.append(is_between | window.missing_in(signal)[before])
         errors.append(_bridge_error(window, signal, before, grid.steps))
     error = BridgeError(*(np.column_stack(columns) for columns in zip(*errors, strict=True)))
     whole = replace(window, start=window.start + float(times[0]), grid=grid)
     return replace(whole, values=np.column_stack(values), missing=np.column_stack(missing), bridge_error=error)
+
+
+def _record_times(window: Window, delays: Collection[float], ends: tuple[float, float]) -> Array:
+    """Return the times (records,) at which a signal with one of the ``delays`` has a sample, between the ``ends``."""
+    tolerance = SAME_RECORD_STEPS * window.sample_period
+    times = np.sort(np.concatenate([window.grid.offsets - delay for delay in sorted(delays)]))
+    times = times[(times >= ends[0] - tolerance) & (times < ends[1] - tolerance)]
+    is_first = np.diff(times, prepend=-np.inf) > tolerance  # of those that are one record
+    return np.asarray(times[is_first])
 
 
 def _grid(times: Array, end: float, tolerance: float) -> TimeGrid:
@@ -157,23 +161,21 @@ def output_slopes(objective: Objective, guess: Array) -> Array:
     excitation, grid = objective.excitation, objective.excitation.grid
     if grid.records < 2:
         return np.zeros(objective.measured.shape)
-    early = grid.offsets[1:] - SLOPE_SHARE * np.diff(grid.offsets)
-    times = np.concatenate([grid.offsets, early])
+    count, before = grid.records, grid.offsets[1:] - SLOPE_SHARE * np.diff(grid.offsets)
+    times = np.concatenate([grid.offsets, before])
     order = np.argsort(times, kind="stable")
-    count = len(grid.offsets)
-    source = np.concatenate([np.arange(count), np.arange(count - 1)])[order]
     is_record = order < count
-    inputs = excitation.inputs[source]
+    record = np.concatenate([np.arange(count), np.arange(count - 1)])[order]  # in whose step a time lies
+    inputs, following = excitation.inputs[record], excitation.inputs[np.minimum(record + 1, count - 1)]
     held = [driven.hold == "zoh" for driven in objective.kernel.definition.inputs]
-    following = excitation.inputs[np.minimum(source + 1, count - 1)]
     between = np.where(held, inputs, inputs + (1.0 - SLOPE_SHARE) * (following - inputs))
     gain, measured = excitation.gain, excitation.measured
     finer = Excitation(
         np.where(is_record[:, None], inputs, between),
         TimeGrid.at(times[order], grid.length),
         excitation.substeps,
-        None if measured is None else np.where(is_record[:, None], measured[source], np.nan),
-        None if gain is None else np.where(is_record[:, None, None], gain[source], 0.0),
+        None if measured is None else np.where(is_record[:, None], measured[record], np.nan),
+        None if gain is None else np.where(is_record[:, None, None], gain[record], 0.0),
     )
     predicted = objective.kernel.simulate(objective.parameters(guess[None]), guess[None, objective.free :], finer)[0]
     rise = predicted[is_record][1:] - predicted[~is_record]

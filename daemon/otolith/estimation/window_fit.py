@@ -68,8 +68,13 @@ class Fit:
     @property
     def window_chi_square(self) -> float:
         """χ² of the window alone."""
-        residuals = self.map_objective.window_residuals(self.result)
+        residuals = self.innovations.ravel()
         return float(residuals @ residuals)
+
+    @property
+    def innovations(self) -> Array:
+        """(records, outputs) whitened: the residuals without those of the prior."""
+        return self.result.residuals[: -len(self.prior.mean)].reshape(self.objective.measured.shape)
 
     @property
     def count(self) -> float:
@@ -86,15 +91,24 @@ class Fit:
         """(free,) at the end of the window."""
         return self.result.guess[: len(self.problem.free)]
 
+    @property
+    def initial(self) -> Array:
+        """(states,) at the first record."""
+        return self.result.guess[2 * len(self.problem.free) :]
+
+    @property
+    def guess(self) -> Array:
+        """(free + states,) without trends, for :attr:`objective`."""
+        return self.objective.without_trends(self.result.guess)
+
     def evidence(self) -> Evidence:
         """Return the evidence of the window; standard deviations are inflated by the unexplained residual."""
-        residuals = self.map_objective.window_residuals(self.result).reshape(self.objective.measured.shape)
-        return self.map_objective.evidence(self.result, inflation_of(residuals, self.objective.present, self.cost))
+        inflation = inflation_of(self.innovations, self.objective.present, self.cost)
+        return self.map_objective.evidence(self.result, inflation)
 
     def linearised_at_end(self) -> "Fit":
         """Return the window linearised at the end of this fit, with a predictor made there."""
-        initial = self.result.guess[2 * len(self.problem.free) :]
-        return _fit(self.problem, self.window, self.prior, self.parameters, max_steps=0, initial=initial)
+        return _fit(self.problem, self.window, self.prior, self.parameters, max_steps=0, initial=self.initial)
 
     def continued(self, max_steps: int) -> "Fit":
         """Return the fit after further steps, unless it has converged."""
@@ -107,11 +121,17 @@ class Fit:
 
         Otherwise the error of the integrator would pass for evidence: as where dry friction changes its sign.
         """
-        free = len(self.problem.free)
-        initial = self.result.guess[2 * free :]
-        if self.objective.is_resolved(self.parameters, initial):
+        if self.objective.is_resolved(self.parameters, self.initial):
             return self
-        return _fit(self.problem, self.window, self.prior, self.parameters, max_steps, initial=initial)
+        return _fit(self.problem, self.window, self.prior, self.parameters, max_steps, initial=self.initial)
+
+    def set_predictor_at_end(self) -> None:
+        """Make the predictor at the end of this fit: in the objective, which other fits of the window may share."""
+        self.objective.set_predictor(self.parameters, self.initial)
+
+    def restarted(self) -> "Fit":
+        """Return a new fit from the end of this one, with the predictor that the objective has now."""
+        return replace(self, result=gauss_newton(self.map_objective, self.result.guess))
 
     def advance(self) -> PhaseAdvance:
         """Return the advance of the components' phases to the next window."""
@@ -218,15 +238,16 @@ def estimate(
 ) -> WindowEstimate:
     """Estimate the free parameters from ``window``; ``start`` (free,) is where the fit starts.
 
-    The same problem, window, prior and start give the same estimate, bit for bit.
+    The same problem, window, prior and start give the same estimate, bit for bit. First Gauss-Newton fits the window
+    under the prior, and from there the window alone. A particle swarm follows as ``search`` says.
     """
     fitted = fit(problem, window, prior, start)
     both = _fit_alone(fitted, fitted.result.evaluations)
     if fitted.cost > EXPLAINED >= both.cost:
         both = _leave_local_minimum(both)
     outcome, generations = Outcome.CONTINUED, 0
-    unexplained = both.cost > EXPLAINED and search is not Search.NEVER
-    if unexplained or (search is Search.FROM_BOUNDS and both.is_informative):
+    is_unexplained = both.cost > EXPLAINED and search is not Search.NEVER
+    if is_unexplained or (search is Search.FROM_BOUNDS and both.is_informative):
         both, outcome, generations = _search(both)
     elif search is Search.FROM_BOUNDS:
         outcome = Outcome.NOTHING_TO_FIND
@@ -261,9 +282,8 @@ class _BothFits:
 
 
 def _fit_alone(fitted: Fit, evaluations: int) -> _BothFits:
-    objective, guess, free = fitted.objective, fitted.result.guess, fitted.objective.free
-    constant = np.concatenate([guess[:free], guess[2 * free :]])
-    alone = gauss_newton(objective, constant, ALONE_STEPS)
+    objective = fitted.objective
+    alone = gauss_newton(objective, fitted.guess, ALONE_STEPS)
     residuals = alone.residuals.reshape(objective.measured.shape)
     inflation = inflation_of(residuals, objective.present, float(np.sqrt(alone.chi_square / objective.count)))
     uncertainty = information(alone.jacobian, objective.high - objective.low, inflation)
@@ -275,31 +295,30 @@ def _leave_local_minimum(both: _BothFits) -> _BothFits:
 
     Where a state is not measured, the first record may lead to a local minimum, which the fit of the window alone left.
     """
-    fitted, objective, free = both.fit, both.fit.objective, both.fit.objective.free
-    parameters, initial = both.alone.guess[:free], both.alone.guess[free:]
-    result = gauss_newton(fitted.map_objective, fitted.map_objective.guess(parameters, initial))
-    if result.chi_square > LOCAL_MINIMUM * fitted.chi_square:
+    fitted, free = both.fit, both.fit.objective.free
+    start = fitted.map_objective.guess(both.alone.guess[:free], both.alone.guess[free:])
+    again = replace(fitted, result=gauss_newton(fitted.map_objective, start))
+    if again.chi_square > LOCAL_MINIMUM * fitted.chi_square:
         return both
-    objective.set_predictor(result.guess[:free], result.guess[2 * free :])  # the present one was made far from here
-    result = gauss_newton(fitted.map_objective, result.guess)
-    return _fit_alone(replace(fitted, result=result), both.evaluations + result.evaluations)
+    again.set_predictor_at_end()
+    again = again.restarted()
+    return _fit_alone(again, both.evaluations + again.result.evaluations)
 
 
 def _search(both: _BothFits) -> tuple[_BothFits, Outcome, int]:
     """Search the bounds with a particle swarm; return the better fit, how the search ended, and its generations."""
-    fitted, objective, problem = both.fit, both.fit.objective, both.fit.problem
-    free, seed = objective.free, problem.seed + both.fit.window.index
-    swarm = search_parameters(objective, problem.swarm, fitted.parameters, seed)
-    from_swarm, evaluations = _refine(fitted, swarm, seed)
-    better = min(from_swarm, fitted.result, key=lambda result: result.chi_square)
-    objective.set_predictor(better.guess[:free], better.guess[2 * free :])  # the present one was made far from here
-    from_swarm = gauss_newton(fitted.map_objective, from_swarm.guess)
-    from_prediction = gauss_newton(fitted.map_objective, fitted.result.guess)
-    distinct = np.abs(from_swarm.guess - from_prediction.guess)[:free] > DISTINCT * both.information.sd[:free]
-    chosen = min(from_prediction, from_swarm, key=lambda result: result.chi_square)
-    evaluations += both.evaluations + swarm.evaluations + from_swarm.evaluations + from_prediction.evaluations
-    after = _fit_alone(replace(fitted, result=chosen), evaluations)
-    if not distinct.any():
+    fitted, problem = both.fit, both.fit.problem
+    seed = problem.seed + fitted.window.index
+    swarm = search_parameters(fitted.objective, problem.swarm, fitted.parameters, seed)
+    refined, evaluations = _refine(fitted, swarm, seed)
+    min(refined, fitted, key=lambda item: item.chi_square).set_predictor_at_end()  # the present one was made far away
+    from_swarm, from_prediction = refined.restarted(), fitted.restarted()
+    chosen = min(from_prediction, from_swarm, key=lambda item: item.chi_square)
+    evaluations += both.evaluations + swarm.evaluations
+    evaluations += from_swarm.result.evaluations + from_prediction.result.evaluations
+    after = _fit_alone(chosen, evaluations)
+    distance = np.abs(from_swarm.parameters - from_prediction.parameters)
+    if not (distance > DISTINCT * both.information.sd[: len(distance)]).any():
         outcome = Outcome.AGREED
     elif abs(from_swarm.chi_square - from_prediction.chi_square) <= EQUALLY_GOOD * max(after.cost, 1.0) ** 2:
         outcome = Outcome.AMBIGUOUS
@@ -308,7 +327,7 @@ def _search(both: _BothFits) -> tuple[_BothFits, Outcome, int]:
     return after, outcome, swarm.generations
 
 
-def _refine(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[FitResult, int]:
+def _refine(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[Fit, int]:
     """Return the best fit from the best particles and from starts over all of the bounds, and its evaluations.
 
     The swarm searches parameters only, from the first record on. Where an initial state is not measured, or the minimum
@@ -320,7 +339,7 @@ def _refine(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[FitResult, int]
     results = [gauss_newton(objective, objective.guess(start), TRIAL_STEPS) for start in starts]
     best, free = min(results, key=lambda result: result.chi_square), objective.free
     final = gauss_newton(fitted.map_objective, fitted.map_objective.guess(best.guess[:free], best.guess[free:]))
-    return final, sum(result.evaluations for result in results) + final.evaluations
+    return replace(fitted, result=final), sum(result.evaluations for result in (*results, final))
 
 
 def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstimate:
@@ -377,18 +396,20 @@ def _parameter_estimates(both: _BothFits, outcome: Outcome) -> tuple[ParameterEs
 
 
 def _pressure(both: _BothFits, at_bound: Mask) -> Array:
-    """Return how far beyond its bound a Gauss-Newton step would lead each value (guess,), in standard deviations.
+    """Return how far beyond its bound a step without bounds would lead each value (guess,), in standard deviations.
 
-    They are inflated by the residual that this step would leave: what the bound causes is no noise.
+    The step is that of Gauss-Newton. Standard deviations are inflated by the residual that it would leave: what the
+    bound causes is no noise. Values that are not at a bound have zero.
     """
     objective, alone = both.fit.objective, both.alone
     pressure = np.zeros(len(alone.guess))
-    if at_bound.any():
-        width = objective.high - objective.low
-        residuals = alone.residuals.ravel()
-        step = -width * np.linalg.lstsq(alone.jacobian * width, residuals, rcond=MIN_SINGULAR)[0]
-        left = np.linalg.norm(residuals + alone.jacobian @ step) / np.sqrt(objective.count)
-        sd = both.information.sd / both.inflation * max(float(left), 1.0)
-        outward = np.where(alone.guess - objective.low < objective.high - alone.guess, -step, step)
-        pressure[at_bound] = np.maximum(outward, 0.0)[at_bound] / sd[at_bound]
+    if not at_bound.any():
+        return pressure
+    width, residuals = objective.high - objective.low, alone.residuals.ravel()
+    step = -width * np.linalg.lstsq(alone.jacobian * width, residuals, rcond=MIN_SINGULAR)[0]
+    cost_after = np.linalg.norm(residuals + alone.jacobian @ step) / np.sqrt(objective.count)
+    sd = both.information.sd / both.inflation * max(float(cost_after), 1.0)
+    is_at_low = alone.guess - objective.low < objective.high - alone.guess
+    outward = np.maximum(np.where(is_at_low, -step, step), 0.0)
+    pressure[at_bound] = outward[at_bound] / sd[at_bound]
     return pressure

@@ -85,17 +85,9 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
         for name, item in report.parameters.items()
     }
     report = report.model_copy(update={"parameters": parameters})
-    levels = {key: record.level for key, record in state.records.items()}
-    is_informative = any(item.status is Status.ESTIMATED for item in report.parameters.values())  # not at rest
-    absent = Level.OK if report.decision in ACCEPTED and is_informative else None
-    observations = {
-        key: Observation(key, MACHINE, absent, persistence=record.persistence) for key, record in state.records.items()
-    }
-    spans = {name: span(history) for name, history in state.histories.items()}
-    state = replace(state, undetermined=_undetermined_times(state.undetermined, report, is_moving=is_informative))
-    past = Past(state.steps, spans, state.undetermined)
-    observations |= {item.key: item for item in observe(plan, report, levels, past)}
-    was_ok = {key for key, item in observations.items() if item.level is Level.OK}
+    is_moving = any(item.status is Status.ESTIMATED for item in report.parameters.values())
+    state = replace(state, undetermined=_undetermined_times(state.undetermined, report, is_moving=is_moving))
+    observations = _observations(plan, state, report, is_moving=is_moving)
     records, events = {}, []
     for key, observed in observations.items():
         own = observed if key in state.inside else _from_start(observed)
@@ -108,9 +100,27 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None]
     document = _states(plan, state.document, report, current, state.undetermined)
-    changed = {"health": document, "events": tuple(events)}
+    was_ok = {key for key, item in observations.items() if item.level is Level.OK}
     state = replace(state, records=records, document=document, inside=state.inside | was_ok)
-    return state, report.model_copy(update=changed)
+    return state, report.model_copy(update={"health": document, "events": tuple(events)})
+
+
+def _observations(
+    plan: MonitoringPlan, state: HealthState, report: ReportDocument, *, is_moving: bool
+) -> dict[str, Observation]:
+    """Return what the window shows about each condition, by its key.
+
+    A condition that earlier windows showed and this one does not is at OK if the window updated the estimates of a
+    moving machine; otherwise nothing is known of it.
+    """
+    absent = Level.OK if report.decision in ACCEPTED and is_moving else None
+    earlier = {
+        key: Observation(key, MACHINE, absent, persistence=record.persistence) for key, record in state.records.items()
+    }
+    levels = {key: record.level for key, record in state.records.items()}
+    spans = {name: span(history) for name, history in state.histories.items()}
+    shown = observe(plan, report, levels, Past(state.steps, spans, state.undetermined))
+    return earlier | {item.key: item for item in shown}
 
 
 def _undetermined_times(before: Mapping[str, float], report: ReportDocument, *, is_moving: bool) -> dict[str, float]:
@@ -129,22 +139,22 @@ def _from_start(observed: Observation) -> Observation:
 
 def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
     """Return the report with the texts of the core in the language of the machine."""
-    say = plan.texts.translated
     if plan.language == "en":
         return report
+    local = plan.texts.translated
     quality, absent = report.window.quality, report.window.absent
-    quality = quality.model_copy(update={"reasons": tuple(map(say, quality.reasons))})
-    absent = absent and {name: say(text) for name, text in absent.items()}
+    quality = quality.model_copy(update={"reasons": tuple(map(local, quality.reasons))})
+    absent = absent and {name: local(text) for name, text in absent.items()}
     findings = [
-        item.model_copy(update={key: say(getattr(item, key)) for key in ("condition", "text", "advice")})
+        item.model_copy(update={key: local(getattr(item, key)) for key in ("condition", "text", "advice")})
         for item in report.findings
     ]
     parameters = {
-        name: item.model_copy(update={"reason": say(item.reason), "advice": item.advice and say(item.advice)})
+        name: item.model_copy(update={"reason": local(item.reason), "advice": item.advice and local(item.advice)})
         for name, item in report.parameters.items()
     }
     components = [
-        item.model_copy(update={key: say(getattr(item, key)) for key in ("meaning", "conditions", "domain")})
+        item.model_copy(update={key: local(getattr(item, key)) for key in ("meaning", "conditions", "domain")})
         for item in report.components
     ]
     window = report.window.model_copy(update={"quality": quality, "absent": absent})
@@ -211,12 +221,7 @@ def _advance(
     level, count = _persistent(before.level, [item[0] for item in recent], persistence)
     first = recent[-count:][0][1]
     if event is None and level is not Level.OK:
-        start = min(first.start, first.start if observed.since is None else observed.since)
-        evidence = EvidenceDocument(windows=(first.index, report.window.index))
-        event = EventDocument(
-            id=f"{observed.key}@{start:.1f}", part=observed.part, state=level, change=EventChange.RAISED,
-            start=start, since=start, condition="", text="", evidence=evidence, language=plan.language,
-        )  # fmt: skip
+        event = _raised(plan, observed, level, (first, report.window))
     elif event is not None and level is not before.level:
         is_over = level is Level.OK
         changed = {"end": first.start} if is_over else {"state": level, "since": first.start}
@@ -227,6 +232,19 @@ def _advance(
         is_other = event.condition_id not in ("", described.condition_id) and event.change is None
         event = described.model_copy(update={"change": EventChange.CHANGED}) if is_other else described
     return ConditionRecord(level, recent, event, persistence)
+
+
+def _raised(
+    plan: MonitoringPlan, observed: Observation, level: Level, windows: tuple[WindowDocument, WindowDocument]
+) -> EventDocument:
+    """Return a new event, not described yet, that the first to the last of ``windows`` agree on."""
+    first, last = windows
+    start = min(first.start, first.start if observed.since is None else observed.since)
+    evidence = EvidenceDocument(windows=(first.index, last.index))
+    return EventDocument(
+        id=f"{observed.key}@{start:.1f}", part=observed.part, state=level, change=EventChange.RAISED,
+        start=start, since=start, condition="", text="", evidence=evidence, language=plan.language,
+    )  # fmt: skip
 
 
 def _persistent(level: Level, recent: Sequence[Level], persistence: Persistence) -> tuple[Level, int]:
@@ -260,22 +278,24 @@ def _states(
 ) -> HealthDocument:
     """Return the states of parts and machine; ``events`` begin with the most severe.
 
-    ``determined`` are the parameters that once were.
+    ``determined`` are the parameters that once were. Without data, all parts of the machine are at NO DATA.
     """
     worst = {event.part: event for event in reversed(events)}
-    silent = next((event for event in events if event.state is Level.NO_DATA and event.part == BUS), None)
+    no_data = next((event for event in events if event.state is Level.NO_DATA and event.part == BUS), None)
     parts: dict[str, PartDocument] = {}
     for part in dict.fromkeys((*plan.parts, SENSORS, BUS, *worst)):
-        event = worst.get(part, silent)
-        missing = () if event else _undetermined(plan, part, report)
-        key = "no_longer" if any(name in determined for name in missing) else "not_yet"
-        why = plan.texts(key, names=", ".join(missing)) if missing else ""
-        state = event.state if event else Level.NO_DATA if missing else Level.OK
-        since, reason = (event.since, event.condition) if event else (report.window.start, why)
-        parts[part] = _kept(before.parts.get(part) if before else None, state, since, reason, missing)
+        earlier = before.parts.get(part) if before else None
+        if event := worst.get(part, no_data):
+            parts[part] = _kept(earlier, event.state, event.since, event.condition, ())
+        elif missing := _undetermined(plan, part, report):
+            key = "no_longer" if any(name in determined for name in missing) else "not_yet"
+            reason = plan.texts(key, names=", ".join(missing))
+            parts[part] = _kept(earlier, Level.NO_DATA, report.window.start, reason, missing)
+        else:
+            parts[part] = _kept(earlier, Level.OK, report.window.start, "", ())
     levels = [item.state for item in parts.values() if item.state.rank > Level.NO_DATA.rank]
     is_known = any(parts[part].state is not Level.NO_DATA for part in plan.parts) or not plan.parts
-    state = max(levels, key=lambda level: level.rank, default=Level.OK if is_known and not silent else Level.NO_DATA)
+    state = max(levels, key=lambda level: level.rank, default=Level.OK if is_known and not no_data else Level.NO_DATA)
     same = [item for item in parts.values() if item.state is state]
     reason = "; ".join(dict.fromkeys(item.reason for item in same if item.reason))
     since = min(item.since for item in same) if levels else report.window.start

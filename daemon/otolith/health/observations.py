@@ -258,7 +258,7 @@ def _of_component(
 ) -> Observation:
     """Return the observation of a component; one that is expected, fades or is of the size of noise is no warning.
 
-    Its key leaves its input open: at a constant speed, a sine of time may later prove to be one of the angle.
+    Its key does not contain its input: at constant speed, a sine of time may later prove to be one of the angle.
     """
     key, amplitude = f"component/{component.site}/{component.family}", component.values["amplitude"]
     order = component.values.get("order")

@@ -1,6 +1,6 @@
 """When a parameter passes its limits, from the history of its estimates.
 
-Meta-models of the paper (Table 1) are compared: a constant, a line, and an exponential that accelerates or levels off.
+Three models of the paper (Table 1) are compared: a constant, a line, and an exponential that accelerates or levels off.
 Line and exponential begin at an unknown onset:
 
     value(t) = c + d·φ(t),   φ = s or (exp(x·s) - 1)/(exp(x) - 1),   s = (t - onset)/(now - onset), 0 before the onset
@@ -153,7 +153,7 @@ def span(history: History) -> float:
 
 
 def find_trend(history: History, change: float) -> Trend | str:
-    """Return the trend of a history, or why there is none; ``change`` is one that would not be surprising."""
+    """Return the trend of a history, or why there is none; ``change`` is the standard deviation of its prior."""
     if len(history) < MIN_POINTS:
         return f"too short: {len(history)} of {MIN_POINTS} estimates"
     data = _Data.of(history, change)
@@ -238,11 +238,12 @@ def _cells(data: _Data, onset: Array, exponent: Array, *, is_constant: bool = Fa
     moment = np.stack([np.broadcast_to((ones * values).sum(2), (len(rows), count)), (shapes * values).sum(2)], axis=2)
     covariance = np.linalg.inv(precision)
     mean = np.einsum("tcij,tcj->tci", covariance, moment)
-    misfit = (values * values).sum(2) - (mean * moment).sum(2)
-    scale, shape = FACTOR_SHAPE + 0.5 * np.maximum(misfit, 0.0), FACTOR_SHAPE + 0.5 * points
-    log_weight = 0.5 * (np.log(np.linalg.det(prior)) - np.log(np.linalg.det(precision))) - shape * np.log(scale)
+    residual = (values * values).sum(2) - (mean * moment).sum(2)
+    # The factor on the variances has an inverse gamma posterior of this scale and order.
+    scale, order = FACTOR_SHAPE + 0.5 * np.maximum(residual, 0.0), FACTOR_SHAPE + 0.5 * points
+    log_weight = 0.5 * (np.log(np.linalg.det(prior)) - np.log(np.linalg.det(precision))) - order * np.log(scale)
     log_weight -= 0.5 * np.log(data.innovation).sum(1)[:, None] + math.log(log_weight.size)
-    covariance = covariance * (scale / (shape - 1.0))[..., None, None]
+    covariance = covariance * (scale / (order - 1.0))[..., None, None]
     mean[..., 0] += data.origin
     onset, exponent = (np.tile(each, len(rows)) for each in (onset, exponent))
     return _Cells(log_weight.ravel(), onset, exponent, mean.reshape(-1, 2), covariance.reshape(-1, 2, 2))

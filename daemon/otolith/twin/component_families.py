@@ -15,7 +15,7 @@ from otolith.acquisition.window import Array
 
 # Decisions. docs/reference/thresholds-twin.md gives the origin of each and the test that guards it.
 MIN_MAGNITUDE = 1e-9  # of |x|, in the unit of x: roots and logarithms have no slope at zero
-MIN_VARIATION = 0.02  # range of x over its largest magnitude: below it x is constant and only a constant can be told
+MIN_VARIATION = 0.02  # range of x over its largest magnitude: below it x is constant and so is any shape of it
 MIN_PERIODIC_ANGLE = 0.75 * 2.0 * math.pi  # rad of a sine within a window: less is a bend and no period
 MAX_ANGLE_PER_RECORD = 0.8 * math.pi  # rad of a sine from record to record: the Nyquist limit, with 20 % of margin
 MIN_BEND, MAX_BEND = 0.3, 12.0  # exponent of an exponential over the range of x: below a line, above a step
@@ -34,7 +34,7 @@ class SourceKind(StrEnum):
     NOTHING = "nothing"
     TIME = "time"
     PLACE = "place"
-    """An angle or a position: a machine repeats itself in it."""
+    """An angle or a position: forces of a machine are periodic in it."""
     SPEED = "speed"
     """Of a rotation or a motion: force times speed is a power."""
     SIGNAL = "signal"
@@ -99,7 +99,7 @@ class ComponentFamily:
     inputs: frozenset[SourceKind]
     """Kinds of source that it may depend on."""
     valid: Callable[[SourceRange], bool]
-    """Whether the window can tell the family from others."""
+    """Whether the window distinguishes the family from others."""
     inner: InnerParameter | None = None
     threshold_like: bool = False
     """Whether it can hold what it depends on at zero, as dry friction does: a linear response then underrates it."""
@@ -151,7 +151,7 @@ def _has_rates(x: SourceRange) -> bool:
 
 
 def _coulomb_transitions(x: SourceRange) -> tuple[float, float]:
-    """Widths of the transition around zero; with a step a machine at rest would never come to rest."""
+    """Widths of the transition around zero; with a step the simulated speed would oscillate around zero."""
     width = COULOMB_TRANSITION * _largest(x)
     return width, WIDEST_TRANSITION * width
 

@@ -65,7 +65,7 @@ def linearise(code: KernelCode) -> list[str]:
     ``state + input_now @ u[k] + input_next @ u[k + 1]`` to the next record, ``output @ state + feedthrough @ u[k]``.
     """
     states = len(code.x)
-    reaching = sorted({site for _, site, _ in code.f.named("f")})  # the sites that no output alone sees
+    reaching = sorted({site for _, site, _ in code.f.named("f")})  # the sites that enter a rate
     column_of = {site: states + index for index, site in enumerate(reaching)}
     blocks: Blocks = {
         "n_sites": str(code.sites),

@@ -33,7 +33,7 @@ class Parameter:
     watch: tuple[str | float, ...] = ()
     """Limits beyond which the part is watched, as written: absolute or relative to the nominal value."""
     act: tuple[str | float, ...] = ()
-    """Limits beyond which somebody has to act."""
+    """Limits beyond which action is required."""
     temperature_coefficient: float = 0.0
     """Relative change per kelvin."""
 
