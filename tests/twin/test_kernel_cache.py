@@ -113,9 +113,9 @@ def test_identity_depends_on_equations_only() -> None:
 
 
 def test_old_kernels_are_removed(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernel_cache, "MAX_BYTES", 3500)
+    monkeypatch.setattr(kernel_cache, "MAX_BYTES", 35_000)
     for index in range(6):
-        kernel_cache.load(f"number {index}", lambda: "#" * 1000)
+        kernel_cache.load(f"number {index}", lambda: "#" * 10_000)
         time.sleep(0.01)  # so that their times differ
     assert len([path for path in cache.iterdir() if path.is_dir()]) == 3
 
