@@ -12,7 +12,7 @@ PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --constra
 
 help:
 	@echo "make demo    run the simulated machine and the daemon for 90 s, and compare"
-	@echo "make test    run the tests, long ones shortened: a quarter of an hour on two cores"
+	@echo "make test    run the tests, long ones left out: six minutes on two cores"
 	@echo "make test-full"
 	@echo "             the long tests, and those that time something, one at a time: twenty minutes"
 	@echo "make system-test"
@@ -29,7 +29,7 @@ demo: $(RUNTIME)
 unexport PYTHONDONTWRITEBYTECODE
 
 # More processes than cores, as many tests wait for real time. A file's tests stay together and share what they compute.
-WORKERS ?= $(shell expr 2 \* $$(nproc) + 1)
+WORKERS ?= $(shell expr 3 \* $$(nproc))
 SHARED = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
 test: $(DEV)
 	$(SHARED) -m "not full and not timed"

@@ -29,6 +29,7 @@ from otolith.discovery.decision import ACCEPTED
 from otolith.health.schema import ReportDocument
 from otolith.machine import load_machine
 from otolith.runtime.replay import Replay, open_recorded
+from tests.variants import often
 
 WINDOWS = 10
 UNIFORM = Schedule(rows=Timing(0.01))
@@ -209,7 +210,7 @@ LOGS = {
 }
 
 
-@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("name", often(["rows every 10.7 ms", "rows with jitter", "80 % of omega missing"], LOGS))
 def test_an_irregular_or_slow_log_is_used_with_valid_intervals(log: Log, name: str) -> None:
     schedule, outcomes = LOGS[name], []
     for seed in (7, 8):

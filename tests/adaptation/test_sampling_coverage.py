@@ -15,18 +15,18 @@ from scipy.integrate import solve_ivp
 from otolith.acquisition.window import Array
 
 SHORT = (
-    "uniform rows",
     "omega every 50 ms",
-    "i every 100 ms",
     "samples 80 % missing",
     "rows 30 % missing, commands on change",
     "rows every 10.7 ms",
     "100 ms, 80 % missing",
     "polled every 21 ms",
-    "inputs every 50 ms",
 )
 FULL = (
     *SHORT,
+    "uniform rows",
+    "i every 100 ms",
+    "inputs every 50 ms",
     "omega every 20 ms",
     "both every 50 ms, commands on change",
     "rows 30 % missing",

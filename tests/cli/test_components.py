@@ -145,6 +145,7 @@ def test_commission_approve_reject_and_forget(commissioned: tuple[str, str]) -> 
     assert KEY in store().decisions().forgotten
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("commissioned")
 def test_a_replay_begins_with_the_approved_components_and_leaves_out_the_rejected_ones(data: Path) -> None:
     first = otolith("replay", MACHINE, data, "--json").stdout.splitlines()[0]

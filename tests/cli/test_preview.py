@@ -258,7 +258,7 @@ def test_the_data_are_read_once_and_again_for_a_proposal_unless_the_preview_is_s
     assert counts == [(1, False), (2, True), (2, True), (1, False)]
 
 
-@pytest.mark.parametrize(("end", "kind"), [(1.0, "largest"), (-1.0, "smallest")])
+@pytest.mark.parametrize(("end", "kind"), [(1.0, "largest"), pytest.param(-1.0, "smallest", marks=pytest.mark.full)])
 def test_a_saturated_sensor_is_remarked(tmp_path: Path, rows: Lines, end: float, kind: str) -> None:
     """A tenth of the readings of the current are at the end of its range; a turning point or a rest is no end."""
     readings = np.array([float(row[3]) for row in rows])

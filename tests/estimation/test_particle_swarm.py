@@ -55,6 +55,7 @@ def pymoo_minimum(cost: Callable[[Array], Array], seed: int, generations: int) -
     return float(minimize(Bounded(), swarm, ("n_gen", generations), seed=seed).F[0])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("cost", [sphere, rosenbrock, rastrigin])
 def test_particle_swarm_is_no_worse_than_pymoo(cost: Callable[[Array], Array]) -> None:
     """Medians over ten seeds, with 120 generations each."""

@@ -79,6 +79,7 @@ def processor_time(*processes: psutil.Process) -> float:
     return sum(sum(process.cpu_times()[:4]) for process in processes)
 
 
+@pytest.mark.timed
 def test_a_warm_start_takes_little_of_the_processor(tmp_path: Path) -> None:
     """Ratios within one run hold on a busy computer as well."""
     machine = OwnMachine(tmp_path / "machine", "in-process", faults="").machine
