@@ -19,7 +19,7 @@ from otolith.acquisition.ring import Rings
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.canbus.bus import BusOptions, enlarge_buffer, open_bus
 from otolith_drivers.canbus.driver import CanOptions, build
-from otolith_drivers.canbus.signals import CanSource
+from otolith_drivers.canbus.options import CanSource
 
 RATE, MESSAGES, FIRST_ID = 8000.0, 10, 0x180  # frames/s
 SETTLE = 0.5  # s after the last frame

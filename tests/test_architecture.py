@@ -17,10 +17,10 @@ LINTER = Path(sys.executable).with_name("lint-imports")
 SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root).rglob("*.py"))
 MAX_FILE_LINES = 600
 # Room for history, security, recordings, several sources and their commands: beyond it something must be replaced.
-MAX_SOURCE_LINES = 33_721
-MAX_MODULES = 171  # in daemon and drivers
+MAX_SOURCE_LINES = 32_555
+MAX_MODULES = 160  # in daemon and drivers
 MAX_MODULES_IN_A_FOLDER = 12
-MAX_LAYERS = 13
+MAX_LAYERS = 12
 
 BREACHES = {
     "a driver imports the daemon": ("drivers/otolith_drivers/base.py", "import otolith.machine"),

@@ -65,8 +65,7 @@ class CompileStep(NamedTuple):
 
     kernel: str
     is_end: bool
-    compiled: bool
-    """At the end: whether it was compiled, and not loaded."""
+    compiled: bool  # At the end: whether it was compiled, and not loaded
 
 
 _observers: list[Callable[[CompileStep], None]] = []

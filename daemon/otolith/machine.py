@@ -17,7 +17,6 @@ from otolith.estimation.problem import Problem, SwarmOptions, WindowOptions, key
 from otolith.health.diagnosis import Rule, RulesFile, worded
 from otolith.health.language import Language, texts_in
 from otolith.health.limits import MACHINE, Level, Limit, MonitoredQuantity, MonitoringPlan
-from otolith.machine_drivers import build_driver, driver_configs, observed_signals, own_keys
 from otolith.machine_file import (
     DiscoveryTable,
     LimitsTable,
@@ -26,6 +25,10 @@ from otolith.machine_file import (
     RawQuantity,
     SignalTable,
     WindowTable,
+    build_driver,
+    driver_configs,
+    observed_signals,
+    own_keys,
 )
 from otolith.twin.augmentation import sensor_site, sites, sources
 from otolith.twin.component_families import FAMILY_NAMES
@@ -52,19 +55,13 @@ MAX_GRID_ERROR = 1e-6  # share of a window's length by which it may differ from 
 class RecordedMachine:
     """What a recording has beside the reports. It can be sent to another process."""
 
-    title: str
-    """Name and site of the machine, for people."""
+    title: str  # Name and site of the machine, for people
     twin: Definition
-    parameters: Sequence[Parameter]
-    """Those that are estimated."""
-    sampling: Sampling | Mapping[str, Sampling]
-    """Meaning of the times of its samples, the same for all signals or by signal."""
-    delays: Mapping[str, float]
-    """Of its signals, s: they are subtracted from the times of the records."""
-    all_curves: bool = False
-    """Whether every curve has all records, instead of the extremes of some."""
-    plan: MonitoringPlan = field(default_factory=MonitoringPlan)
-    """Limits of its parameters."""
+    parameters: Sequence[Parameter]  # Those that are estimated
+    sampling: Sampling | Mapping[str, Sampling]  # Meaning of its sample times, the same for all signals or by signal
+    delays: Mapping[str, float]  # Of its signals, s: they are subtracted from the times of the records
+    all_curves: bool = False  # Whether every curve has all records, instead of the extremes of some
+    plan: MonitoringPlan = field(default_factory=MonitoringPlan)  # Limits of its parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,20 +72,13 @@ class LoadedMachine:
     file: MachineFile
     twin: Definition
     problem: Problem
-    plan: MonitoringPlan
-    """Limits of parameters and components, and the rules of the diagnosis."""
-    signal_tables: Mapping[str, SignalTable]
-    """Of each signal of the twin."""
-    built_driver: Driver | None
-    """None if the file was loaded without its driver."""
+    plan: MonitoringPlan  # Limits of parameters and components, and the rules of the diagnosis
+    signal_tables: Mapping[str, SignalTable]  # Of each signal of the twin
+    built_driver: Driver | None  # None if the file was loaded without its driver
 
     @property
     def driver(self) -> Driver:
-        """The driver, built and not yet opened.
-
-        Raises:
-            ConfigurationError: the file was loaded without its driver.
-        """
+        """The driver, built and not yet opened; raise ConfigurationError if the file was loaded without its driver."""
         if self.built_driver is None:
             raise ConfigurationError(f"{self.path}: loaded without its driver")
         return self.built_driver
@@ -212,22 +202,14 @@ def library_twins() -> list[str]:
 
 
 def find_twin(name: str) -> Definition:
-    """Return the twin ``name`` of the library.
-
-    Raises:
-        ConfigurationError: the library has no such twin.
-    """
+    """Return the twin ``name`` of the library; raise ConfigurationError if the library has no such twin."""
     if name not in library_twins():
         raise ConfigurationError(f"unknown twin {name!r}: {nearest(name, library_twins())}")
     return load_twin(LIBRARY / f"{name}.toml")
 
 
 def load_twin(path: Path) -> Definition:
-    """Return the twin in a file.
-
-    Raises:
-        ConfigurationError: the file is unreadable or wrong; one line per fault.
-    """
+    """Return the twin in a file; raise ConfigurationError if the file is unreadable or wrong; one line per fault."""
     return read_twin(read(path))
 
 

@@ -1,10 +1,13 @@
-"""Schema of the machine file: typed, bounded, closed, every value with its unit.
+"""The machine file: its schema, typed, bounded, closed, every value with its unit; and the drivers that it names.
 
 ``docs/reference/machine-file.md`` explains every key; paths are relative to the machine file.
 """
 
+import contextlib
 import ipaddress
 import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,13 +15,15 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.acquisition.samples import Check
 from otolith.health.language import Language
-from otolith_drivers.base import Sampling
-from otolith_drivers.config_files import Limits, StrictModel
+from otolith.twin.definition import Definition
+from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
+from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, validate
+from otolith_drivers.errors import ConfigurationError, nearest
+from otolith_drivers.several_sources import NamedSource, SeveralSources
 from otolith_drivers.units import Quantity
 
 PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream")
-LOCAL = "local"
-"""The socket of the machine on this computer, instead of an endpoint to listen on."""
+LOCAL = "local"  # The socket of the machine on this computer, instead of an endpoint to listen on
 
 
 def check_name(text: str) -> str:
@@ -71,8 +76,7 @@ def _expand_value(written: object) -> object:
 Name = Annotated[str, AfterValidator(check_name)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 Listening = Annotated[str, AfterValidator(_listening)]
-RawQuantity = str | float | None
-"""A quantity as written in the file. It is converted once the twin gives its unit; a number without unit is refused."""
+RawQuantity = str | float | None  # A quantity as written; converted once the twin gives its unit
 WindowLength = Annotated[float, BeforeValidator(Quantity("s", 0.1, 600.0))]
 
 
@@ -81,10 +85,8 @@ class MachineTable(StrictModel):
 
     name: Name
     site: Name = "site"
-    language: Language = "en"
-    """Of states, events and advice."""
-    on_event: Annotated[tuple[str, ...], AfterValidator(_command)] = ()
-    """Command and arguments that the daemon runs for each event."""
+    language: Language = "en"  # Of states, events and advice
+    on_event: Annotated[tuple[str, ...], AfterValidator(_command)] = ()  # Command and arguments, run for each event
 
 
 class TwinTable(StrictModel):
@@ -104,16 +106,12 @@ class LimitsTable(StrictModel):
 class ParameterTable(LimitsTable):
     """What the file states of one parameter; the rest is that of the twin."""
 
-    value: RawQuantity = None
-    """Value of a known parameter, or start of the search for an estimated one."""
-    estimate: bool | None = None
-    """Without it, a parameter with a value is known, and one without has the role that the twin gives it."""
+    value: RawQuantity = None  # Value of a known parameter, or start of the search for an estimated one
+    estimate: bool | None = None  # By default one without a value has the role of the twin, one with a value is known
     low: RawQuantity = None
     high: RawQuantity = None
-    temperature: str | None = None
-    """Signal that measures the temperature on which the parameter depends."""
-    temperature_coefficient: RawQuantity = None
-    """Relative change per kelvin; without it that of the twin."""
+    temperature: str | None = None  # Signal that measures the temperature on which the parameter depends
+    temperature_coefficient: RawQuantity = None  # Relative change per kelvin; without it that of the twin
     reference_temperature: Annotated[float, BeforeValidator(Quantity("K", 0.0, 5000.0))] = 293.15
     """K, for which value and limits are stated."""
 
@@ -121,16 +119,12 @@ class ParameterTable(LimitsTable):
 class SignalTable(StrictModel):
     """What the daemon needs to know of a signal, beside the keys by which the driver reads it."""
 
-    source: str | None = None
-    """Name of the driver that reads it; needed if there are several."""
+    source: str | None = None  # Name of the driver that reads it; needed if there are several
     delay: Annotated[float, BeforeValidator(Quantity("s", 0.0, 60.0))] = 0.0
     """Time by which the signal is late against the others; it is subtracted from the time of each sample."""
-    times: Sampling | None = None
-    """Meaning of the times of its samples; without it what the source gives."""
-    on_change: bool | None = None
-    """Of a command: whether it is recorded only when it changes; without it the record shows it."""
-    checks: tuple[Check, ...] = tuple(Check)
-    """The checks of its data; an empty list turns them off."""
+    times: Sampling | None = None  # Meaning of the times of its samples; without it what the source gives
+    on_change: bool | None = None  # Whether a command is recorded only when it changes; by default the record shows it
+    checks: tuple[Check, ...] = tuple(Check)  # The checks of its data; an empty list turns them off
 
 
 class WindowTable(StrictModel):
@@ -138,11 +132,9 @@ class WindowTable(StrictModel):
 
     length: WindowLength = 2.0
     shortest: WindowLength | None = None
-    longest: WindowLength | None = None
-    """With ``shortest`` or ``longest`` the length adapts to drift and noise, starting at ``length``."""
+    longest: WindowLength | None = None  # With shortest or longest the length adapts, starting at length
     sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-4, 10.0))] = 0.01
-    times: Sampling | None = None
-    """Meaning of the times of all samples; without it what the source gives."""
+    times: Sampling | None = None  # Meaning of the times of all samples; without it what the source gives
     missing_limit: Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))] = 1.0
     gap_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 600.0))] = 600.0
     jitter_limit: Annotated[float, BeforeValidator(Quantity("s", 0.0, 10.0))] = 0.005
@@ -154,8 +146,7 @@ class WindowTable(StrictModel):
 class EstimationTable(StrictModel):
     """Options of the estimator."""
 
-    open_loop: bool = False
-    """Use the paper's cost: no innovation correction within a window, and sensor noise only."""
+    open_loop: bool = False  # Use the paper's cost: no innovation correction within a window, and sensor noise only
     determined_within: Annotated[float, BeforeValidator(Quantity("1", 1e-6, 1.0))] = 0.1
     """A parameter is determined when half its 95 % interval is at most this share of its nominal value."""
 
@@ -184,21 +175,17 @@ class SwarmTable(StrictModel):
 class TlsTable(StrictModel):
     """Certificates of ``tls/`` and ``quic/`` endpoints, in PEM form."""
 
-    ca: Path
-    """The authority that clients and routers must be certified by."""
+    ca: Path  # The authority that clients and routers must be certified by
     certificate: Path
     key: Path
-    clients: bool = True
-    """Whether a client needs a certificate."""
+    clients: bool = True  # Whether a client needs a certificate
 
 
 class AccessTable(StrictModel):
     """Who may read the reports; nobody but the daemon may write under its keys."""
 
-    passwords: Path | None = None
-    """A file with a line ``name:password`` per user; with it, every connection needs one of them."""
-    readers: tuple[str, ...] | None = None
-    """Names of certificates and users that may read; without it all that may connect."""
+    passwords: Path | None = None  # File of lines name:password; with it, every connection needs one of them
+    readers: tuple[str, ...] | None = None  # Names of certificates and users that may read; by default all that connect
 
 
 class ZenohTable(StrictModel):
@@ -226,12 +213,9 @@ class HistoryTable(StrictModel):
     """The history of estimates, reports and events."""
 
     enabled: bool = True
-    max_megabytes: Annotated[int, Field(ge=20, le=1_000_000)] = 200
-    """Size of its files."""
-    days: Annotated[int, Field(ge=1, le=36_500)] = 3650
-    """Age of what is kept longest: daily values, events and findings."""
-    resend_hours: Annotated[int, Field(ge=1, le=8760)] = 24
-    """Age of whole reports, for subscribers that were away."""
+    max_megabytes: Annotated[int, Field(ge=20, le=1_000_000)] = 200  # Size of its files
+    days: Annotated[int, Field(ge=1, le=36_500)] = 3650  # Age of what is kept longest: days, events and findings
+    resend_hours: Annotated[int, Field(ge=1, le=8760)] = 24  # Age of whole reports, for subscribers that were away
 
 
 class EvidenceTable(StrictModel):
@@ -253,12 +237,9 @@ class MachineFile(StrictModel):
     parameters: Annotated[
         dict[str, Annotated[ParameterTable, BeforeValidator(_expand_value)]], Field(default_factory=dict)
     ]
-    components: Annotated[dict[str, LimitsTable], Field(default_factory=dict)]
-    """Limits of the amplitudes of components, by site."""
-    noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]
-    """Standard deviation of the sensors of outputs and measured inputs."""
-    process_noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]
-    """Process noise of states, each in the state's unit per square root of a second."""
+    components: Annotated[dict[str, LimitsTable], Field(default_factory=dict)]  # Limits of amplitudes, by site
+    noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # Standard deviation of each sensor
+    process_noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # In the state's unit per s^0.5
     window: WindowTable = WindowTable()
     estimation: EstimationTable = EstimationTable()
     discovery: DiscoveryTable = DiscoveryTable()
@@ -274,3 +255,150 @@ class MachineFile(StrictModel):
         if isinstance(self.driver, tuple):
             return self.driver
         return (self.driver,) if self.driver else ()
+
+
+TEMPERATURE_UNIT = "K"
+
+
+@dataclass(frozen=True, slots=True)
+class DriverConfig:
+    """A driver that a machine file names, with its validated options."""
+
+    name: str  # Of the source; the type of the driver if the file has no name
+    place: tuple[int | str, ...]  # Where the file has its table
+    kind: str  # Its type
+    module: DriverType
+    options: Any  # Instance of the module's Options
+    setup: Setup
+    file: SourceFile
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the signals that the driver reads."""
+        return tuple(signal.name for signal in self.setup.signals)
+
+    def build(self) -> Driver:
+        """Return the driver, which is not open."""
+        with self.located_errors():
+            return self.module.build(self.options, self.setup)
+
+    @contextlib.contextmanager
+    def located_errors(self) -> Iterator[None]:
+        """Add file and line to the errors of a driver, which knows only the key."""
+        try:
+            yield
+        except ConfigurationError as error:
+            if error.key:
+                is_option = error.key[:1] == ("driver",)
+                Context(self.file).fail((*self.place, *error.key[1:]) if is_option else error.key, str(error))
+            raise
+
+
+def driver_configs(file: MachineFile, twin: Definition, source: SourceFile) -> tuple[DriverConfig, ...]:
+    """Return what each table of ``[driver]`` configures; raise ConfigurationError if one is wrong or missing."""
+    context = Context(source)
+    if not file.drivers:
+        remedy = "write [driver] with type = \"can\" or another driver, and [signals]; only 'otolith replay' needs none"
+        context.fail(("driver",), f"missing: {remedy}")
+    units = signal_units(file, twin)
+    needed = list(units)
+    for name in file.signals:
+        if name not in needed:
+            context.fail(("signals", name), f"twin {twin.name!r} has no such signal: {nearest(name, needed)}")
+    for name, unit in units.items():
+        if name not in file.signals:
+            reason = f"the twin needs {', '.join(twin.signals)}" if name in twin.signals else "[parameters] names it"
+            context.fail(("signals",), f"{name} ({unit}) is missing: {reason}")
+    names = source_names(file, context)
+    readers = {name: _source_of(name, file, names, context) for name in needed}
+    for number, name in enumerate(names):
+        if name not in readers.values():
+            remedy = f'write source = "{name}" for a signal in [signals], or remove this [[driver]]'
+            context.fail(_place(file, number), f"no signal comes from source {name!r}: {remedy}")
+    return tuple(
+        _driver_config(number, [signal for signal in needed if readers[signal] == name], file, twin, source)
+        for number, name in enumerate(names)
+    )
+
+
+def signal_units(file: MachineFile, twin: Definition) -> dict[str, str]:
+    """Return the signals that the drivers read, with their units: those of the twin, and the observed ones."""
+    return {name: twin.unit_of(name) for name in twin.signals} | dict.fromkeys(observed_signals(file), TEMPERATURE_UNIT)
+
+
+def observed_signals(file: MachineFile) -> tuple[str, ...]:
+    """Return the signals of the temperatures that parameters depend on."""
+    names = (table.temperature for table in file.parameters.values())
+    return tuple(dict.fromkeys(name for name in names if name))
+
+
+def source_names(file: MachineFile, context: Context) -> list[str]:
+    """Return the names of the drivers, by default their types; raise ConfigurationError if one is wrong or repeated."""
+    names: list[str] = []
+    for number, table in enumerate(file.drivers):
+        where = (*_place(file, number), "name")
+        name = table.get("name")
+        if not isinstance(name, str) and (name is not None or isinstance(file.driver, tuple)):
+            context.fail(where, 'missing: each [[driver]] needs a name of its own, like name = "drive"')
+        with context.at(*where):
+            names.append(str(table.get("type")) if name is None else check_name(name))
+        if name in names[:-1]:
+            context.fail(where, f"{name!r} is the name of another [[driver]] too: give each a name of its own")
+    return names
+
+
+def _place(file: MachineFile, number: int) -> tuple[int | str, ...]:
+    """Return where the file has its driver of that number."""
+    return ("driver",) if isinstance(file.driver, dict) else ("driver", number)
+
+
+def _source_of(signal: str, file: MachineFile, names: Sequence[str], context: Context) -> str:
+    """Return the name of the driver that reads ``signal``."""
+    written = file.signals[signal].get("source")
+    if written is None and len(names) == 1:
+        return names[0]
+    if written is None:
+        text = f"missing: the file has {len(names)} drivers, so each signal names its own: {' or '.join(names)}"
+        context.fail(("signals", signal, "source"), text)
+    if written not in names:
+        text = f"no [[driver]] has the name {written!r}: {nearest(str(written), list(names))}"
+        context.fail(("signals", signal, "source"), text)
+    return str(written)
+
+
+def _driver_config(
+    number: int, signals: Sequence[str], file: MachineFile, twin: Definition, source: SourceFile
+) -> DriverConfig:
+    """Return the driver of that number in the file, which reads ``signals``."""
+    place, table = _place(file, number), file.drivers[number]
+    with Context(source).at(*place, "type"):
+        kind = table.get("type")
+        if not isinstance(kind, str):
+            raise ValueError('missing: write type = "can" or another driver')  # noqa: TRY004 - a fault of the file
+        module = find_driver(kind)
+    written = {key: value for key, value in table.items() if key not in ("type", "name")}
+    options = validate(written, module.Options, source, under=place)
+    units = signal_units(file, twin)
+    own = tuple(
+        Signal(
+            signal,
+            units[signal],
+            validate(own_keys(file.signals[signal]), module.Source, source, under=("signals", signal)),
+            twin.ordinary_range(signal),
+        )
+        for signal in signals
+    )
+    setup = Setup(own, source.path.parent, file.window.sample_period)
+    return DriverConfig(table.get("name", kind), place, kind, module, options, setup, source)
+
+
+def build_driver(configs: Sequence[DriverConfig]) -> Driver:
+    """Return the driver of a machine: one, or several as one."""
+    if len(configs) == 1:
+        return configs[0].build()
+    return SeveralSources(tuple(NamedSource(config.name, config.build(), config.signals) for config in configs))
+
+
+def own_keys(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a signal by which its driver reads it."""
+    return {key: value for key, value in table.items() if key not in SignalTable.model_fields}

@@ -12,9 +12,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup
+from otolith_drivers.base import Conversion, Counters, Deliver, Link, Sample, Sampling, ScaledSource, Setup
 from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver, cause_of
-from otolith_drivers.common.scaled import Conversion, ScaledSource
 from otolith_drivers.config_files import StrictModel
 
 MAX_LINE = 4096  # bytes

@@ -3,19 +3,24 @@
 A driver is read-only by construction: the protocol has no method that writes to a machine. A driver owns its threads
 and its reconnect loop, counts the samples that it receives and loses, and lets no exception leave its threads.
 
-The table of drivers, and the entry points through which other packages add theirs, are here as well.
+The table of drivers, and the entry points through which other packages add theirs, are here as well; and what drivers
+need whose signals arrive as plain numbers: :class:`ScaledSource` for the machine file, and :class:`Conversion`.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, Self, cast
 
-from otolith_drivers.config_files import StrictModel
+from pydantic import model_validator
+
+from otolith_drivers.config_files import Range, StrictModel
 from otolith_drivers.errors import ConfigurationError, installation_of, nearest
+from otolith_drivers.units import factor
 
 ENTRY_POINT_GROUP = "otolith.drivers"
 
@@ -25,21 +30,18 @@ DRIVERS: dict[str, str] = {
     "modbus": "otolith_drivers.modbus.driver",
     "mqtt": "otolith_drivers.mqtt",
     "opcua": "otolith_drivers.opcua.driver",
-    "plant": "otolith_drivers.plant.driver",
+    "plant": "otolith_drivers.plant.realtime",
     "replay": "otolith_drivers.replay.driver",
 }
-EXTRAS = ("mqtt", "opcua")
-"""Drivers whose libraries come with the extra of the same name."""
+EXTRAS = ("mqtt", "opcua")  # Drivers whose libraries come with the extra of the same name
 
 
 class Sample(NamedTuple):
     """One reading of one signal."""
 
     signal: str
-    time: float
-    """Seconds on this computer's monotonic clock at which the value was true or, if that is unknown, arrived."""
-    value: float
-    """In the unit of the signal; NaN if the source reports that it has no reading."""
+    time: float  # Seconds on the monotonic clock at which the value was true or, if that is unknown, arrived
+    value: float  # In the unit of the signal; NaN if the source reports that it has no reading
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +50,7 @@ class Signal:
 
     name: str
     unit: str
-    source: Any
-    """Address of the signal: an instance of the driver's ``Source``."""
+    source: Any  # Address of the signal: an instance of the driver's Source
     ordinary: tuple[float, float] | None = None
     """Values of an input in ordinary operation, in ``unit``; None for all other signals."""
 
@@ -57,12 +58,9 @@ class Signal:
 class Sampling(StrEnum):
     """Meaning of the times of a driver's samples, which decides how samples become records of a window."""
 
-    CYCLIC = "cyclic"
-    """The source samples on its own grid; a time is an arrival time, which may be late but never early."""
-    TRUE = "true"
-    """A time is the moment at which the value was true, and is used as it is. A command changes at its samples."""
-    POLLED = "polled"
-    """As ``TRUE``, but the source is asked by a clock of its own: a command may have changed since the last reading."""
+    CYCLIC = "cyclic"  # The source samples on its own grid; a time is one of arrival: maybe late, never early
+    TRUE = "true"  # A time is when the value was true, and is used as it is. A command changes at its samples
+    POLLED = "polled"  # As TRUE, but asked by a clock of its own: a command may have changed since
 
 
 def sampling_of(sampling: Sampling | Mapping[str, Sampling], signal: str) -> Sampling:
@@ -75,22 +73,17 @@ class Setup:
     """What a driver is built for."""
 
     signals: tuple[Signal, ...]
-    folder: Path
-    """Files named in options are relative to this folder."""
-    sample_period: float
-    """Period of the window's grid in s."""
+    folder: Path  # Files named in options are relative to this folder
+    sample_period: float  # Period of the window's grid in s
 
 
 @dataclass(frozen=True, slots=True)
 class Counters:
     """Counts since the driver was opened."""
 
-    received: int = 0
-    """Samples delivered."""
-    bad: int = 0
-    """Frames, replies, rows or values that arrived but are unusable: not decodable, out of range, repeated."""
-    lost: int = 0
-    """Samples known to be sent or requested that never arrived."""
+    received: int = 0  # Samples delivered
+    bad: int = 0  # Frames, replies, rows or values that arrived but are unusable: not decodable, out of range, repeated
+    lost: int = 0  # Samples known to be sent or requested that never arrived
     reconnects: int = 0
 
 
@@ -99,18 +92,13 @@ class Link:
     """State of the connection to the machine."""
 
     up: bool
-    reason: str = ""
-    """Why the connection is down; empty if it is up."""
+    reason: str = ""  # Why the connection is down; empty if it is up
     warnings: tuple[str, ...] = ()
     """Present faults of a connection that is up, one line each: a silent frame, a dead device, refused registers."""
-    plan: str = ""
-    """Requested and achieved polling; empty if the machine sends by its own clock."""
-    period: float | None = None
-    """Achieved sample period in s; None if the machine sends by its own clock, or if it is not known yet."""
-    latency: float = 0.0
-    """Longest time in s by which samples arrive after their times because the source sends many at once."""
-    sources: tuple["SourceState", ...] = ()
-    """Of a machine with several sources."""
+    plan: str = ""  # Requested and achieved polling; empty if the machine sends by its own clock
+    period: float | None = None  # Achieved, s; None if the machine sends by its own clock, or not known yet
+    latency: float = 0.0  # Longest time, s, by which samples arrive late because the source sends many at once
+    sources: tuple["SourceState", ...] = ()  # Of a machine with several sources
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,10 +145,8 @@ class Driver(Protocol):
 class DriverType(Protocol):
     """What a row of the registry points to: a module with these three names."""
 
-    Options: type[StrictModel]
-    """The keys of ``[driver]`` except ``type`` and ``name``."""
-    Source: type[StrictModel]
-    """The keys of each signal in ``[signals]``."""
+    Options: type[StrictModel]  # The keys of [driver] except type and name
+    Source: type[StrictModel]  # The keys of each signal in [signals]
 
     def build(self, options: Any, setup: Setup) -> Driver:
         """Return a driver that is not open yet; ``options`` is an instance of ``Options``.
@@ -176,11 +162,7 @@ def known_drivers() -> list[str]:
 
 
 def find_driver(name: str) -> DriverType:
-    """Return the driver module called ``name``.
-
-    Raises:
-        ConfigurationError: no driver has this name, or its package cannot be imported.
-    """
+    """Return the driver module ``name``; raise ConfigurationError if there is none, or it cannot be imported."""
     try:
         if name in DRIVERS:
             return cast("DriverType", import_module(DRIVERS[name]))
@@ -193,3 +175,52 @@ def find_driver(name: str) -> DriverType:
         raise ConfigurationError(f"driver {name!r} cannot be loaded: {error}") from error
     text = f"unknown driver {name!r}: {nearest(name, known_drivers())}"
     raise ConfigurationError(f"{text}; a package that brings its own must be installed here")
+
+
+class ScaledSource(StrictModel):
+    """Keys of a signal that arrives as a number; the value is ``scale * number + offset`` in ``unit``."""
+
+    unit: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+    range: Range | None = None  # In unit; a value outside is no reading
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        if self.scale == 0.0:
+            raise ValueError("scale 0 makes every value the same: leave it out, or write what one step is worth")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """From a number to the value in the unit of the twin."""
+
+    source: ScaledSource
+    to_target: tuple[float, float]  # Scale and offset from the unit of the source
+
+    @classmethod
+    def of(cls, source: ScaledSource, unit: str, target: str) -> Self:
+        """Return the conversion of ``source``, which is in ``unit``; raise ValueError if the quantities differ."""
+        return cls(source, factor(unit, target))
+
+    @classmethod
+    def for_signal(cls, signal: Signal) -> Self:
+        """Return the conversion from the unit of the source; raise ConfigurationError for another quantity."""
+        try:
+            return cls.of(signal.source, signal.source.unit, signal.unit)
+        except ValueError as error:
+            raise ConfigurationError(str(error), ("signals", signal.name)) from error
+
+    def value(self, number: object) -> float:
+        """Return the value; NaN if ``number`` is none, not finite, or out of range."""
+        if not isinstance(number, bool | int | float):
+            return math.nan
+        try:
+            written = self.source.scale * float(number) + self.source.offset
+        except OverflowError:  # an integer beyond the largest float
+            return math.nan
+        if self.source.range is not None and not self.source.range[0] <= written <= self.source.range[1]:
+            return math.nan
+        value = self.to_target[0] * written + self.to_target[1]
+        return value if math.isfinite(value) else math.nan

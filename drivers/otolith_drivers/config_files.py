@@ -5,19 +5,19 @@ import tomllib
 import types
 import typing
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
 from otolith_drivers.errors import ConfigurationError, nearest, shown
 
 FILE_SIZE_LIMIT = 1 << 20  # bytes of a TOML file: engineering choice, 100 times the largest machine file
 
-Location = Sequence[int | str]
-"""Keys and list indices that lead to a value."""
+Location = Sequence[int | str]  # Keys and list indices that lead to a value
 Model = TypeVar("Model", bound=BaseModel)
 
 SECTION = re.compile(r"\s*(\[\[?)\s*([^\]]+?)\s*\]\]?\s*(?:#.*)?$")
@@ -54,6 +54,15 @@ def _one_or_two(written: object) -> object:
 
 Limits = Annotated[tuple[str | float, ...], BeforeValidator(_one_or_two)]
 """One limit or a list of two, relative to the nominal value or with a unit."""
+
+
+def _in_order(limits: tuple[float, float]) -> tuple[float, float]:
+    if not limits[0] < limits[1]:
+        raise ValueError(f"range {list(limits)}: the lower end comes first")
+    return limits
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_in_order)]
 
 
 class StrictModel(BaseModel):
@@ -112,28 +121,23 @@ class SourceFile:
         return f"{self.path}:{line}: {dotted(location)}" if line else f"{self.path}: {dotted(location)}"
 
 
+@dataclass(frozen=True, slots=True)
 class Context:
     """Adds file, line and key to errors of checks that run after the file has been validated."""
 
-    def __init__(self, file: SourceFile) -> None:
-        self.file = file
-        self._location: tuple[int | str, ...] = ()
+    file: SourceFile
 
     def fail(self, location: tuple[int | str, ...], message: str) -> None:
         """Raise ``message`` as an error at ``location``."""
         raise ConfigurationError(f"{self.file.place(location)}: {message}")
 
-    def at(self, *location: int | str) -> "Context":
-        """Return a context manager that places errors raised in it at ``location``."""
-        self._location = location
-        return self
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if isinstance(error, ValueError | ConfigurationError):
-            raise ConfigurationError(f"{self.file.place(self._location)}: {error}") from error
+    @contextmanager
+    def at(self, *location: int | str) -> Iterator[None]:
+        """Place errors that are raised meanwhile at ``location``."""
+        try:
+            yield
+        except (ValueError, ConfigurationError) as error:
+            raise ConfigurationError(f"{self.file.place(location)}: {error}") from error
 
 
 def _kinds(annotation: Any) -> Iterator[Any]:
@@ -285,8 +289,7 @@ def _message(fault: dict[str, Any], location: Location, model: type[BaseModel]) 
         return str(fault["ctx"]["error"])
     if fault["type"] in TOML_TYPES:
         return f"{shown(fault['input'])}: must be {TOML_TYPES[fault['type']]}"
-    message = re.sub(r"^Input", "the value", fault["msg"])
-    return f"{shown(fault['input'])}: {message}"
+    return f"{shown(fault['input'])}: {re.sub('^Input', 'the value', fault['msg'])}"
 
 
 def _keys_at(model: Any, location: Location) -> list[str]:

@@ -32,10 +32,8 @@ class Rig:
     """A driver that is not open, and a real source for it."""
 
     driver: Driver
-    expected: Mapping[str, float]
-    """The value of each signal, in the unit that the setup asks for."""
-    emit: Callable[[], None] = field(default=lambda: None)
-    """Makes the source send these values once; needless for a source that is polled or sends by itself."""
+    expected: Mapping[str, float]  # The value of each signal, in the unit that the setup asks for
+    emit: Callable[[], None] = field(default=lambda: None)  # Makes the source send the values once, if it must be asked
 
 
 def samples_have_the_wanted_unit_and_time(rig: Rig) -> None:

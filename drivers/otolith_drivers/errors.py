@@ -1,7 +1,7 @@
 """The errors that a user can meet.
 
     OtolithError
-     ├── ConfigurationError   a file is wrong: unknown key, wrong unit, missing signal
+     ├── ConfigurationError   a file is wrong: unknown key, value out of its bounds, missing signal
      ├── DeviceError          a device, bus or interface is missing or refuses: no vcan0, no permission
      └── ServiceError         the computer refuses: port in use, folder not writable (raised by the daemon)
 
@@ -27,10 +27,7 @@ class OtolithError(Exception):
 
 
 class ConfigurationError(OtolithError):
-    """A machine file, scenario, DBC or option is wrong.
-
-    Examples: unknown key, value without a unit, parameter outside its bounds, DBC without the named signal.
-    """
+    """A machine file, scenario, DBC or option is wrong."""
 
     def __init__(self, message: str, key: tuple[str, ...] = ()) -> None:
         """``key`` locates the fault in the machine file, for code that does not know the file itself."""
@@ -39,17 +36,11 @@ class ConfigurationError(OtolithError):
 
 
 class DeviceError(OtolithError):
-    """A device, bus or interface is missing or refuses.
-
-    Examples: no such CAN interface, no permission for it, no route for the virtual bus.
-    """
+    """A device, bus or interface is missing or refuses."""
 
 
 class ServiceError(OtolithError):
-    """The computer that runs the daemon refuses.
-
-    Examples: the Zenoh port is in use, the recording folder is not writable.
-    """
+    """The computer that runs the daemon refuses."""
 
 
 def counted(number: int, noun: str) -> str:

@@ -21,11 +21,10 @@ from paho.mqtt import client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
+from otolith_drivers.base import Conversion, Counters, Deliver, Link, Sample, Sampling, ScaledSource, Setup, Signal
 from otolith_drivers.common.credentials import CredentialOptions, certificate, certificate_and_key, password
 from otolith_drivers.common.message_times import ArrivalClock, PeriodEstimator, unix_time
 from otolith_drivers.common.reconnection import PassingFault, Reconnection, ThreadedDriver, cause_of
-from otolith_drivers.common.scaled import Conversion, ScaledSource
 from otolith_drivers.errors import ConfigurationError, counted, shown
 from otolith_drivers.units import Quantity
 
@@ -47,20 +46,15 @@ class MqttOptions(CredentialOptions):
     """``[driver]`` with ``type = "mqtt"``."""
 
     host: Annotated[str, Field(min_length=1)]
-    port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """By default 1883, and 8883 with TLS."""
+    port: Annotated[int, Field(ge=1, le=65535)] | None = None  # By default 1883, and 8883 with TLS
     qos: Literal[0, 1, 2] = 0
     tls: bool = False
-    ca: Path | None = None
-    """The certificate of the authority that signed the broker's; by default those of the computer."""
-    client_id: str = ""
-    """By default a random one."""
+    ca: Path | None = None  # Of the authority that signed the broker's certificate; by default the computer's
+    client_id: str = ""  # By default a random one
     keepalive: Annotated[float, BeforeValidator(Quantity("s", 1.0, 3600.0))] = 10.0
     """Time (s) without a message, after which the broker is asked whether it is there."""
-    time: FieldPath | None = None
-    """Field of the messages with the time at which their values were true; without it the time of arrival is used."""
-    time_format: Literal["s", "ms", "us", "ns", "iso"] = "ms"
-    """Unit of that time since 1970, or ISO 8601, which is in UTC if it names no time zone."""
+    time: FieldPath | None = None  # Field with the time of the values; without it the time of arrival is used
+    time_format: Literal["s", "ms", "us", "ns", "iso"] = "ms"  # Unit since 1970, or ISO 8601, in UTC without a zone
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -83,8 +77,7 @@ class MqttSource(ScaledSource):
     """Place of a signal: ``{ topic = "motor/speed", unit = "rpm" }``, in JSON with ``field = "values.speed"``."""
 
     topic: Annotated[str, Field(min_length=1, max_length=1000)]
-    field: FieldPath | None = None
-    """Path in a JSON message; without it the message is the number."""
+    field: FieldPath | None = None  # Path in a JSON message; without it the message is the number
     unit: str
 
     @model_validator(mode="after")
@@ -102,13 +95,10 @@ class TopicSignals:
     signals: list[tuple[str, str | None, Conversion]] = field(default_factory=list)
     """Name, path in the message, and conversion."""
     periods: PeriodEstimator = field(default_factory=PeriodEstimator)
-    time: float = -math.inf
-    """s; of the latest samples."""
+    time: float = -math.inf  # s; of the latest samples
     clock: ArrivalClock = field(default_factory=ArrivalClock)
-    retained: bool = False
-    """Whether a retained message has come."""
-    unusable: PassingFault = field(default_factory=PassingFault)
-    """Messages and values that could not be used."""
+    retained: bool = False  # Whether a retained message has come
+    unusable: PassingFault = field(default_factory=PassingFault)  # Messages and values that could not be used
 
     def warnings(self, now: float, begun: float) -> list[str]:
         """Return what is wrong at ``now`` (s) since the subscription at ``begun`` (s), a line each."""
@@ -133,9 +123,8 @@ class Messages:
             source: MqttSource = signal.source
             key = ("signals", signal.name)
             if options.time is not None and source.field is None:
-                raise ConfigurationError(
-                    f"{source.topic}: a plain number has no field {options.time!r}: give 'field'", key
-                )
+                text = f"{source.topic}: a plain number has no field {options.time!r}: give 'field'"
+                raise ConfigurationError(text, key)
             topic = self.topics.setdefault(source.topic, TopicSignals(source.topic))
             topic.signals.append((signal.name, source.field, Conversion.for_signal(signal)))
 
@@ -207,11 +196,7 @@ class Messages:
 
 
 def _content(payload: bytes, *, plain: bool) -> Any:
-    """Return the number or the JSON document in a message.
-
-    Raises:
-        ValueError: it is neither.
-    """
+    """Return the number or the JSON document in a message; raise ValueError if it is neither."""
     if len(payload) > MAX_PAYLOAD:
         raise ValueError(f"a message of {len(payload)} bytes, more than {MAX_PAYLOAD}")
     try:
@@ -220,16 +205,11 @@ def _content(payload: bytes, *, plain: bool) -> Any:
             return float(text)
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        kind = "number" if plain else "JSON document"
-        raise ValueError(f"{shown(payload[:60])} is no {kind}") from error
+        raise ValueError(f"{shown(payload[:60])} is no {'number' if plain else 'JSON document'}") from error
 
 
 def at(content: Any, path: str | None) -> Any:
-    """Return what is at ``path``, like ``values.speed`` or ``axes[0].speed``, of a JSON document.
-
-    Raises:
-        ValueError: there is nothing.
-    """
+    """Return what is at ``path``, like ``axes[0].speed``, of a JSON document; raise ValueError if there is nothing."""
     value = content
     for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path or ""):
         try:
@@ -244,11 +224,7 @@ Options, Source = MqttOptions, MqttSource  # for base.DriverType
 
 
 def build(options: MqttOptions, setup: Setup) -> "MqttListener":
-    """Return a listener to the topics of all signals of ``setup``.
-
-    Raises:
-        ConfigurationError: a unit has the wrong dimension, or a certificate, key or password cannot be read.
-    """
+    """Return a listener to all signals; raise ConfigurationError for a wrong unit, certificate, key or password."""
     secret = None if options.password_file is None else setup.folder / options.password_file
     return MqttListener(options, Messages(options, setup.signals), password(secret), _tls(options, setup.folder))
 
@@ -283,21 +259,17 @@ class MqttListener(ThreadedDriver):
 
     @property
     def sampling(self) -> Sampling:
-        """See :attr:`otolith_drivers.base.Driver.sampling`."""
         return Sampling.CYCLIC if self._options.time is None else Sampling.POLLED
 
     def open(self, deliver: Deliver) -> None:
-        """See :meth:`otolith_drivers.base.Driver.open`."""
         self._connection.reason = "not connected yet"
         self._start("mqtt-listen", self._run, deliver)
 
     def counters(self) -> Counters:
-        """See :meth:`otolith_drivers.base.Driver.counters`."""
         messages = self._messages
         return Counters(messages.received, messages.bad, messages.lost, self._connection.count)
 
     def link(self) -> Link:
-        """See :meth:`otolith_drivers.base.Driver.link`."""
         now, messages, connection = time.monotonic(), self._messages, self._connection
         lines = [line for topic in messages.topics.values() for line in topic.warnings(now, self._begun)]
         facts = []
@@ -310,7 +282,6 @@ class MqttListener(ThreadedDriver):
         return Link(connection.up, connection.reason, tuple(lines) if connection.up else (), ", ".join(facts))
 
     def describe(self) -> list[str]:
-        """See :meth:`otolith_drivers.base.Driver.describe`."""
         stamps = "times of arrival" if self._options.time is None else f"times of the field {self._options.time}"
         lines = [f"{self._options.title()}, subscribed only (QoS {self._options.qos}), {stamps}"]
         if self._options.user is not None and not self._options.tls:

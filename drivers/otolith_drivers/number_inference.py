@@ -55,8 +55,7 @@ MAX_OTHERS = 3  # alternatives reported for one number
 MAX_WIDTH = 8  # bytes of a number
 FRACTION_BITS = {4: 24, 8: 53}  # of IEEE 754 floats, by bytes
 
-Bytes = NDArray[np.uint8]
-"""Readings by bytes."""
+Bytes = NDArray[np.uint8]  # Readings by bytes
 Floats = NDArray[np.float64]
 Ranks = NDArray[np.int64] | NDArray[np.uint64]
 
@@ -65,14 +64,10 @@ Ranks = NDArray[np.int64] | NDArray[np.uint64]
 class Layout:
     """A way to read bytes as a number."""
 
-    kind: str
-    """``"int16"``, ``"uint24"``, ``"float32"``."""
-    order: str
-    """As the machine file writes it: ``"CDAB"``, ``"little"``."""
-    positions: tuple[int, ...]
-    """Positions of the number's bytes, the highest byte first."""
-    prior: float
-    """Cost of the type and order in bits."""
+    kind: str  # "int16", "uint24", "float32"
+    order: str  # As the machine file writes it: "CDAB", "little"
+    positions: tuple[int, ...]  # Positions of the number's bytes, the highest byte first
+    prior: float  # Cost of the type and order in bits
 
     @property
     def width(self) -> int:
@@ -154,23 +149,17 @@ def _frame_layouts() -> Iterator[Layout]:
 
 REGISTERS: tuple[Layout, ...] = tuple(layout for kind in LETTERS for layout in register_layouts(kind))
 """All layouts of Modbus registers."""
-FRAMES: tuple[Layout, ...] = tuple(_frame_layouts())
-"""All layouts of whole bytes in a CAN frame."""
+FRAMES: tuple[Layout, ...] = tuple(_frame_layouts())  # All layouts of whole bytes in a CAN frame
 
 
 class LayoutVerdict(StrEnum):
     """What is known about some bytes."""
 
-    CERTAIN = "certain"
-    """The changes fit this number only."""
-    LIKELY = "likely"
-    """The changes are too few to exclude other numbers."""
-    STILL = "still"
-    """The bytes do not change, so their type is unknown."""
-    ERRATIC = "erratic"
-    """The number jumps over its whole range: part of a larger number, a checksum, or noise."""
-    COUNTER = "counter"
-    """The number increases by one: a counter of frames or cycles."""
+    CERTAIN = "certain"  # The changes fit this number only
+    LIKELY = "likely"  # The changes are too few to exclude other numbers
+    STILL = "still"  # The bytes do not change, so their type is unknown
+    ERRATIC = "erratic"  # The number jumps over its whole range: part of a larger number, a checksum, or noise
+    COUNTER = "counter"  # The number increases by one: a counter of frames or cycles
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,20 +175,14 @@ class Other:
 class Part:
     """Bytes that are one number, or whose type is unknown."""
 
-    start: int
-    """Position of the first byte."""
+    start: int  # Position of the first byte
     width: int
-    bits: float
-    """Cost of writing down all readings."""
+    bits: float  # Cost of writing down all readings
     verdict: LayoutVerdict = LayoutVerdict.STILL
-    layout: Layout | None = None
-    """None for bytes that do not change."""
-    numbers: Floats = field(default_factory=lambda: np.full(1, np.nan))
-    """The number in each reading."""
-    others: tuple[Other, ...] = ()
-    """Alternatives with other values, the most probable first."""
-    probability: float = MAX_PROBABILITY
-    """That it is this number, if one of the layouts is right."""
+    layout: Layout | None = None  # None for bytes that do not change
+    numbers: Floats = field(default_factory=lambda: np.full(1, np.nan))  # The number in each reading
+    others: tuple[Other, ...] = ()  # Alternatives with other values, the most probable first
+    probability: float = MAX_PROBABILITY  # That it is this number, if one of the layouts is right
 
     @property
     def end(self) -> int:

@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 from otolith_drivers.base import Counters, Deliver, Driver, Link, Sampling, SourceState, sampling_of
 from otolith_drivers.common.reconnection import CLOSE_TIMEOUT, ReconnectBackoff, ThreadedDriver
@@ -31,8 +31,7 @@ class SeveralSources(ThreadedDriver):
     def __init__(self, sources: tuple[NamedSource, ...]) -> None:
         super().__init__()
         self._sources = sources
-        self._faults: dict[str, str] = {}
-        """Why a source could not be opened, by its name; it is tried again until it can."""
+        self._faults: dict[str, str] = {}  # Why a source cannot be opened, by its name; it is tried again
 
     @property
     def sampling(self) -> Mapping[str, Sampling]:
@@ -92,13 +91,8 @@ class SeveralSources(ThreadedDriver):
 
     def counters(self) -> Counters:
         """Return the sums over all drivers."""
-        counters = [source.driver.counters() for source in self._sources]
-        return Counters(
-            received=sum(item.received for item in counters),
-            bad=sum(item.bad for item in counters),
-            lost=sum(item.lost for item in counters),
-            reconnects=sum(item.reconnects for item in counters),
-        )
+        counters = [astuple(source.driver.counters()) for source in self._sources]
+        return Counters(*map(sum, zip(*counters, strict=True)))
 
     def link(self) -> Link:
         """Return the state of each source, and that of the machine: it is up while any source is.

@@ -141,11 +141,7 @@ def _replaced(text: str, symbols: Mapping[str, str]) -> str:
 
 @cache
 def unit(text: str) -> "pint.Unit":
-    """Return the unit that ``text`` names.
-
-    Raises:
-        UnitNameError: unknown, malformed or ambiguous unit.
-    """
+    """Return the unit that ``text`` names; raise UnitNameError if it is unknown, malformed or ambiguous."""
     short = re.sub(r"\s+", " ", text.strip()).removesuffix(".").replace("\u2126", "Ω")
     whole = short.replace(" ", "")
     written = _known_name(whole) if whole else "dimensionless"
@@ -161,12 +157,15 @@ def unit(text: str) -> "pint.Unit":
     return parsed
 
 
-def _known_name(spelling: str) -> str:
-    """Return pint's name of what databases write as ``spelling``; empty if no table has it.
+def is_unit(text: str) -> bool:
+    """Return whether ``text`` names a unit."""
+    with contextlib.suppress(UnitNameError):
+        return unit(text) is not None
+    return False
 
-    Raises:
-        UnitNameError: it has several meanings of one dimension.
-    """
+
+def _known_name(spelling: str) -> str:
+    """Return pint's name of ``spelling``, empty if no table has it; raise UnitNameError if it has several meanings."""
     if spelling in UNCLEAR:
         names = " or ".join(map(repr, UNCLEAR[spelling]))
         raise UnitNameError(f"{spelling!r} may be {names}: write one of them")
@@ -188,11 +187,7 @@ def _meant(source: str, target: str) -> str:
 
 
 def factor(source: str, target: str) -> tuple[float, float]:
-    """Return ``(scale, offset)`` with ``value_in_target = scale * value_in_source + offset``.
-
-    Raises:
-        ValueError: the units have different dimensions; the message names both.
-    """
+    """Return scale and offset from ``source`` to ``target``; raise ValueError if their dimensions differ."""
     source = _meant(source, target)
     _check_dimension(source, target)
     zero = _registry().Quantity(0.0, unit(source)).to(unit(target)).magnitude
@@ -217,9 +212,8 @@ def _check_dimension(source: str, target: str) -> None:
         return
     if _is_angular(source):
         raise ValueError(f"unit {source!r} has turns or radians, but {target!r} has none: write {target!r}")
-    raise UnitNameError(
-        f"unit {source!r} leaves open whether turns or radians are meant: write {target!r} or {turns!r}"
-    )
+    text = f"unit {source!r} leaves open whether turns or radians are meant: write {target!r} or {turns!r}"
+    raise UnitNameError(text)
 
 
 def _is_angular(text: str) -> bool:
@@ -306,9 +300,8 @@ def _limit_value(written: Any, unit_text: str, nominal: float) -> float:
     bare = NUMBER_AND_UNIT.fullmatch(str(written).strip()[:MAX_LENGTH])
     if bare and not bare[2] and not quantity.is_plain_number:
         number = bare[1] if bare[1][0] in "+-" else f"+{bare[1]}"
-        raise ValueError(
-            f'{written!r} has no unit: write "{number} %" of the nominal value, or "{bare[1]} {unit_text}"'
-        )
+        text = f'{written!r} has no unit: write "{number} %" of the nominal value, or "{bare[1]} {unit_text}"'
+        raise ValueError(text)
     value = nominal * (1.0 + float(match[1] + match[2]) / 100.0) if match else quantity(written)
     if value == nominal:
         raise ValueError(f"{written!r} is the nominal value {nominal:g} {unit_text} itself: write a limit beside it")

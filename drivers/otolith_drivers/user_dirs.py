@@ -6,16 +6,11 @@ from pathlib import Path
 
 from otolith_drivers.errors import ServiceError
 
-SERVICES = Path("/run/otolith")
-"""The folder of systemd's ``RuntimeDirectory=otolith/%i``: one folder for each service."""
+SERVICES = Path("/run/otolith")  # The folder of systemd's RuntimeDirectory=otolith/%i: one folder for each service
 
 
 def state_directory() -> Path:
-    """Return the folder for recordings and estimated parameters; it may be missing, and who only reads leaves it so.
-
-    Raises:
-        ServiceError: there is no home directory.
-    """
+    """Return the folder for recordings and estimates, which may be missing; raise ServiceError without a home."""
     return _user_directory("STATE_DIRECTORY", "XDG_STATE_HOME", ".local/state")
 
 
@@ -60,11 +55,7 @@ def _guarded(folder: Path, reason: str) -> Path:
 
 
 def writable(folder: Path) -> Path:
-    """Return ``folder``, created if it is missing, as the missing ones above it: for this user alone.
-
-    Raises:
-        ServiceError: the folder cannot be created or is not writable.
-    """
+    """Return ``folder``, created for this user alone if it is missing; raise ServiceError if it is not writable."""
     try:
         for missing in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
             missing.mkdir(exist_ok=True, mode=0o700)
@@ -76,11 +67,7 @@ def writable(folder: Path) -> Path:
 
 
 def check_writable(folder: Path) -> None:
-    """Check that :func:`writable` would accept ``folder``, without creating it.
-
-    Raises:
-        ServiceError: the folder, or the nearest parent that exists, is not writable.
-    """
+    """Raise ServiceError if :func:`writable` would not accept ``folder``, without creating it."""
     parent = folder
     while not parent.exists() and parent != parent.parent:
         parent = parent.parent

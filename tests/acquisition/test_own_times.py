@@ -25,7 +25,7 @@ from benchmarks.sampling.schedules import Recording, Schedule, Timing, record
 
 from otolith.acquisition.window import Verdict, Window
 from otolith.cli.replay import replay
-from otolith.discovery.decision import ACCEPTED
+from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.health.schema import ReportDocument
 from otolith.machine import load_machine
 from otolith.runtime.replay import Replay, open_recorded
@@ -133,6 +133,22 @@ def test_rows_of_a_coarse_clock_give_the_estimates_of_exact_times(log: Log, step
             assert other.parameters[name].raw == pytest.approx(one.parameters[name].raw, rel=1e-5)
 
 
+@pytest.mark.parametrize(("interval", "step"), [(0.0035, 0.001), (0.0107, 0.01)])
+def test_rows_with_rounded_times_give_the_estimates_of_exact_times(log: Log, interval: float, step: float) -> None:
+    """Half a step of the clock, times the slope of the current at a step of the voltage, is more than its noise."""
+    schedule = Schedule(rows=Timing(interval))
+    recording = recorded(schedule)
+    exact, rows = log.of(schedule, recording), recording.rows()
+    rounded = [[f"{np.rint(float(row[0]) / step) * step:.6f}", *row[1:]] for row in rows]
+    documents = log.reports(schedule, recording.header, rounded)
+    assert_used(documents)
+    for one, other in zip(exact, documents, strict=True):
+        for name in FREE:
+            sd = one.parameters[name].raw_sd
+            assert sd is not None
+            assert other.parameters[name].raw == pytest.approx(one.parameters[name].raw, abs=0.5 * sd)
+
+
 def test_irregular_rows_of_a_coarse_clock_are_refused_and_give_no_finding(log: Log) -> None:
     """Their times are not known, so nothing can be concluded from them about a sensor or the machine."""
     schedule = Schedule(rows=Timing(jitter=0.5), load="walk", load_noise=True)
@@ -196,6 +212,34 @@ def test_commands_on_change_give_valid_intervals(log: Log, voltage: Voltage) -> 
     documents = log.of(schedule, recording)
     assert_used(documents)
     assert_valid_intervals([outcome(recording, document) for document in documents])
+
+
+@pytest.mark.parametrize("voltage", often(["levels"], ["levels", "steps", "sine"]))
+def test_a_command_that_changes_between_rows_is_recognised_and_named(log: Log, voltage: Voltage) -> None:
+    """The controller has a clock of its own: no window says that the command is late. The machine file may say it."""
+    truth = Schedule(rows=Timing(0.0107), voltage=voltage, polled=True)
+    recording = recorded(truth)
+    documents = log.of(replace(truth, polled=False), recording)
+    remedy = 'V_a changes between its samples: write times = "polled" under [signals] V_a'
+    for document in documents:
+        assert not any("late" in text.text.split(remedy)[0] for text in document.findings)
+    assert_used(documents[2:], at_least=WINDOWS - 2)
+    assert documents[1].decision is WindowDecision.NOISIER
+    assert_valid_intervals([outcome(recording, document) for document in documents[1:]])
+    assert all(remedy in document.parameters["J"].reason for document in documents[2:])
+    assert not any(document.findings for document in documents[2:])
+    path = write_machine(log.folder, UNIFORM, '[signals]\nV_a = { times = "polled" }')
+    machine = load_machine(path, with_driver=False)
+    data = write(log.folder, recording.header, recording.rows())
+    with open_recorded(machine, data) as opened:
+        declared = [report.document for report in Replay(machine, opened).reports()]
+    assert_used(declared)
+    assert not any(remedy in document.parameters["J"].reason for document in declared)
+    for own, other in zip(documents[2:], declared[2:], strict=True):
+        for name in FREE:
+            sd = other.parameters[name].raw_sd
+            assert sd is not None
+            assert own.parameters[name].raw == pytest.approx(other.parameters[name].raw, abs=0.3 * sd)
 
 
 SLOW_OMEGA = Schedule(rows=Timing(0.01), omega=Timing(missing=0.8))

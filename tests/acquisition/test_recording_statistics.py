@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from otolith.acquisition import recording_statistics
-from otolith.acquisition.recording_statistics import RecordingStatistics, SignalSampling
+from otolith.acquisition import playback
+from otolith.acquisition.playback import RecordingStatistics, SignalSampling
 from otolith.acquisition.samples import stale_repeats
 from otolith.acquisition.window import Array
 from otolith_drivers.replay.readers import Rows
@@ -102,7 +102,7 @@ def test_blank_cells_are_counted_and_split_no_interval() -> None:
 
 
 def test_memory_is_bounded_and_the_choice_fair(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording_statistics, "MAX_KEPT", 1000)
+    monkeypatch.setattr(playback, "MAX_KEPT", 1000)
     intervals = np.where(np.arange(60_000) % 2 == 0, 0.004, 0.006)
     times = np.cumsum(intervals)
     sampling = sampling_of(times, times, chunk=7000)

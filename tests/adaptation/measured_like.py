@@ -3,7 +3,7 @@
 They are integrated here, apart from the kernels of the twins.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,21 @@ class Imperfections:
     """rad/s: 0 for none."""
     wandering_load: float = 0.0
     """N*m: standard deviation of a load torque that is not measured."""
+
+
+def settled_windows(seed: int, count: int, scatter: float) -> list[Window]:
+    """Return windows of a motor at constant voltage of which only the speed is measured, by counts of an encoder.
+
+    The speed reads ``scatter`` (rad/s) too much in one period and too little in the next, in steps of a count.
+    """
+    random, total = np.random.default_rng(seed), count * RECORDS
+    system, drive = _motor_matrices()
+    slow = -1.0 / np.linalg.eigvals(system).real.max()
+    speed = np.linalg.solve(system, -drive @ (LEVELS[1], 0.0))[1] * -np.expm1(-PERIOD * np.arange(total) / slow)
+    turns = np.cumsum(random.random(total) < 0.9)  # one period in ten has the same sign as the one before
+    counted = np.rint(speed / (0.4 * scatter) + 2.5 * (-1.0) ** turns) * 0.4 * scatter
+    values = np.column_stack([np.full(total, LEVELS[1]), np.zeros(total), counted])
+    return cut(("V_a", "T_load", "omega"), values, RECORDS, PERIOD)
 
 
 def motor_windows(seed: int, count: int, have: Imperfections) -> list[Window]:
@@ -96,10 +111,15 @@ def cut(signals: tuple[str, ...], values: Array, records: int, period: float) ->
     return [Window.whole(at, at * records * period, period, signals, part) for at, part in enumerate(parts)]
 
 
-def motor_problem(*free: str) -> Problem:
-    """Return the problem of the motor whose other parameters are known."""
+def motor_problem(*free: str, sensors: tuple[str, ...] = ("i", "omega")) -> Problem:
+    """Return the problem of the motor whose other parameters are known, with some of its ``sensors``."""
     known = tuple((row.name, row.nominal) for row in MOTOR.parameters if row.name not in free)
-    return Problem(MOTOR, known, tuple(row for row in MOTOR.parameters if row.name in free), noise=NOISE)
+    rows = [(output, level) for output, level in zip(MOTOR.outputs, NOISE, strict=True) if output.name in sensors]
+    twin = replace(MOTOR, name=f"dc_motor_{'_'.join(sensors)}", outputs=tuple(output for output, _ in rows))
+    unknown = tuple(row for row in MOTOR.parameters if row.name in free)
+    return Problem(
+        MOTOR if twin.outputs == MOTOR.outputs else twin, known, unknown, noise=tuple(level for _, level in rows)
+    )
 
 
 def reports(problem: Problem, windows: list[Window]) -> list[ReportDocument]:

@@ -16,6 +16,7 @@ from tests.adaptation.measured_like import (
     motor_problem,
     motor_windows,
     reports,
+    settled_windows,
 )
 
 WINDOWS = 8
@@ -99,6 +100,14 @@ def test_what_is_known_stays_when_a_sensor_begins_to_clip() -> None:
     assert not blamed(documents[:4])
     assert blamed(documents[4:]) == {"i"}
     assert CLIPPED in documents[4].parameters["R_a"].reason
+
+
+@pytest.mark.parametrize("scatter", [0.05, 0.3])
+def test_a_settled_speed_that_scatters_more_than_stated_is_neither_clipped_nor_late(scatter: float) -> None:
+    """Its sensor's noise is stated as 0.02 rad/s. A constant speed shows no delay."""
+    documents = reports(motor_problem("R_a", "J", sensors=("omega",)), settled_windows(0, 4, scatter))
+    assert not blamed(documents)
+    assert not any("late" in finding.text or "early" in finding.text for item in documents for finding in item.findings)
 
 
 def test_a_healthy_plateau_is_no_limit() -> None:

@@ -154,7 +154,7 @@ def test_since_is_an_age_or_a_date(written: HistoryWriter) -> None:
     ("arguments", "message"),
     [
         (("press-4",), "did you mean 'press-3'"),
-        (("../../etc",), "No such file"),
+        (("../../no-such-folder",), "No such file"),
         ((MACHINE, "--parameter", "R_b"), "did you mean 'R_a'"),
         ((MACHINE, "--since", "yesterday"), "write an age"),
         ((MACHINE, "--csv", "--json"), "give one of"),

@@ -233,3 +233,25 @@ def test_a_bridge_error_of_any_size_lasts_as_long_in_a_shifted_window(variance: 
     error = shifted(twin, window, {"omega": 20 * MS}).bridge_error
     assert error is not None
     assert error.held_variance / error.variance == pytest.approx(5.0)
+
+
+def test_a_command_that_changes_between_its_samples_is_not_late(tmp_path: Path) -> None:
+    """The controller has a clock of its own: the mean delay of half a row is none, and its scatter no process noise."""
+    schedule = Schedule(rows=Timing(0.0107), polled=True)
+    problem, windows = cut(tmp_path, replace(schedule, polled=False), recorded(schedule, 100))
+    delays, noise = identify_delays_and_noise(problem, windows, {})
+    assert not late(delays)
+    assert delays.changing == ("V_a",)
+    (remark,) = (own.remark for own in delays.signals if own.name == "V_a")
+    assert 'times = "polled"' in remark
+    assert noise.outputs[0].value == pytest.approx(0.005, rel=0.1)
+    assert noise.states[0].value < 0.01
+
+
+def test_a_command_that_is_late_by_several_samples_does_not_change_between_them(tmp_path: Path) -> None:
+    """A smooth command between its samples is as good as a held one, and late all the same."""
+    schedule = replace(ROWS, voltage="sine")
+    problem, windows = cut(tmp_path, schedule, recorded(schedule, 100).delayed({"V_a": 35.0 * MS}))
+    delays, _ = identify_delays_and_noise(problem, windows, {})
+    assert not delays.changing
+    assert late(delays)["V_a"].value == pytest.approx(35.0 * MS, abs=1.0 * MS)

@@ -9,7 +9,9 @@ import pytest
 from otolith.acquisition.window import Array, Quality, TimeGrid, Verdict, Window
 from otolith.commissioning import identification as text
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise, observable_states, sample_noise
+from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.problem import Problem
+from otolith.estimation.window_fit import estimate
 from otolith.machine import find_twin
 from otolith.twin.kernel import Excitation, kernel_of
 
@@ -246,6 +248,29 @@ def test_inconsistent_windows_without_process_noise_add_it() -> None:
     assert noise.consistency.factor is None
     assert noise.consistency.after == pytest.approx(1.0, abs=0.1)
     assert (levels(noise)[2:] > 0.0).all()
+
+
+def test_process_noise_is_enlarged_as_far_as_it_helps() -> None:
+    """A slow load makes the damping scatter; the resistance differs between windows, which noise of the speed is not.
+
+    So no factor makes the windows consistent, but the damping's interval holds the truth as often as it says.
+    """
+    random = np.random.default_rng(14)
+
+    def windows(count: int) -> list[Window]:
+        resistances = 6.5 + 0.003 * random.normal(size=count)
+        return [window(random, at, (0.0, 0.3), hidden=0.006, R_a=float(value)) for at, value in enumerate(resistances)]
+
+    noise = identify_noise(PROBLEM, windows(10))
+    consistency = noise.consistency
+    assert consistency.before is not None
+    assert consistency.after is not None
+    assert consistency.remark.startswith(text.PARTLY)
+    assert 1.3 < consistency.after < 0.5 * consistency.before
+    problem = noise.applied(PROBLEM)
+    rows = [estimate(problem, own, initial_prior(problem), problem.nominal).parameters[1] for own in windows(20)]
+    deviates = [(row.value - TRUTH["D"]) / row.sd for row in rows]
+    assert np.mean(np.square(deviates)) < 2.0
 
 
 def test_inconsistency_that_process_noise_cannot_explain(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,8 @@
 """The physical range of components: no more force than the machine's terms balance, and friction that dissipates."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,10 +10,11 @@ import sympy
 from benchmarks.discovery.motor import Faults, simulate_motor, windows
 from benchmarks.discovery.setting import problem, screen
 
+from otolith.discovery import candidates
 from otolith.discovery.candidate_forms import PhysicalRange, rate_terms
-from otolith.discovery.candidates import find_candidates
+from otolith.discovery.candidates import best_guesses, find_candidates
 from otolith.discovery.linear_response import LinearResponse
-from otolith.discovery.screening import candidate_library, linearised
+from otolith.discovery.screening import ScoredGuess, candidate_library, linearised
 from otolith.discovery.search import search
 from otolith.estimation.arrival_cost import Prior, initial_prior
 from otolith.machine import find_twin
@@ -67,6 +70,27 @@ def test_friction_that_drives_is_no_candidate(kind: str) -> None:
             if (component.site, component.family, component.source) == ("shaft", "Coulomb", "omega"):
                 names = [parameter.name for parameter in fitted.problem.free]
                 assert fitted.fit.parameters[names.index(f"_amplitude_{slot}")] < 0.001
+
+
+def test_dry_friction_is_fitted_although_simpler_forms_of_a_lower_score_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own score is too low among forms with an inner parameter, but the linear response underrates it."""
+    of = response("reversing", lambda *moment: -0.004 * float(np.sign(moment[-1])))
+
+    def scored(*arguments: Any) -> list[ScoredGuess]:
+        simple: list[ScoredGuess] = []
+        friction: list[ScoredGuess] = []
+        for guess in best_guesses(*arguments):
+            model, at_shaft = guess.form.model, sites(TWIN)[guess.form.site].name == "shaft"
+            if model.inner is None:
+                simple.append(replace(guess, score=30.0 if simple else 100.0))
+            elif (model.name, at_shaft, sources(TWIN)[guess.form.source].name) == ("Coulomb", True, "omega"):
+                friction.append(replace(guess, score=40.0))
+        return [simple[0], *friction, *simple[1:]]
+
+    monkeypatch.setattr(candidates, "best_guesses", scored)
+    keys = [candidate.component.key for candidate in find_candidates(of)]
+    assert [key for key in keys if "Coulomb" in key], keys
+    assert len(keys) == len(set(keys))
 
 
 def test_friction_may_fall_to_nothing_and_no_further() -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from otolith.discovery.decision import WindowDecision, decide
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis, is_usable, prune
 from otolith.discovery.sequential_test import FitSummary, SequentialTest, join
 from otolith.estimation.arrival_cost import Evidence, Prior
@@ -69,9 +70,19 @@ def test_what_opened_a_test_has_ended_where_the_filter_alone_explains_a_window(e
     null, moved = hypothesis(FaultType.NOTHING, BARE), hypothesis(FaultType.PARAMETER, BARE)
     wrong = hypothesis(FaultType.SENSOR, augment(BARE, [PERIODIC]))
     wrong = replace(wrong, cost=5.0)
-    old = SequentialTest(BARE, (wrong, null.worse_by(60.0, 60.0)), 0.0, windows=15, last=FitSummary(9000.0, 0.0, 400.0))
+    old = SequentialTest(BARE, (wrong, null.worse_by(60.0, 60.0)), 0.0, windows=15, last=FitSummary(9000.0))
     others = (null, moved.worse_by(5.0, 0.0)) if ended else (moved, null.worse_by(15.0, 15.0))
-    fresh = SequentialTest(BARE, others, 30.0, last=FitSummary(400.0, 0.0, 400.0))
+    fresh = SequentialTest(BARE, others, 30.0, last=FitSummary(400.0))
     joined = join(old, fresh)
     assert joined.best.type is (FaultType.NOTHING if ended else FaultType.PARAMETER)
     assert (joined is fresh) == ended
+
+
+@pytest.mark.parametrize(("inflation", "named"), [(1.2, True), (1.8, False)])
+def test_a_sensor_is_named_only_if_no_structure_is_left(inflation: float, named: bool) -> None:
+    """Its error may follow a part of what the machine does and the twin lacks, up to 1.2 times the noise."""
+    null = hypothesis(FaultType.NOTHING, BARE).worse_by(60.0, 60.0)
+    problem = augment(BARE, [Component("sensor of omega", "linear", "omega", 0.25)])
+    sensor = replace(hypothesis(FaultType.SENSOR, problem), cost=1.2, inflation=inflation)
+    test = SequentialTest(BARE, (sensor, null), 0.0, windows=5, leading=5, settled=5)
+    assert decide(test, learned=10).decision is (WindowDecision.SENSOR if named else WindowDecision.SUSPECTED)

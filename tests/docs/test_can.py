@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from otolith_drivers.canbus.driver import CanOptions
-from otolith_drivers.canbus.signals import CanSource
+from otolith_drivers.canbus.options import CanSource
 
 PAGE = (Path(__file__).parents[2] / "docs" / "can.md").read_text(encoding="utf-8")
 BLOCKS = [

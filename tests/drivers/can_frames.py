@@ -8,8 +8,7 @@ import can
 
 from otolith_drivers.base import Sample, Setup, Signal
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
-from otolith_drivers.canbus.options import FrameOptions
-from otolith_drivers.canbus.signals import CanSource
+from otolith_drivers.canbus.options import CanSource, FrameOptions
 
 Requests = Mapping[str, tuple[str, dict[str, Any]]]
 """Name of each signal, its unit, and its source as in a machine file."""

@@ -14,7 +14,7 @@ import can
 from otolith_drivers.base import Driver, Setup, Signal
 from otolith_drivers.canbus import driver as can_receiver
 from otolith_drivers.canbus.bus import BusOptions, open_bus
-from otolith_drivers.canbus.signals import CanSource
+from otolith_drivers.canbus.options import CanSource
 from otolith_drivers.common import reconnection
 from otolith_drivers.modbus import driver as modbus_poller
 from tests.conftest import EXAMPLES, free_port

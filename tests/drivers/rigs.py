@@ -16,7 +16,7 @@ from otolith_drivers.canbus.bus import BusOptions, open_bus
 from otolith_drivers.conformance import Rig
 from otolith_drivers.modbus import driver as modbus_driver
 from otolith_drivers.opcua import driver as opcua_driver
-from otolith_drivers.plant import driver as plant_driver
+from otolith_drivers.plant import realtime as plant_driver
 from otolith_drivers.replay import driver as replay_driver
 from tests.conftest import EXAMPLES, OwnMachine
 from tests.drivers.modbus_servers import library_server

@@ -226,6 +226,16 @@ def test_only_correlated_residuals_are_inflated_further() -> None:
         assert low <= inflation_of(3.0 / cost * residuals, np.ones_like(residuals, dtype=np.bool_), 3.0) / 3.0 <= high
 
 
+def test_fit_without_its_prior_is_linearised_as_the_window_alone(scenario: MotorScenario, windows: Cut) -> None:
+    window, _ = windows(scenario, 11)[-1]
+    fitted = estimated(problem_for("R_a", "D"), window, [3.0, 2e-4]).fit
+    assert fitted.result.guess[2:4].any()  # trends
+    alone, (residuals, jacobian) = fitted.without_prior(), fitted.objective.linearise(fitted.guess)
+    np.testing.assert_allclose(alone.residuals, residuals, atol=1e-9)
+    np.testing.assert_allclose(alone.jacobian, jacobian, rtol=1e-9)
+    assert alone.chi_square == pytest.approx(float(residuals @ residuals))
+
+
 def test_diverging_guess_costs_the_penalty(scenario: MotorScenario, windows: Cut) -> None:
     window, _ = windows(scenario, 1)[-1]
     objective = Objective(problem_for("J"), window, np.array([0.001171]))

@@ -12,7 +12,13 @@ from otolith.discovery.decision import Approval, WindowDecision
 from otolith.health.diagnosis import FindingKind
 from otolith.health.events import HealthState, assess
 from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity, MonitoringPlan
-from otolith.health.observations import LOST_AFTER, PERSISTENT_WINDOWS, RELEASE_WINDOWS, UNDECIDED
+from otolith.health.observations import (
+    INTERMITTENT_WINDOWS,
+    LOST_AFTER,
+    PERSISTENT_WINDOWS,
+    RELEASE_WINDOWS,
+    UNDECIDED,
+)
 from otolith.health.schema import (
     ComponentDocument,
     ComponentStatus,
@@ -487,3 +493,79 @@ def test_a_machine_that_starts_after_a_night_has_not_lost_what_it_determines_lat
     night = [of_length(lost(index, others=False), 60.0) for index in range(5, 300)]
     morning = [of_length(lost(index), 60.0) for index in range(1000, 1010)]
     assert changes(assessed([*evening, *night, *morning])) == []
+
+
+SENSOR = FindingDocument(
+    id="sensor/i",
+    kind=FindingKind.SENSOR,
+    subject="i",
+    severity=Severity.FAULT,
+    condition="a sensor is wrong",
+    text="i is frozen at 3 A",
+    since=0.0,
+)
+
+
+def sensor_reports(faulty: Iterable[bool]) -> list[ReportDocument]:
+    return [
+        report(index, decision=WindowDecision.SENSOR, status=Status.HELD, findings=(SENSOR,))
+        if is_faulty
+        else report(index)
+        for index, is_faulty in enumerate(faulty)
+    ]
+
+
+@pytest.mark.parametrize("every", [2, 3, 4, 5])
+def test_a_sensor_with_a_loose_contact_is_one_event(every: int) -> None:
+    """It is faulty in one of some windows, and works between them; then it is mended."""
+    broken, healthy = 60, 3 * INTERMITTENT_WINDOWS
+    documents = assessed(sensor_reports([index < broken and index % every == 0 for index in range(broken + healthy)]))
+    (raised, _, level), (cleared, change, _) = changes(documents)
+    assert (raised, level) == (2 * every, Level.ACT)
+    assert change is EventChange.CLEARED
+    assert cleared == broken - every + INTERMITTENT_WINDOWS
+    assert {event.start for document in documents for event in document.events} == {0.0}
+    (event,) = documents[cleared].events
+    assert event.end == LENGTH * (broken - every + 1)  # since the first window without the fault
+
+
+def test_a_rare_fault_of_a_sensor_is_no_event() -> None:
+    documents = assessed(sensor_reports([index % INTERMITTENT_WINDOWS == 0 for index in range(100)]))
+    assert changes(documents) == []
+
+
+def test_a_sensor_that_was_wrong_without_a_break_is_cleared_after_three_windows() -> None:
+    documents = assessed(sensor_reports([10 <= index < 20 for index in range(40)]))
+    assert [(index, change) for index, change, _ in changes(documents)] == [
+        (9 + PERSISTENT_WINDOWS, EventChange.RAISED),
+        (19 + PERSISTENT_WINDOWS, EventChange.CLEARED),
+    ]
+
+
+@pytest.mark.parametrize("decision", [WindowDecision.STEPPED, WindowDecision.DISCOVERED])
+def test_a_class_of_causes_is_cleared_when_it_is_decided(decision: WindowDecision) -> None:
+    finding = SENSOR.model_copy(
+        update={"id": "undecided", "kind": FindingKind.CLASS, "subject": "", "text": "R_a or V_a"}
+    )
+    open_windows = [
+        report(index, decision=WindowDecision.AMBIGUOUS, status=Status.HELD, findings=(finding,)) for index in range(15)
+    ]
+    decided = report(15, decision=decision, status=Status.HELD)
+    documents = assessed([*open_windows, decided, *(report(index) for index in range(16, 20))])
+    assert [(index, change) for index, change, _ in changes(documents)] == [
+        (UNDECIDED.rise - 1, EventChange.RAISED),
+        (15, EventChange.CLEARED),
+    ]
+
+
+def test_a_later_step_of_another_parameter_does_not_make_a_sudden_change_a_slow_one() -> None:
+    reports = [
+        report(0),
+        report(1),
+        report(2, 5.9, decision=WindowDecision.STEPPED),
+        *(report(index, 5.9) for index in range(3, 8)),
+    ]
+    reports += [report(8, 5.9001, decision=WindowDecision.STEPPED), *(report(index, 5.9) for index in range(9, 14))]
+    documents = assessed(reports)
+    assert len(changes(documents)) == 1
+    assert "winding-turns-step" in events(documents[-1])["winding"].condition_id

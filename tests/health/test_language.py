@@ -25,7 +25,7 @@ from otolith.health.schema import CountersDocument, ReportDocument
 from otolith.health.text import announcements, event_text, headline
 from otolith.machine import LoadedMachine, find_twin, library_twins, load_machine, load_rules
 from otolith.publishing.html_report import html_report
-from otolith.publishing.recording_layout import blueprint, operator_text, report_text
+from otolith.publishing.recorder import blueprint, operator_text, report_text
 from otolith.storage.history import SUFFIX, WINDOW, describe_machine
 from otolith.storage.history_writer import Bounds, HistoryWriter
 from otolith_drivers.base import Sampling

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.prognosis import QUANTITY, coverage, median_error, run
+from benchmarks.prognosis import QUANTITY, SHARES, coverage, median_error, run, run_motor
 
 from otolith.discovery.decision import WindowDecision
 from otolith.health.events import HealthState, assess
@@ -46,6 +46,28 @@ def test_eighty_percent_intervals_hold_eighty_percent() -> None:
     outcomes = [outcome for seed in range(1, 101) for outcome in run(seed)]
     assert median_error(outcomes) < 0.1
     assert 0.75 <= coverage(outcomes) <= 0.85
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_precise_estimates_of_a_degradation_give_a_precise_forecast(seed: int) -> None:
+    """Onset and exponent that fit lie on a ridge that is much narrower than the distance of a coarse grid's points."""
+    random, times = np.random.default_rng(seed), np.arange(2.0, 520.0, 2.0)
+    onset, rate, sd = random.uniform(100.0, 200.0), random.uniform(0.0025, 0.0035), 5e-4
+    values = NOMINAL - 0.044 * np.expm1(rate * np.maximum(times - onset, 0.0)) + sd * random.standard_normal(len(times))
+    result = forecast(QUANTITY, history_of(values.tolist(), sd=sd)).act
+    end = onset + np.log1p(0.65 / 0.044) / rate
+    assert result is not None
+    assert result.high is not None
+    assert result.at == pytest.approx(end, abs=0.1 * (end - 518.0))
+    assert abs(result.at - end) < 5.0 * (result.high - result.low)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_paper_s_degradation_is_forecast_from_the_signals_of_the_motor(seed: int) -> None:
+    outcomes = run_motor(seed)
+    assert len(outcomes) == len(SHARES)
+    assert max(abs(outcome.error) for outcome in outcomes) < 0.1
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.8, 0.98, 1.0])
@@ -104,7 +126,32 @@ def test_a_history_stays_small_and_dense_where_it_is_recent() -> None:
     gaps = np.diff([time for time, _, _ in history])
     assert gaps[-1] == 2.0
     assert gaps[:20].mean() > 3.0 * gaps[-20:].mean()
-    assert history[0][0] == 0.0
+    assert history[0][0] < 0.02 * 10000.0
+
+
+def test_a_history_keeps_what_all_estimates_say_about_the_mean() -> None:
+    random = np.random.default_rng(7)
+    values = (NOMINAL + SD * random.standard_normal(3000)).tolist()
+    _, kept, variances = np.array(history_of(values)).T
+    precision = 1.0 / variances
+    assert precision @ kept / precision.sum() == pytest.approx(np.mean(values), abs=1e-9)
+    assert precision.sum() == pytest.approx(3000.0 / SD**2)
+
+
+def test_a_history_takes_the_estimate_of_the_window_alone_at_its_middle() -> None:
+    """The value from all windows lags behind a trend, and its error is that of the window before, too."""
+    plain, alone = report(0, 6.4), report(1, 6.4)
+    own = alone.parameters["R_a"].model_copy(update={"raw": 6.3, "raw_sd": 0.02})
+    alone = alone.model_copy(update={"parameters": {"R_a": own}})
+    stepped = alone.model_copy(update={"decision": WindowDecision.DISCOVERED})
+    for document, expected in (
+        (plain, (2.0, 6.4, 0.01**2)),
+        (alone, (3.0, 6.3, 0.02**2)),
+        (stepped, (4.0, 6.4, 0.01**2)),
+    ):
+        state, _ = assess(PLAN, HealthState(), document)
+        (point,) = state.histories["R_a"]
+        assert point == pytest.approx(expected)
 
 
 def test_a_clock_that_is_set_keeps_a_history_usable() -> None:

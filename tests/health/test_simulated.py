@@ -14,7 +14,7 @@ from otolith.health.schema import EventChange, ReportDocument
 from otolith.health.text import announcements
 from otolith.machine import load_machine
 from otolith_drivers.plant.dc_motor import MotorScenario
-from otolith_drivers.plant.faults import Gain, Step
+from otolith_drivers.plant.faults import Gain, Offset, Step
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES, SIGNALS
 
@@ -80,6 +80,23 @@ def test_a_sensor_that_works_again_leaves_no_other_event() -> None:
     announced = [(event.part, event.change) for document in documents for event in announcements(document)]
     assert announced == [("sensors", EventChange.RAISED), ("sensors", EventChange.CLEARED)]
     assert WindowDecision.STEPPED not in {document.decision for document in documents}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Offset.model_validate({"kind": "offset", "signal": "ArmatureCurrent", "amount": "0.15 A", "start": "20 s"}),
+        Step.model_validate({"kind": "step", "parameter": "R_a", "amount": "2 ohm", "start": "20 s"}),
+    ],
+    ids=lambda fault: fault.kind,
+)
+def test_a_steady_speed_is_no_limit_of_its_sensor(fault: Offset | Step) -> None:
+    """Without its samples, the speed is what another fault makes of it; the class of causes ends when it is decided."""
+    documents = reports(motor("demo").model_copy(update={"faults": (fault,)}), 32)
+    assert "clipped" not in " ".join(finding.text for document in documents for finding in document.findings)
+    (event,) = documents[-1].events
+    assert event.part == ("sensors" if fault.kind == "offset" else "winding")
 
 
 def test_a_weaker_magnet_is_an_event_although_the_machine_file_gives_it_as_known() -> None:

@@ -11,7 +11,7 @@ from otolith import machine_file
 from otolith_drivers.canbus import driver as can
 from otolith_drivers.canbus.options import MessageTable, PdoTable
 from otolith_drivers.modbus import driver as modbus
-from otolith_drivers.plant import driver as plant
+from otolith_drivers.plant import realtime as plant
 from otolith_drivers.replay import driver as replay
 from otolith_drivers.replay import tables
 

@@ -11,7 +11,7 @@ import pytest
 from otolith.health.limits import Level
 from otolith.health.schema import EventChange, EventDocument, EvidenceDocument
 from otolith.machine import load_machine
-from otolith.runtime.event_command import MAX_RUNNING, MAX_WAITING_EVENTS, EventCommand
+from otolith.runtime.process import MAX_RUNNING, MAX_WAITING_EVENTS, EventCommand
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import OwnMachine
 from tests.waiting import wait_for

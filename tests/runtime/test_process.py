@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -94,3 +95,17 @@ def test_a_death_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
         child.count_failed_start()
     child.stop(0.0)
     assert caplog.messages == ["echo has ended with code -9, and is started again"]
+
+
+def fail(connection: Any) -> None:
+    """Main function of a child that finds its folder gone."""
+    del connection
+    Path("/nowhere/folder").stat()
+
+
+def test_a_file_that_is_gone_gives_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    child = ChildProcess("recorder", "tests.runtime.test_process:fail", room=2)
+    child.start()
+    wait_for(lambda: not child.alive)
+    child.stop(PATIENCE)
+    assert capfd.readouterr().err == "recorder: [Errno 2] No such file or directory: '/nowhere/folder'\n"

@@ -1,5 +1,6 @@
 """The recorder process under supervision: stopped, killed, on a full disk. Times of the supervisor are simulated."""
 
+import errno
 import logging
 import os
 import shutil
@@ -13,6 +14,7 @@ import pytest
 
 from otolith.machine import LoadedMachine, load_machine
 from otolith.runtime.recorder_supervisor import RECORDER_TIMEOUT, RecorderSupervisor
+from otolith_drivers.errors import ServiceError
 from otolith_drivers.replay.recording import RecordingReader
 from tests.conftest import EXAMPLES
 from tests.publishing.test_recording_size import UNITS, noise
@@ -104,13 +106,40 @@ def test_a_full_disk_gives_one_warning_and_one_line_when_it_has_room(
 
 
 def test_a_folder_that_cannot_be_written_is_logged_once(
-    supervisor: RecorderSupervisor, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    supervisor: RecorderSupervisor, machine: LoadedMachine, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Monitoring begins and goes on without recordings; a file that somebody asked for is refused at once."""
     (tmp_path / "recordings").write_text("a file", encoding="utf-8")
+    with pytest.raises(ServiceError, match="not writable"):
+        RecorderSupervisor(machine, tmp_path / "recordings" / "own.rrd").start(0.0)
+    supervisor.start(0.0)
     for minute in range(100):
         supervisor.poll(60.0 * minute)
     (line,) = caplog.messages
     assert line.startswith("no recording: ")
+
+
+def test_a_link_to_itself_among_the_recordings_is_left_alone(supervisor: RecorderSupervisor, tmp_path: Path) -> None:
+    link = tmp_path / "recordings" / "demo.dc-motor-in-process-20260101T000000-1.rrd"
+    link.parent.mkdir()
+    link.symlink_to(link.name)
+    supervisor.start(0.0)
+    assert link.is_symlink()
+    assert supervisor._problem == ""
+
+
+def test_a_disk_that_fails_costs_recordings_alone(
+    supervisor: RecorderSupervisor, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_: Path) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(shutil, "disk_usage", fail)
+    supervisor.start(0.0)
+    for minute in range(100):
+        supervisor.poll(60.0 * minute)
+    (line,) = caplog.messages
+    assert line == "no recording: [Errno 5] Input/output error"
 
 
 def test_a_file_is_never_larger_than_an_eighth_of_the_budget(machine: LoadedMachine) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from otolith.adaptation.state import with_problem
 from otolith.health.prognosis import Baseline
 from otolith.machine import load_machine
 from otolith.runtime.service import Reload, Service, reloaded
@@ -84,3 +85,18 @@ def test_limits_that_are_reloaded_still_refer_to_the_baselines(tmp_path: Path) -
     limited = service._supervisor._next_state().plan.parameters["R_a"]
     assert (limited.nominal, limited.has_baseline) == (6.1, True)
     assert max(limit.value for limit in limited.limits) == pytest.approx(1.6 * 6.1)
+
+
+@pytest.mark.parametrize(("declared", "left"), [("", ("V_a",)), (', times = "polled"', ())])
+def test_a_command_that_was_found_to_change_unseen_and_is_declared_so_needs_no_advice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, declared: str, left: tuple[str, ...]
+) -> None:
+    text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
+    path = tmp_path / "motor.toml"
+    text = text.replace('"scenarios/', f'"{EXAMPLES}/scenarios/').replace('Voltage"', f'Voltage"{declared}')
+    path.write_text(text, encoding="utf-8")
+    service = Service(load_machine(path))
+    state = service._supervisor.state
+    learned = with_problem(state, replace(state.problem, changing=("V_a",)))
+    monkeypatch.setattr(service._store, "restore", lambda *_: (learned, ""))
+    assert service._restored(state).problem.changing == left

@@ -279,7 +279,7 @@ def _raised(report: Report) -> Report:
 
 def test_a_writer_that_is_killed_leaves_no_bundle(bundles: list[Path], folder: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; from otolith.storage.state_store import replace_file;"
+        "import os, signal, sys; from pathlib import Path; from otolith.storage.disk import replace_file;"
         "os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL);"
         f"replace_file(Path({str(folder)!r}) / '{KEY}-000001-20260101T000000.zip', b'torn', '{KEY}.new')"
     )

@@ -368,7 +368,7 @@ def test_a_full_disk_is_logged_once_and_what_waits_is_written_later(
 ) -> None:
     writer = HistoryWriter(path, BOUNDS)
     numbers, _ = writer.open(START)
-    monkeypatch.setattr("otolith.storage.writer_thread.WRITE_RETRY", 0.0)
+    monkeypatch.setattr("otolith.storage.disk.WRITE_RETRY", 0.0)
     tries = list[int]()
 
     def full(*_: object) -> None:

@@ -1,7 +1,7 @@
 """State store and writer thread, with real files and with a disk that does not answer."""
 
-import contextlib
 import os
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +21,7 @@ from otolith.estimation.problem import Component
 from otolith.machine import load_machine
 from otolith.storage import state_store
 from otolith.storage.state_store import StateStore, StateWriter
-from otolith_drivers.errors import OtolithError, ServiceError
+from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
 from tests.cli.replays import MACHINE
 from tests.waiting import PATIENCE, wait_for, within
 
@@ -38,13 +38,6 @@ def with_friction(amplitude: float) -> AdaptationState:
 
 STATE = with_friction(-0.004)
 SAVED = component_records(STATE)
-
-
-def is_being_read(pipe: Path, descriptors: list[int]) -> bool:
-    """Return whether a thread waits to read from ``pipe``, and append a descriptor that keeps it waiting."""
-    with contextlib.suppress(OSError):
-        descriptors.append(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
-    return bool(descriptors)
 
 
 @pytest.fixture
@@ -95,12 +88,19 @@ def test_decisions_known_at_the_start_are_not_returned(store: StateStore) -> Non
 
 
 @pytest.mark.timed
-def test_callers_do_not_wait_for_a_disk_that_hangs(store: StateStore, writer: StateWriter) -> None:
-    """A named pipe without a writer stands in for the decisions file: reading it blocks."""
-    store.decisions_path.parent.mkdir(parents=True)
-    os.mkfifo(store.decisions_path)
-    descriptors: list[int] = []
-    wait_for(lambda: is_being_read(store.decisions_path, descriptors))
+def test_callers_do_not_wait_for_a_disk_that_hangs(
+    store: StateStore, writer: StateWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_read, answers = threading.Event(), threading.Event()
+
+    def hang() -> OperatorDecisions:
+        is_read.set()
+        answers.wait(PATIENCE)
+        return OperatorDecisions()
+
+    store.save_decisions(OperatorDecisions())
+    monkeypatch.setattr(store, "decisions", hang)
+    assert is_read.wait(PATIENCE)
     begun = time.monotonic()
     writer.save(STATE)
     assert writer.new_decisions() is None
@@ -108,8 +108,29 @@ def test_callers_do_not_wait_for_a_disk_that_hangs(store: StateStore, writer: St
     writer.stop(0.2)
     assert time.monotonic() - begun < 0.2 + IMMEDIATELY
     assert not store.components_path.exists()
-    os.close(descriptors.pop())
+    answers.set()
     wait_for(store.components_path.exists)  # written late, but not lost
+    assert store.components() == SAVED
+
+
+@pytest.mark.parametrize("other", ["pipe", "device", "folder"])
+def test_what_is_no_file_in_the_place_of_a_file_is_refused(store: StateStore, other: str) -> None:
+    """A pipe, above all, must not block the daemon at its start."""
+    store.components_path.parent.mkdir()
+    for path in (store.components_path, store.decisions_path):
+        if other == "pipe":
+            os.mkfifo(path)
+        elif other == "device":
+            path.symlink_to("/dev/zero")
+        else:
+            path.mkdir()
+    initial = with_friction(-0.003)
+    state, note = store.restore(initial, 0.0)
+    assert state is initial
+    assert "not a file; the file is kept as" in note
+    with pytest.raises(ConfigurationError, match="not a file"):
+        store.decisions()
+    store.save(STATE)
     assert store.components() == SAVED
 
 

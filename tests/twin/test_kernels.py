@@ -177,7 +177,8 @@ def test_gain_is_that_of_an_extended_kalman_filter() -> None:
     measured = kernel.simulate(nominal(twin)[None], initial(twin)[None], drive)[0] + random.normal(size=(RECORDS, 2))
     measured[7, 0] = np.nan
     noisy = np.array([0.0, 0.01])
-    noise = NoiseModel.uniform(np.array([0.5, 1.0]), noisy, np.array([0.2, 3.0]), RECORDS)
+    every = np.tile(noisy, (RECORDS, 1))
+    noise = NoiseModel(np.array([0.5, 1.0]), every, every, np.array([0.2, 3.0]))
     model = kernel.innovation_model(nominal(twin), initial(twin), replace(drive, measured=measured), noise)
     state, covariance, log_determinant = initial(twin), np.zeros((2, 2)), 0.0
     for record in range(RECORDS):

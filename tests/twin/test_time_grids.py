@@ -22,6 +22,11 @@ SENSORS, PROCESS = np.array([0.005, 0.02]), np.array([0.02, 0.2])
 NONE = np.zeros(2)
 
 
+def uniform_noise(outputs: Array, inputs: Array, states: Array, records: int) -> NoiseModel:
+    every = np.tile(inputs, (records, 1))
+    return NoiseModel(outputs, every, every, states)
+
+
 def chosen(seed: int, share: float = 0.05) -> list[int]:
     """Some records of the dense grid, from the first to the last."""
     inner = np.flatnonzero(np.random.default_rng(seed).random(DENSE - 2) < share) + 1
@@ -163,7 +168,7 @@ def innovation_model(drive: Excitation, noise: NoiseModel) -> InnovationModel:
 def test_gains_equal_those_of_a_dense_filter_with_missing_measurements() -> None:
     """Records every 10 ms of which one in five is measured, against steps of 50 ms and of other lengths."""
     period, count = 0.01, 201
-    noise = NoiseModel.uniform(SENSORS, NONE, PROCESS, count)
+    noise = uniform_noise(SENSORS, NONE, PROCESS, count)
     drawn = np.random.default_rng(6).permutation(count - 2)[:40] + 1
     for records in (list(range(0, count, 5)), [0, *sorted(drawn.tolist()), count - 1]):
         inputs = np.tile([12.0, 0.05], (count, 1))
@@ -174,7 +179,7 @@ def test_gains_equal_those_of_a_dense_filter_with_missing_measurements() -> None
         grid = TimeGrid.at(period * np.array(records, dtype=np.float64), period * count)
         steps = 8 * round(float(grid.steps[:-1].max()) / period)
         merged = Excitation(inputs[records], grid, steps, measured[records])
-        own = NoiseModel.uniform(SENSORS, NONE, PROCESS, len(records))
+        own = uniform_noise(SENSORS, NONE, PROCESS, len(records))
         model = innovation_model(merged, replace(own, period=period))
         assert model.gain == pytest.approx(expected.gain[records], rel=1e-6, abs=1e-9)
         assert model.whitening == pytest.approx(expected.whitening[records], rel=1e-6, abs=1e-6)
@@ -244,7 +249,7 @@ def test_records_without_measurements_change_nothing() -> None:
     expected, own = (
         innovation_model(
             replace(drive, measured=values),
-            replace(NoiseModel.uniform(SENSORS, NONE, PROCESS, len(values)), period=PERIOD),
+            replace(uniform_noise(SENSORS, NONE, PROCESS, len(values)), period=PERIOD),
         )
         for drive, values in ((whole, measured), (split, split_measured))
     )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from otolith.acquisition.window import Verdict
-from otolith.health.schema import CountersDocument, ParameterDocument, ReportDocument
+from otolith.health.schema import CountersDocument, ParameterDocument, ReportDocument, Status
 from otolith.publishing.subscriber import Subscriber
 from otolith.publishing.zenoh_config import Connection
 from tests.conftest import EXAMPLES, free_port
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 CHANNEL = "vcan0"
 STATISTICS = Path(f"/sys/class/net/{CHANNEL}/statistics")
 PATIENCE = 300.0  # s for what takes a few; a busy computer may give the guest a tenth of a processor
+NUMBA_STARTS = 1.5  # s that Python with Numba takes to start in the guest on an idle computer
 RESISTANCE = 6.1  # ohm, of the plant; the machine file says 6.5
 PUNCTUALLY = ("chrt", "--fifo", "10")  # before a program that stands for a machine, which no computation delays
 OTOLITH = [sys.executable, "-m", "otolith"]
@@ -56,6 +57,13 @@ def run(*command: str, seconds: float = PATIENCE) -> str:
     return done.stdout
 
 
+def slowness() -> float:
+    """How many times longer than on an idle computer a program takes to start here now; 1 at least."""
+    begun = time.monotonic()
+    run(sys.executable, "-c", "import numba")
+    return max(1.0, (time.monotonic() - begun) / NUMBA_STARTS)
+
+
 def transmitted() -> int:
     """Number of frames that anybody has sent since the bus was made."""
     return int((STATISTICS / "tx_packets").read_text(encoding="ascii"))
@@ -76,6 +84,16 @@ def counters(reports: Reports) -> CountersDocument:
 def good(reports: Reports) -> Reports:
     """Reports of good windows."""
     return [report for report in reports if report.window.quality.verdict is Verdict.GOOD]
+
+
+def is_estimated(report: ReportDocument) -> bool:
+    """Whether the window gave an estimate of R_a: some windows of a busy computer have late samples."""
+    return report.parameters["R_a"].status is Status.ESTIMATED
+
+
+def check_missed(before: CountersDocument, after: CountersDocument) -> None:
+    """No window was missed; a busy computer may leave the worker behind."""
+    assert after.windows_missed == before.windows_missed or slowness() > 1.0
 
 
 @dataclass
@@ -128,9 +146,14 @@ class ReportListener:
         return self.reports
 
     def wait_for_good(self, count: int) -> Reports:
-        """The reports, once ``count`` more good windows have come."""
+        """The reports, once ``count`` more good windows have come, and the newest one was estimated."""
         before = len(good(self.reports))
-        return self.wait_for(lambda reports: len(good(reports)) >= before + count)
+        return self.wait_for(lambda reports: len(good(reports)) >= before + count and is_estimated(reports[-1]))
+
+    def wait_for_window(self) -> Reports:
+        """The reports, once that of a window which begins after this call has come."""
+        moment = time.time()
+        return self.wait_for(lambda reports: reports[-1].window.start >= moment)
 
     def close(self) -> None:
         """End the session."""

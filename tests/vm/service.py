@@ -84,10 +84,18 @@ class Instance:
         assert done.returncode == 0, f"{command}: {done.stderr}"
         return done.stdout
 
+    def history(self) -> HistoryReader:
+        """The history of its machine."""
+        (path,) = self.state.rglob("*.history.sqlite")
+        return HistoryReader(path)
+
     def reports(self, after: int = 0) -> Reports:
         """The reports in its history with numbers above ``after``."""
-        (path,) = self.state.rglob("*.history.sqlite")
-        return [ReportDocument.from_json(text) for text in HistoryReader(path).messages("report", 100_000, after)]
+        return [ReportDocument.from_json(text) for text in self.history().messages("report", 100_000, after)]
+
+    def last(self) -> ReportDocument:
+        """The newest report in its history."""
+        return self.history().latest(1)[0]
 
     def wait_for_reports(self, count: int, after: int = 0, seconds: float = PATIENCE) -> Reports:
         """At least ``count`` reports with numbers above ``after``."""
@@ -100,7 +108,7 @@ class Instance:
 
     def before(self) -> Before:
         """What it has now."""
-        last = self.reports()[-1]
+        last = self.last()
         assert last.sequence is not None
         approved = json.loads(self.otolith("components", "list", str(self.file), "--json"))["approved"]
         return Before(last.sequence, last.window.index, {event.id: str(event.state) for event in last.events}, approved)
@@ -169,13 +177,14 @@ def learned_instance(folder: Path) -> Instance:
     press.install(simulated_machine(folder))
     run("systemctl", "enable", "--now", press.unit, seconds=300.0)
     deadline = time.monotonic() + 400.0
-    while not ((report := press.wait_for_reports(1, seconds=300.0)[-1]).components and report.events):
+    press.wait_for_reports(1, seconds=300.0)
+    while not ((report := press.last()).components and report.events):
         assert time.monotonic() < deadline, report.to_json()
         time.sleep(1.0)
     print(f"a component after {report.window.index} windows")
     component = report.components[0].id
     press.otolith("components", "approve", str(press.file), component)
-    while press.reports()[-1].components[0].approval != "approved":
+    while press.last().components[0].approval != "approved":
         assert time.monotonic() < deadline
         time.sleep(0.5)
     return press

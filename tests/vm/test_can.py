@@ -13,14 +13,17 @@ from otolith.acquisition.window import Verdict
 from otolith.health.schema import CountersDocument, ParameterDocument, ReportDocument, Status
 from tests.vm.conftest import (
     CHANNEL,
+    PATIENCE,
     PUNCTUALLY,
     RESISTANCE,
     Machine,
     Program,
     ReportListener,
     Reports,
+    check_missed,
     counters,
     good,
+    is_estimated,
     machine_on_a_bus,
     resistance,
     run,
@@ -28,6 +31,7 @@ from tests.vm.conftest import (
 )
 
 FRAMES = 200  # per second, of the plant
+MAX_ROUNDS = 10  # in which the dump of the bus is played
 OURS = ("181", "281")
 
 
@@ -100,7 +104,8 @@ def check(found: ParameterDocument) -> None:
 def test_it_estimates_what_the_bus_brings(live: Live) -> None:
     check(resistance(live.reports))
     first, last = counters(good(live.reports)[:1]), counters(live.reports)
-    assert (last.bad, last.lost, last.windows_missed) == (0, 0, first.windows_missed)
+    assert (last.bad, last.lost) == (0, 0)
+    check_missed(first, last)
     assert last.reconnects == first.reconnects  # a bus that is silent for long is opened anew
 
 
@@ -117,13 +122,19 @@ def test_it_never_sends(live: Live) -> None:
 def test_a_replayed_dump_says_what_the_live_bus_said(
     compiled: None, live: Live, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
+    """It is played until five whole windows were estimated: a worker that is behind, as it starts, misses some."""
     with machine_on_a_bus(tmp_path_factory.mktemp("replayed")) as machine:
         _, listener = machine.daemon()
-        player = machine.start(*PUNCTUALLY, "canplayer", "-I", str(live.dump))
-        reports = listener.wait_for_good(7)
-        assert player.process.wait(timeout=30) == 0
-        assert transmitted() == live.frames
-    found, then = resistance(reports), resistance(live.reports)
+        rounds, whole = 0, Reports()
+        while len(whole) < 5:
+            assert rounds < MAX_ROUNDS, [str(report.window.quality) for report in listener.reports]
+            rounds += 1
+            player = machine.start(*PUNCTUALLY, "canplayer", "-I", str(live.dump))
+            assert player.process.wait(timeout=PATIENCE) == 0
+            reports = listener.wait_for_window()  # no window has the end of the dump and its begin
+            whole = [report for report in filter(is_estimated, good(reports)) if not report.window.quality.missing]
+        assert transmitted() == rounds * live.frames
+    found, then = resistance(whole), resistance(live.reports)
     check(found)
     assert found.value is not None
     assert found.sd is not None
@@ -159,7 +170,7 @@ def test_a_flood_of_other_frames_changes_nothing(watched: Watched, plant: Progra
     check(resistance(reports))
     last = counters(reports)
     assert (last.bad, last.lost, last.reconnects) == (before.bad, before.lost, before.reconnects)
-    assert last.windows_missed == before.windows_missed
+    check_missed(before, last)
     driver = reports[-1].driver
     assert driver is not None
     assert any("3 error frames" in line for line in driver.warnings)

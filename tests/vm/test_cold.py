@@ -19,10 +19,11 @@ def test_a_slow_computer_compiles_without_a_kill(tmp_path: Path) -> None:
     run("systemctl", "start", cold.unit, seconds=PATIENCE)
     print(f"ready after {time.monotonic() - begun:.0f} s")
     deadline = begun + PATIENCE
-    while cold.wait_for_reports(1, seconds=PATIENCE)[-1].parameters["R_a"].low is None:
+    cold.wait_for_reports(1, seconds=PATIENCE)
+    while cold.last().parameters["R_a"].low is None:
         assert time.monotonic() < deadline, cold.log()
         time.sleep(1.0)
     print(f"first estimate after {time.monotonic() - begun:.0f} s")
-    holds_truth(cold.reports()[-1])
+    holds_truth(cold.last())
     assert cold.shown("NRestarts") == "0"
-    assert counters(cold.reports()).worker_restarts == 0
+    assert counters([cold.last()]).worker_restarts == 0

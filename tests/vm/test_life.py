@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.publishing import attacker
-from tests.vm.conftest import PATIENCE, run
+from tests.vm.conftest import PATIENCE, run, slowness
 from tests.vm.service import PROGRAM, SHARE, STRANGER, Instance, install_wheel, simulated_machine
 from tests.waiting import within
 
@@ -55,8 +55,9 @@ def test_what_was_learned_survives_a_kill(press: Instance) -> None:
 
 @pytest.mark.timed
 def test_what_was_learned_survives_a_restart_which_is_ready_in_3_s(press: Instance) -> None:
-    press.wait_for_reports(3, after=press.reports()[-1].sequence or 0)
-    before, begun = press.before(), time.monotonic()
+    press.wait_for_reports(3, after=press.last().sequence or 0)
+    before, slow = press.before(), slowness()
+    begun = time.monotonic()
     run("systemctl", "stop", press.unit)
     stopped = time.monotonic()
     run("systemctl", "start", press.unit)  # returns when the daemon is ready
@@ -65,8 +66,10 @@ def test_what_was_learned_survives_a_restart_which_is_ready_in_3_s(press: Instan
     first = press.check_continued(before)[0]
     published = first.window.end + (first.cost.latency_s or 0.0)
     print(f"the first report came {published - wall:.1f} s after it was ready, of a window of {WINDOW_LENGTH:g} s")
-    assert ready - stopped <= within(READY)
-    assert published - wall <= WINDOW_LENGTH + within(FIRST_REPORT)
+    slow = max(slow, slowness())
+    print(f"{slow:.1f} times slower than on an idle computer")
+    assert ready - stopped <= slow * within(READY)
+    assert published - wall <= WINDOW_LENGTH + slow * within(FIRST_REPORT)
 
 
 def test_all_processes_take_at_most_300_mb(press: Instance) -> None:

@@ -34,12 +34,9 @@ class CyclicSeries:
     """The samples of a cyclic signal at the times of its clock."""
 
     series: Series
-    lateness: Array
-    """Arrival of each sample minus the time of its slot, s."""
-    on_grid: bool
-    """Whether the slots are those of the grid of the window."""
-    surplus: int = 0
-    """Samples dropped because there was no slot for them."""
+    lateness: Array  # Arrival of each sample minus the time of its slot, s
+    on_grid: bool  # Whether the slots are those of the grid of the window
+    surplus: int = 0  # Samples dropped because there was no slot for them
     irregularity: float = 0.0
     """Standard deviation of the interval over its mean, of a signal with a period of its own; zero if samples were lost
     at random only."""

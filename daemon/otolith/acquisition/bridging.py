@@ -33,14 +33,10 @@ ROUNDING = 1e-6  # usual intervals: rounding of the times of lost instants
 class InputKind(StrEnum):
     """What an input does between its samples."""
 
-    LINE = "line"
-    """A measured quantity: near the line between two samples."""
-    SAMPLED = "sampled"
-    """A command that changes at its samples only."""
-    ON_CHANGE = "on change"
-    """A command that is recorded when it changes, and holds until then."""
-    POLLED = "polled"
-    """A command that may change at any time between two readings."""
+    LINE = "line"  # A measured quantity: near the line between two samples
+    SAMPLED = "sampled"  # A command that changes at its samples only
+    ON_CHANGE = "on change"  # A command that is recorded when it changes, and holds until then
+    POLLED = "polled"  # A command that may change at any time between two readings
 
 
 def kind_of(plan: SignalPlan, values: Array) -> InputKind:
@@ -79,14 +75,15 @@ class LostIntervals:
         )
 
 
+NOTHING_LOST = LostIntervals(np.zeros(0), np.zeros(0), np.zeros(0))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherSamples:
     """The samples of all other signals."""
 
-    times: Array
-    """s, increasing."""
-    interval: Interval
-    """Of the signal that comes most often."""
+    times: Array  # s, increasing
+    interval: Interval  # Of the signal that comes most often
 
 
 def lost_samples(series: Series, kind: InputKind, own: Interval, others: OtherSamples) -> LostIntervals:
@@ -114,10 +111,8 @@ def lost_samples(series: Series, kind: InputKind, own: Interval, others: OtherSa
 class BridgedInput:
     """An input at the records of a window."""
 
-    values: Array
-    """(records,)."""
-    error: BridgeError
-    """Of this input: (records,) each."""
+    values: Array  # (records,)
+    error: BridgeError  # Of this input: (records,) each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,8 +121,7 @@ class InputSamples:
 
     series: Series
     kind: InputKind
-    noise: float
-    """Standard deviation of the noise of a sample."""
+    noise: float  # Standard deviation of the noise of a sample
     interval: Interval
     lost: LostIntervals
 
@@ -137,43 +131,46 @@ class _Error:
     """Error of a bridge, (records,) each."""
 
     variance: Array
-    duration: Array
-    """How long the error lasts, s."""
+    duration: Array  # How long the error lasts, s
 
 
 def bridge(samples: InputSamples, times: Array, steps: Array) -> BridgedInput:
     """Return an input at ``times`` (records,) s, each followed by a step (records,) s."""
     series, usual = samples.series, samples.interval.usual
     steps = np.maximum(steps, MIN_STEP)
-    rounding = ROUNDING * np.minimum(steps, usual)
-    before = np.maximum(np.searchsorted(series.times, times + rounding, "right") - 1, 0)
-    after = np.minimum(before + 1, len(series.times) - 1)
+    before, after = _neighbours(samples, times, steps)
     length = series.times[after] - series.times[before]
     ended = after == before
     spacing = np.where(ended, usual if np.isfinite(usual) else steps, length)
+    expected_change = np.zeros(len(times))
     if samples.kind is InputKind.LINE:
-        values, error = _line(samples, times, before, after)
+        values, error, expected_change = _measured(samples, times, steps)
     else:
         values, error = _hold(samples, times, before)
     outdated = _outdated(samples, times)
     variance = error.variance + outdated.variance
     duration = np.where(outdated.variance > 0.0, outdated.duration, error.duration)
     held_variance = variance * np.maximum(1.0, duration / steps)
-    expected_change = np.zeros(len(times))
     if samples.kind is InputKind.POLLED:
         unseen = _unseen_change(samples, times, steps, before, after)
-        values, expected_change = values + unseen.expected, unseen.expected
+        expected_change = unseen.expected
         variance, held_variance = variance + unseen.variance, held_variance + unseen.held_variance
     noise_ratio = np.maximum(spacing, steps) / steps
-    return BridgedInput(values, BridgeError(noise_ratio, variance, held_variance, expected_change))
+    return BridgedInput(values + expected_change, BridgeError(noise_ratio, variance, held_variance, expected_change))
+
+
+def _neighbours(samples: InputSamples, times: Array, steps: Array) -> tuple[Indices, Indices]:
+    """Return the last sample before or at each of ``times``, and the one after it; the last sample has none."""
+    series, rounding = samples.series, ROUNDING * np.minimum(steps, samples.interval.usual)
+    before = np.maximum(np.searchsorted(series.times, times + rounding, "right") - 1, 0)
+    return before, np.minimum(before + 1, len(series.times) - 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _UnseenChange:
     """The change of a polled command in the step after each record, (records,) each."""
 
-    expected: Array
-    """Mean over the step of what is expected beside the last reading."""
+    expected: Array  # Mean over the step of what is expected beside the last reading
     variance: Array
     held_variance: Array
 
@@ -223,9 +220,26 @@ def _usual_change(series: Series, own: Interval) -> float:
     return float(np.median(np.diff(series.values)[usual] ** 2)) / NORMAL_SQUARE_MEDIAN if usual.any() else 0.0
 
 
-def _line(samples: InputSamples, times: Array, before: Indices, after: Indices) -> tuple[Array, _Error]:
+def _measured(samples: InputSamples, times: Array, steps: Array) -> tuple[Array, _Error, Array]:
+    """Return a measured quantity at ``times``, its error, and by how much each value is moved.
+
+    The twin draws a line from record to record. A curve is above it or below it for half a period, which looks like
+    another moment of inertia. Half of the integral between both is added at each end of a step, by Simpson's rule.
+    """
+    both = np.concatenate([times, times + 0.5 * steps])
+    values, error = _line(samples, both, np.concatenate([steps, steps]))
+    at_records, middles = values[: len(times)], values[len(times) :]
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd values
+        following = np.append(at_records[1:], 2.0 * middles[-1:] - at_records[-1:])
+        area = 2.0 / 3.0 * (middles - 0.5 * (at_records + following)) * steps
+        moved = (area + np.append(0.0, area[:-1])) / (steps + np.append(0.0, steps[:-1]))
+    moved[~np.isfinite(moved)] = 0.0
+    return at_records, _Error(error.variance[: len(times)], error.duration[: len(times)]), moved
+
+
+def _line(samples: InputSamples, times: Array, steps: Array) -> tuple[Array, _Error]:
     """Return a measured quantity at ``times``, and its error."""
-    series = samples.series
+    series, (before, after) = samples.series, _neighbours(samples, times, steps)
     length = series.times[after] - series.times[before]
     values, none = np.interp(times, series.times, series.values), np.zeros(len(times))
     share = np.clip((times - series.times[before]) / np.maximum(length, MIN_STEP), 0.0, 1.0)
@@ -249,8 +263,7 @@ class GapVariance:
     """Variance of a quantity in the middle between two samples: ``at_two * (length / two)**exponent``."""
 
     at_two: float
-    two: float
-    """Two intervals, s."""
+    two: float  # Two intervals, s
     exponent: float
 
     def __call__(self, length: Array) -> Array:

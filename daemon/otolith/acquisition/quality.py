@@ -23,28 +23,20 @@ FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # sentences that differ by their num
 class QualityLimits:
     """Bounds that the worst signal of a window must keep for the window to be good."""
 
-    missing: float = 1.0
-    """Share of the records of the grid without a sample, 0 to 1."""
-    gap: float = np.inf
-    """Longest time without a sample, s."""
-    jitter: float = 0.005
-    """Root mean square lateness of a cyclic signal, s."""
-    surplus: float = 0.02
-    """Share of samples of a cyclic signal for which there is no slot: a second sender."""
-    irregularity: float = 0.3
-    """Standard deviation of the interval of a cyclic signal over its mean: a second sender."""
-    same_time: float = 0.25
-    """Share of samples with the time, but not the value of another one: a coarse clock, or two machines."""
+    missing: float = 1.0  # Share of the records of the grid without a sample, 0 to 1
+    gap: float = np.inf  # Longest time without a sample, s
+    jitter: float = 0.005  # Root mean square lateness of a cyclic signal, s
+    surplus: float = 0.02  # Share of samples of a cyclic signal for which there is no slot: a second sender
+    irregularity: float = 0.3  # Standard deviation of the interval of a cyclic signal over its mean: a second sender
+    same_time: float = 0.25  # Share of samples with time but not value of another: a coarse clock, or two machines
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
     """The longest time without a sample of a signal."""
 
-    start: float
-    """s, in the time of the window."""
-    length: float
-    """s."""
+    start: float  # s, in the time of the window
+    length: float  # s
 
 
 def assess_quality(

@@ -40,14 +40,10 @@ class Records:
     values: Array
     missing: Mask
     bridge_error: BridgeError | None
-    stale: int
-    """Repeats of a register in the window that were skipped."""
-    held: frozenset[str]
-    """Commands that are recorded only when they change."""
-    unknown: frozenset[str]
-    """Inputs that have no sample before the end of the window."""
-    ambiguous: Mapping[str, float] = field(default_factory=dict)
-    """Share of the samples of some signals that have the time, but not the value of another one."""
+    stale: int  # Repeats of a register in the window that were skipped
+    held: frozenset[str]  # Commands that are recorded only when they change
+    unknown: frozenset[str]  # Inputs that have no sample before the end of the window
+    ambiguous: Mapping[str, float] = field(default_factory=dict)  # Share of samples with time but not value of another
 
 
 def lies_on_grid(times: Array, start: float, period: float) -> bool:

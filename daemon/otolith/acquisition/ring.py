@@ -18,12 +18,9 @@ MAX_OBSERVED_AGE = 600.0  # s after which the last value of an observed signal i
 class RingCounters:
     """Counts of samples since the start."""
 
-    received: int = 0
-    """Samples with a finite value; the driver counts the others as bad."""
-    overwritten: int = 0
-    """Samples that were overwritten in a full ring before a window had read them."""
-    unknown: int = 0
-    """Samples of signals that have no ring."""
+    received: int = 0  # Samples with a finite value; the driver counts the others as bad
+    overwritten: int = 0  # Samples that were overwritten in a full ring before a window had read them
+    unknown: int = 0  # Samples of signals that have no ring
 
 
 class Ring:

@@ -36,19 +36,13 @@ class SignalPlan:
     """How a signal is sampled, and what it is in the twin."""
 
     name: str
-    hold: str | None = None
-    """Of an input: ``zoh`` for a command, ``foh`` for a measured quantity; None for an output."""
+    hold: str | None = None  # Of an input: zoh for a command, foh for a measured quantity; None for an output
     sampling: Sampling = Sampling.TRUE
-    delay: float = 0.0
-    """Time by which the signal is late, s; it is subtracted from the time of each sample."""
-    on_change: bool | None = None
-    """Whether a command is recorded only when it changes; None if the record shall show it."""
-    noise: float = 0.0
-    """Standard deviation of the noise of a sample, in the unit of the signal."""
-    checks: frozenset[Check] = frozenset(Check)
-    """What its samples are checked for."""
-    source: str = ""
-    """Which of several sources of the machine it comes from: sources have clocks of their own."""
+    delay: float = 0.0  # Time by which the signal is late, s; it is subtracted from the time of each sample
+    on_change: bool | None = None  # Whether a command is recorded only when it changes; None: the record shall show it
+    noise: float = 0.0  # Standard deviation of the noise of a sample, in the unit of the signal
+    checks: frozenset[Check] = frozenset(Check)  # What its samples are checked for
+    source: str = ""  # Which of several sources of the machine it comes from: sources have clocks of their own
 
     @property
     def is_cyclic(self) -> bool:
@@ -67,10 +61,8 @@ class Series:
 
     times: Array
     values: Array
-    repeated: int = 0
-    """Samples that were dropped because another one has the same time."""
-    differing: int = 0
-    """Those of them with another value."""
+    repeated: int = 0  # Samples that were dropped because another one has the same time
+    differing: int = 0  # Those of them with another value
 
     def within(self, start: float, end: float) -> "Series":
         """Return the samples with ``start <= time < end``."""
@@ -139,10 +131,8 @@ def stale_repeats(values: Array) -> Mask:
 class Interval:
     """How often samples come."""
 
-    usual: float
-    """Time between two samples without a loss, s; infinity for fewer than two samples."""
-    longest: float
-    """Time between two samples above which a sample was lost, s."""
+    usual: float  # Time between two samples without a loss, s; infinity for fewer than two samples
+    longest: float  # Time between two samples above which a sample was lost, s
 
 
 def interval_of(times: Array) -> Interval:

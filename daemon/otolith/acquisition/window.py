@@ -3,9 +3,10 @@
 The times of its records are uniform, or those at which the samples were taken.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -15,16 +16,13 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots: times before the last record are computed once
 class TimeGrid:
     """The records of a window in time. A uniform grid gives the same numbers, bit for bit, wherever it starts."""
 
-    offsets: Array
-    """(records,) time since the first record, s; increasing from zero."""
-    steps: Array
-    """(records,) time to the next record, s; from the last record to the end of the window."""
-    period: float | None = None
-    """Time between any two records, s; None if the records are not uniform."""
+    offsets: Array  # (records,) time since the first record, s; increasing from zero
+    steps: Array  # (records,) time to the next record, s; from the last record to the end of the window
+    period: float | None = None  # Time between any two records, s; None if the records are not uniform
 
     @classmethod
     def uniform(cls, records: int, period: float) -> Self:
@@ -53,7 +51,7 @@ class TimeGrid:
         """Mean time between two records, s."""
         return self.period if self.period is not None else self.length / max(self.records, 1)
 
-    @property
+    @cached_property
     def before_last(self) -> Array:
         """(records,) time since the last record, s; zero or negative."""
         if self.period is not None:
@@ -77,12 +75,9 @@ class TimeGrid:
 class GridSpan:
     """The stretch of time of a window, and the grid that is laid through it."""
 
-    start: float
-    """s."""
-    records: int
-    """Of the grid."""
-    period: float
-    """Of the grid, s."""
+    start: float  # s
+    records: int  # Of the grid
+    period: float  # Of the grid, s
 
     @property
     def length(self) -> float:
@@ -107,16 +102,11 @@ class Quality:
     """How well a window was sampled; each number is that of the worst signal."""
 
     verdict: Verdict
-    missing: float
-    """Share of records without a sample, 0 to 1."""
-    longest_gap: float
-    """Longest time without a sample, s."""
-    jitter: float
-    """Root mean square distance of the samples from the grid, s."""
-    skew: float
-    """Largest difference between two signals' median distances from the grid, s."""
-    reasons: tuple[str, ...] = ()
-    """Why the verdict is bad, one sentence per limit; empty if it is good."""
+    missing: float  # Share of records without a sample, 0 to 1
+    longest_gap: float  # Longest time without a sample, s
+    jitter: float  # Root mean square distance of the samples from the grid, s
+    skew: float  # Largest difference between two signals' median distances from the grid, s
+    reasons: tuple[str, ...] = ()  # Why the verdict is bad, one sentence per limit; empty if it is good
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,8 +120,7 @@ class BridgeError:
     noise_ratio: Array
     """Variance of the independent noise of a record over that of the noise of a sample; one where each record has one.
     """
-    variance: Array
-    """Variance of the value of a record beside that noise, in the squared unit of the signal."""
+    variance: Array  # Variance of the value of a record beside that noise, in the squared unit of the signal
     held_variance: Array
     """Variance of the independent error of a record beside that noise, in the squared unit of the signal."""
     expected_change: Array
@@ -149,17 +138,13 @@ class Window:
     """Records of all signals of a machine. Frozen and picklable."""
 
     index: int
-    start: float
-    """Unix seconds of the first record."""
+    start: float  # Unix seconds of the first record
     grid: TimeGrid
     signals: tuple[str, ...]
-    values: Array
-    """(records, signals), each in the unit of its signal; an input is bridged between its samples."""
-    missing: Mask
-    """(records, signals), true where a value is no measurement."""
+    values: Array  # (records, signals), each in the unit of its signal; an input is bridged between its samples
+    missing: Mask  # (records, signals), true where a value is no measurement
     quality: Quality
-    bridge_error: BridgeError | None = None
-    """None if every record has a sample of every input."""
+    bridge_error: BridgeError | None = None  # None if every record has a sample of every input
     observed: Mapping[str, float] = field(default_factory=dict)
     """Mean over the window of each signal that only the judgement of the estimates needs, as a temperature."""
     absent: Mapping[str, str] = field(default_factory=dict)
@@ -210,6 +195,11 @@ class Window:
         values = self.column(signal)
         error = self.bridge_error
         return values if error is None else values - error.expected_change[:, self.signals.index(signal)]
+
+    def measured(self, names: Sequence[str]) -> Array:
+        """Return the readings (records, names) of signals, not-a-number where nothing was measured."""
+        columns = [np.where(self.missing_in(name), np.nan, self.readings(name)) for name in names]
+        return np.column_stack(columns) if columns else np.zeros((self.records, 0))
 
     def missing_in(self, signal: str) -> Mask:
         """Return where one signal is missing, (records,)."""

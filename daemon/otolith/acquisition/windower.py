@@ -30,10 +30,8 @@ NO_SAMPLES = Series(np.zeros(0), np.zeros(0))
 class WindowerCounts:
     """Samples that no record has."""
 
-    repeated: int = 0
-    """Samples at the time of another one."""
-    stale: int = 0
-    """Readings of a register that had not been renewed."""
+    repeated: int = 0  # Samples at the time of another one
+    stale: int = 0  # Readings of a register that had not been renewed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,10 +39,8 @@ class _AlignedSamples:
     """The samples of each signal by its name, for a window."""
 
     series: dict[str, Series]
-    cyclic: dict[str, CyclicSeries]
-    """Of the signals on the grid or with a clock."""
-    repeated: int
-    """Samples of the window at the time of another one."""
+    cyclic: dict[str, CyclicSeries]  # Of the signals on the grid or with a clock
+    repeated: int  # Samples of the window at the time of another one
     ambiguous: dict[str, float]
     """Share of the samples of the window that have the time, but not the value of another one."""
 
@@ -64,7 +60,7 @@ class Windower:
         self.counts = WindowerCounts()
         self._limits = limits or QualityLimits()
         self._source_of_grid = next((plan.source for plan in plans if plan.is_cyclic), None)
-        self._grace = GRACE_PERIOD
+        self.grace = GRACE_PERIOD  # Time after its end that the next window waits for late samples, s
         self._intervals: dict[str, float] = {}
         self._start = math.inf
         self._index = 0
@@ -85,14 +81,9 @@ class Windower:
         return self._start + self.length
 
     @property
-    def grace(self) -> float:
-        """Time after its end that the next window waits for late samples, s."""
-        return self._grace
-
-    @property
     def deadline(self) -> float:
         """Time after which the next window no longer waits for late samples, s."""
-        return self.next_end + max(plan.delay for plan in self.plans.values()) + self._grace + self.latency
+        return self.next_end + max(plan.delay for plan in self.plans.values()) + self.grace + self.latency
 
     def begin(self, rings: Rings, now: float, waited: float) -> bool:
         """Return whether the first window has begun.
@@ -140,7 +131,7 @@ class Windower:
         )
         self.counts.repeated += samples.repeated
         self.counts.stale += records.stale
-        self._grace = self._next_grace(samples.series)
+        self.grace = self._next_grace(samples.series)
         self._index += 1
         self._start = self._start + self.length + self._grid_shift(samples.cyclic, first=False)
         return window
@@ -205,7 +196,7 @@ class Windower:
 
         The second series has those of this window alone, if some have equal times; it is empty otherwise.
         """
-        start, end = self._start - self.length + plan.delay, self.next_end + max(self._grace, self.length) + plan.delay
+        start, end = self._start - self.length + plan.delay, self.next_end + max(self.grace, self.length) + plan.delay
         times, values = finite_samples(*rings.around(plan.name, start, end, self.next_end + plan.delay))
         if plan.is_cyclic:  # the alignment subtracts the delay
             return Series(times, values), NO_SAMPLES

@@ -13,7 +13,7 @@ import numpy as np
 from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
-from otolith.adaptation.state import AdaptationState, with_posterior
+from otolith.adaptation.state import AdaptationState, with_converter_steps, with_posterior
 from otolith.discovery.decision import (
     MAX_COST,
     UPDATES,
@@ -27,7 +27,7 @@ from otolith.discovery.decision import (
     keep_present,
     with_approvals,
 )
-from otolith.discovery.hypotheses import FaultType
+from otolith.discovery.hypotheses import CHANGING, FaultType
 from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
@@ -37,6 +37,7 @@ from otolith.estimation.information import QUANTILE, Identifiability, informatio
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of
+from otolith.estimation.timing import with_changes_between
 from otolith.estimation.window_fit import Search, WindowEstimate, estimate, estimate_window
 from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
@@ -51,9 +52,12 @@ def adapt(state: AdaptationState, window: Window) -> tuple[AdaptationState, Repo
     posterior = state.posterior.without_expired(window.start)
     if posterior is not state.posterior:
         state = with_posterior(state, posterior)
-    state, predicted, checked = _predict_and_check(state, window)
+    commands = posterior.problem.changing
+    bridged = with_changes_between(window, commands) if commands else window
+    state, predicted, checked = _predict_and_check(state, bridged)
     result = _estimate(state, predicted, checked) if checked.is_usable else _reject(state, predicted, checked)
-    result = replace(result, notes=(*checked.notes, *(sensor.text for sensor in result.faulty_sensors)))
+    named = map(CHANGING.format, commands)
+    result = replace(result, notes=(*checked.notes, *named, *(own.text for own in result.faulty_sensors)))
     if result.adopted:
         result = replace(result, adopted=with_approvals(result.adopted, state.approved))
     previous, report = make_report(state, window, result)
@@ -66,15 +70,13 @@ def _predict_and_check(state: AdaptationState, window: Window) -> tuple[Adaptati
 
     If the data are faulty, the state keeps its steps: differences between faulty values are none of a converter.
     """
-    posterior = state.posterior.with_steps(window)
-    predicted = posterior.predict(window)
+    problem, predicted = state.posterior.problem, state.posterior.with_steps(window).predict(window)
     checked = check_window(window, predicted)
-    if posterior is state.posterior:
+    if predicted.problem is problem:
         return state, predicted, checked
     if not checked.is_usable:
-        return state, state.posterior.predict(window), checked
-    test = None if state.test is None else state.test.with_steps(posterior.problem.steps)
-    return replace(state, posterior=posterior, test=test), predicted, checked
+        return state, replace(predicted, problem=problem), checked
+    return with_converter_steps(state, predicted.problem), predicted, checked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +162,7 @@ def _continued_test(
 
 
 def _open_test(state: AdaptationState, tested: _TestedEstimate, screening: ScreeningResult) -> WindowResult:
-    """Return the result of a window that opens a test, unless it is expected and the null hypothesis is possible."""
+    """Search for hypotheses. If the window is expected and none is decisively better, only the filter is updated."""
     state, test = replace(state, test=None), open_test(tested.predicted, screening)
     if tested.is_expected and test.is_null_possible:
         return _update_filter(state, tested)
@@ -191,7 +193,7 @@ def _apply_decision(state: AdaptationState, tested: _TestedEstimate, test: Seque
         return _with_mixture(result, state.problem) if outcome.decision in OPEN else result
     if estimated.cost > MAX_COST:  # the null hypothesis leads, but does not explain the whole window
         return WindowResult.unchanged(state, tested.predicted, WindowDecision.REFUSED, estimate=estimated)
-    if state.test is None:  # a change in the last records is left to the next window: nothing else was compared
+    if state.test is None:  # no hypothesis is better yet: a change in the last records shows in the next window
         return WindowResult.unchanged(state, tested.predicted, WindowDecision.SUSPECTED, estimate=estimated)
     return _update_filter(state, tested)
 
@@ -212,7 +214,7 @@ def _update_filter_beside(state: AdaptationState, tested: _TestedEstimate, test:
 def _update_filter(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
     """Return the result of a window that updates the filter; a faded component that it does not need is removed."""
     innovation, estimated = tested.innovation, tested.estimated
-    if state.test is not None and state.test.quiet == 0:  # the windows before were wrong for an unknown reason
+    if state.test is not None and state.test.quiet == 0:  # the filter did not expect the window before: it may be wrong
         innovation = innovation.inflate_variance(state.test.null_reduced_chi_square)
     posterior, before = tested.predicted.update(innovation, estimated.advance), estimated.fit.prior
     result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), (), estimate=estimated)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Window
 from otolith.adaptation.state import AdaptationState
 from otolith.discovery.decision import (
     ACCEPTED,
@@ -19,7 +19,7 @@ from otolith.discovery.decision import (
     alternatives_of,
 )
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
-from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_noise
+from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_sensors
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.data_checks import FaultySensor
@@ -58,7 +58,7 @@ from otolith_drivers.units import equation_text
 
 DISAGREEING_RATIO = 3.0  # ratio of variances above which windows disagree with each other
 DISAGREEMENT = "windows differ {:.1f} times more than they should: the twin or [noise] lacks something"
-UNEXPLAINED = "the twin does not explain the window up to the noise: another parameter, a component or a sensor is off"
+UNEXPLAINED = "the twin does not explain the window up to the noise: a parameter, component, sensor or [noise] is off"
 NEVER_EXPLAINED = "check unit and scale in [signals], and the levels in [noise]"
 DATA_FAULTS = frozenset({WindowDecision.SENSOR, WindowDecision.TIMING})
 OPEN = DATA_FAULTS | {WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS}
@@ -77,30 +77,21 @@ class WindowResult:
     """What a window led to."""
 
     decision: WindowDecision
-    posterior: Posterior
-    """For the next window."""
+    posterior: Posterior  # For the next window
     before: Prior
     """Prior at the end of the window, without the window; equal to ``after`` where another posterior replaced it."""
-    after: Prior
-    """What is known there with the window."""
+    after: Prior  # What is known there with the window
     adopted: tuple[AdoptedComponent, ...]
-    estimate: WindowEstimate | None = None
-    """None for a window that was not estimated from."""
+    estimate: WindowEstimate | None = None  # None for a window that was not estimated from
     test: SequentialTest | None = None
     """The sequential test that is open, or that this window decided; with an updated filter, one that may still close.
     """
-    reason: str = ""
-    """Why the window was not estimated from."""
-    faulty_sensors: tuple[FaultySensor, ...] = ()
-    """Those whose samples made it unusable."""
-    notes: tuple[str, ...] = ()
-    """What the data checks left out."""
-    is_mixture: bool = False
-    """Whether ``after`` is the mixture of the hypotheses of an open test."""
-    searched: bool = False
-    """Whether other hypotheses were compared."""
-    shifts: ParameterCusum | None = None
-    """With those of this window; None for a window that was not estimated from."""
+    reason: str = ""  # Why the window was not estimated from
+    faulty_sensors: tuple[FaultySensor, ...] = ()  # Those whose samples made it unusable
+    notes: tuple[str, ...] = ()  # What the data checks left out
+    is_mixture: bool = False  # Whether after is the mixture of the hypotheses of an open test
+    searched: bool = False  # Whether other hypotheses were compared
+    shifts: ParameterCusum | None = None  # With those of this window; None for a window that was not estimated from
 
     @classmethod
     def unchanged(  # noqa: PLR0913 - the optional parts of a result
@@ -133,7 +124,8 @@ class WindowResult:
 
     def noisier_since(self, state: AdaptationState) -> float | None:
         """Return from when on sensors are noisier than stated, Unix seconds; None if they are not."""
-        return self.test.onset if self.decision is WindowDecision.NOISIER and self.test else state.noisier_since
+        is_noisier = self.decision is WindowDecision.NOISIER and self.posterior.problem.stated_noise
+        return self.test.onset if is_noisier and self.test else state.noisier_since
 
 
 def make_report(
@@ -389,7 +381,7 @@ def _noise_finding(problem: Problem, since: float) -> FindingDocument:
         kind=FindingKind.NOISE,
         severity=Severity.WARNING,
         condition=NOISE_CONDITION,
-        text=describe_noise(problem),
+        text="; ".join(describe_sensors(problem)),
         since=since,
         advice=NOISE_ADVICE,
     )
@@ -487,11 +479,5 @@ def _traces(problem: Problem, window: Window, estimated: WindowEstimate | None) 
     twin = problem.base_model
     outputs, inputs = tuple(output.name for output in twin.outputs), tuple(source.name for source in twin.inputs)
     predicted = None if estimated is None else estimated.predicted
-    measured, driving = _measured(window, outputs), _measured(window, inputs)
+    measured, driving = window.measured(outputs), window.measured(inputs)
     return Traces(window.grid.offsets, outputs, measured, predicted, problem.noise, inputs, driving)
-
-
-def _measured(window: Window, names: tuple[str, ...]) -> Array:
-    """Return (records, names), not-a-number where nothing was measured."""
-    columns = [np.where(window.missing_in(name), np.nan, window.readings(name)) for name in names]
-    return np.column_stack(columns) if columns else np.zeros((window.records, 0))

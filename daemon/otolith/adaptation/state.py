@@ -19,8 +19,7 @@ from otolith.health.status import PreviousStatus
 MIN_COARSE_RECORDS = 50  # records of a window on a coarser grid: fewer determine little, however long the sample period
 RESTART_FACTOR = 3.0  # on the standard deviations of a component whose filter was not saved: nothing was observed since
 PHASE = 2  # position of the phase among the values of a component
-EVERYTHING = "*"
-"""Stands for all parameters, components and noise levels among the names of :attr:`OperatorDecisions.resets`."""
+EVERYTHING = "*"  # Stands for all parameters, components and noise levels among the names of OperatorDecisions.resets
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,22 +29,15 @@ class AdaptationState:
     machine: str
     site: str
     posterior: Posterior
-    previous: dict[str, PreviousStatus]
-    """Status of each free parameter in the report before, by its label."""
-    records: int
-    """Of the next window."""
-    test: SequentialTest | None = None
-    """The competing hypotheses, while they are undecided."""
-    learned: int = 0
-    """Windows that updated the posterior."""
+    previous: dict[str, PreviousStatus]  # Status of each free parameter in the report before, by its label
+    records: int  # Of the next window
+    test: SequentialTest | None = None  # The competing hypotheses, while they are undecided
+    learned: int = 0  # Windows that updated the posterior
     contradictions: int = 0
     """Consecutive windows that did not update the posterior; windows with bad data are not counted."""
-    restricted: frozenset[str] = frozenset()
-    """Keys of components that the machine file excludes."""
-    approved: frozenset[str] = frozenset()
-    """Keys of components that the operator approved."""
-    adopted: tuple[AdoptedComponent, ...] = ()
-    """The components in the twin."""
+    restricted: frozenset[str] = frozenset()  # Keys of components that the machine file excludes
+    approved: frozenset[str] = frozenset()  # Keys of components that the operator approved
+    adopted: tuple[AdoptedComponent, ...] = ()  # The components in the twin
     shifts: ParameterCusum = field(default_factory=ParameterCusum)
     """By how much the estimates of windows differ from their predictions, all the same way."""
     noisier_since: float | None = None
@@ -53,8 +45,7 @@ class AdaptationState:
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)
     """Limits and rules by which states and events follow from the reports."""
     health: HealthState = field(default_factory=HealthState)
-    resets: Mapping[str, float] = field(default_factory=dict)
-    """The :attr:`OperatorDecisions.resets` that have been applied."""
+    resets: Mapping[str, float] = field(default_factory=dict)  # The OperatorDecisions.resets that have been applied
 
     @property
     def is_valid(self) -> bool:
@@ -86,7 +77,7 @@ def cleared(state: AdaptationState) -> AdaptationState:
     problem = state.problem
     for component in problem.components:
         problem = without(problem, component)
-    problem = replace(problem.with_levels(problem.stated_levels), steps=())
+    problem = replace(problem.with_levels(problem.stated_levels), steps=(), changing=())
     initial = initial_state(state.machine, state.site, problem, state.plan)
     return replace(initial, restricted=state.restricted, approved=state.approved)
 
@@ -105,6 +96,12 @@ def with_sample_grid(state: AdaptationState, configured: WindowOptions, ratio: f
     period = None if configured.sample_period is None else ratio * configured.sample_period
     window = WindowOptions(scaled(configured.records), scaled(configured.shortest), scaled(configured.longest), period)
     return replace(with_problem(state, replace(state.problem, window=window)), records=window.records)
+
+
+def with_converter_steps(state: AdaptationState, problem: Problem) -> AdaptationState:
+    """Return the state with the steps of converters that ``problem`` has, also in an open test."""
+    test = None if state.test is None else state.test.with_steps(problem.steps)
+    return replace(state, posterior=replace(state.posterior, problem=problem), test=test)
 
 
 def with_posterior(state: AdaptationState, posterior: Posterior) -> AdaptationState:
@@ -129,10 +126,8 @@ def without_component(state: AdaptationState, component: Component) -> Adaptatio
 class OperatorDecisions:
     """What the operator decided, by the keys of components."""
 
-    approved: frozenset[str] = frozenset()
-    """They belong to the healthy machine."""
-    rejected: frozenset[str] = frozenset()
-    """They are no components, and discovery leaves them out."""
+    approved: frozenset[str] = frozenset()  # They belong to the healthy machine
+    rejected: frozenset[str] = frozenset()  # They are no components, and discovery leaves them out
     forgotten: Mapping[str, float] = field(default_factory=dict)
     """Unix seconds: a component discovered before then has to be discovered again."""
     resets: Mapping[str, float] = field(default_factory=dict)
@@ -190,8 +185,7 @@ class ComponentRecord:
     """A component as it was known before a restart."""
 
     adopted: AdoptedComponent
-    values: tuple[float, ...]
-    """Amplitude, inner parameter and phase, as far as it has them."""
+    values: tuple[float, ...]  # Amplitude, inner parameter and phase, as far as it has them
     deviations: tuple[float, ...]
 
 

@@ -63,8 +63,7 @@ class Comparison:
     end: float
     parameter: str
     injected: float
-    estimated: float | None
-    """None where the report has no valid value."""
+    estimated: float | None  # None where the report has no valid value
     sd: float
 
     @property
@@ -112,10 +111,8 @@ class UnbalanceComparison:
     """An unbalance of the scenario, and the component that the daemon adopted for it."""
 
     source: str
-    inner: float
-    """Order, or frequency in rad/s."""
-    amplitude: float
-    """N·m."""
+    inner: float  # Order, or frequency in rad/s
+    amplitude: float  # N·m
     component: ComponentDocument | None
 
     @property
@@ -151,11 +148,7 @@ def compare_unbalance(fault: Unbalance, inertia: float, components: Sequence[Com
 
 
 def transports_of(machine: LoadedMachine) -> list[str]:
-    """Return how the simulated machine must send what ``machine`` receives.
-
-    Raises:
-        ConfigurationError: the machine is read in a way that no simulated machine offers.
-    """
+    """Return how the plant must send what ``machine`` receives; raise ConfigurationError if no plant can."""
     transports = []
     for driver in machine.file.drivers:
         kind, is_tcp = driver.get("type"), driver.get("framing", "tcp") == "tcp"
@@ -374,11 +367,7 @@ class Demo:
 
 
 def _refuse_busy(endpoints: Sequence[str]) -> None:
-    """Refuse an endpoint where another daemon publishes: its reports would be taken for the demo's own.
-
-    Raises:
-        ServiceError: something listens there.
-    """
+    """Raise ServiceError if another daemon publishes at an endpoint: its reports would be taken for the demo's."""
     for endpoint in endpoints:
         is_file = endpoint.startswith(SOCKET)
         host, _, port = endpoint.partition("/")[2].rpartition(":")

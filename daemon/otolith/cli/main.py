@@ -31,10 +31,8 @@ from otolith.cli.common import (
     reader_options,
     shipped_directory,
 )
-from otolith.cli.operation.history import history, report
-from otolith.cli.operation.install import install
-from otolith.cli.operation.keys import keys
-from otolith.cli.operation.reproduce import reproduce
+from otolith.cli.operation.history import history, report, reproduce
+from otolith.cli.operation.install import install, keys
 from otolith.cli.operation.view import view
 
 if TYPE_CHECKING:

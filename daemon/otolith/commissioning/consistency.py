@@ -25,6 +25,7 @@ from otolith.estimation.arrival_cost import eliminate_states
 MIN_INFORMATION = 2.0  # prior standard deviations per one of the window: below it, a direction is not determined
 SIGNIFICANCE = 0.05  # probability of a larger chi-square by chance, below which windows are inconsistent
 MAX_FACTOR = 1e4  # on process noise
+HARDLY_MORE = 1.1  # times the least reduced chi-square of all factors
 BRACKET_RATIO = 2.0  # between successive factors until they enclose the solution
 FACTOR_TOLERANCE = 0.01  # of the factor's logarithm
 MAX_OUTLYING_SHARE = 0.2  # of the windows: more of them are no exceptions
@@ -39,12 +40,9 @@ BAND_RATIO = 4.0  # between the ends of a band of the spectrum
 class Band:
     """The power of the innovations between two frequencies."""
 
-    low: float
-    """Hz."""
-    high: float
-    """Hz."""
-    ratio: float
-    """Over the power of white noise with the noise levels."""
+    low: float  # Hz
+    high: float  # Hz
+    ratio: float  # Over the power of white noise with the noise levels
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,16 +50,12 @@ class Whiteness:
     """The innovations of one output, in all windows together."""
 
     output: str
-    correlation: float
-    """The autocorrelation of largest magnitude."""
-    lag: float
-    """s, of that autocorrelation."""
-    of_correlations: float
-    """Probability that white noise has autocorrelations as large."""
+    correlation: float  # The autocorrelation of largest magnitude
+    lag: float  # s, of that autocorrelation
+    of_correlations: float  # Probability that white noise has autocorrelations as large
     of_periodogram: float | None
     """Probability that the cumulative periodogram of white noise is as far from a line; None at irregular times."""
-    bands: tuple[Band, ...]
-    """From low to high frequencies; none at irregular times."""
+    bands: tuple[Band, ...]  # From low to high frequencies; none at irregular times
 
     @property
     def is_white(self) -> bool:
@@ -138,10 +132,8 @@ def _spectrum(series: Sequence[Array], step: float) -> tuple[float | None, tuple
 class ChiSquareTest:
     """Chi-square of the windows' estimates about their common weighted mean."""
 
-    reduced: float
-    """Per degree of freedom: 1 is expected. Not a number without degrees of freedom."""
-    degrees: int
-    """Degrees of freedom; 0 if no two windows determine the same direction."""
+    reduced: float  # Per degree of freedom: 1 is expected. Not a number without degrees of freedom
+    degrees: int  # Degrees of freedom; 0 if no two windows determine the same direction
 
     @property
     def passed(self) -> bool:
@@ -216,7 +208,8 @@ def inflate_process_noise(
 ) -> tuple[float, ChiSquareTest, Fits]:
     """The factor on process noise that makes the reduced chi-square of ``fits`` one, and test and fits with it.
 
-    ``levels`` returns the levels (outputs + states,) for a factor. If none suffices, the test of the largest is failed.
+    ``levels`` returns the levels (outputs + states,) for a factor. If none suffices, it is the smallest one that leaves
+    hardly more than the best.
     """
     from scipy.optimize import brentq  # noqa: PLC0415 - only noise identification needs SciPy
 
@@ -236,5 +229,8 @@ def inflate_process_noise(
     if log_excess(high) <= 0.0:
         high = float(brentq(log_excess, low, high, xtol=FACTOR_TOLERANCE, rtol=FACTOR_TOLERANCE))
         log_excess(high)
+    else:
+        least = min(test.reduced for _, test in tried.values())
+        high = min(log_factor for log_factor, (_, test) in tried.items() if test.reduced <= HARDLY_MORE * least)
     refitted, test = tried[high]
     return float(np.exp(high)), test, refitted

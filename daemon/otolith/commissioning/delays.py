@@ -12,9 +12,18 @@ import numpy as np
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.commissioning.identification import IdentifiedNoise, identify_noise, with_initial_noise
 from otolith.commissioning.likelihood import FIRST_FITS, FittedWindow, Likelihood, Progress
+from otolith.discovery.screening import DECISIVE
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
-from otolith.estimation.timing import delay_response, delayable, largest_delay, same_measurements, shifted, trial_delays
+from otolith.estimation.timing import (
+    delay_response,
+    delayable,
+    largest_delay,
+    same_measurements,
+    shifted,
+    trial_delays,
+    with_changes_between,
+)
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 SEARCHED_WINDOWS = 8  # windows with the most information, in which delays are tried
@@ -30,6 +39,7 @@ UNOBSERVABLE = "its delay cannot be identified: it does not move, or no output d
 NO_DELAY = "no delay is significant; up to about {:.2g} ms could not be detected"
 AT_LIMIT = "at the largest delay that was searched"
 NO_WINDOW = "no window can be used: no delay was identified"
+CHANGING = 'it changes between its samples: add times = "polled" to it in [signals]'
 STRUCTURE = "a delay of {:.4g} ms would explain as much as the structure that the twin lacks, so it is not identified"
 
 
@@ -38,12 +48,9 @@ class SignalDelay:
     """The delay of one signal against those that are not late."""
 
     name: str
-    value: float
-    """s."""
-    sd: float | None = None
-    """Standard deviation, s; None if it was not identified."""
-    remark: str = ""
-    """Why there is none, or what limits it; empty if nothing does."""
+    value: float  # s
+    sd: float | None = None  # Standard deviation, s; None if it was not identified
+    remark: str = ""  # Why there is none, or what limits it; empty if nothing does
 
     @property
     def is_late(self) -> bool:
@@ -56,10 +63,10 @@ class IdentifiedDelays:
     """The delays of all signals, outputs first."""
 
     signals: tuple[SignalDelay, ...]
-    windows: int = 0
-    """How many were used."""
+    windows: int = 0  # How many were used
     shifts: tuple[float, ...] = ()
     """By how much the samples of each signal are late in the windows, s; signed, zero for one of them."""
+    changing: tuple[str, ...] = ()  # Commands that change between their samples
     noise_without: IdentifiedNoise | None = None
     """Noise levels of the windows as they come; None if the search did not need them."""
 
@@ -71,6 +78,8 @@ class IdentifiedDelays:
     def applied(self, problem: Problem, windows: Sequence[Window]) -> list[Window]:
         """Return the windows that the delays were identified from, without what is left of the delays in them."""
         given = dict(zip((signal.name for signal in self.signals), self.shifts, strict=False))
+        if self.changing:
+            windows = [with_changes_between(window, self.changing) for window in windows]
         return [shifted(problem.twin, window, given) for window in windows]
 
 
@@ -78,8 +87,7 @@ class IdentifiedDelays:
 class _Point:
     """All windows, shifted by ``delays`` and fitted."""
 
-    delays: Array
-    """(signals,) s."""
+    delays: Array  # (signals,) s
     fits: list[FittedWindow]
     deviance: float
 
@@ -88,12 +96,10 @@ class _Point:
 class _Score:
     """Estimate of the delays of some signals from all windows, around a point."""
 
-    step: Array
-    """(signals,) to the minimum, s."""
+    step: Array  # (signals,) to the minimum, s
     covariance: Array
     """(signals, signals); enlarged where the windows differ by more than their uncertainties explain."""
-    gain: float
-    """By which the deviance falls, with the same enlargement."""
+    gain: float  # By which the deviance falls, with the same enlargement
 
 
 def identify_delays(
@@ -116,6 +122,32 @@ def identify_delays_and_noise(
     problem: Problem, windows: Sequence[Window], declared: Mapping[str, float], progress: Progress = lambda _: None
 ) -> tuple[IdentifiedDelays, IdentifiedNoise]:
     """Return the delays as :func:`identify_delays`, and the noise levels of windows without them.
+
+    A command that changes between its samples seems late by their mean distance. Which of both it is shows where the
+    windows are decisively more likely.
+    """
+    late, noise = _delays_and_noise(problem, windows, declared, progress)
+    commands = {driven.name for driven in problem.twin.inputs if driven.hold == "zoh"}
+    names = tuple(own.name for own in late.signals if own.is_late and own.name in commands)
+    if not names or not noise.windows:
+        return late, noise
+    changed = [with_changes_between(window, names) for window in windows]
+    other, other_noise = _delays_and_noise(problem, changed, declared, progress)
+    deviances = [
+        _Search(levels.applied(problem), used, progress).deviance(delays)
+        for delays, levels, used in ((late, noise, windows), (other, other_noise, changed))
+    ]
+    is_late = any(own.name in names and own.is_late for own in other.signals)  # by more than a time between samples
+    if is_late or not deviances[1] <= deviances[0] - DECISIVE:  # a deviance may be no number
+        return late, noise
+    kept = tuple(replace(own, remark=CHANGING) if own.name in names else own for own in other.signals)
+    return replace(other, signals=kept, changing=names), other_noise
+
+
+def _delays_and_noise(
+    problem: Problem, windows: Sequence[Window], declared: Mapping[str, float], progress: Progress
+) -> tuple[IdentifiedDelays, IdentifiedNoise]:
+    """Return the delays of signals, and the noise levels of windows without them.
 
     A delay looks like process noise, so delays come first, with initial noise levels. With the identified ones they
     are refined, and then the noise, because even the uncertainty of a delay looks like process noise.
@@ -178,6 +210,11 @@ class _Search:
             point, active = self._simplified(*better)
         results = tuple(self._results(point, active, declared))
         return IdentifiedDelays(results, len(self._windows), tuple(point.delays.tolist()))
+
+    def deviance(self, delays: IdentifiedDelays) -> float:
+        """Return that of the windows with these delays; infinite if none can be used."""
+        shifts = np.array(delays.shifts or (0.0,) * len(self.names))
+        return self._again(self._first, shifts).deviance if self._windows else np.inf
 
     def _evaluate(
         self, delays: Array, windows: Sequence[Window], starts: Sequence[Array], rounds: int = FIRST_FITS

@@ -49,6 +49,7 @@ MIN_SENSOR_SHARE = 0.02  # of the noise that a signal shows: floor of the sensor
 MAX_COST = 1e6  # of a window's first fit, in units of the noise: beyond it, the twin cannot follow
 POOR_FIT = 5.0  # cost of the first window's fit beyond which the particle swarm looks for a better minimum
 SMALL_PROCESS_SHARE = 1e-3  # of the observable process noise: where inflation begins if the likelihood found none
+MAX_LEFT = 0.5  # of the reduced chi-square that process noise may leave where it cannot make windows consistent
 MAX_PLAUSIBLE_FACTOR = 10.0  # on process noise: beyond it, noise is hardly the cause
 
 NEVER_MEASURED = "no window has a sample of it: its level is unchanged"
@@ -69,6 +70,9 @@ NOT_COMPARABLE = "consistency of windows: not tested, as no two windows determin
 CONSISTENT = "consistency of windows: they scatter as their uncertainties predict"
 INFLATED = "consistency of windows: they scattered more than their uncertainties predict, so process noise was inflated"
 ADDED = "consistency of windows: they scattered more than their uncertainties predict, so process noise was added"
+PARTLY = (
+    "consistency of windows: process noise was enlarged until more of it helped no further, but they still scatter more"
+)
 NOT_INFLATED = "consistency of windows: they scatter more than their uncertainties predict, but not from process noise"
 DOUBTFUL = "; by so much that the machine probably changes between windows, or the twin lacks something"
 
@@ -78,25 +82,19 @@ class NoiseLevel:
     """The noise of one output, or the process noise of one state."""
 
     name: str
-    value: float
-    """Standard deviation in the unit of the output; of a state, in its unit per square root of a second."""
-    sd: float | None = None
-    """Standard deviation of the value; None if it was not identified."""
-    remark: str = NO_WINDOW
-    """Why it was not identified, or what limits it; empty if nothing does."""
+    value: float  # Standard deviation in the unit of the output; of a state, in its unit per square root of a second
+    sd: float | None = None  # Standard deviation of the value; None if it was not identified
+    remark: str = NO_WINDOW  # Why it was not identified, or what limits it; empty if nothing does
 
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
     """The consistency test with maximum-likelihood levels, and with those that are returned."""
 
-    degrees: int = 0
-    """Degrees of freedom; 0 if nothing can be compared, and the numbers below are None."""
-    before: float | None = None
-    """Reduced chi-square of the windows."""
+    degrees: int = 0  # Degrees of freedom; 0 if nothing can be compared, and the numbers below are None
+    before: float | None = None  # Reduced chi-square of the windows
     after: float | None = None
-    factor: float | None = None
-    """On process noise; None if there was none to inflate."""
+    factor: float | None = None  # On process noise; None if there was none to inflate
     remark: str = NO_WINDOW
 
 
@@ -106,21 +104,16 @@ class IdentifiedNoise:
 
     outputs: tuple[NoiseLevel, ...]
     states: tuple[NoiseLevel, ...]
-    remarks: tuple[str, ...]
-    """About windows that were not used."""
+    remarks: tuple[str, ...]  # About windows that were not used
     consistency: Consistency = Consistency()
     before_inflation: tuple[float, ...] = ()
     """Levels of outputs and states before inflation; empty if nothing was identified."""
-    whiteness: tuple[Whiteness, ...] = ()
-    """Of the innovations before inflation, by output."""
-    whiteness_after: tuple[Whiteness, ...] = ()
-    """With the levels that are returned, if process noise was inflated."""
+    whiteness: tuple[Whiteness, ...] = ()  # Of the innovations before inflation, by output
+    whiteness_after: tuple[Whiteness, ...] = ()  # With the levels that are returned, if process noise was inflated
     log_likelihood: float | None = None
     """Restricted, before inflation, up to a constant; None if nothing was identified."""
-    windows: int = 0
-    """How many were used."""
-    evaluations: int = 0
-    """Linearisations of a window, for all its fits."""
+    windows: int = 0  # How many were used
+    evaluations: int = 0  # Linearisations of a window, for all its fits
 
     def applied(self, problem: Problem) -> Problem:
         """The problem with these levels."""
@@ -162,14 +155,10 @@ def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progre
 class _InitialGuess:
     """Where the search begins."""
 
-    signal_noise: Array
-    """(outputs,) what the signals show; 0 if one is constant, NaN if it is never measured."""
-    process: Array
-    """(states,) process noise that is just observable; NaN if none is."""
-    variances: VarianceParametrisation
-    """All levels that can be identified are free."""
-    fits: list[FittedWindow]
-    """The windows that are used; none if none can be."""
+    signal_noise: Array  # (outputs,) what the signals show; 0 if one is constant, NaN if it is never measured
+    process: Array  # (states,) process noise that is just observable; NaN if none is
+    variances: VarianceParametrisation  # All levels that can be identified are free
+    fits: list[FittedWindow]  # The windows that are used; none if none can be
     remarks: tuple[str, ...]
 
 
@@ -217,10 +206,8 @@ class _ConsistentLevels:
     """What the consistency test leads to."""
 
     consistency: Consistency
-    levels: Array
-    """(outputs + states,), inflated if necessary."""
-    inflated: Fits = ()
-    """The windows fitted with inflated levels; none if they are not."""
+    levels: Array  # (outputs + states,), inflated if necessary
+    inflated: Fits = ()  # The windows fitted with inflated levels; none if they are not
 
 
 def _without_outlying(
@@ -286,10 +273,12 @@ def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Prog
         process[outputs:] = np.where(observable_states(likelihood.problem.base_model), small, 0.0)
     progress(f"reduced chi-square of the windows: {before.reduced:.3g}")
     factor, after, inflated = inflate_process_noise(likelihood, lambda factor: sensors + factor * process, best.fits)
-    if not after.degrees or not after.passed:
+    if not after.degrees or (not after.passed and after.reduced > MAX_LEFT * before.reduced):
         consistency = Consistency(before.degrees, before.reduced, before.reduced, None, NOT_INFLATED)
         return _ConsistentLevels(consistency, best.levels)
-    remark = ADDED if added else INFLATED + (DOUBTFUL if factor > MAX_PLAUSIBLE_FACTOR else "")
+    remark = (ADDED if added else INFLATED) if after.passed else PARTLY
+    if not added and factor > MAX_PLAUSIBLE_FACTOR:
+        remark += DOUBTFUL
     consistency = Consistency(before.degrees, before.reduced, after.reduced, None if added else factor, remark)
     return _ConsistentLevels(consistency, sensors + factor * process, inflated)
 
@@ -340,12 +329,9 @@ def with_initial_noise(problem: Problem, windows: Sequence[Window]) -> Problem:
 class _InitialLevels:
     """Noise levels that the signals show, before any fit."""
 
-    signal_noise: Array
-    """(outputs,) what the signals show; 0 if one is constant, NaN if it is never measured."""
-    sensors: Array
-    """(outputs,) the same, or the level of the problem where the signals show none."""
-    process: Array
-    """(states,) process noise that is just observable; NaN if none is."""
+    signal_noise: Array  # (outputs,) what the signals show; 0 if one is constant, NaN if it is never measured
+    sensors: Array  # (outputs,) the same, or the level of the problem where the signals show none
+    process: Array  # (states,) process noise that is just observable; NaN if none is
 
     @property
     def values(self) -> Array:

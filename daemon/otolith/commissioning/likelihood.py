@@ -41,8 +41,7 @@ class FittedWindow:
 
     window: Window
     objective: Objective
-    centre: Array
-    """(guess,) around which the predictor was made."""
+    centre: Array  # (guess,) around which the predictor was made
     result: FitResult
 
     @property
@@ -64,8 +63,7 @@ class Linearisation:
     """Near a fit's levels: half the Hessian of the deviance is approximately JᵀJ, J the Jacobian of ``whitened``."""
 
     deviance: float
-    whitened: Array
-    """Projected whitened innovations of all windows, then the logarithms of their whitening factors."""
+    whitened: Array  # Projected whitened innovations of all windows, then the logarithms of their whitening factors
 
 
 class Likelihood:
@@ -153,10 +151,8 @@ def with_levels(problem: Problem, levels: Array) -> Problem:
 class LikelihoodPoint:
     """Noise levels, and all windows fitted at them."""
 
-    shares: Array
-    """(free,) as in :class:`VarianceParametrisation`."""
-    levels: Array
-    """(outputs + states,)."""
+    shares: Array  # (free,) as in VarianceParametrisation
+    levels: Array  # (outputs + states,)
     fits: list[FittedWindow]
     deviance: float
     sd: Array
@@ -168,12 +164,9 @@ class VarianceParametrisation:
     """The deviance by the free variances, each in shares of its initial value: level² = floor² + share·initial²."""
 
     likelihood: Likelihood
-    initial: Array
-    """(outputs + states,) levels where the search begins, with shares of one."""
-    floor: Array
-    """(outputs + states,) levels at a share of zero."""
-    free: Mask
-    """(outputs + states,); a level that is not free stays at its floor."""
+    initial: Array  # (outputs + states,) levels where the search begins, with shares of one
+    floor: Array  # (outputs + states,) levels at a share of zero
+    free: Mask  # (outputs + states,); a level that is not free stays at its floor
 
     def levels(self, shares: Array) -> Array:
         """(free,) -> (outputs + states,)."""

@@ -51,12 +51,9 @@ class Structure:
     """A component that all windows show."""
 
     component: Component
-    sd: float
-    """Standard deviation of its amplitude, from the scatter between windows."""
-    inner_sd: float
-    """Standard deviation of its inner parameter."""
-    evidence: float
-    """-2 log evidence of all windows against a twin without it."""
+    sd: float  # Standard deviation of its amplitude, from the scatter between windows
+    inner_sd: float  # Standard deviation of its inner parameter
+    evidence: float  # -2 log evidence of all windows against a twin without it
     is_restarted: bool
     """Whether its phase is another in each window: a sine of time, or of an angle that begins at zero there."""
     is_at_bound: bool = False

@@ -32,13 +32,10 @@ PROBE = 1e-3  # in the unit of a site: difference that gives its coefficient; co
 class CandidateForm(NamedTuple):
     """A component without amplitude, inner parameter and phase."""
 
-    site: int
-    """Index of the site."""
+    site: int  # Index of the site
     model: ComponentFamily
-    source: int
-    """Index of the source."""
-    bounds: tuple[float, float] = (0.0, 0.0)
-    """Of the inner parameter."""
+    source: int  # Index of the source
+    bounds: tuple[float, float] = (0.0, 0.0)  # Of the inner parameter
 
 
 @lru_cache(maxsize=64)

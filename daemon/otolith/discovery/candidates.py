@@ -39,8 +39,7 @@ class Candidate:
     """A component worth a fit."""
 
     component: Component
-    competing: float
-    """Number of forms of its kind."""
+    competing: float  # Number of forms of its kind
     of_sensor: bool
 
 
@@ -52,16 +51,15 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     guesses = best_guesses(response, forms, competing)
     if not guesses:
         return []
-    best = guesses[0].score
-    guesses = _without_parameters(response, guesses, competing)
-    least = max(best - SCORE_MARGIN - SCORE_SHARE * abs(best), -DECISIVE)
-    kept = [guess for guess in guesses if guess.score > least][: _affordable(response)]
-    kept += threshold_like(problem, guesses[len(kept) :]) if kept else []
-    components = components_of(response, kept)
-    return [
-        Candidate(component, competing.of(guess.form), competing.is_sensor(guess.form))
-        for guess, component in components
-    ]
+    best, guesses = guesses[0].score, _without_parameters(response, guesses, competing)
+    error = SCORE_MARGIN + SCORE_SHARE * abs(best)
+    # Of a large change, an inner parameter also fits that error, which a simpler form cannot: both scores may be off.
+    kept = [own for own in guesses if own.score > max(best - error * (2 - bool(own.form.model.inner)), -DECISIVE)]
+    kept = kept[: _affordable(response)]
+    chosen = {own.form for own in kept}
+    kept += threshold_like(problem, [own for own in guesses if own.form not in chosen]) if kept else []
+    rows = ((guess.form, component) for guess, component in components_of(response, kept))
+    return [Candidate(component, competing.of(form), competing.is_sensor(form)) for form, component in rows]
 
 
 def best_guesses(

@@ -36,7 +36,7 @@ class WindowDecision(StrEnum):
     STEPPED = "two windows agree on a sudden change"
     DISCOVERED = "several windows agree on a new component"
     FADED = "a component is no longer there"
-    NOISIER = "two windows agree that a sensor is noisier than stated"
+    NOISIER = "two windows agree that a signal is less certain than stated"
     AMBIGUOUS = "several hypotheses explain the windows equally well: what they agree on is estimated"
     SENSOR = "a sensor is wrong: its error does not count as a change of a parameter"
     TIMING = "a signal is late: its delay does not count as a change of a parameter"
@@ -111,7 +111,7 @@ def _data_fault_or_component(test: SequentialTest, *, is_young: bool) -> WindowO
     """
     best = test.best
     for kind, (decision, windows) in DATA_FAULTS.items():
-        if not test.explains:  # the cause may be none of the hypotheses
+        if best.inflation > EXPLAINED:  # it leaves structure: the cause may be none of the hypotheses
             break
         needed = COMPONENT_WINDOWS if is_young and kind is FaultType.SENSOR else windows
         if test.probability(kind) >= DATA_FAULT_PROBABILITY and test.leading >= needed:
@@ -194,14 +194,11 @@ class AdoptedComponent:
     """A component in the twin, with its history."""
 
     component: Component
-    onset: float
-    """Unix seconds."""
-    probability: float = 1.0
-    """When it was adopted."""
+    onset: float  # Unix seconds
+    probability: float = 1.0  # When it was adopted
     approval: Approval = Approval.OPEN
     alternatives: tuple[Alternative, ...] = ()
-    fading: int = 0
-    """Consecutive windows in which it was not significant."""
+    fading: int = 0  # Consecutive windows in which it was not significant
 
     @property
     def has_faded(self) -> bool:

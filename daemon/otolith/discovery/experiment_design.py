@@ -36,13 +36,10 @@ NO_EXPERIMENT = "no change of one input distinguishes them: inspect the sensors 
 class Situation:
     """Where the machine is."""
 
-    inputs: Array
-    """(inputs,)."""
-    state: Array
-    """(states,)."""
+    inputs: Array  # (inputs,)
+    state: Array  # (states,)
     records: int
-    sample_period: float
-    """Mean time between two records, s."""
+    sample_period: float  # Mean time between two records, s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +47,7 @@ class Move:
     """A move of one input."""
 
     text: str
-    inputs: Array
-    """(records, inputs)."""
+    inputs: Array  # (records, inputs)
 
 
 def advise(problem: Problem, known: Prior, situation: Situation, wanted: list[str]) -> dict[str, str]:

@@ -18,7 +18,7 @@ from otolith.estimation.arrival_cost import Evidence, Prior, extend_prior, initi
 from otolith.estimation.information import QUANTILE, orthonormal_basis
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, amplitude_indices, augment, equation, indices, site_of
-from otolith.estimation.timing import delay_response, delayable
+from otolith.estimation.timing import delay_response, delayable, largest_delay
 from otolith.estimation.window_fit import Fit
 from otolith_drivers.units import equation_text, unit_text
 
@@ -29,6 +29,7 @@ MAX_DELAY_SDS = 100  # windows whose delays count for the parameters
 MIN_DELAY_SHARE = 1e-6  # of the response to a delay that is left beside those to parameters; less shows no delay
 NARROWEST = 1.01  # of the least width of a hump: as narrow as its range allows
 MS = 1e3  # ms in a second
+CHANGING = '{0} changes between its samples: write times = "polled" under [signals] {0}'
 DISCRIMINATES = 4.0  # in -2 log evidence of one window: a smaller difference does not discriminate
 
 
@@ -40,7 +41,7 @@ class FaultType(StrEnum):
     COMPONENT = "a component has appeared"
     SENSOR = "a sensor is wrong"
     TIMING = "a signal is late"
-    NOISE = "sensors are noisier than stated"
+    NOISE = "signals are less certain than stated"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +49,9 @@ class FaultHypothesis:
     """What a hypothesis states."""
 
     type: FaultType
-    name: str = ""
-    """Names of the parameters, or keys of the components."""
-    added: int = 0
-    """Number of values that it estimates in addition."""
-    alternatives: float = 1.0
-    """Number of hypotheses of the same type."""
+    name: str = ""  # Names of the parameters, or keys of the components
+    added: int = 0  # Number of values that it estimates in addition
+    alternatives: float = 1.0  # Number of hypotheses of the same type
 
     @property
     def prior_deviance(self) -> float:
@@ -67,10 +65,8 @@ class Proposal:
 
     hypothesis: FaultHypothesis
     problem: Problem
-    prior: Prior
-    """Of all free parameters of ``problem``."""
-    start: Array
-    """(free, ...)."""
+    prior: Prior  # Of all free parameters of ``problem``
+    start: Array  # (free, ...)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,26 +177,29 @@ def residual_variance_factor(chi_squares: Iterable[float], count: float) -> floa
     return max(min(chi_squares) / count, 1.0)
 
 
+def evidence_factor(fitted: Iterable[FittedHypothesis]) -> float:
+    """Return by what the evidence of a search is divided, at least one: what even the best hypothesis leaves.
+
+    What exceeds the noise is correlated, and its samples are no independent evidence: its long-run variance counts.
+    """
+    return min(fitted, key=lambda item: item.unexplained).fit.inflation ** 2
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedHypothesis:
     """A hypothesis with its posterior after some windows. Plain: it pickles."""
 
     hypothesis: FaultHypothesis
     posterior: Posterior
-    deviance: float
-    """-2 log evidence of all windows so far, relative to the best hypothesis."""
-    misfit: float
-    """The same from the data alone: without prior weight and complexity."""
-    cost: float
-    """RMSE of the last window in units of the noise."""
-    delay_information: float = 0.0
-    """About the delay that the hypothesis states, 1/s²; 0 if it states none."""
-    delay_sds: tuple[float, ...] = ()
-    """Standard deviation, in s, of the delay with which each window was fitted."""
+    deviance: float  # -2 log evidence of all windows so far, relative to the best hypothesis
+    misfit: float  # The same from the data alone: without prior weight and complexity
+    cost: float  # RMSE of the last window in units of the noise
+    inflation: float = 1.0  # Of standard deviations, by what it leaves of the last window: see inflation_of
+    delay_information: float = 0.0  # About the delay that the hypothesis states, 1/s²; 0 if it states none
+    delay_sds: tuple[float, ...] = ()  # Standard deviation, in s, of the delay with which each window was fitted
     shift_by_delay: tuple[float, ...] = ()
     """(free,) how far the parameters move with that delay, per second; empty if it states none."""
-    explains_all: bool = True
-    """Whether the screening test found nothing in what it left of the last window."""
+    explains_all: bool = True  # Whether the screening test found nothing in what it left of the last window
 
     @property
     def type(self) -> FaultType:
@@ -244,10 +243,8 @@ class HypothesisStep:
     predicted: Posterior
     fitted: FittedHypothesis
     evidence: Evidence
-    deviance: float = 0.0
-    """-2 log evidence of this window."""
-    misfit: float = 0.0
-    """The same without the complexity."""
+    deviance: float = 0.0  # -2 log evidence of this window
+    misfit: float = 0.0  # The same without the complexity
 
     @property
     def is_usable(self) -> bool:
@@ -260,10 +257,12 @@ class HypothesisStep:
         None if the window contradicts the delay that it states, or a component leaves its physical range.
         """
         posterior = self.predicted.update(self.predicted.innovation(self.evidence), self.fitted.fit.advance())
-        tracked = replace(self.tracked, posterior=posterior, cost=self.fitted.fit.cost).worse_by(deviance, misfit)
+        own = self.fitted.fit
+        tracked = replace(self.tracked, posterior=posterior, cost=own.cost, inflation=own.inflation)
+        tracked = tracked.worse_by(deviance, misfit)
         if self.tracked.type is FaultType.COMPONENT and not is_possible(posterior.problem, posterior.prior().mean):
             return None
-        return tracked if self.tracked.type is not FaultType.TIMING else _with_delay(tracked, self.fitted.fit)
+        return tracked if self.tracked.type is not FaultType.TIMING else _with_delay(tracked, own)
 
 
 def is_usable(hypothesis: FaultHypothesis, predicted: Posterior, evidence: Evidence) -> bool:
@@ -285,26 +284,28 @@ def track(fitted: FittedHypothesis, predicted: Posterior, deviance: float, misfi
     if not is_usable(fitted.hypothesis, own, evidence):
         return None
     posterior = own.update(own.innovation(evidence), fitted.fit.advance())
-    tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, misfit, fitted.fit.cost)
+    left = fitted.fit.cost, fitted.fit.inflation
+    tracked = TrackedHypothesis(fitted.hypothesis, posterior, deviance, misfit, *left)
     return tracked if fitted.type is not FaultType.TIMING else _with_delay(tracked, fitted.fit)
 
 
 def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | None:
     """Return the hypothesis with what the window of ``fitted`` adds to the estimate of its delay.
 
-    None if the window contradicts the delay: it is no constant.
+    None if the window contradicts the delay, or if it may be zero or is beyond those that are searched.
     """
     ((signal, delay),) = tracked.problem.delays
     own = delay_score(fitted, signal)
     before = tracked.delay_information
     information = before + own.information
-    if before > 0.0 and own.step**2 * before * own.information > MAX_DELAY_CHANGE**2 * information:
+    if not information > 0.0 or own.step**2 * before * own.information > MAX_DELAY_CHANGE**2 * information:
         return None
-    moved = delay + (own.information * own.step / information if information > 0.0 else 0.0)
+    moved = delay + own.information * own.step / information
+    if not QUANTILE / np.sqrt(information) < abs(moved) <= largest_delay(fitted.window.grid.length):
+        return None
     problem = replace(tracked.problem, delays=((signal, moved),))
     posterior = replace(tracked.posterior, problem=problem)
-    used = before or own.information
-    sds = (*tracked.delay_sds, used**-0.5)[-MAX_DELAY_SDS:] if used > 0.0 else tracked.delay_sds
+    sds = (*tracked.delay_sds, (before or own.information) ** -0.5)[-MAX_DELAY_SDS:]
     return replace(tracked, posterior=posterior, delay_information=information, delay_sds=sds, shift_by_delay=own.shift)
 
 
@@ -312,12 +313,9 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
 class DelayScore:
     """Estimate of a delay from one window, around the one that it was fitted with."""
 
-    step: float
-    """To the best delay, s."""
-    information: float
-    """1/s²; less if the window is not explained."""
-    shift: tuple[float, ...]
-    """(free,) how far the best parameters move with the delay, per second."""
+    step: float  # To the best delay, s
+    information: float  # 1/s²; less if the window is not explained
+    shift: tuple[float, ...]  # (free,) how far the best parameters move with the delay, per second
 
 
 def delay_score(fitted: Fit, signal: str) -> DelayScore:
@@ -434,14 +432,19 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
 
 
 def describe_noise(problem: Problem) -> str:
-    """Return which sensors are noisier than stated, with their noise."""
+    """Return which sensors are noisier than stated, and which commands change between their samples."""
+    return "; ".join([*describe_sensors(problem), *map(CHANGING.format, problem.changing)])
+
+
+def describe_sensors(problem: Problem) -> list[str]:
+    """Return which sensors are noisier than stated, with their noise, one text each."""
     twin = problem.base_model
     units = {name: "" if unit == "1" else f" {unit_text(unit)}" for name, unit in twin.units().items()}
-    return "; ".join(
+    return [
         f"{name} is noisier than stated: {noise:.2g}{units[name]} instead of {stated:.2g}"
         for name, noise, stated in zip(twin.signals, problem.levels, problem.stated_levels, strict=True)
         if noise > stated
-    )
+    ]
 
 
 def _describe_delay(tracked: TrackedHypothesis) -> str:

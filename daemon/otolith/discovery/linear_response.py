@@ -34,8 +34,7 @@ PROBES = 16  # random vectors by which the length of a projected response is est
 MIN_INDEPENDENCE = 1e-9  # of the two curves of a periodic component
 
 
-Guess = tuple[CandidateForm, float]
-"""A form and its inner parameter."""
+Guess = tuple[CandidateForm, float]  # A form and its inner parameter
 Shape = tuple[float, int, float, float]
 """Family code, source, inner parameter and phase of a component of unit amplitude."""
 
@@ -44,18 +43,12 @@ Shape = tuple[float, int, float, float]
 class BasisFunctions:
     """Curves of components of unit amplitude; the curves of one guess are neighbours, and sites share their shapes."""
 
-    families: Array
-    """(shapes,) codes."""
-    sources: Indices
-    """(shapes,) indices."""
-    inner: Array
-    """(shapes,)."""
-    phases: Array
-    """(shapes,) rad."""
-    shapes: Indices
-    """(curves,) indices."""
-    sites: Indices
-    """(curves,) indices."""
+    families: Array  # (shapes,) codes
+    sources: Indices  # (shapes,) indices
+    inner: Array  # (shapes,)
+    phases: Array  # (shapes,) rad
+    shapes: Indices  # (curves,) indices
+    sites: Indices  # (curves,) indices
 
 
 def basis_functions(guesses: Iterable[Guess]) -> BasisFunctions:
@@ -79,10 +72,8 @@ def _columns(shapes: Iterable[Shape]) -> tuple[Array, Indices, Array, Array]:
 class ScoreStatistics:
     """What each guess would gain."""
 
-    gain: Array
-    """(guesses,) by which χ² falls."""
-    amplitudes: Array
-    """(guesses, 2) of its curves; zero for a second curve that it does not have."""
+    gain: Array  # (guesses,) by which χ² falls
+    amplitudes: Array  # (guesses, 2) of its curves; zero for a second curve that it does not have
 
 
 class ProjectedResponse(ABC):
@@ -90,18 +81,12 @@ class ProjectedResponse(ABC):
 
     problem: Problem
     window: Window
-    objective: Objective
-    """Of the window, or of the first of several."""
-    count: float
-    """Measured values of all outputs."""
-    x: Array
-    """(sources, records)."""
-    chi_square: float
-    """Of parameters only, with the prior."""
-    _remainder: Array
-    """(residuals,) what is left of the residual."""
-    _basis: Array
-    """(residuals, columns) orthonormal: what is projected out."""
+    objective: Objective  # Of the window, or of the first of several
+    count: float  # Measured values of all outputs
+    x: Array  # (sources, records)
+    chi_square: float  # Of parameters only, with the prior
+    _remainder: Array  # (residuals,) what is left of the residual
+    _basis: Array  # (residuals, columns) orthonormal: what is projected out
 
     @abstractmethod
     def responses(self, curves: BasisFunctions) -> Array:

@@ -1,4 +1,4 @@
-"""The hypothesis that sensors are noisier than the problem states.
+"""The hypothesis that signals are less certain than the problem states: sensors are noisier, commands change unseen.
 
 Each output has its own factor on the standard deviation of its noise: the root mean square of its whitened innovations.
 The noise of an input colours the innovations. It is at most what its signal shows from sample to sample, and the most
@@ -7,12 +7,14 @@ grows with the noise. So parameters or a component that explain a window up to t
 innovations that are white with this noise count as noise: what follows a curve is no noise, however large.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from otolith.acquisition.window import Array
 from otolith.discovery.hypotheses import FaultHypothesis, FaultType, FittedHypothesis
 from otolith.discovery.linear_response import chi_square_of_parameters
-from otolith.discovery.screening import linearised
+from otolith.discovery.screening import DECISIVE, linearised
 from otolith.estimation.data_checks import MAD_TO_SD, median, sample_differences
 from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import Fit, fit
@@ -38,6 +40,25 @@ def noisier_sensors(null: FittedHypothesis) -> list[FittedHypothesis]:
         problems.append(noisier)
     fitted = (_fitted(problem, null) for problem in problems)
     return [item for item in fitted if item is not None]
+
+
+def changing_commands(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]:
+    """Return the hypotheses that a command, or each, changes between its samples, fitted to the window of ``null``.
+
+    The command is late by another time at each change. ``gains`` are those of delays, as of :func:`delayable`.
+    """
+    twin = null.problem.base_model
+    of_inputs = zip(twin.inputs, gains[len(twin.outputs) :].tolist(), strict=True)
+    late = [source.name for source, gain in of_inputs if source.hold == "zoh" and gain > DECISIVE]
+    choices = [(name,) for name in late] + [tuple(late)] * (len(late) > 1)
+    hypotheses = []
+    for names in choices:
+        problem = replace(null.problem, changing=tuple(dict.fromkeys((*null.problem.changing, *names))))
+        best = fit(problem, null.fit.window, null.fit.prior, null.fit.prior.mean, STEPS)
+        stated = FaultHypothesis(FaultType.NOISE, f"{', '.join(names)} between samples", 0, float(len(choices)))
+        if is_white(best):
+            hypotheses.append(FittedHypothesis(stated, best, normalisation(best, null.fit)))
+    return hypotheses
 
 
 def _fitted(problem: Problem, null: FittedHypothesis) -> FittedHypothesis | None:

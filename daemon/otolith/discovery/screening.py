@@ -100,8 +100,8 @@ def inner_grid(form: CandidateForm, x: Array, fineness: float) -> Array:
 
 def geometric_grids(bounds: list[tuple[float, float]], points: int, fineness: float) -> Array:
     """Return values (forms, points) between the ``bounds`` of inner parameters with grids of so many ``points``."""
-    low, high = np.log(np.array(bounds)).T
-    return np.asarray(np.exp(np.linspace(low, high, max(round(points / fineness**2), 2), axis=1)))
+    low, high = np.log(np.array(bounds)).T[..., None]
+    return np.asarray(np.exp(low + (high - low) * np.linspace(0.0, 1.0, max(round(points / fineness**2), 2))))
 
 
 def candidate_library(twin: Definition, x: Array, taken: frozenset[str] = frozenset()) -> list[CandidateForm]:

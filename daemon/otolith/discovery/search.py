@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidates import MAX_CANDIDATES, Candidate, components_of, find_candidates, threshold_like
 from otolith.discovery.hypotheses import (
     FaultHypothesis,
@@ -26,7 +26,7 @@ from otolith.discovery.hypotheses import (
     with_components,
 )
 from otolith.discovery.linear_response import LinearResponse, chi_square_of_parameters
-from otolith.discovery.noise_hypothesis import noisier_sensors
+from otolith.discovery.noise_hypothesis import changing_commands, noisier_sensors
 from otolith.discovery.screening import (
     DECISIVE,
     CompetingForms,
@@ -155,7 +155,9 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
     proposals += _one_parameter_moved(problem, prior, screening.response)
     candidates = [with_candidate(problem, prior, candidate) for candidate in find_candidates(screening.response)]
     fitted = [*fit_hypotheses(proposals, window), *_possible(fit_hypotheses(candidates, window, FAR_WORSE))]
-    return [*fitted, *noisier_sensors(fitted[0]), *late_signals(fitted[0], screening.response)]
+    gains = screening.response.score_delays().gain
+    uncertain = [*noisier_sensors(fitted[0]), *changing_commands(fitted[0], gains)]
+    return [*fitted, *uncertain, *late_signals(fitted[0], gains)]
 
 
 def _several_components(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
@@ -193,9 +195,8 @@ def _without_local_minima(fitted: list[FittedHypothesis]) -> list[FittedHypothes
     return [min(item, refitted.get(item, item), key=_chi_square) for item in fitted]
 
 
-def late_signals(null: FittedHypothesis, response: LinearResponse) -> list[FittedHypothesis]:
-    """Return the hypotheses that one signal is late or early against all others, for the signals of largest gain."""
-    gains = response.score_delays().gain
+def late_signals(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]:
+    """Return the hypotheses that one signal is late or early against all others, for those of the largest ``gains``."""
     least = max(MIN_LATE_SHARE * gains.max(initial=0.0), DECISIVE)
     return [
         _late_signal(null, index)

@@ -25,6 +25,7 @@ from otolith.discovery.hypotheses import (
     Proposal,
     TrackedHypothesis,
     complexity_penalty,
+    evidence_factor,
     prune,
     residual_variance_factor,
     track,
@@ -130,34 +131,23 @@ class FitSummary:
     """How well the best hypothesis explains a window."""
 
     chi_square: float = 0.0
-    penalty: float = 0.0
-    """Of its complexity, in -2 log evidence."""
-    count: float = 1.0
-    """Measured values of all outputs."""
+    penalty: float = 0.0  # Of its complexity, in -2 log evidence
+    variance_factor: float = 1.0  # By what evidence is divided
 
 
 @dataclass(frozen=True, eq=False)  # no slots: probabilities are computed once
 class SequentialTest:
     """The competing hypotheses. Plain: it pickles."""
 
-    problem: Problem
-    """Of the filter, without what the hypotheses add."""
-    hypotheses: tuple[TrackedHypothesis, ...]
-    """The best first."""
-    onset: float
-    """Unix seconds."""
-    windows: int = 1
-    """Windows since the test was opened; hypotheses that a later search added are younger."""
-    leading: int = 1
-    """Consecutive windows in which the best hypothesis was the best."""
-    settled: int = 1
-    """Windows since a hypothesis of a new search took the lead."""
-    last: FitSummary = FitSummary()
-    """Of the last window."""
-    clear: int = CLEAR_WINDOWS
-    """Consecutive windows after which one cause explained all windows best."""
-    quiet: int = 0
-    """Consecutive windows, up to the last, that the filter expected, and that did not confirm the test."""
+    problem: Problem  # Of the filter, without what the hypotheses add
+    hypotheses: tuple[TrackedHypothesis, ...]  # The best first
+    onset: float  # Unix seconds
+    windows: int = 1  # Windows since the test was opened; hypotheses that a later search added are younger
+    leading: int = 1  # Consecutive windows in which the best hypothesis was the best
+    settled: int = 1  # Windows since a hypothesis of a new search took the lead
+    last: FitSummary = FitSummary()  # Of the last window
+    clear: int = CLEAR_WINDOWS  # Consecutive windows after which one cause explained all windows best
+    quiet: int = 0  # Consecutive windows, up to the last, that the filter expected, and that did not confirm the test
     cusum_against_filter: float = -MAX_WINDOW_EVIDENCE
     """Cumulative sum of the evidence against the filter, in -2 log likelihood, of the windows after the one that opened
     the test. It starts below zero, because it must exceed the complexity penalty of a hypothesis. See
@@ -246,7 +236,7 @@ class SequentialTest:
         its reference value: it falls in windows that give less.
         """
         last = self.last
-        more = (filtered.chi_square - last.chi_square) / residual_variance_factor([last.chi_square], last.count)
+        more = (filtered.chi_square - last.chi_square) / last.variance_factor
         total = self.cusum_against_filter + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         deviance = self.filter_deviance + np.clip(more, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
         return replace(
@@ -290,7 +280,7 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
     null = fitted[0]
     fitted = [null, *(item for item in fitted[1:] if item.chi_square < DIVERGED)]
     count = null.fit.count
-    variance_factor = residual_variance_factor([item.unexplained for item in fitted], count)
+    variance_factor = evidence_factor(fitted)
     deviances = {item: item.deviance(count, variance_factor) for item in fitted}
     ordered = sorted(fitted, key=lambda item: deviances[item])
     best = ordered[0]
@@ -306,7 +296,7 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
         predicted.problem,
         _sorted([item for item in tracked if item is not None]),
         best.fit.window.start,
-        last=FitSummary(best.chi_square, least - best.chi_square / variance_factor, count),
+        last=FitSummary(best.chi_square, least - best.chi_square / variance_factor, variance_factor),
         null_reduced_chi_square=max(null.chi_square / max(count, 1.0), 1.0),
         has_explained=best.fit.cost <= EXPLAINED,
     )
@@ -386,8 +376,7 @@ def _with_noise(steps: list[HypothesisStep]) -> list[HypothesisStep]:
 
 def _with_deviances(steps: list[HypothesisStep]) -> tuple[list[HypothesisStep], FitSummary]:
     """Return the steps with their deviances, and a summary of the best."""
-    count = steps[0].fitted.fit.count
-    variance_factor = residual_variance_factor([step.fitted.unexplained for step in steps], count)
+    variance_factor = residual_variance_factor([item.fitted.unexplained for item in steps], steps[0].fitted.fit.count)
     steps = [
         replace(
             step,
@@ -398,7 +387,7 @@ def _with_deviances(steps: list[HypothesisStep]) -> tuple[list[HypothesisStep], 
     ]
     best = min(steps, key=lambda step: step.deviance)
     chi_square = best.fitted.chi_square
-    return steps, FitSummary(chi_square, best.deviance - chi_square / variance_factor, count)
+    return steps, FitSummary(chi_square, best.deviance - chi_square / variance_factor, variance_factor)
 
 
 def _screened(hypotheses: tuple[TrackedHypothesis, ...], steps: list[HypothesisStep]) -> tuple[TrackedHypothesis, ...]:
@@ -419,8 +408,7 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
     If the filter alone explains the window, but not the leading hypothesis, what opened the test has ended.
     """
     old, new = test.last, fresh.last
-    variance_factor = residual_variance_factor([new.chi_square], old.count)
-    gain = (old.chi_square - new.chi_square) / variance_factor + old.penalty - new.penalty  # of the window alone
+    gain = (old.chi_square - new.chi_square) / new.variance_factor + old.penalty - new.penalty  # of the window alone
     if fresh.best.type is FaultType.NOTHING and fresh.best.cost <= EXPLAINED < test.best.cost:
         return fresh
     if gain <= DECISIVE:

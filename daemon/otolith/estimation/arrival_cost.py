@@ -29,10 +29,8 @@ MIN_SINGULAR = 1e-12  # relative singular value below which a direction is not d
 class Prior:
     """A normal distribution of the parameters at the end of a window, then of their trends per second."""
 
-    mean: Array
-    """(2 free,)."""
-    covariance: Array
-    """(2 free, 2 free)."""
+    mean: Array  # (2 free,)
+    covariance: Array  # (2 free, 2 free)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,12 +41,9 @@ class Evidence:
     ``residual + sqrt_information @ (z - point)`` has unit variance for the true ``z``.
     """
 
-    point: Array
-    """(2 free,)."""
-    sqrt_information: Array
-    """(2 free, 2 free)."""
-    residual: Array
-    """(2 free,)."""
+    point: Array  # (2 free,)
+    sqrt_information: Array  # (2 free, 2 free)
+    residual: Array  # (2 free,)
 
 
 def initial_prior(problem: Problem) -> Prior:

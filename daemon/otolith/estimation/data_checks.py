@@ -28,10 +28,10 @@ from otolith.acquisition.quality import time_text
 from otolith.acquisition.samples import Check
 from otolith.acquisition.window import Array, Mask, Verdict, Window
 from otolith.estimation.imm_filter import NIS_DEVIATE, nis_limit
-from otolith.estimation.objective import EXPLAINED, MIN_ADC_LEVELS, PENALTY, adc_step, rounding_variance
+from otolith.estimation.objective import EXPLAINED, MIN_ADC_LEVELS, PENALTY, unmodelled_rounding
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
-from otolith.estimation.window_fit import Fit, fit
+from otolith.estimation.window_fit import fit_predicted
 from otolith.twin.definition import Definition, Output
 from otolith_drivers.units import unit_text
 
@@ -240,17 +240,11 @@ class _Channel:
         missing[records, self.window.signals.index(self.name)] = True
         return replace(self.window, missing=missing)
 
-    def prediction(self, fitted: Fit) -> Array:
-        """Return what a fit predicts of the sensor (records,)."""
-        return np.asarray(fitted.objective.predict_with_trends(fitted.result.guess)[0][:, self.index])
-
 
 def _checked_channels(predicted: Posterior, window: Window) -> Iterator[_Channel]:
-    """Yield the sensors that the machine file lets be checked for frozen readings."""
-    problem = predicted.problem
-    for output in problem.base_model.outputs:
-        if (output.name, Check.FROZEN) not in problem.unchecked:
-            yield _Channel(predicted, window, output)
+    """Return the sensors that the machine file lets be checked for frozen readings."""
+    outputs, unchecked = predicted.problem.base_model.outputs, predicted.problem.unchecked
+    return (_Channel(predicted, window, each) for each in outputs if (each.name, Check.FROZEN) not in unchecked)
 
 
 def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
@@ -258,10 +252,8 @@ def frozen_channels(predicted: Posterior, window: Window) -> list[FaultySensor]:
     faulty = []
     for channel in _checked_channels(predicted, window):
         runs = _constant_runs(channel.values, channel.present)
-        if _samples_in(runs) <= MAX_FROZEN_SHARE * len(channel.present):
-            continue
-        run = _frozen_run(channel, runs)
-        if run is not None:
+        is_long = _samples_in(runs) > MAX_FROZEN_SHARE * len(channel.present)
+        if is_long and (run := _frozen_run(channel, runs)) is not None:
             advice = _turned_off(channel.name, Check.FROZEN)
             faulty.append(FaultySensor(channel.name, _frozen_sentence(channel, run), advice))
     return faulty
@@ -279,20 +271,23 @@ def without_saturated(predicted: Posterior, window: Window) -> tuple[Window, Fau
 def _without_piles(channel: _Channel) -> tuple[Window, FaultySensor] | None:
     """Return the window without the samples at the limits of a sensor if the twin explains all others, or None.
 
-    At a limit the prediction moves further than the samples spread. Where a machine has changed, both settle.
+    At a limit the prediction moves further than the samples spread. Where a machine has changed, both settle. Samples
+    that are noisier than stated are at no limit if the twin with their noise explains them.
     """
     problem, values = channel.predicted.problem, channel.values
     noise = problem.noise[channel.index]
-    piles = [(side, run) for side in (1.0, -1.0) for run in _pile(side * values, channel.present, noise)]
-    if not piles:
+    piles = [(side, *_pile(side * values, channel.present, noise)) for side in (1.0, -1.0)]
+    piled = np.unique([record for _, runs, _ in piles for run in runs for record in run]).astype(np.int64)
+    if len(piled) in (0, len(channel.present)):  # a steady sensor shows no limit
         return None
-    others = _fit(channel.predicted, problem, channel.without(np.concatenate([run for _, run in piles])))
+    others = fit_predicted(channel.predicted, problem, channel.without(piled))
     if not others.cost <= EXPLAINED:
         return None
-    prediction, least = channel.prediction(others), FROZEN_MOVEMENT * noise
+    prediction, least = others.predict()[0][:, channel.index], FROZEN_MOVEMENT * noise
     runs = [
         run
-        for side, run in piles
+        for side, pile, _ in piles
+        for run in pile
         if np.median(side * (prediction - values)[run]) > least
         and np.ptp(prediction[run]) > max(least, np.ptp(values[run]))
     ]
@@ -300,9 +295,9 @@ def _without_piles(channel: _Channel) -> tuple[Window, FaultySensor] | None:
         return None
     records = np.concatenate(runs)
     reduced, expected = channel.without(records), len(records) + NIS_DEVIATE * np.sqrt(2.0 * len(records))
-    if _are_probable(channel, problem, runs, reduced, expected):
-        return None
-    return reduced, _clipped_sensor(channel, runs)
+    noisier = _with_noise(problem, channel.index, max(level for _, _, level in piles))
+    is_probable = _are_probable(channel, noisier, runs, reduced, expected)
+    return None if is_probable else (reduced, _clipped_sensor(channel, runs))
 
 
 def _clipped_sensor(channel: _Channel, runs: list[Indices]) -> FaultySensor:
@@ -317,15 +312,14 @@ def _clipped_sensor(channel: _Channel, runs: list[Indices]) -> FaultySensor:
     return FaultySensor(name, text, f"look at the range of the sensor; {_turned_off(name, Check.FROZEN)}")
 
 
-def _pile(values: Array, present: Indices, noise: float) -> list[Indices]:
+def _pile(values: Array, present: Indices, noise: float) -> tuple[list[Indices], float]:
     """Return the records of each long run within the range of the noise below the largest of ``values`` (records,).
 
-    Those ``present`` count. The noise at a limit may be larger than ``noise``: the second differences of the samples
-    there show it.
+    Those ``present`` count. The noise there, which may be larger than ``noise``, is returned as well.
     """
-    samples = values[present]
+    samples, deviation = values[present], noise
     if len(samples) < MIN_FROZEN_RUN:
-        return []
+        return [], noise
     second = np.abs(np.convolve(np.pad(samples, 1, mode="edge"), (-0.5, 1.0, -0.5), mode="valid"))
     top, high = samples.max(), samples >= samples.max() - PILE_WIDTH * noise
     for _ in range(PILE_ROUNDS):
@@ -333,7 +327,8 @@ def _pile(values: Array, present: Indices, noise: float) -> list[Indices]:
         high = samples >= top - PILE_WIDTH * deviation
     edges = np.flatnonzero(np.diff(np.concatenate([[False], high, [False]]).astype(np.int8)))
     runs = zip(edges[::2], edges[1::2], strict=True)
-    return [present[first:end] for first, end in runs if end - first >= MIN_FROZEN_RUN]
+    long = [present[first:end] for first, end in runs if end - first >= MIN_FROZEN_RUN]
+    return long, deviation if long else noise
 
 
 def _constant_runs(values: Array, present: Indices) -> list[Indices]:
@@ -364,11 +359,13 @@ def _frozen_run(channel: _Channel, runs: list[Indices]) -> _FrozenRun | None:
     other times, or the twin does not explain the readings. A machine that dry friction holds at rest may look alike:
     then no disturbance of a state may explain them either.
     """
-    values, noise = channel.values[channel.present], channel.predicted.problem.noise[channel.index]
-    step = _step(values)
-    problem = _with_rounding(channel, step)
+    problem, at = channel.predicted.problem, channel.index
+    values, noise = channel.values[channel.present], problem.noise[at]
     reduced = channel.without(np.concatenate([run[1:] for run in runs]))
-    prediction = channel.prediction(_fit(channel.predicted, problem, reduced))
+    step, lacking = unmodelled_rounding(values, noise, problem.steps[at] if problem.steps else 0.0)
+    if lacking:
+        problem = _with_noise(problem, at, float(np.sqrt(noise**2 + lacking)))
+    prediction = fit_predicted(channel.predicted, problem, reduced).predict()[0][:, at]
     movement = FROZEN_MOVEMENT * noise + FROZEN_STEPS * step
     moving = [run for run in runs if np.ptp(prediction[run[0] : run[-1] + 1]) > movement]  # false for not-a-number
     if _samples_in(moving) <= MAX_FROZEN_SHARE * len(values):
@@ -381,25 +378,9 @@ def _frozen_run(channel: _Channel, runs: list[Indices]) -> _FrozenRun | None:
     return _FrozenRun(max(moving, key=len), float(np.median(excess)))
 
 
-def _with_rounding(channel: _Channel, step: float) -> Problem:
-    """Return the problem with the noise of rounding to ``step``, where the objective leaves it out: on few levels."""
-    problem, index = channel.predicted.problem, channel.index
-    noise, known = problem.noise[index], problem.steps[index] if problem.steps else 0.0
-    lacking = step**2 / 12.0 - rounding_variance(channel.values[channel.present], noise, known)
-    if not lacking > 0.0:
-        return problem
-    with_rounding = float(np.sqrt(noise**2 + lacking))
-    return replace(problem, noise=(*problem.noise[:index], with_rounding, *problem.noise[index + 1 :]))
-
-
-def _step(values: Array) -> float:
-    """Return the step of the converter behind ``values`` (n,), 0 if they show none; two or three levels show it."""
-    levels = np.unique(values)
-    return float(np.diff(levels).min()) if 1 < len(levels) < MIN_ADC_LEVELS else adc_step(values)
-
-
-def _fit(predicted: Posterior, problem: Problem, window: Window, start: Array | None = None) -> Fit:
-    return fit(problem, window, predicted.prior(), predicted.start() if start is None else start)
+def _with_noise(problem: Problem, index: int, noise: float) -> Problem:
+    """Return the problem with ``noise`` of the output at ``index``."""
+    return replace(problem, noise=(*problem.noise[:index], noise, *problem.noise[index + 1 :]))
 
 
 def _are_probable(channel: _Channel, problem: Problem, runs: list[Indices], reduced: Window, rounding: float) -> bool:
@@ -417,13 +398,13 @@ def _is_probable(channel: _Channel, problem: Problem, reduced: Window, rounding:
     explain the other readings, its errors are larger by as much.
     """
     predicted = channel.predicted
-    others = _fit(predicted, problem, reduced)
+    others = fit_predicted(predicted, problem, reduced)
     if not others.chi_square < PENALTY:
         return True  # a twin that diverges predicts nothing
     unknowns = len(problem.free) + len(problem.twin.states)
     limit = others.chi_square + max(others.cost, 1.0) ** 2 * (nis_limit(unknowns) + rounding)
     starts = (others.parameters, predicted.start())  # either may lead into a local minimum
-    chi_squares = (_fit(predicted, problem, channel.window, start).chi_square for start in starts)
+    chi_squares = (fit_predicted(predicted, problem, channel.window, start).chi_square for start in starts)
     return any(chi_square <= limit or not chi_square < PENALTY for chi_square in chi_squares)
 
 
@@ -477,19 +458,14 @@ def _disturbances(problem: Problem, window: Window) -> Iterator[Problem]:
 def _frozen_sentence(channel: _Channel, run: _FrozenRun) -> str:
     """Return which channel is frozen, at which value, and for how much of the window."""
     window, times = channel.window, channel.window.grid.offsets[run.records]
-    value = float(channel.values[run.records[0]])
-    kind = _frozen_or_clipped(channel.values[channel.present], value, run.excess)
+    values, value = channel.values[channel.present], float(channel.values[run.records[0]])
+    is_at_end = (value == values.max() and run.excess > 0.0) or (value == values.min() and run.excess < 0.0)
+    kind = "clipped" if np.ptp(values) > 0.0 and is_at_end else "frozen"
     length, count = f"{times[-1] - times[0]:.4g} s", len(run.records)
     when = f"for {length} ({count} samples) from {time_text(window.start + float(times[0]))}"
     if count == len(channel.present):  # it may be so for longer: the finding has the time of the first window
         when = f"throughout the window of {length} ({count} samples)"
     return f"{channel.name} is {kind} at {value:.6g} {unit_text(channel.output.unit)} {when} while the twin moves on"
-
-
-def _frozen_or_clipped(values: Array, value: float, excess: float) -> str:
-    """Return the kind of fault; ``excess`` is how far the twin is above ``value``, at which the channel stands."""
-    above, below = value == values.max() and excess > 0.0, value == values.min() and excess < 0.0
-    return "clipped" if np.ptp(values) > 0.0 and (above or below) else "frozen"
 
 
 def drop_repeats(window: Window, twin: Definition, checked: frozenset[str] | None = None) -> tuple[Window, list[str]]:

@@ -48,18 +48,12 @@ Levels = NDArray[np.int64]
 class ImmPosterior:
     """Parameters and trends relative to the parameters' sizes, one normal distribution per mode. It pickles."""
 
-    level: Levels
-    """(modes, free) indices into TREND_NOISE; the first mode is the centre of the bank."""
-    mean: Array
-    """(modes, 2 free) at ``end``."""
-    covariance: Array
-    """(modes, 2 free, 2 free)."""
-    weight: Array
-    """(modes,) probabilities."""
-    end: float
-    """Unix seconds at which the last window ends; minus infinity before the first window."""
-    variance_ratio: float = 1.0
-    """Variance between windows over the variance that they state; one if they agree."""
+    level: Levels  # (modes, free) indices into TREND_NOISE; the first mode is the centre of the bank
+    mean: Array  # (modes, 2 free) at end
+    covariance: Array  # (modes, 2 free, 2 free)
+    weight: Array  # (modes,) probabilities
+    end: float  # Unix seconds at which the last window ends; minus infinity before the first window
+    variance_ratio: float = 1.0  # Variance between windows over the variance that they state; one if they agree
 
 
 def initial_modes(mean: Array, covariance: Array) -> ImmPosterior:
@@ -173,16 +167,11 @@ class Innovation:
 
     prediction: ImmPosterior
     evidence: Evidence
-    sqrt_information: Array
-    """(2 free, 2 free) of the window: R of ``docs/explanation/filter.md``."""
-    covariance: Array
-    """(modes, 2 free, 2 free): S."""
-    inverse: Array
-    """(modes, 2 free, 2 free) of the covariance."""
-    value: Array
-    """(modes, 2 free): ν."""
-    nis_of_mode: Array
-    """(modes,) normalised innovation squared."""
+    sqrt_information: Array  # (2 free, 2 free) of the window: R of docs/explanation/filter.md
+    covariance: Array  # (modes, 2 free, 2 free): S
+    inverse: Array  # (modes, 2 free, 2 free) of the covariance
+    value: Array  # (modes, 2 free): ν
+    nis_of_mode: Array  # (modes,) normalised innovation squared
 
     @property
     def nis(self) -> float:
@@ -210,8 +199,7 @@ class ParameterCusum:
     deviations, and the filter would follow it slowly, with an interval that excludes both values.
     """
 
-    sums: Array | None = None
-    """(2, free); None if nothing is summed."""
+    sums: Array | None = None  # (2, free); None if nothing is summed
 
     def after(self, shifts: Array) -> "ParameterCusum":
         """Return the sums after a window of these ``shifts`` (free,), in standard deviations."""

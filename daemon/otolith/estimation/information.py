@@ -48,10 +48,8 @@ class Outcome(StrEnum):
 class Information:
     """Uncertainty of every entry of a guess from one window alone."""
 
-    sd: Array
-    """(guess,) standard deviation; infinite where the window has no information."""
-    correlation: Array
-    """(guess, guess)."""
+    sd: Array  # (guess,) standard deviation; infinite where the window has no information
+    correlation: Array  # (guess, guess)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +58,7 @@ class ParameterEstimate:
 
     name: str
     value: float
-    sd: float
-    """Standard deviation; infinite where the window has no information."""
+    sd: float  # Standard deviation; infinite where the window has no information
     identifiability: Identifiability
     reason: str
 
@@ -127,14 +124,11 @@ def inflation_of(residuals: Array, present: Mask, cost: float) -> float:
 class AccuracyTarget:
     """What is required of one parameter, and whether its best value lies at a bound."""
 
-    half_width: float
-    """Largest half-width of the 95 % interval of a determined parameter."""
+    half_width: float  # Largest half-width of the 95 % interval of a determined parameter
     unit: str
     at_bound: bool
-    value: float = 0.0
-    """The best value."""
-    pressure: float = 0.0
-    """How far beyond the bound a further step would lead, in standard deviations."""
+    value: float = 0.0  # The best value
+    pressure: float = 0.0  # How far beyond the bound a further step would lead, in standard deviations
 
 
 def at_its_bound(value: float, unit: str) -> str:

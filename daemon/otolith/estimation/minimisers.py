@@ -31,10 +31,8 @@ LOG_SCALE_RATIO = 10.0  # ratio of the bounds above which a start is drawn by or
 class LeastSquares(Protocol):
     """Residuals whose sum of squares is minimised within bounds."""
 
-    low: Array
-    """(guess,)."""
-    high: Array
-    """(guess,)."""
+    low: Array  # (guess,)
+    high: Array  # (guess,)
 
     def linearise(self, guess: Array) -> tuple[Array, Array]:
         """Return residuals (residuals,) and their derivatives (residuals, guess) at ``guess`` (guess,)."""
@@ -44,17 +42,13 @@ class LeastSquares(Protocol):
 class FitResult:
     """Where Gauss-Newton stopped."""
 
-    guess: Array
-    """(guess,)."""
-    residuals: Array
-    """(residuals,)."""
-    jacobian: Array
-    """(residuals, guess) derivatives of the residuals."""
+    guess: Array  # (guess,)
+    residuals: Array  # (residuals,)
+    jacobian: Array  # (residuals, guess) derivatives of the residuals
     chi_square: float
     evaluations: int
     converged: bool
-    first: tuple[Array, Array, Array]
-    """Guess, residuals and Jacobian at the start."""
+    first: tuple[Array, Array, Array]  # Guess, residuals and Jacobian at the start
 
 
 def gauss_newton(objective: LeastSquares, start: Array, max_steps: int = MAX_STEPS) -> FitResult:
@@ -131,10 +125,8 @@ def _bounded_step(objective: LeastSquares, reached: FitResult, damping: float) -
 class SwarmResult:
     """Where the swarm stopped."""
 
-    positions: Array
-    """(particles, dimensions) best position of each particle, the best particle first."""
-    costs: Array
-    """(particles,)."""
+    positions: Array  # (particles, dimensions) best position of each particle, the best particle first
+    costs: Array  # (particles,)
     generations: int
     evaluations: int
     converged: bool

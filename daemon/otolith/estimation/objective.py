@@ -13,46 +13,22 @@ from dataclasses import replace
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.problem import Problem, time_offsets
-from otolith.twin.augmentation import ELAPSED
+from otolith.estimation.problem import Problem
+from otolith.twin.augmentation import ELAPSED, shift_setting
 from otolith.twin.definition import Definition
-from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, Indices, InnovationModel, Kernel, NoiseModel, kernel_of
+from otolith.twin.kernel import MAX_SUBSTEPS, Excitation, Indices, InnovationModel, NoiseModel, kernel_of
 
 EXPLAINED = 1.5  # cost up to which the residual counts as noise
 INITIAL_STATE_REACH = 10.0  # standard deviations around the first record: least width of the bounds of a start
 TRUNCATION = 1e-3  # share of the noise: largest truncation error of the integrator
 PENALTY = 1e30  # cost of a guess whose prediction is not finite
+MAX_HALVINGS = 20  # of start amplitudes with which the twin diverges
 MAX_SUBSTEPS_WITH_COMPONENTS = 8  # no number of sub-steps makes the step of dry friction smooth
 ADC_TOLERANCE = 0.01  # share of a step: how far level differences may be from whole multiples of it
 WHITE_ROUNDING = 2.0  # standard deviations of the noise: rounding to steps up to this size is white noise
 # Standard deviations of the noise: what differs by more are wrong values, no levels of a converter.
 MAX_ADC_STEP = 1000.0
 MIN_ADC_LEVELS = 4  # levels in a window that show the step of a converter
-
-
-def predictor(
-    kernel: Kernel, parameters: Array, initial: Array, excitation: Excitation, noise: NoiseModel
-) -> InnovationModel:
-    """Return gain and whitening along the window, around ``parameters`` (parameters,) and ``initial`` (states,).
-
-    A twin that diverges there, or that has no process noise, runs in open loop.
-    """
-    if noise.disturbs:
-        model = kernel.innovation_model(parameters, initial, excitation, noise)
-        if np.isfinite(model.gain).all() and np.isfinite(model.whitening).all():
-            return model
-    return open_loop(kernel, excitation, noise)
-
-
-def open_loop(kernel: Kernel, excitation: Excitation, noise: NoiseModel) -> InnovationModel:
-    """Return a zero gain and the whitening of the sensor noise alone."""
-    if excitation.measured is None:
-        raise ValueError("a predictor needs measurements")
-    present = np.isfinite(excitation.measured)
-    scales = np.where(present, 1.0 / noise.outputs, 1.0)
-    whitening = scales[:, :, None] * np.eye(len(noise.outputs))
-    gain = np.zeros((len(excitation.inputs), len(kernel.definition.states), len(noise.outputs)))
-    return InnovationModel(gain, whitening, float(-2.0 * np.log(scales).sum()))
 
 
 class Objective:
@@ -74,16 +50,14 @@ class Objective:
         self.kernel = kernel_of(twin)
         self.measured = np.column_stack([window.column(output.name) for output in twin.outputs])
         self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
-        self.count = max(float(self.present.sum()), 1.0)
-        """Measured values of all outputs."""
-        self.is_complete = bool(self.present.all())
-        """Whether every output was measured in every record."""
+        self.count = max(float(self.present.sum()), 1.0)  # Measured values of all outputs
+        self.is_complete = bool(self.present.all())  # Whether every output was measured in every record
         self.noise = self._noise_model(problem, window)
         lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
         if problem.components:  # a faulty sensor shows the first state far from where it is
             wider = np.where(highest > lowest, np.abs(self._first) + highest - lowest, 0.0)
             lowest, highest = lowest - wider, highest + wider
-        given = dict(problem.known) | (time_offsets(problem, window) if problem.components else {})
+        given = dict(problem.known) | _time_offsets(problem, window)
         self._template = np.array([given.get(parameter.name, parameter.nominal) for parameter in twin.parameters])
         self.free, self._states = len(problem.free), len(twin.states)
         self._choose_columns(problem)
@@ -92,7 +66,10 @@ class Objective:
         states = (f"initial {state.name}" for state in twin.states)
         self.names = (*(parameter.label for parameter in problem.free), *states)
         self._open_loop = problem.open_loop
-        self._max_substeps = MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS
+        self._limits = (
+            TRUNCATION * self.noise.outputs,
+            MAX_SUBSTEPS if twin.base is None else MAX_SUBSTEPS_WITH_COMPONENTS,
+        )
         self._base = twin.base or twin
         measured = np.where(self.present, self.measured, np.nan)
         self.excitation = Excitation(input_matrix(twin, window), window.grid, measured=measured)
@@ -118,7 +95,7 @@ class Objective:
         while True:
             model = self._innovation_model(full, initial, uncorrected)
             corrected = replace(uncorrected, gain=model.gain)
-            needed = self._substeps(full, initial, replace(corrected, substeps=substeps))
+            needed = self.kernel.substeps(full, initial, replace(corrected, substeps=substeps), *self._limits)
             if needed <= uncorrected.substeps:  # otherwise the gain comes from too coarse an integrator
                 break
             uncorrected = replace(uncorrected, substeps=needed)
@@ -127,23 +104,15 @@ class Objective:
 
     def is_resolved(self, parameters: Array, initial: Array) -> bool:
         """Whether the sub-steps of the predictor suffice at ``parameters`` (free,) and ``initial`` (states,)."""
-        needed = self._substeps(self.parameters(parameters[None])[0], initial, self.excitation)
-        return needed <= self.excitation.substeps
-
-    def _substeps(self, full: Array, initial: Array, excitation: Excitation) -> int:
-        return self.kernel.substeps(full, initial, excitation, TRUNCATION * self.noise.outputs, self._max_substeps)
+        full = self.parameters(parameters[None])[0]
+        return self.kernel.substeps(full, initial, self.excitation, *self._limits) <= self.excitation.substeps
 
     def _innovation_model(self, parameters: Array, initial: Array, excitation: Excitation) -> InnovationModel:
         """Return gain and whitening of the base model: components hardly change the prediction error covariance."""
         twin = self._base
         reduced = replace(excitation, inputs=excitation.inputs[:, : len(twin.inputs)])
         parameters, initial = parameters[: len(twin.parameters)], initial[: len(twin.states)]
-        kernel = kernel_of(twin)
-        model = (
-            open_loop(kernel, reduced, self.noise)
-            if self._open_loop
-            else predictor(kernel, parameters, initial, reduced, self.noise)
-        )
+        model = kernel_of(twin).predictor(parameters, initial, reduced, self.noise, open_loop=self._open_loop)
         extra = self._states - len(twin.states)
         return model._replace(gain=np.pad(model.gain, ((0, 0), (0, extra), (0, 0)))) if extra else model
 
@@ -231,6 +200,15 @@ class Objective:
             cost = np.sqrt(np.einsum("pro,pro->p", errors, errors) / self.count)
         return np.where(np.isfinite(cost), np.minimum(cost, PENALTY), PENALTY)
 
+    def with_bounded(self, start: Array, amplitudes: list[int]) -> Array:
+        """Return ``start`` (free,), with smaller ``amplitudes`` if the twin diverges at those of the screening test."""
+        start = start.copy()
+        for _ in range(MAX_HALVINGS):
+            if self.cost(np.concatenate([start, self.initial])[None])[0] < PENALTY:
+                break
+            start[amplitudes] *= 0.5
+        return start
+
     def cost_of_parameters(self, parameters: Array) -> Array:
         """Return the cost (particles,) of parameters (particles, free), each started at the first record."""
         starts = np.repeat(self._first[None, :], len(parameters), axis=0)
@@ -254,14 +232,21 @@ class Objective:
         states = np.array(problem.process_noise or [0.0] * len(twin.states))
         inputs = np.array(problem.input_noise or [0.0] * len(twin.inputs))
         error = window.bridge_error
-        if error is None:
-            model = NoiseModel.uniform(outputs, inputs, states, window.records)
-        else:
+        at_records = held = np.tile(inputs, (window.records, 1))
+        if error is not None:
             columns = [window.signals.index(driven.name) for driven in twin.inputs]
             at_records = np.sqrt(inputs**2 + error.variance[:, columns])
             held = np.sqrt(inputs**2 * error.noise_ratio[:, columns] + error.held_variance[:, columns])
-            model = NoiseModel(outputs, at_records, held, states)
-        return replace(model, period=problem.window.sample_period)
+        return NoiseModel(outputs, at_records, held, states, problem.window.sample_period)
+
+
+def _time_offsets(problem: Problem, window: Window) -> dict[str, float]:
+    """Return the settings that count the time of a window from the origins of the components."""
+    return {
+        shift_setting(slot): window.start - component.origin
+        for slot, component in enumerate(problem.components)
+        if component.source == "t" and not component.periodic
+    }
 
 
 def input_matrix(twin: Definition, window: Window) -> Array:
@@ -292,6 +277,16 @@ def rounding_variance(values: Array, noise: float, known_step: float) -> float:
         step = known_step
     alike = 1.0 if step <= WHITE_ROUNDING * noise else len(values) / _runs(values)
     return step**2 / 12.0 * alike
+
+
+def unmodelled_rounding(values: Array, noise: float, known_step: float) -> tuple[float, float]:
+    """Return the step of the converter behind ``values`` (n,), which two or three levels show here; 0 if none do.
+
+    And the variance that rounding to it adds beyond that of :func:`rounding_variance`, which needs more levels.
+    """
+    levels = np.unique(values)
+    step = float(np.diff(levels).min()) if 1 < len(levels) < MIN_ADC_LEVELS else adc_step(values)
+    return step, max(step**2 / 12.0 - rounding_variance(values, noise, known_step), 0.0)
 
 
 def converter_steps(problem: Problem, window: Window) -> tuple[float, ...]:

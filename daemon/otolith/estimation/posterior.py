@@ -29,14 +29,10 @@ MAX_AGE = 600.0  # s for which a component over time that is not periodic is kep
 class PhaseAdvance:
     """How far the sources of the components moved from the first record of a window to that of the next."""
 
-    start: float
-    """Unix seconds of the window's first record."""
-    next_start: float
-    """Unix seconds of the next window's first record, if no window is missing between."""
-    by: tuple[float, ...]
-    """Of each slot, in the unit of its source."""
-    last_state: tuple[float, ...] = ()
-    """State of the twin at the last record of the window; empty if it is not known."""
+    start: float  # Unix seconds of the window's first record
+    next_start: float  # Unix seconds of the next window's first record, if no window is missing between
+    by: tuple[float, ...]  # Of each slot, in the unit of its source
+    last_state: tuple[float, ...] = ()  # State of the twin at the last record of the window; empty if it is not known
 
 
 def phase_advance(problem: Problem, window: Window, last_state: Array) -> PhaseAdvance:
@@ -61,10 +57,8 @@ class Posterior:
     """What is known of the free parameters of ``problem``. Plain: it pickles."""
 
     problem: Problem
-    belief: ImmPosterior
-    """Relative to the sizes of the parameters."""
-    phase: PhaseAdvance | None = None
-    """None before the first window."""
+    belief: ImmPosterior  # Relative to the sizes of the parameters
+    phase: PhaseAdvance | None = None  # None before the first window
 
     @classmethod
     def initial(cls, problem: Problem) -> "Posterior":

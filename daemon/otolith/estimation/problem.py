@@ -9,14 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from otolith.acquisition.samples import Check
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Array
 from otolith.twin.augmentation import (
     MAX_COMPONENTS,
     ComponentSource,
     augmented_model,
     component_parameters,
     family_setting,
-    shift_setting,
     site_setting,
     sites,
     source_setting,
@@ -41,24 +40,15 @@ class Component:
 
     site: str
     family: str
-    source: str
-    """Empty for none, ``t``, ``angle(omega)``, or the name of a signal or state."""
-    amplitude: float
-    """In the unit of the site."""
-    inner: float = 0.0
-    """The family's nonlinear parameter: a frequency, an order, a rate or an exponent."""
-    phase: float = 0.0
-    """rad, at the first record of the window of discovery."""
-    low: float = 0.0
-    """Lower bound of the inner parameter."""
-    high: float = 0.0
-    """Upper bound of the inner parameter."""
-    amplitude_low: float = -UNLIMITED
-    """Lower bound of the amplitude, in the unit of the site."""
-    amplitude_high: float = UNLIMITED
-    """Upper bound of the amplitude."""
-    origin: float = 0.0
-    """Unix seconds at which a source ``t`` that is not periodic counts zero."""
+    source: str  # Empty for none, t, angle(omega), or the name of a signal or state
+    amplitude: float  # In the unit of the site
+    inner: float = 0.0  # The family's nonlinear parameter: a frequency, an order, a rate or an exponent
+    phase: float = 0.0  # rad, at the first record of the window of discovery
+    low: float = 0.0  # Lower bound of the inner parameter
+    high: float = 0.0  # Upper bound of the inner parameter
+    amplitude_low: float = -UNLIMITED  # Lower bound of the amplitude, in the unit of the site
+    amplitude_high: float = UNLIMITED  # Upper bound of the amplitude
+    origin: float = 0.0  # Unix seconds at which a source t that is not periodic counts zero
 
     @property
     def key(self) -> str:
@@ -99,12 +89,10 @@ class SwarmOptions:
 class WindowOptions:
     """Records per window."""
 
-    records: int = 200
-    """Of the first window, and of all windows if the length is fixed."""
+    records: int = 200  # Of the first window, and of all windows if the length is fixed
     shortest: int = 200
     longest: int = 200
-    sample_period: float | None = None
-    """Nominal time between two records, s; None for that of each window."""
+    sample_period: float | None = None  # Nominal time between two records, s; None for that of each window
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,22 +100,17 @@ class Problem:
     """What is estimated, from what, under which noise."""
 
     twin: Definition
-    known: tuple[tuple[str, float], ...]
-    """Name and value of each parameter that is given."""
-    free: tuple[Parameter, ...]
-    """Parameters to estimate, with the nominal values and bounds of this machine."""
-    noise: tuple[float, ...]
-    """Standard deviation of the sensor of each output."""
+    known: tuple[tuple[str, float], ...]  # Name and value of each parameter that is given
+    free: tuple[Parameter, ...]  # Parameters to estimate, with the nominal values and bounds of this machine
+    noise: tuple[float, ...]  # Standard deviation of the sensor of each output
     stated_noise: tuple[float, ...] = ()
     """:attr:`levels` as the machine file states them, where windows have shown that one is larger; empty otherwise."""
     steps: tuple[float, ...] = ()
     """Step of the converter of each output, as the windows have shown it; 0 or empty for none."""
-    input_noise: tuple[float, ...] = ()
-    """Standard deviation of each input; empty for none."""
+    input_noise: tuple[float, ...] = ()  # Standard deviation of each input; empty for none
     process_noise: tuple[float, ...] = ()
     """Standard deviation of each state per square root of a second; empty for none."""
-    open_loop: bool = False
-    """Use the paper's cost: no innovation corrects the twin within a window."""
+    open_loop: bool = False  # Use the paper's cost: no innovation corrects the twin within a window
     determined_within: float = 0.1
     """A parameter is determined when half of its 95 % interval is at most this share of its nominal value."""
     components: tuple[Component, ...] = ()
@@ -136,22 +119,18 @@ class Problem:
     """Checks of the data that are turned off, each with its signal."""
     delays: tuple[tuple[str, float], ...] = ()
     """Signals that are late in the windows, and by how many seconds: their samples are moved before a fit."""
-    excluded: frozenset[str] = frozenset()
-    """Keys of components that discovery leaves out."""
-    discover: bool = True
-    """Whether discovery looks for components of the machine."""
+    changing: tuple[str, ...] = ()  # Commands that change between their samples, as windows have shown it
+    excluded: frozenset[str] = frozenset()  # Keys of components that discovery leaves out
+    discover: bool = True  # Whether discovery looks for components of the machine
     window: WindowOptions = WindowOptions()
     swarm: SwarmOptions = SwarmOptions()
     seed: int = 1
 
-    base_model: Definition = field(init=False, compare=False, repr=False)
-    """The twin without slots for components."""
+    base_model: Definition = field(init=False, compare=False, repr=False)  # The twin without slots for components
     scale: Array = field(init=False, compare=False, repr=False)
     """(free,) the size of each parameter, to which accuracy is relative."""
-    nominal: Array = field(init=False, compare=False, repr=False)
-    """(free,) values of the machine file."""
-    bounds: tuple[Array, Array] = field(init=False, compare=False, repr=False)
-    """(free,) lower and upper bounds."""
+    nominal: Array = field(init=False, compare=False, repr=False)  # (free,) values of the machine file
+    bounds: tuple[Array, Array] = field(init=False, compare=False, repr=False)  # (free,) lower and upper bounds
 
     def __post_init__(self) -> None:
         low, high = (np.array([getattr(free, end) for free in self.free]) for end in ("low", "high"))
@@ -189,12 +168,9 @@ class Problem:
 class WindowExcitation:
     """What a window showed of the parameters."""
 
-    sd: Array
-    """(free,) standard deviation of each parameter from the window alone; infinite for none."""
-    trend: Array
-    """(free,) root mean square of each parameter's trend, per second."""
-    explained: bool
-    """Whether the twin leaves nothing but noise."""
+    sd: Array  # (free,) standard deviation of each parameter from the window alone; infinite for none
+    trend: Array  # (free,) root mean square of each parameter's trend, per second
+    explained: bool  # Whether the twin leaves nothing but noise
 
 
 def next_records(options: WindowOptions, length: float, sample_period: float, excitation: WindowExcitation) -> int:
@@ -301,15 +277,6 @@ def slot_of(problem: Problem, component: Component) -> int | None:
     """Return the slot of a component, or None if the twin does not have it."""
     keys = [other.key for other in problem.components]
     return keys.index(component.key) if component.key in keys else None
-
-
-def time_offsets(problem: Problem, window: Window) -> dict[str, float]:
-    """Return the settings that count the time of a window from the origins of the components."""
-    return {
-        shift_setting(slot): window.start - component.origin
-        for slot, component in enumerate(problem.components)
-        if component.source == "t" and not component.periodic
-    }
 
 
 def equation(twin: Definition, component: Component, values: Sequence[float]) -> str:

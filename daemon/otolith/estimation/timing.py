@@ -1,14 +1,18 @@
 """Delays of signals: windows as other delays would give them, and how innovations depend on a delay.
 
+A command that changes between its samples is late by another time at each change.
+
 Each sample moves in time with its value; nothing measured is interpolated. Inputs are evaluated at the new records by
 their hold. ``docs/explanation/delays.md`` has the equations.
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
+from otolith.acquisition.bridging import NOTHING_LOST, InputKind, InputSamples, bridge
+from otolith.acquisition.samples import Series, interval_of
 from otolith.acquisition.window import Array, BridgeError, Mask, TimeGrid, Window
 from otolith.estimation.objective import Objective
 from otolith.twin.definition import Definition
@@ -97,6 +101,24 @@ def _bridge_error(
     duration = np.divide(held * old, variance, out=np.zeros(len(old)), where=variance > 0.0)[before]
     change = error.expected_change[:, column][before]
     return spacing / steps, variance[before], variance[before] * np.maximum(1.0, duration / steps), change
+
+
+def with_changes_between(window: Window, commands: Collection[str]) -> Window:
+    """Return the window with ``commands`` that may change at any time between two of their samples, as polled ones."""
+    grid, values = window.grid, window.values.copy()
+    before = window.bridge_error or BridgeError(np.ones(values.shape), *(np.zeros(values.shape) for _ in range(3)))
+    error = BridgeError(*(getattr(before, item.name).copy() for item in fields(before)))
+    for name in commands:
+        column, sampled = window.signals.index(name), ~window.missing_in(name)
+        series = Series(grid.offsets[sampled], window.readings(name)[sampled])
+        if len(series.times) < 2:
+            continue
+        samples = InputSamples(series, InputKind.POLLED, 0.0, interval_of(series.times), NOTHING_LOST)
+        bridged = bridge(samples, grid.offsets, grid.steps)
+        values[:, column] = bridged.values
+        for item in fields(error):
+            getattr(error, item.name)[:, column] = getattr(bridged.error, item.name)
+    return replace(window, values=values, bridge_error=error)
 
 
 def same_measurements(

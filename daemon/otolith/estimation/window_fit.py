@@ -31,10 +31,10 @@ from otolith.estimation.minimisers import (
     search_parameters,
     spread_starts,
 )
-from otolith.estimation.objective import EXPLAINED, PENALTY, Objective
+from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import PhaseAdvance, Posterior, phase_advance
 from otolith.estimation.problem import Problem, amplitude_indices
-from otolith.estimation.timing import shifted
+from otolith.estimation.timing import shifted, with_changes_between
 
 AT_BOUND = 1e-4  # share of the width of the bounds
 REFINED_PARTICLES = 4  # best particles of the swarm that Gauss-Newton starts from
@@ -46,7 +46,6 @@ ALONE_STEPS = 12  # of Gauss-Newton for the window alone, which starts at the fi
 LOCAL_MINIMUM = 0.5  # ratio of χ² between two fits under one prior below which the worse one is a local minimum
 DISTINCT = 5.0  # standard deviations between two different results
 EQUALLY_GOOD = 9.0  # difference in χ² between two explanations that are equally good
-MAX_HALVINGS = 20  # of start amplitudes with which the twin diverges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,10 +100,14 @@ class Fit:
         """(free + states,) without trends, for :attr:`objective`."""
         return self.objective.without_trends(self.result.guess)
 
+    @property
+    def inflation(self) -> float:
+        """Factor on standard deviations for a residual larger than the noise; see :func:`inflation_of`."""
+        return inflation_of(self.innovations, self.objective.present, self.cost)
+
     def evidence(self) -> Evidence:
         """Return the evidence of the window; standard deviations are inflated by the unexplained residual."""
-        inflation = inflation_of(self.innovations, self.objective.present, self.cost)
-        return self.map_objective.evidence(self.result, inflation)
+        return self.map_objective.evidence(self.result, self.inflation)
 
     def linearised_at_end(self) -> "Fit":
         """Return the window linearised at the end of this fit, with a predictor made there."""
@@ -133,10 +136,21 @@ class Fit:
         """Return a new fit from the end of this one, with the predictor that the objective has now."""
         return replace(self, result=gauss_newton(self.map_objective, self.result.guess))
 
+    def predict(self) -> tuple[Array, Array]:
+        """Return the prediction (records, outputs) and the state (states,) at the last record."""
+        return self.objective.predict_with_trends(self.result.guess)
+
+    def without_prior(self) -> FitResult:
+        """Return the same without prior and trends, as :attr:`objective` linearises it at :attr:`guess`."""
+        free, rows = len(self.problem.free), len(self.prior.mean)
+        jacobian, trends = self.result.jacobian[:-rows], slice(free, 2 * free)
+        residuals = self.result.residuals[:-rows] - jacobian[:, trends] @ self.result.guess[trends]
+        there = self.guess, residuals, np.delete(jacobian, trends, axis=1)
+        return FitResult(*there, float(residuals @ residuals), 0, False, there)
+
     def advance(self) -> PhaseAdvance:
         """Return the advance of the components' phases to the next window."""
-        last_state = self.objective.predict_with_trends(self.result.guess)[1]
-        return phase_advance(self.problem, self.window, last_state)
+        return phase_advance(self.problem, self.window, self.predict()[1])
 
 
 def fit(  # noqa: PLR0913 - the two parts of a start
@@ -153,15 +167,21 @@ def fit(  # noqa: PLR0913 - the two parts of a start
     States of the twin that are not measured start at ``state`` (states,), if it is given. The window of the fit is
     without the delays of the problem.
     """
+    if problem.changing:
+        window = with_changes_between(window, problem.changing)
     if problem.delays:
         window = shifted(problem.base_model, window, dict(problem.delays))
     initial = None
     if state:
-        measured = {output.name for output in problem.base_model.outputs}
-        reached = dict(zip((own.name for own in problem.base_model.states), state, strict=True))
-        names = (own.name for own in problem.twin.states)
-        initial = np.array([np.nan if name in measured else reached.get(name, np.nan) for name in names])
+        reached = {own.name: value for own, value in zip(problem.base_model.states, state, strict=True)}
+        reached |= {output.name: np.nan for output in problem.base_model.outputs}
+        initial = np.array([reached.get(own.name, np.nan) for own in problem.twin.states])
     return _fit(problem, window, prior, start, max_steps, initial=initial)
+
+
+def fit_predicted(predicted: Posterior, problem: Problem, window: Window, start: Array | None = None) -> Fit:
+    """Fit ``window`` under its prediction, with a ``problem`` of the same parameters."""
+    return fit(problem, window, predicted.prior(), predicted.start() if start is None else start)
 
 
 def _fit(  # noqa: PLR0913 - the two parts of a start
@@ -170,21 +190,11 @@ def _fit(  # noqa: PLR0913 - the two parts of a start
     """Fit a window without delays from ``start`` (free,) and ``initial`` (states,), by default the first record."""
     start = np.clip(start[: len(problem.free)], *problem.bounds)
     objective = Objective(problem, window, start, initial)
-    map_objective = MapObjective(objective, problem, prior)
     if problem.components:
-        start = _with_bounded_amplitudes(problem, objective, start)
+        start = objective.with_bounded(start, amplitude_indices(problem))
+    map_objective = MapObjective(objective, problem, prior)
     result = gauss_newton(map_objective, map_objective.guess(start, objective.initial), max_steps)
     return Fit(problem, prior, window, objective, map_objective, result)
-
-
-def _with_bounded_amplitudes(problem: Problem, objective: Objective, start: Array) -> Array:
-    """Return ``start`` (free,) with smaller amplitudes if the twin diverges at those of the linear approximation."""
-    start, amplitudes = start.copy(), amplitude_indices(problem)
-    for _ in range(MAX_HALVINGS):
-        if objective.cost(np.concatenate([start, objective.initial])[None])[0] < PENALTY:
-            break
-        start[amplitudes] *= 0.5
-    return start
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,7 +293,7 @@ class _BothFits:
 
 def _fit_alone(fitted: Fit, evaluations: int) -> _BothFits:
     objective = fitted.objective
-    alone = gauss_newton(objective, fitted.guess, ALONE_STEPS)
+    alone = continued(objective, fitted.without_prior(), ALONE_STEPS)
     residuals = alone.residuals.reshape(objective.measured.shape)
     inflation = inflation_of(residuals, objective.present, float(np.sqrt(alone.chi_square / objective.count)))
     uncertainty = information(alone.jacobian, objective.high - objective.low, inflation)
@@ -345,7 +355,7 @@ def _refine(fitted: Fit, swarm: SwarmResult, seed: int) -> tuple[Fit, int]:
 def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstimate:
     objective, problem, result = both.fit.objective, both.fit.problem, both.fit.result
     configured = objective.predict(objective.guess(_without_amplitudes(problem, problem.nominal))[None])[0]
-    predicted, last_state = objective.predict_with_trends(result.guess)
+    predicted, last_state = both.fit.predict()
     rmse_completed = rmse_estimated = tuple(map(float, objective.rmse(predicted)))
     if problem.components:
         bare = objective.predict_with_trends(_without_amplitudes(problem, result.guess))[0]

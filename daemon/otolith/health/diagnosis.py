@@ -19,30 +19,21 @@ KEYS = ("twin", "subject", "side", "manner", "family", "input")
 class FindingKind(StrEnum):
     """What was observed."""
 
-    LIMIT = "limit"
-    """A parameter is beyond a limit."""
-    LIMIT_FROM_START = "limit from the start"
-    """The same, since the first window that determined it."""
-    TREND = "trend"
-    """A parameter within its limits is on its way to one."""
-    LOST = "identifiability lost"
-    """A parameter that was determined is not any more, although the machine moves."""
+    LIMIT = "limit"  # A parameter is beyond a limit
+    LIMIT_FROM_START = "limit from the start"  # The same, since the first window that determined it
+    TREND = "trend"  # A parameter within its limits is on its way to one
+    LOST = "identifiability lost"  # A parameter that was determined is not any more, although the machine moves
     COMPONENT = "component"
     SENSOR = "sensor"
     TIMING = "late signal"
     NOISE = "noise"
-    CLASS = "class"
-    """Several hypotheses explain the windows equally well."""
-    OPEN = "open"
-    """Hypotheses are being compared."""
-    MOVED = "moved"
-    """A parameter that the machine file gives as known is another."""
+    CLASS = "class"  # Several hypotheses explain the windows equally well
+    OPEN = "open"  # Hypotheses are being compared
+    MOVED = "moved"  # A parameter that the machine file gives as known is another
     UNEXPLAINED = "unexplained"
     NO_DATA = "no data"
-    NO_TEMPERATURE = "no temperature"
-    """The temperature on which a parameter depends is not measured at present."""
-    NO_SOURCE = "no source"
-    """One of several sources is down or gave no sample."""
+    NO_TEMPERATURE = "no temperature"  # The temperature on which a parameter depends is not measured at present
+    NO_SOURCE = "no source"  # One of several sources is down or gave no sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,24 +42,18 @@ class FindingFeatures:
 
     finding: FindingKind
     twin: str = ""
-    subject: str = ""
-    """Parameter, site or signal."""
-    side: str = ""
-    """Of the nominal value on which a parameter is: ``below`` or ``above``."""
-    manner: str = ""
-    """How a parameter came there: by a ``step`` or by a ``trend``."""
+    subject: str = ""  # Parameter, site or signal
+    side: str = ""  # Of the nominal value on which a parameter is: below or above
+    manner: str = ""  # How a parameter came there: by a step or by a trend
     family: str = ""
-    input: str = ""
-    """``t``, ``angle``, or another signal or state."""
-    order: float | None = None
-    """Of a component that is periodic in an angle."""
+    input: str = ""  # t, angle, or another signal or state
+    order: float | None = None  # Of a component that is periodic in an angle
 
 
 class Rule(StrictModel):
     """A row: the values that it matches, and what they mean. A key without values matches everything."""
 
-    id: str
-    """Key of its texts in `texts/`."""
+    id: str  # Key of its texts in `texts/`
     finding: FindingKind
     twin: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
@@ -76,14 +61,11 @@ class Rule(StrictModel):
     manner: tuple[Literal["step", "trend"], ...] = ()
     family: tuple[str, ...] = ()
     input: tuple[str, ...] = ()
-    order: tuple[float, float] | None = None
-    """Lowest and highest order."""
-    condition: str = ""
-    """Empty until :func:`worded`, as are cause and advice."""
+    order: tuple[float, float] | None = None  # Lowest and highest order
+    condition: str = ""  # Empty until worded, as are cause and advice
     cause: str = ""
     advice: str = ""
-    severity: Literal["WATCH", "ACT"] = "WATCH"
-    """Level of what has no limits."""
+    severity: Literal["WATCH", "ACT"] = "WATCH"  # Level of what has no limits
     source: str
 
     @property
@@ -124,18 +106,9 @@ def diagnose(rules: Sequence[Rule], features: FindingFeatures, texts: Texts | No
     ``texts`` has the joints; English by default.
     """
     rows, texts = matching(rules, features), texts or texts_in("en")
-    joints = {
-        "condition_id": ("id", " "),
-        "condition": ("condition", texts("or")),
-        "cause": ("cause", texts("alternatives")),
-        "advice": ("advice", "; "),
-        "source": ("source", "; "),
-    }
-    return {
-        name: joint.join(dict.fromkeys(getattr(rule, key) for rule in rows))
-        for name, (key, joint) in joints.items()
-        if rows
-    }
+    joints = {"id": " ", "condition": texts("or"), "cause": texts("alternatives"), "advice": "; ", "source": "; "}
+    joined = {key: joint.join(dict.fromkeys(getattr(rule, key) for rule in rows)) for key, joint in joints.items()}
+    return {"condition_id" if key == "id" else key: text for key, text in joined.items() if rows}
 
 
 def severity(rules: Sequence[Rule], features: FindingFeatures) -> Literal["WATCH", "ACT"]:

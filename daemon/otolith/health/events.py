@@ -7,12 +7,13 @@ Times are those of the windows. A window that determines nothing about a conditi
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingKind, diagnose
 from otolith.health.limits import MACHINE, Level, MonitoredQuantity, MonitoringPlan
-from otolith.health.observations import BUS, SENSORS, Observation, Past, Persistence, is_determined, observe
+from otolith.health.observations import BUS, SENSORS, UNDECIDED, Observation, Past, Persistence, is_determined, observe
 from otolith.health.prognosis import History, forecast, is_due, span, with_point
 from otolith.health.schema import (
     EventChange,
@@ -26,16 +27,16 @@ from otolith.health.schema import (
     WindowDocument,
 )
 
+DECIDED = frozenset({WindowDecision.STEPPED, WindowDecision.DISCOVERED, WindowDecision.NOISIER})  # They end a test
+
 
 @dataclass(frozen=True, slots=True)
 class ConditionRecord:
     """What is carried from window to window about one condition."""
 
     level: Level = Level.OK
-    recent: tuple[tuple[Level, WindowDocument], ...] = ()
-    """The last observed levels with their windows."""
-    event: EventDocument | None = None
-    """None at :attr:`Level.OK`."""
+    recent: tuple[tuple[Level, WindowDocument], ...] = ()  # The last observed levels with their windows
+    event: EventDocument | None = None  # None at Level.OK
     persistence: Persistence = field(default_factory=Persistence)
 
     @property
@@ -48,21 +49,17 @@ class ConditionRecord:
 class HealthState:
     """Everything that the states of parts need from earlier windows. Plain: it pickles."""
 
-    records: Mapping[str, ConditionRecord] = field(default_factory=dict)
-    """By the key of the condition."""
+    records: Mapping[str, ConditionRecord] = field(default_factory=dict)  # By the key of the condition
     values: Mapping[str, float] = field(default_factory=dict)
     """Of the parameters, after the last window that updated them."""
-    steps: Mapping[str, float] = field(default_factory=dict)
-    """Last sudden change of each parameter."""
+    steps: Mapping[str, float] = field(default_factory=dict)  # Last sudden change of each parameter
     histories: Mapping[str, History] = field(default_factory=dict)
     """Of the parameters with limits, since their last sudden change."""
     forecasts: Mapping[str, ForecastDocument] = field(default_factory=dict)
     undetermined: Mapping[str, float] = field(default_factory=dict)
     """Time for which the machine has moved since each parameter was determined, s; none of those that never were."""
-    inside: frozenset[str] = frozenset()
-    """Keys of conditions that were at OK in some window."""
-    document: HealthDocument | None = None
-    """The states in the report before."""
+    inside: frozenset[str] = frozenset()  # Keys of conditions that were at OK in some window
+    document: HealthDocument | None = None  # The states in the report before
 
     @property
     def open_events(self) -> tuple[EventDocument, ...]:
@@ -114,9 +111,11 @@ def _observations(
     moving machine; otherwise nothing is known of it.
     """
     absent = Level.OK if report.decision in ACCEPTED and is_moving else None
-    earlier = {
-        key: Observation(key, MACHINE, absent, persistence=record.persistence) for key, record in state.records.items()
-    }
+    earlier = {}
+    for key, record in state.records.items():
+        is_decided = report.decision in DECIDED and record.persistence == UNDECIDED
+        persistence = replace(UNDECIDED, fall=1) if is_decided else record.persistence
+        earlier[key] = Observation(key, MACHINE, Level.OK if is_decided else absent, persistence=persistence)
     levels = {key: record.level for key, record in state.records.items()}
     spans = {name: span(history) for name, history in state.histories.items()}
     shown = observe(plan, report, levels, Past(state.steps, spans, state.undetermined))
@@ -142,24 +141,19 @@ def _translated(plan: MonitoringPlan, report: ReportDocument) -> ReportDocument:
     if plan.language == "en":
         return report
     local = plan.texts.translated
-    quality, absent = report.window.quality, report.window.absent
-    quality = quality.model_copy(update={"reasons": tuple(map(local, quality.reasons))})
-    absent = absent and {name: local(text) for name, text in absent.items()}
-    findings = [
-        item.model_copy(update={key: local(getattr(item, key)) for key in ("condition", "text", "advice")})
-        for item in report.findings
-    ]
-    parameters = {
-        name: item.model_copy(update={"reason": local(item.reason), "advice": item.advice and local(item.advice)})
-        for name, item in report.parameters.items()
+
+    def localised(item: Any, *keys: str) -> Any:
+        return item.model_copy(update={key: local(text) for key in keys if (text := getattr(item, key))})
+
+    quality = report.window.quality.model_copy(update={"reasons": tuple(map(local, report.window.quality.reasons))})
+    absent = report.window.absent and {name: local(text) for name, text in report.window.absent.items()}
+    changed = {
+        "window": report.window.model_copy(update={"quality": quality, "absent": absent}),
+        "findings": tuple(localised(item, "condition", "text", "advice") for item in report.findings),
+        "parameters": {name: localised(item, "reason", "advice") for name, item in report.parameters.items()},
+        "components": tuple(localised(item, "meaning", "conditions", "domain") for item in report.components),
     }
-    components = [
-        item.model_copy(update={key: local(getattr(item, key)) for key in ("meaning", "conditions", "domain")})
-        for item in report.components
-    ]
-    window = report.window.model_copy(update={"quality": quality, "absent": absent})
-    changed = {"findings": tuple(findings), "parameters": parameters, "components": tuple(components)}
-    return report.model_copy(update={**changed, "window": window})
+    return report.model_copy(update=changed)
 
 
 def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
@@ -176,7 +170,7 @@ def _with_steps(state: HealthState, report: ReportDocument) -> HealthState:
     moved = {name for name, change in changes.items() if abs(change) > QUANTILE * (report.parameters[name].sd or 0.0)}
     for name in moved:
         state = state.without_history(name)
-    return replace(state, values=values, steps={**state.steps, **changes})
+    return replace(state, values=values, steps={**state.steps, **{name: changes[name] for name in moved}})
 
 
 def _judged(plan: MonitoringPlan, report: ReportDocument, name: str) -> dict[str, float]:
@@ -200,9 +194,13 @@ def _with_forecasts(plan: MonitoringPlan, state: HealthState, report: ReportDocu
         is_new = report.decision in ACCEPTED and item.status is Status.ESTIMATED
         if quantity is None or not quantity.limits or not is_new or item.value is None or not item.sd:
             continue
-        if (referred := quantity.referred(item.value, item.sd, report.window.observed or {})) is None:
+        time, value, sd = report.window.end, item.value, item.sd
+        if report.decision is WindowDecision.LEARNED and item.raw is not None and item.raw_sd:
+            # Of this window alone, in its middle: its error is that of no other window, and lags behind no trend.
+            time, value, sd = 0.5 * (report.window.start + report.window.end), item.raw, item.raw_sd
+        if (referred := quantity.referred(value, sd, report.window.observed or {})) is None:
             continue
-        histories[name] = with_point(histories.get(name, ()), report.window.end, referred[0], referred[1] ** 2)
+        histories[name] = with_point(histories.get(name, ()), time, referred[0], referred[1] ** 2)
         if is_due(forecasts.get(name), histories[name]):
             forecasts[name] = forecast(quantity, histories[name])
     return replace(state, histories=histories, forecasts=forecasts)
@@ -217,7 +215,8 @@ def _advance(
         is_interrupted = event is None and report.decision is WindowDecision.SUSPECTED  # something else may be true
         return replace(before, event=event, recent=() if is_interrupted else before.recent)
     persistence = observed.persistence
-    recent = (*before.recent, (observed.level, report.window))[-max(persistence.rise, persistence.fall) :]
+    length = max(persistence.rise, persistence.fall, persistence.within)
+    recent = (*before.recent, (observed.level, report.window))[-length:]
     level, count = _persistent(before.level, [item[0] for item in recent], persistence)
     first = recent[-count:][0][1]
     if event is None and level is not Level.OK:
@@ -231,16 +230,16 @@ def _advance(
         described = event.model_copy(update=_description(plan, event, observed, report.window.index))
         is_other = event.condition_id not in ("", described.condition_id) and event.change is None
         event = described.model_copy(update={"change": EventChange.CHANGED}) if is_other else described
-    return ConditionRecord(level, recent, event, persistence)
+    kept = recent[-count:] if level.rank < before.level.rank else recent  # what is over does not count again
+    return ConditionRecord(level, kept, event, persistence)
 
 
 def _raised(
     plan: MonitoringPlan, observed: Observation, level: Level, windows: tuple[WindowDocument, WindowDocument]
 ) -> EventDocument:
     """Return a new event, not described yet, that the first to the last of ``windows`` agree on."""
-    first, last = windows
-    start = min(first.start, first.start if observed.since is None else observed.since)
-    evidence = EvidenceDocument(windows=(first.index, last.index))
+    start = min(windows[0].start, windows[0].start if observed.since is None else observed.since)
+    evidence = EvidenceDocument(windows=(windows[0].index, windows[1].index))
     return EventDocument(
         id=f"{observed.key}@{start:.1f}", part=observed.part, state=level, change=EventChange.RAISED,
         start=start, since=start, condition="", text="", evidence=evidence, language=plan.language,
@@ -248,14 +247,19 @@ def _raised(
 
 
 def _persistent(level: Level, recent: Sequence[Level], persistence: Persistence) -> tuple[Level, int]:
-    """Return the level after the ``recent`` observations, and how many of them agree that it is higher or lower."""
-    lowest = min(recent[-persistence.rise :], key=lambda item: item.rank)
-    highest = max(recent[-persistence.fall :], key=lambda item: item.rank)
-    if len(recent) >= persistence.rise and lowest.rank > level.rank:
-        return lowest, persistence.rise
-    if len(recent) >= persistence.fall and highest.rank < level.rank:
-        return highest, persistence.fall
-    return level, persistence.rise
+    """Return the level after the ``recent`` observations, and how many windows ago the first of them began that agree.
+
+    A condition that comes and goes is not over before all of ``within`` windows are without it.
+    """
+    rise, fall = persistence.rise, persistence.fall
+    among = recent[-max(rise, persistence.within) :]
+    agreed = sorted(among, key=lambda item: -item.rank)[rise - 1 : rise]
+    if agreed and agreed[0].rank > level.rank:
+        return agreed[0], len(among) - next(at for at, item in enumerate(among) if item.rank >= agreed[0].rank)
+    shown = [at for at, item in enumerate(among) if item.rank >= level.rank]
+    fall = fall if shown and len(shown) >= max(rise, 1 + shown[-1] - shown[0]) else max(fall, persistence.within)
+    highest = max(recent[-fall:], key=lambda item: item.rank)
+    return (highest, fall) if len(recent) >= fall and highest.rank < level.rank else (level, rise)
 
 
 def _description(

@@ -24,14 +24,10 @@ class Texts:
     """The texts of a language."""
 
     language: Language
-    rules: dict[str, dict[str, str]]
-    """Condition, cause and advice of each rule, by its id."""
-    texts: dict[str, str]
-    """By key, with names in braces."""
-    phrases: dict[str, str]
-    """Translations by the English phrase; empty for English."""
-    patterns: tuple[tuple[re.Pattern[str], str], ...]
-    """The phrases with names in braces; the first that matches counts."""
+    rules: dict[str, dict[str, str]]  # Condition, cause and advice of each rule, by its id
+    texts: dict[str, str]  # By key, with names in braces
+    phrases: dict[str, str]  # Translations by the English phrase; empty for English
+    patterns: tuple[tuple[re.Pattern[str], str], ...]  # The phrases with names in braces; the first that matches counts
 
     def __call__(self, key: str, **values: object) -> str:
         """Return the text of ``key`` with its values."""

@@ -23,8 +23,7 @@ class Level(StrEnum):
     """State of a part or of the machine."""
 
     OK = "OK"
-    NO_DATA = "NO DATA"
-    """Nothing is known at present."""
+    NO_DATA = "NO DATA"  # Nothing is known at present
     WATCH = "WATCH"
     ACT = "ACT"
 
@@ -43,10 +42,8 @@ class Limit:
 
     level: Level
     value: float
-    is_lower: bool
-    """Whether values below it are beyond it."""
-    is_relative: bool = False
-    """Whether it is stated in percent of the nominal value."""
+    is_lower: bool  # Whether values below it are beyond it
+    is_relative: bool = False  # Whether it is stated in percent of the nominal value
 
     @property
     def side(self) -> str:
@@ -67,14 +64,10 @@ class MonitoredQuantity:
     unit: str = ""
     nominal: float = 0.0
     limits: tuple[Limit, ...] = ()
-    temperature_coefficient: float = 0.0
-    """Relative change per kelvin."""
-    temperature: str = ""
-    """Signal of the temperature, K; empty if it is not measured."""
-    reference: float = 293.15
-    """Temperature for which nominal value and limits are stated, K."""
-    has_baseline: bool = False
-    """Whether ``nominal`` is a value from commissioning instead of that of the machine file."""
+    temperature_coefficient: float = 0.0  # Relative change per kelvin
+    temperature: str = ""  # Signal of the temperature, K; empty if it is not measured
+    reference: float = 293.15  # Temperature for which nominal value and limits are stated, K
+    has_baseline: bool = False  # Whether nominal is a value from commissioning instead of that of the machine file
 
     def referred(self, value: float, sd: float, observed: Mapping[str, float]) -> tuple[float, float] | None:
         """Return an estimate as it would be at the reference temperature, from the ``observed`` signals of a window.
@@ -118,19 +111,14 @@ def probability_beyond(limit: Limit, value: float, sd: float) -> float:
 class MonitoringPlan:
     """What is monitored of a machine, and the rules of the diagnosis. Plain: it pickles."""
 
-    parameters: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
-    """Of the estimated parameters."""
-    sites: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
-    """Limits are those of the amplitude of a component at the site."""
+    parameters: Mapping[str, MonitoredQuantity] = field(default_factory=dict)  # Of the estimated parameters
+    sites: Mapping[str, MonitoredQuantity] = field(default_factory=dict)  # Of the amplitude of a component there
     rules: Sequence[Rule] = ()
-    stated: Mapping[str, MonitoredQuantity] | None = None
-    """The parameters as the machine file states them, if there is a baseline."""
-    language: Language = "en"
-    """Of the texts for people."""
+    stated: Mapping[str, MonitoredQuantity] | None = None  # As the machine file states them, if there is a baseline
+    language: Language = "en"  # Of the texts for people
     known: Mapping[str, MonitoredQuantity] = field(default_factory=dict)
     """Of the parameters that are not estimated, against the values of the machine file."""
-    signals: Mapping[str, str] = field(default_factory=dict)
-    """Their meanings."""
+    signals: Mapping[str, str] = field(default_factory=dict)  # Their meanings
 
     @property
     def texts(self) -> Texts:

@@ -21,14 +21,14 @@ from otolith.health.text import forecast_text, interval_text, number_text, value
 from otolith_drivers.units import equation_text, unit_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
+INTERMITTENT_WINDOWS = 12  # among which as many windows with a fault of a sensor are one that comes and goes
 RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine moves
 MIN_TREND_SPAN = 3600.0  # s: of a history whose trend is announced before a limit is passed
 LOST_AFTER = 3600.0  # s for which a parameter was not determined
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
 DETERMINED = frozenset({Status.ESTIMATED, Status.AMBIGUOUS})
 BUS, SENSORS = "bus", "sensors"  # parts that every machine has
-PARTS = {FindingKind.SENSOR: SENSORS, FindingKind.NOISE: SENSORS, FindingKind.TIMING: BUS}
-"""Of findings that are about no part of the twin."""
+PARTS = {FindingKind.SENSOR: SENSORS, FindingKind.NOISE: SENSORS, FindingKind.TIMING: BUS}  # Of findings about no part
 NOTHING = FindingFeatures(FindingKind.OPEN)
 
 
@@ -36,14 +36,14 @@ NOTHING = FindingFeatures(FindingKind.OPEN)
 class Persistence:
     """How many windows in a row must agree."""
 
-    rise: int = PERSISTENT_WINDOWS
-    """On a higher level."""
-    fall: int = PERSISTENT_WINDOWS
-    """On a lower one."""
+    rise: int = PERSISTENT_WINDOWS  # On a higher level
+    fall: int = PERSISTENT_WINDOWS  # On a lower one
+    within: int = 0  # Windows among which those on a higher level need not follow each other, if more than ``rise``
 
 
-UNDECIDED = Persistence(MAX_OPEN_WINDOWS, RELEASE_WINDOWS)
-"""Of what an open test states: it may still be decided, and shows only in windows that excite it."""
+UNDECIDED = Persistence(MAX_OPEN_WINDOWS, RELEASE_WINDOWS)  # Of what an open test states; it shows only with excitation
+INTERMITTENT = Persistence(within=INTERMITTENT_WINDOWS)  # Of a sensor: a loose contact is no fault in most windows
+PERSISTENCE = {FindingKind.CLASS: UNDECIDED, FindingKind.MOVED: UNDECIDED, FindingKind.SENSOR: INTERMITTENT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,16 +52,12 @@ class Observation:
 
     key: str
     part: str
-    level: Level | None
-    """None if the window does not show it."""
+    level: Level | None  # None if the window does not show it
     features: FindingFeatures = NOTHING
     text: str = ""
-    advice: str = ""
-    """Beside that of the rules."""
-    since: float | None = None
-    """Unix seconds; None for the first window that shows it."""
-    numbers: Mapping[str, float | str] | None = None
-    """For the evidence of the event."""
+    advice: str = ""  # Beside that of the rules
+    since: float | None = None  # Unix seconds; None for the first window that shows it
+    numbers: Mapping[str, float | str] | None = None  # For the evidence of the event
     persistence: Persistence = Persistence()
 
 
@@ -69,12 +65,9 @@ class Observation:
 class Past:
     """What earlier windows showed of the parameters."""
 
-    steps: Mapping[str, float]
-    """Last sudden change of each."""
-    spans: Mapping[str, float]
-    """Length of the history of each, s."""
-    undetermined: Mapping[str, float]
-    """Time for which the machine has moved since each was determined, s."""
+    steps: Mapping[str, float]  # Last sudden change of each
+    spans: Mapping[str, float]  # Length of the history of each, s
+    undetermined: Mapping[str, float]  # Time for which the machine has moved since each was determined, s
 
 
 def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], past: Past) -> list[Observation]:
@@ -126,15 +119,11 @@ def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, befor
         deviation = value.value - quantity.nominal
         features = replace(features, side="below" if deviation < 0.0 else "above", manner="step")
         numbers = _numbers(value.value, value.sd, value.unit, limit)
-        text = plan.texts(
-            "moved",
-            what=plan.texts.translated(quantity.meaning),
-            name=finding.subject,
-            value=interval_text(value.value, value.sd, value.unit),
-            change=f" ({deviation / quantity.nominal:+.1%})" if quantity.nominal else "",
-            stated=number_text(quantity.nominal),
-        )
-    persistence = UNDECIDED if finding.kind in (FindingKind.CLASS, FindingKind.MOVED) else Persistence()
+        change = f" ({deviation / quantity.nominal:+.1%})" if quantity.nominal else ""
+        what = {"what": plan.texts.translated(quantity.meaning), "name": finding.subject, "change": change}
+        interval = interval_text(value.value, value.sd, value.unit)
+        text = plan.texts("moved", **what, value=interval, stated=number_text(quantity.nominal))
+    persistence = PERSISTENCE.get(finding.kind, Persistence())
     return Observation(finding.id, part, level, features, text, finding.advice, finding.since, numbers, persistence)
 
 
@@ -144,9 +133,9 @@ def _of_parameter(
     """Return the observation of a parameter, whose level is not known unless this window determines it."""
     key, parameter, quantity = f"limit/{name}", report.parameters[name], plan.parameters.get(name, MonitoredQuantity())
     value, sd, unit = parameter.value, parameter.sd, parameter.unit
-    if value is None or sd is None or parameter.status not in DETERMINED:
-        return Observation(key, quantity.part, None)
-    if (referred := quantity.referred(value, sd, report.window.observed or {})) is None:
+    is_known = value is not None and sd is not None and parameter.status in DETERMINED
+    referred = quantity.referred(value or 0.0, sd or 0.0, report.window.observed or {}) if is_known else None
+    if referred is None:
         return Observation(key, quantity.part, None)
     deviation = referred[0] - quantity.nominal
     level, limit = quantity.level(*referred, before.get(key, Level.OK))
@@ -158,17 +147,12 @@ def _of_parameter(
     against = texts("of_baseline") if quantity.has_baseline else ""
     share = f"{deviation / quantity.nominal:+.1%}" if quantity.nominal else ""
     expected = forecast_text(parameter, report.window.end, texts.language)
-    text = texts(
-        "limit",
-        what=texts.translated(quantity.meaning),
-        name=name,
-        value=value_text(parameter),
-        change=f" ({share}{against}{_at_temperature(quantity, texts)})" if share else "",
-        side=texts(limit.side if limit.excess(referred[0]) > 0.0 else "still_near"),
-        limit=f"{number_text(limit.value, 4)} {unit_text(unit)}".rstrip(),
-        expected=expected and f", {expected}",
-        warming=_warming(quantity, deviation, texts),
-    )
+    change = f" ({share}{against}{_at_temperature(quantity, texts)})" if share else ""
+    side = texts(limit.side if limit.excess(referred[0]) > 0.0 else "still_near")
+    what = {"what": texts.translated(quantity.meaning), "name": name, "value": value_text(parameter), "change": change}
+    ahead = {"expected": expected and f", {expected}", "warming": _warming(quantity, deviation, texts)}
+    beside = f"{number_text(limit.value, 4)} {unit_text(unit)}".rstrip()
+    text = texts("limit", **what, side=side, limit=beside, **ahead)
     return Observation(key, quantity.part, level, features, text, numbers=_numbers(*referred, unit, limit))
 
 
@@ -215,10 +199,8 @@ def is_determined(parameter: ParameterDocument) -> bool:
 
 
 def _numbers(value: float, sd: float, unit: str, limit: Limit | None) -> dict[str, float | str]:
-    numbers: dict[str, float | str] = {"value": value, "sd": sd, "unit": unit}
-    if limit is None:
-        return numbers
-    return numbers | {"limit": limit.value, "probability": probability_beyond(limit, value, sd)}
+    beyond = {"limit": limit.value, "probability": probability_beyond(limit, value, sd)} if limit else {}
+    return {"value": value, "sd": sd, "unit": unit, **beyond}
 
 
 def _at_temperature(quantity: MonitoredQuantity, texts: Texts) -> str:
@@ -233,16 +215,14 @@ def _warming(quantity: MonitoredQuantity, deviation: float, texts: Texts) -> str
     return texts("warming", kelvin=f"{kelvin:.3g}") if kelvin > 0.0 else ""
 
 
-def _without_temperature(plan: MonitoringPlan, report: ReportDocument) -> list[Observation]:
-    """Return for each temperature whether it is measured: without it, limits that depend on it are not judged."""
-    observations = []
+def _without_temperature(plan: MonitoringPlan, report: ReportDocument) -> Iterator[Observation]:
+    """Yield for each temperature whether it is measured: without it, limits that depend on it are not judged."""
     for name, quantity in plan.parameters.items():
         if quantity.temperature:
             is_known = quantity.referred(1.0, 0.0, report.window.observed or {}) is not None
             text = plan.texts("no_temperature", signal=quantity.temperature, name=name)
             level, features = Level.OK if is_known else Level.NO_DATA, FindingFeatures(FindingKind.NO_TEMPERATURE)
-            observations.append(Observation(f"temperature/{name}", quantity.part, level, features, text))
-    return observations
+            yield Observation(f"temperature/{name}", quantity.part, level, features, text)
 
 
 def _manner(parameter: ParameterDocument, deviation: float, step: float) -> str:
@@ -261,16 +241,9 @@ def _of_component(
     Its key does not contain its input: at constant speed, a sine of time may later prove to be one of the angle.
     """
     key, amplitude = f"component/{component.site}/{component.family}", component.values["amplitude"]
-    order = component.values.get("order")
-    source = component.input.partition("(")[0]
-    features = FindingFeatures(
-        FindingKind.COMPONENT,
-        twin,
-        component.site,
-        family=component.family,
-        input=source,
-        order=order.value if order else None,
-    )
+    order, source = component.values.get("order"), component.input.partition("(")[0]
+    is_of = {"subject": component.site, "family": component.family, "input": source}
+    features = FindingFeatures(FindingKind.COMPONENT, twin, **is_of, order=order.value if order else None)
     quantity = plan.sites.get(component.site, MonitoredQuantity())
     size, limit, level = abs(amplitude.value), None, Level.OK
     is_expected = component.approval is Approval.APPROVED or component.status is ComponentStatus.FADING

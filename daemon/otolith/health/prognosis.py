@@ -5,7 +5,7 @@ Line and exponential begin at an unknown onset:
 
     value(t) = c + d·φ(t),   φ = s or (exp(x·s) - 1)/(exp(x) - 1),   s = (t - onset)/(now - onset), 0 before the onset
 
-Errors of consecutive estimates are correlated, because the filter carries information from window to window. They are
+Errors of consecutive estimates are correlated, because what the twin lacks lasts for several windows. They are
 an Ornstein-Uhlenbeck process of unknown time constant, whose variance is that of the estimates times an unknown factor.
 For given onset, ``x`` and time constant this is a linear regression with a conjugate prior (C. M. Bishop, Pattern
 Recognition and Machine Learning, section 3.5). These three are summed over a grid, which is refined where the evidence
@@ -36,14 +36,14 @@ HORIZON = 10.0  # spans of the history after now: no forecast beyond
 COVERAGE = 0.8  # probability of the interval of a forecast
 GROWTH = (-6.0, 8.0)  # lowest and highest exponent of an exponential between its onset and now
 GRID = 13, 15, 7  # points of onset, exponent and time constant
-REFINEMENTS = 3  # of the grid
-MIN_WEIGHT = 1e-3  # weight of a grid point, over that of the best one, that a refined grid encloses
+REFINEMENTS = 9  # of the grid, at most
+REFINED = 0.2  # of the points of a grid: how many must have weight so that it is not refined any more
+MIN_WEIGHT = 1e-3  # weight of a grid point, over that of the best one, from which on it counts
 FACTOR_SHAPE = 1.5  # of the inverse gamma prior of the factor on the variances, and its scale: its mode is 0.6
 UNKNOWN_CONSTANT = 100.0  # standard deviation of the constant, over that of the change
 BISECTIONS = 40  # of the time of a crossing: more than a number has digits
 
-History = tuple[tuple[float, float, float], ...]
-"""Time (Unix s), value and variance of a parameter; the times rise."""
+History = tuple[tuple[float, float, float], ...]  # Time (Unix s), value and variance of a parameter; the times rise
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +52,7 @@ class Crossing:
 
     median: float
     low: float
-    high: float
-    """Infinite beyond the horizon."""
+    high: float  # Infinite beyond the horizon
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,12 +61,9 @@ class _Cells:
 
     log_weight: Array
     onset: Array
-    exponent: Array
-    """0 for a line."""
-    mean: Array
-    """(cells, 2) constant and change until now."""
-    covariance: Array
-    """(cells, 2, 2)."""
+    exponent: Array  # 0 for a line
+    mean: Array  # (cells, 2) constant and change until now
+    covariance: Array  # (cells, 2, 2)
 
     @property
     def heavy(self) -> Array:
@@ -79,12 +75,9 @@ class _Cells:
 class Trend:
     """The posterior of the models of a history."""
 
-    family: str
-    """``linear`` or ``exponential``: the one with more evidence."""
-    now: float
-    """Time of the last point, Unix s."""
-    span: float
-    """See :func:`span`."""
+    family: str  # linear or exponential: the one with more evidence
+    now: float  # Time of the last point, Unix s
+    span: float  # See span
     cells: _Cells
 
     def crossing(self, limit: float, *, is_lower: bool) -> Crossing | None:
@@ -130,13 +123,17 @@ class Trend:
 def with_point(history: History, time: float, value: float, variance: float) -> History:
     """Return the history with another point and at most :data:`MAX_POINTS`, whose density falls with the root of age.
 
-    Points that are not before ``time`` are dropped: the clock was set back.
+    Two neighbours become their mean, weighted by their precisions. Points that are not before ``time`` are dropped: the
+    clock was set back.
     """
     kept = [*(point for point in history if point[0] < time), (time, value, variance)]
     if len(kept) > MAX_POINTS:
         times = np.array([point[0] for point in kept])
-        gaps = (times[2:] - times[:-2]) / np.sqrt(time - times[1:-1])
-        del kept[1 + int(np.argmin(gaps))]
+        first = int(np.argmin(np.diff(times)[:-1] / np.sqrt(time - times[:-2])))
+        pair = np.array(kept[first : first + 2])
+        precision = 1.0 / pair[:, 2]
+        middle, mean = (precision @ pair[:, :2] / precision.sum()).tolist()
+        kept[first : first + 2] = [(middle, mean, float(1.0 / precision.sum()))]
     return tuple(kept)
 
 
@@ -172,15 +169,12 @@ class _Data:
     """A history relative to its last value, with the errors of each possible time constant made white."""
 
     times: Array
-    origin: float
-    """Of the values."""
+    origin: float  # Of the values
     values: Array
     deviations: Array
     change: float
-    correlation: Array
-    """(time constants, points - 1) of consecutive errors."""
-    innovation: Array
-    """Share of the variance of an error that the one before does not predict."""
+    correlation: Array  # (time constants, points - 1) of consecutive errors
+    innovation: Array  # Share of the variance of an error that the one before does not predict
 
     @classmethod
     def of(cls, history: History, change: float) -> "_Data":
@@ -250,25 +244,32 @@ def _cells(data: _Data, onset: Array, exponent: Array, *, is_constant: bool = Fa
 
 
 def _refined(data: _Data, growth: tuple[float, float]) -> _Cells:
-    """Return the grid points of a family, on a grid around those with weight."""
+    """Return the grid points of a family, on a grid that is refined around the best of them.
+
+    Onsets and exponents that fit equally well lie on a narrow ridge: each grid is aligned with the best points before.
+    """
     points = len(data.times)
-    box = np.array([[0.0, points - MIN_POINTS_AFTER - 1.0], growth])
-    whole, share = box[:, 1] - box[:, 0], 1.0
-    numbers = GRID[0], GRID[1] if whole[1] > 0.0 else 1
-    for step in range(REFINEMENTS + 1):
-        axes = [np.linspace(low, high, number) for (low, high), number in zip(box, numbers, strict=True)]
-        index, exponent = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
-        onset = np.interp(index, np.arange(points), data.times)
-        cells = _cells(data, onset, exponent)
-        cells.log_weight[:] += math.log(share)
-        if step == REFINEMENTS:
+    low, whole = np.array([0.0, growth[0]]), np.array([points - MIN_POINTS_AFTER - 1.0, growth[1] - growth[0]])
+    numbers = GRID[:2] if whole[1] > 0.0 else (GRID[0], 1)
+    steps = np.indices(numbers).reshape(2, -1).T
+    axes, begin, spacing = np.eye(2), np.zeros(2), (whole > 0.0) / np.maximum(np.subtract(numbers, 1), 1)
+    for number in range(REFINEMENTS + 1):
+        place = (begin + spacing * steps) @ axes  # in shares of the whole
+        place = place[(np.abs(place - 0.5) <= 0.5 + 1e-9).all(1)]
+        index, exponent = (low + whole * place).T
+        cells = _cells(data, np.interp(index, np.arange(points), data.times), exponent)
+        cells.log_weight[:] += math.log(len(place) * np.prod((spacing * numbers)[whole > 0.0]) / len(steps))
+        best = cells.log_weight.reshape(-1, len(place)).max(0)
+        heavy = int((best > best.max() + math.log(MIN_WEIGHT)).sum())
+        if number == REFINEMENTS or heavy >= REFINED * len(steps):
             break
-        heavy = cells.heavy.reshape(-1, len(index)).any(0)
-        for axis, values in enumerate((index, exponent)):
-            spacing = (box[axis, 1] - box[axis, 0]) / max(numbers[axis] - 1, 1)
-            low, high = values[heavy].min() - spacing, values[heavy].max() + spacing
-            box[axis] = max(low, box[axis, 0]), min(high, box[axis, 1])
-        share = float(np.prod([(b - a) / w for (a, b), w in zip(box, whole, strict=True) if w > 0.0]))
+        kept = place[np.argsort(-best)[: max(heavy, math.ceil(0.5 * REFINED * len(steps)))]]
+        if whole[1] > 0.0:
+            before, axes = axes, np.linalg.eigh(np.cov(kept.T))[1].T
+            spacing = np.abs(axes @ before.T) @ spacing
+        along = kept @ axes.T
+        begin, end = along.min(0) - spacing, along.max(0) + spacing
+        spacing = (whole > 0.0) * (end - begin) / np.maximum(np.subtract(numbers, 1), 1)
     return cells
 
 
@@ -290,8 +291,8 @@ def forecast(quantity: MonitoredQuantity, history: History) -> ForecastDocument:
         crossing, key = trend.crossing(limit.value, is_lower=limit.is_lower), limit.level.lower()
         if crossing is not None and (key not in crossings or now + crossing.median < crossings[key].at):
             high = now + crossing.high if math.isfinite(crossing.high) else None
-            at, low = now + crossing.median, now + crossing.low
-            crossings[key] = CrossingDocument(limit=limit.value, at=at, low=low, high=high)
+            at = now + crossing.median
+            crossings[key] = CrossingDocument(limit=limit.value, at=at, low=now + crossing.low, high=high)
     reason = "" if crossings else "the trend leads to no further limit"
     return ForecastDocument(computed=now, family=trend.family, reason=reason, **crossings)
 
@@ -307,10 +308,8 @@ class Baseline:
 
     value: float
     sd: float
-    windows: int
-    """Number of estimates that it is the mean of."""
-    end: float
-    """Time of the last of them, Unix s."""
+    windows: int  # Number of estimates that it is the mean of
+    end: float  # Time of the last of them, Unix s
 
 
 def baselines(histories: Mapping[str, History]) -> dict[str, Baseline]:

@@ -22,10 +22,8 @@ from otolith_drivers.config_files import StrictModel
 class ComponentStatus(StrEnum):
     """Whether a component is still significant."""
 
-    ADOPTED = "adopted"
-    """Several windows agreed on it; it is in the twin and tracked."""
-    FADING = "fading"
-    """It is hardly significant any more."""
+    ADOPTED = "adopted"  # Several windows agreed on it; it is in the twin and tracked
+    FADING = "fading"  # It is hardly significant any more
 
 
 class NumberDocument(StrictModel):
@@ -33,8 +31,7 @@ class NumberDocument(StrictModel):
 
     value: float
     sd: float
-    low: float
-    """Lower end of the 95 % interval."""
+    low: float  # Lower end of the 95 % interval
     high: float
     unit: str
 
@@ -50,29 +47,21 @@ class AlternativeDocument(StrictModel):
 class ComponentDocument(StrictModel):
     """A component that was added to the twin."""
 
-    id: str
-    """Site, family and input: the same from adoption to the end."""
+    id: str  # Site, family and input: the same from adoption to the end
     site: str
-    meaning: str
-    """Meaning of the site."""
+    meaning: str  # Meaning of the site
     mode: Literal["additive", "multiplicative"]
     family: str
-    input: str
-    """The source: empty for none, ``t``, an angle, or a signal."""
+    input: str  # The source: empty for none, t, an angle, or a signal
     equation: str
     values: dict[str, NumberDocument]
-    conditions: str
-    """Working conditions under which machines show such a component (Table 1 of the paper)."""
-    domain: str
-    """Inputs for which the equation is valid, in words."""
+    conditions: str  # Working conditions under which machines show such a component (Table 1 of the paper)
+    domain: str  # Inputs for which the equation is valid, in words
     status: ComponentStatus
     approval: Approval
-    probability: float
-    """Probability of the component when it was adopted."""
-    onset: float
-    """Unix seconds."""
-    alternatives: tuple[AlternativeDocument, ...] = ()
-    """Hypotheses that the data did not distinguish from it."""
+    probability: float  # Probability of the component when it was adopted
+    onset: float  # Unix seconds
+    alternatives: tuple[AlternativeDocument, ...] = ()  # Hypotheses that the data did not distinguish from it
 
 
 class Severity(StrEnum):
@@ -87,15 +76,12 @@ class FindingDocument(StrictModel):
 
     id: str
     kind: FindingKind
-    subject: str = ""
-    """Signal, site or parameter that it is about."""
-    value: NumberDocument | None = None
-    """Of a parameter that has moved."""
+    subject: str = ""  # Signal, site or parameter that it is about
+    value: NumberDocument | None = None  # Of a parameter that has moved
     severity: Severity
     condition: str
     text: str
-    since: float
-    """Unix seconds."""
+    since: float  # Unix seconds
     advice: str = ""
 
 
@@ -110,44 +96,33 @@ class EventChange(StrEnum):
 class EvidenceDocument(StrictModel):
     """What an event rests on."""
 
-    windows: tuple[int, int]
-    """Index of the first and of the latest window that showed it."""
+    windows: tuple[int, int]  # Index of the first and of the latest window that showed it
     value: float | None = None
     sd: float | None = None
     unit: str = ""
-    limit: float | None = None
-    """The limit that was passed, in ``unit``."""
-    probability: float | None = None
-    """That the true value is beyond the limit."""
+    limit: float | None = None  # The limit that was passed, in unit
+    probability: float | None = None  # That the true value is beyond the limit
 
 
 class EventDocument(StrictModel):
     """A condition of a part that calls for attention, from the window that raised it to the one that cleared it."""
 
-    id: str
-    """What it is about, and when it began: the same in each of its reports."""
-    sequence: int | None = None
-    """Of a change: see :attr:`ReportDocument.sequence`."""
-    previous: int | None = None
-    """Of a change: the sequence number of the change of an event before it."""
+    id: str  # What it is about, and when it began: the same in each of its reports
+    sequence: int | None = None  # Of a change: see ReportDocument.sequence
+    previous: int | None = None  # Of a change: the sequence number of the change of an event before it
     part: str
     state: Level
-    change: EventChange | None = None
-    """None if this window changed nothing."""
-    start: float
-    """Unix seconds, as are ``since`` and ``end``."""
-    since: float
-    """Begin of the present state."""
+    change: EventChange | None = None  # None if this window changed nothing
+    start: float  # Unix seconds, as are since and end
+    since: float  # Begin of the present state
     end: float | None = None
     condition: str
-    condition_id: str = ""
-    """Ids of the rules that the condition is from, with spaces between; the same in all languages."""
+    condition_id: str = ""  # Ids of the rules that it is from, with spaces between; the same in all languages
     text: str
     cause: str = ""
     advice: str = ""
     source: str = ""
-    language: Language = "en"
-    """Of condition, text, cause and advice."""
+    language: Language = "en"  # Of condition, text, cause and advice
     evidence: EvidenceDocument
 
     @property
@@ -160,19 +135,16 @@ class PartDocument(StrictModel):
     """State of a part or of the machine."""
 
     state: Level
-    since: float
-    """Unix seconds."""
+    since: float  # Unix seconds
     reason: str = ""
-    undetermined: tuple[str, ...] = ()
-    """The parameters because of which it is at NO DATA, although there are data."""
+    undetermined: tuple[str, ...] = ()  # The parameters because of which it is at NO DATA, although there are data
 
 
 class HealthDocument(PartDocument):
     """State of the machine and of its parts."""
 
     parts: dict[str, PartDocument]
-    language: Language = "en"
-    """Of the reasons."""
+    language: Language = "en"  # Of the reasons
 
 
 SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"
@@ -181,14 +153,11 @@ SCHEMA: Literal["otolith.report/1"] = "otolith.report/1"
 class Status(StrEnum):
     """How far a published parameter may be trusted."""
 
-    UNESTIMATED = "unestimated"
-    """No window has determined it yet; there is no value."""
-    ESTIMATED = "estimated"
-    """From this window and those before it."""
+    UNESTIMATED = "unestimated"  # No window has determined it yet; there is no value
+    ESTIMATED = "estimated"  # From this window and those before it
     AMBIGUOUS = "ambiguous"
     """The hypotheses that explain the windows differ in it by more than is required; the interval holds all of them."""
-    HELD = "held"
-    """From earlier windows; this one adds nothing; why is in the reason."""
+    HELD = "held"  # From earlier windows; this one adds nothing; why is in the reason
     INVALID = "invalid"
     """The windows contradict the twin or the bounds, how is in the reason; the value is the last that did not."""
 
@@ -212,36 +181,27 @@ class WindowDocument(StrictModel):
     end: float
     records: int
     quality: QualityDocument
-    observed: dict[str, float] | None = None
-    """Mean of each observed signal, as a temperature in K."""
-    absent: dict[str, str] | None = None
-    """Of several sources, those that are down or gave no sample: in words, by name."""
+    observed: dict[str, float] | None = None  # Mean of each observed signal, as a temperature in K
+    absent: dict[str, str] | None = None  # Of several sources, those that are down or gave no sample: in words, by name
 
 
 class CrossingDocument(StrictModel):
     """When a parameter will pass a limit, Unix seconds."""
 
-    limit: float
-    """In the unit of the parameter."""
-    at: float
-    """Median."""
-    low: float
-    """Lower end of the 80 % interval."""
-    high: float | None = None
-    """None if it lies beyond ten times the length of the history."""
+    limit: float  # In the unit of the parameter
+    at: float  # Median
+    low: float  # Lower end of the 80 % interval
+    high: float | None = None  # None if it lies beyond ten times the length of the history
 
 
 class ForecastDocument(StrictModel):
     """Whether and when a parameter will pass its limits, from its history."""
 
-    computed: float
-    """Unix seconds."""
-    family: Literal["", "linear", "exponential"] = ""
-    """Of the trend; empty without one."""
+    computed: float  # Unix seconds
+    family: Literal["", "linear", "exponential"] = ""  # Of the trend; empty without one
     watch: CrossingDocument | None = None
     act: CrossingDocument | None = None
-    reason: str = ""
-    """Why there is no forecast."""
+    reason: str = ""  # Why there is no forecast
 
 
 class ParameterDocument(StrictModel):
@@ -250,31 +210,22 @@ class ParameterDocument(StrictModel):
     value: float | None = None
     unit: str
     sd: float | None = None
-    low: float | None = None
-    """Lower end of the 95 % interval."""
+    low: float | None = None  # Lower end of the 95 % interval
     high: float | None = None
     nominal: float
-    baseline: float | None = None
-    """Value of the healthy machine, to which limits in percent refer; None if they refer to ``nominal``."""
-    limit: float | None = None
-    """Of the most severe limits, the one that is nearest to the healthy value; None without limits."""
-    referred: float | None = None
-    """Value at the reference temperature, by which the limits are judged; None if no temperature is measured."""
-    raw: float | None = None
-    """Estimate of this window alone."""
+    baseline: float | None = None  # Healthy value, to which limits in percent refer; None if they refer to nominal
+    limit: float | None = None  # The nearest to the healthy value of the most severe limits; None without limits
+    referred: float | None = None  # At the reference temperature, for the limits; None without a temperature
+    raw: float | None = None  # Estimate of this window alone
     raw_sd: float | None = None
-    trend_per_hour: float | None = None
-    """Present trend, in the unit of the parameter per hour."""
+    trend_per_hour: float | None = None  # Present trend, in the unit of the parameter per hour
     trend_sd_per_hour: float | None = None
     status: Status
-    progress: float = 0.0
-    """How far the interval has come from the bounds to what is required, 0 to 1."""
+    progress: float = 0.0  # How far the interval has come from the bounds to what is required, 0 to 1
     identifiability: Identifiability | None = None
     reason: str = ""
-    forecast: ForecastDocument | None = None
-    """None without limits."""
-    advice: str | None = None
-    """The experiment that would determine the parameter, if this window did not."""
+    forecast: ForecastDocument | None = None  # None without limits
+    advice: str | None = None  # The experiment that would determine the parameter, if this window did not
 
 
 class FitDocument(StrictModel):
@@ -282,29 +233,21 @@ class FitDocument(StrictModel):
 
     rmse_configured: dict[str, float]
     rmse_estimated: dict[str, float]
-    rmse_completed: dict[str, float] | None = None
-    """With the components in the twin."""
-    explained: bool
-    """Whether the estimated twin leaves nothing but noise."""
-    cost: float
-    """RMSE of all outputs in units of their noise."""
-    variance_ratio: float
-    """Variance between windows over the variance that they state; one if they agree."""
-    outcome: Outcome
-    """How the search ended."""
+    rmse_completed: dict[str, float] | None = None  # With the components in the twin
+    explained: bool  # Whether the estimated twin leaves nothing but noise
+    cost: float  # RMSE of all outputs in units of their noise
+    variance_ratio: float  # Variance between windows over the variance that they state; one if they agree
+    outcome: Outcome  # How the search ended
 
 
 class CostDocument(StrictModel):
     """Computing effort of a report."""
 
-    seconds: float | None = None
-    """Computing time in seconds; None in a replay, whose reports are the same in each run, unless it was asked for."""
-    latency_s: float | None = None
-    """From the end of the window to the publication of this report; None in a replay."""
+    seconds: float | None = None  # Computing time, s; None in a replay, unless it was asked for
+    latency_s: float | None = None  # From the end of the window to the publication of this report; None in a replay
     evaluations: int = 0
     generations: int = 0
-    searched: bool = False
-    """Whether hypotheses were compared: components, moved parameters, faulty sensors."""
+    searched: bool = False  # Whether hypotheses were compared: components, moved parameters, faulty sensors
 
 
 class SourceDocument(StrictModel):
@@ -312,16 +255,11 @@ class SourceDocument(StrictModel):
 
     signals: tuple[str, ...]
     up: bool
-    reason: str = ""
-    """Why it is down."""
-    warnings: tuple[str, ...] = ()
-    """What is wrong although it is up, a line each."""
-    received: int = 0
-    """Samples."""
-    bad: int = 0
-    """Received frames, replies or values that could not be used."""
-    lost: int = 0
-    """Samples that were sent or requested and did not arrive."""
+    reason: str = ""  # Why it is down
+    warnings: tuple[str, ...] = ()  # What is wrong although it is up, a line each
+    received: int = 0  # Samples
+    bad: int = 0  # Received frames, replies or values that could not be used
+    lost: int = 0  # Samples that were sent or requested and did not arrive
     reconnects: int = 0
 
 
@@ -329,78 +267,53 @@ class DriverDocument(StrictModel):
     """State of the connection to the machine."""
 
     up: bool
-    reason: str = ""
-    """Why the connection is down."""
-    warnings: tuple[str, ...] = ()
-    """What is wrong although the connection is up, a line each."""
-    plan: str = ""
-    """Polling plan and achieved rate of a polling driver."""
-    sources: dict[str, SourceDocument] = Field(default_factory=dict)
-    """By name, of a machine with several; the connection is up while any of them is."""
+    reason: str = ""  # Why the connection is down
+    warnings: tuple[str, ...] = ()  # What is wrong although the connection is up, a line each
+    plan: str = ""  # Polling plan and achieved rate of a polling driver
+    sources: dict[str, SourceDocument] = Field(default_factory=dict)  # By name; the connection is up while any is
 
 
 class CountersDocument(StrictModel):
     """What was received and lost since the daemon started."""
 
-    received: int = 0
-    """Samples."""
-    bad: int = 0
-    """Received frames, replies or values that could not be used."""
-    lost: int = 0
-    """Samples that were sent or requested and did not arrive, or that overflowed a buffer."""
+    received: int = 0  # Samples
+    bad: int = 0  # Received frames, replies or values that could not be used
+    lost: int = 0  # Samples that were sent or requested and did not arrive, or that overflowed a buffer
     reconnects: int = 0
-    windows: int = 0
-    """Windows formed."""
-    windows_bad: int = 0
-    """Windows not estimated from because of their quality."""
-    windows_missed: int = 0
-    """Windows not estimated from because the worker was down or busy."""
+    windows: int = 0  # Windows formed
+    windows_bad: int = 0  # Windows not estimated from because of their quality
+    windows_missed: int = 0  # Windows not estimated from because the worker was down or busy
     worker_restarts: int = 0
-    recordings_dropped: int = 0
-    """Windows that the recorder did not accept in time, or lost when it ended."""
+    recordings_dropped: int = 0  # Windows that the recorder did not accept in time, or lost when it ended
     recorder_restarts: int = 0
-    history_dropped: int = 0
-    """Windows that the history did not take: its disk was full or too slow."""
-    evidence_dropped: int = 0
-    """Changes of events of which no evidence could be kept."""
-    commands_failed: int = 0
-    """Events for which ``on_event`` failed."""
+    history_dropped: int = 0  # Windows that the history did not take: its disk was full or too slow
+    evidence_dropped: int = 0  # Changes of events of which no evidence could be kept
+    commands_failed: int = 0  # Events for which on_event failed
 
 
 class ReportDocument(StrictModel):
     """The report of one window."""
 
     schema_: Literal["otolith.report/1"] = SCHEMA
-    sequence: int | None = None
-    """Rises from message to message of a machine, also after a restart; None in a replay."""
-    previous: int | None = None
-    """Sequence number of the report before it; None for the first one."""
+    sequence: int | None = None  # Rises from message to message of a machine, also after a restart; None in a replay
+    previous: int | None = None  # Sequence number of the report before it; None for the first one
     machine: str
     site: str
     twin: str
-    model: str = "DT"
-    """The paper's name: ``DT`` as configured, ``DT'`` with estimated parameters, ``DT''`` with components."""
+    model: str = "DT"  # The paper's name: DT as configured, DT' with estimated parameters, DT'' with components
     window: WindowDocument
-    decision: WindowDecision
-    """What the window led to."""
+    decision: WindowDecision  # What the window led to
     parameters: dict[str, ParameterDocument]
-    components: tuple[ComponentDocument, ...] = ()
-    """Components in the twin."""
-    explanations: tuple[AlternativeDocument, ...] = ()
-    """Competing hypotheses while they are undecided; the most probable first."""
+    components: tuple[ComponentDocument, ...] = ()  # Components in the twin
+    explanations: tuple[AlternativeDocument, ...] = ()  # Hypotheses while they are undecided; most probable first
     findings: tuple[FindingDocument, ...] = ()
-    health: HealthDocument | None = None
-    """State of the machine and of its parts."""
-    events: tuple[EventDocument, ...] = ()
-    """Events that are not cleared, and those that this window cleared; the most severe first."""
-    fit: FitDocument | None = None
-    """None for a window that was not estimated from."""
+    health: HealthDocument | None = None  # State of the machine and of its parts
+    events: tuple[EventDocument, ...] = ()  # Those open, and those that this window cleared; most severe first
+    fit: FitDocument | None = None  # None for a window that was not estimated from
     cost: CostDocument = CostDocument()
     counters: CountersDocument | None = None
-    driver: DriverDocument | None = None
-    """None in a replay."""
-    notes: tuple[str, ...] = ()
-    """About the daemon since its start: which saved state it could not use, and why."""
+    driver: DriverDocument | None = None  # None in a replay
+    notes: tuple[str, ...] = ()  # About the daemon since its start: which saved state it could not use, and why
 
     def to_json(self) -> str:
         """Return the published JSON: ``schema`` first, absent keys where there is no content."""
@@ -408,11 +321,7 @@ class ReportDocument(StrictModel):
 
     @classmethod
     def from_json(cls, text: str) -> "ReportDocument":
-        """Return the report of a JSON text, the inverse of :meth:`to_json`.
-
-        Raises:
-            pydantic.ValidationError: not a report of this schema.
-        """
+        """Return the report of a JSON text, as :meth:`to_json` wrote it; raise ValidationError if it is none."""
         return cls.model_validate_json(text.replace('"schema"', '"schema_"', 1))
 
 
@@ -420,17 +329,13 @@ class ReportDocument(StrictModel):
 class Traces:
     """The curves of a window in the units of the twin; not-a-number where nothing was measured."""
 
-    offsets: Array
-    """(records,) time since the first record, s."""
+    offsets: Array  # (records,) time since the first record, s
     outputs: tuple[str, ...]
-    measured: Array
-    """(records, outputs)."""
-    predicted: Array | None
-    """(records, outputs); None for a window that was not estimated from."""
+    measured: Array  # (records, outputs)
+    predicted: Array | None  # (records, outputs); None for a window that was not estimated from
     noise: tuple[float, ...]
     inputs: tuple[str, ...]
-    driving: Array
-    """(records, inputs), as measured."""
+    driving: Array  # (records, inputs), as measured
 
 
 @dataclass(frozen=True, slots=True)

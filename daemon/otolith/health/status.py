@@ -29,19 +29,16 @@ class MarginalPosterior:
 
     value: float
     sd: float
-    trend: float
-    """Per second."""
+    trend: float  # Per second
     trend_sd: float
-    variance_left: float = 1.0
-    """Share of the variance before the window that is left after it."""
+    variance_left: float = 1.0  # Share of the variance before the window that is left after it
 
 
 @dataclass(frozen=True, slots=True)
 class PreviousStatus:
     """The status of a parameter in the report before."""
 
-    known: bool = False
-    """Whether it has been determined."""
+    known: bool = False  # Whether it has been determined
     status: Status = Status.UNESTIMATED
 
 
@@ -54,19 +51,13 @@ def some_parameter_is_determined(previous: Mapping[str, PreviousStatus]) -> bool
 class WindowEvidence:
     """What one window adds about a parameter."""
 
-    estimate: ParameterEstimate | None = None
-    """None for a window that was not estimated from."""
+    estimate: ParameterEstimate | None = None  # None for a window that was not estimated from
     decision: WindowDecision = WindowDecision.BAD
-    contradictions: int = 0
-    """Consecutive windows, this one included, that did not update the posterior; bad data are not counted."""
-    variance_ratio: float = 1.0
-    """Variance between windows over the variance that they state."""
-    is_mixture: bool = False
-    """Whether what is known is the mixture of several hypotheses, each updated with the window."""
-    is_explained: bool = True
-    """Whether the best of these explains the window up to the noise."""
-    reason: str = ""
-    """About the window as a whole."""
+    contradictions: int = 0  # Windows in a row, with this one, that did not update the posterior; no bad data
+    variance_ratio: float = 1.0  # Variance between windows over the variance that they state
+    is_mixture: bool = False  # Whether what is known is the mixture of several hypotheses
+    is_explained: bool = True  # Whether the best of these explains the window up to the noise
+    reason: str = ""  # About the window as a whole
 
     @property
     def at_bound(self) -> bool:

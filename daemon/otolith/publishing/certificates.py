@@ -24,8 +24,7 @@ AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 825  # validity of what 'otolith keys' 
 EXPIRY_WARNING = timedelta(days=30)  # rest of the validity from which the log warns
 CLOCK_TOLERANCE = timedelta(hours=1)  # by which a new certificate is valid before it was made
 
-Key = tuple[str, ...]
-"""Key of the machine file, or option, that names a file."""
+Key = tuple[str, ...]  # Key of the machine file, or option, that names a file
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +37,7 @@ class Identity:
 
 
 def secret(path: Path, key: Key) -> bytes:
-    """Return the content of a file that no other user may read.
-
-    Raises:
-        ConfigurationError: it is missing, unreadable or open to every user of the computer.
-    """
+    """Return the content of a file; raise ConfigurationError if it is unreadable, or open to every user."""
     data = content(path, MAX_PEM_BYTES, key)
     if path.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
         raise ConfigurationError(f"{path}: open to every user of this computer; 'chmod o-rwx {path}' closes it", key)

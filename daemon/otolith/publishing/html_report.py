@@ -46,8 +46,7 @@ UNBROKEN = Markup('<span class="whole">{}</span>')
 MAX_WHOLE = 26  # characters: a line of a phone in the type of a value; engineering choice
 TRUSTED = frozenset({Status.ESTIMATED, "adopted"})  # the others are drawn pale
 
-Span = tuple[float, float]
-"""Begin and end of a time."""
+Span = tuple[float, float]  # Begin and end of a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +54,7 @@ class Axis:
     """The time from left to right."""
 
     begin: float
-    now: float
-    """End of what is known; forecasts are beyond it."""
+    now: float  # End of what is known; forecasts are beyond it
     end: float
 
     def x(self, seconds: float) -> float:
@@ -87,8 +85,7 @@ class Mark:
     style: str
     value: float
     line: float
-    area: Span = (0.0, 0.0)
-    """Begin and height."""
+    area: Span = (0.0, 0.0)  # Begin and height
     label: float = 0.0
 
 
@@ -98,13 +95,10 @@ class Curve:
 
     name: str
     parameter: ParameterDocument | None
-    component: ComponentDocument | None
-    """None of a component that has left the twin."""
-    limits: tuple[tuple[Level, float, bool], ...]
-    """Level, value, and whether values below it are beyond it."""
+    component: ComponentDocument | None  # None of a component that has left the twin
+    limits: tuple[tuple[Level, float, bool], ...]  # Level, value, and whether values below it are beyond it
     last: HistorySample | None
-    away: Mapping[str, float]
-    """Percent of the windows with another status than estimated."""
+    away: Mapping[str, float]  # Percent of the windows with another status than estimated
     plot: Mapping[str, Sequence[Any]] | None = None
     """``band``: polygons of the 95 % interval; ``lines``: whether the value was estimated then, and points; ``marks``;
     ``forecast``: the polygon of its 80 % intervals and the points of its medians; all as SVG takes them."""

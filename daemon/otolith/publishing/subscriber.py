@@ -6,7 +6,6 @@ import queue
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from types import TracebackType
 from typing import Self
 
 import zenoh
@@ -43,8 +42,7 @@ class MessageOrder:
         self._query, self._on_message, self._pause, self._after = query, on_message, pause, after
         self._topics = topics
         self._last: dict[str, int] = {}
-        self.missed = 0
-        """Gaps that no query could fill."""
+        self.missed = 0  # Gaps that no query could fill
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -154,9 +152,7 @@ class Subscriber:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stopping.set()
         self._close_sessions()  # ends their queries
         for thread in self._threads:  # one that comes back from Zenoh while the interpreter ends would abort it

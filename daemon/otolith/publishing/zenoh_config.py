@@ -25,8 +25,7 @@ MAX_DESCRIPTORS = 16_384  # open files and connections of a daemon that listens 
 MAX_MESSAGE_BYTES = 1 << 20  # of a message from a reader or a router: a query
 MAX_SOCKET_PATH = 107  # bytes, of a unix socket under Linux
 
-Settings = dict[str, object]
-"""Keys of Zenoh's configuration and their values."""
+Settings = dict[str, object]  # Keys of Zenoh's configuration and their values
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +35,14 @@ class Credentials:
     ca: Path | None = None
     certificate: Path | None = None
     key: Path | None = None
-    login: Path | None = None
-    """A file with one line ``name:password``."""
+    login: Path | None = None  # A file with one line name:password
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
     """How a reader reaches daemons."""
 
-    endpoints: tuple[str, ...] = ()
-    """Where they publish; empty for the sockets on this computer."""
+    endpoints: tuple[str, ...] = ()  # Where they publish; empty for the sockets on this computer
     credentials: Credentials = field(default_factory=Credentials)
 
 
@@ -57,11 +54,7 @@ class Access:
     path: Path = Path()
 
     def settings(self, prefix: str, listen: Iterable[str]) -> tuple[Settings, str]:
-        """Return the settings of a daemon that publishes below ``prefix``, and a warning that may be empty.
-
-        Raises:
-            ConfigurationError: a file cannot be used; the message has file, key and cause.
-        """
+        """Return settings to publish below ``prefix``, and a warning or ""; raise ConfigurationError for a bad file."""
         listen = tuple(listen)
         try:
             encryption, warning = self._encryption(listen)
@@ -164,11 +157,7 @@ def _login(line: str, place: str, key: tuple[str, ...] = ()) -> tuple[str, str]:
 
 
 def reader_settings(credentials: Credentials, connect: Iterable[str]) -> Settings:
-    """Return the settings of a session that only reads.
-
-    Raises:
-        ConfigurationError: a file is missing or cannot be used.
-    """
+    """Return the settings of a reader's session; raise ConfigurationError if a file cannot be used."""
     settings: Settings = {}
     if credentials.login is not None:
         from otolith.publishing.certificates import secret  # noqa: PLC0415 - slow to import
@@ -178,9 +167,8 @@ def reader_settings(credentials: Credentials, connect: Iterable[str]) -> Setting
         settings["transport/auth/usrpwd"] = {"user": name, "password": password}
     encrypted = [endpoint for endpoint in connect if endpoint.startswith(ENCRYPTED)]
     if credentials.ca is None and (encrypted or credentials.certificate or credentials.key):
-        raise ConfigurationError(
-            f"{' '.join(encrypted) or 'a certificate'}: needs --ca, the certificate of the site's CA"
-        )
+        text = f"{' '.join(encrypted) or 'a certificate'}: needs --ca, the certificate of the site's CA"
+        raise ConfigurationError(text)
     if (credentials.certificate is None) != (credentials.key is None):
         raise ConfigurationError("--certificate and --key belong together: give both")
     if credentials.ca is None:

@@ -51,17 +51,12 @@ class Selection:
     """What a query asks for."""
 
     after: int = 0
-    start: float | None = None
-    """Unix s, as ``end``; None for no bound."""
+    start: float | None = None  # Unix s, as end; None for no bound
     end: float | None = None
 
 
 def selection(parameters: zenoh.Parameters, now: float) -> Selection | None:
-    """Return what the parameters of a query select; None if they select nothing.
-
-    Raises:
-        ValueError: they are malformed.
-    """
+    """Return what the parameters of a query select, None for nothing; raise ValueError if they are malformed."""
     span, after = parameters.get("_time"), parameters.get("after")
     if span is None and after is None:
         return None
@@ -118,22 +113,17 @@ def answer(query: zenoh.Query, key: str, kind: str, latest: str | None, archive:
 class Topic:
     """A kind of Zenoh key."""
 
-    key: str
-    """Below :func:`prefix`; ``*`` stands for a name."""
+    key: str  # Below prefix; * stands for a name
 
     def under(self, site: str, machine: str, name: str = "") -> str:
         """Return the whole key."""
         return f"{prefix(site, machine)}/{self.key.replace('*', name)}"
 
 
-REPORT = Topic("report")
-"""JSON document ``otolith.report/1``, once per window; a query returns the latest one, or those that it selects."""
-PARAMETER = Topic("parameter/*")
-"""JSON object, once per window: the part of the report about one parameter."""
-EVENT = Topic("event")
-"""JSON object, once when a window raises, changes or clears an event; a query returns those that it selects."""
-ALIVE = Topic("alive")
-"""Liveliness token, while the daemon runs."""
+REPORT = Topic("report")  # JSON otolith.report/1, once per window; a query returns the latest, or what it selects
+PARAMETER = Topic("parameter/*")  # JSON object, once per window: the part of the report about one parameter
+EVENT = Topic("event")  # JSON, once when a window raises, changes or clears it; a query returns what it selects
+ALIVE = Topic("alive")  # Liveliness token, while the daemon runs
 
 TOPICS = (REPORT, PARAMETER, EVENT, ALIVE)
 

@@ -15,8 +15,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from otolith.acquisition.playback import RecordingStatistics, SignalSampling
 from otolith.acquisition.quality import ReasonCounts
-from otolith.acquisition.recording_statistics import RecordingStatistics, SignalSampling
 from otolith.acquisition.samples import Check, SignalPlan
 from otolith.acquisition.window import Array, Verdict, Window
 from otolith.adaptation.state import initial_state
@@ -73,8 +73,7 @@ class SignalPreview(SignalSampling):
     """How one signal was sampled."""
 
     unit: str
-    step: float
-    """Quantisation step in the unit of the signal; 0 if the values show none."""
+    step: float  # Quantisation step in the unit of the signal; 0 if the values show none
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +82,10 @@ class ExpectedAccuracy:
 
     unit: str
     nominal: float
-    required: float
-    """Largest half-width of the 95 % interval of a determined parameter."""
-    half_width: float | None
-    """Expected half-width from one window, median over the windows; None if they do not determine the parameter."""
-    determined: int
-    """Windows that are expected to determine it."""
-    reason: str
-    """Why the other windows do not."""
+    required: float  # Largest half-width of the 95 % interval of a determined parameter
+    half_width: float | None  # Expected from one window, median over the windows; None if not determined
+    determined: int  # Windows that are expected to determine it
+    reason: str  # Why the other windows do not
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +95,10 @@ class WindowPreview:
     length_s: float
     sample_period_s: float
     count: int
-    usable: int
-    """Of good quality."""
-    moving: int
-    """Usable windows in which an output moves by more than its noise."""
+    usable: int  # Of good quality
+    moving: int  # Usable windows in which an output moves by more than its noise
     analysed: int
-    refusals: tuple[str, ...]
-    """Why windows were refused, one sentence per cause with its count."""
+    refusals: tuple[str, ...]  # Why windows were refused, one sentence per cause with its count
     parameters: dict[str, ExpectedAccuracy]
 
     @property
@@ -121,23 +113,16 @@ class Preview:
 
     data: str
     rows: int
-    start: float | None
-    """Time of the earliest row, s."""
+    start: float | None  # Time of the earliest row, s
     end: float | None
     steps_back: int
-    sources: tuple[str, ...]
-    """Where each signal comes from, a line per signal."""
+    sources: tuple[str, ...]  # Where each signal comes from, a line per signal
     signals: dict[str, SignalPreview]
-    windows: WindowPreview
-    """As the machine file configures them."""
-    proposed: WindowPreview
-    """With the proposed length and sample period; the same if those of the file fit."""
-    is_partial: bool
-    """Whether only the first rows were read, and neither another window nor the computing time was examined."""
-    computing_s: float | None
-    """Computing time of a window of ``proposed``, s, median of some windows; None if it was not measured."""
-    longest_computing_s: float | None
-    """The longest of these times, s."""
+    windows: WindowPreview  # As the machine file configures them
+    proposed: WindowPreview  # With the proposed length and sample period; the same if those of the file fit
+    is_partial: bool  # Whether only first rows were read, and neither another window nor computing time examined
+    computing_s: float | None  # Of a window of proposed, s, median of some windows; None if not measured
+    longest_computing_s: float | None  # The longest of these times, s
     remarks: tuple[str, ...]
 
     @property
@@ -199,13 +184,11 @@ class _Survey:
 
     machine: LoadedMachine
     sources: tuple[str, ...]
-    warnings: tuple[str, ...]
-    """Of the reader."""
+    warnings: tuple[str, ...]  # Of the reader
     plans: tuple[SignalPlan, ...]
     statistics: RecordingStatistics
     windows: WindowPreview
-    chosen: list[Window]
-    """The windows that were analysed."""
+    chosen: list[Window]  # The windows that were analysed
 
 
 def _proposal(machine: LoadedMachine, survey: _Survey, again: Callable[[LoadedMachine], _Survey]) -> _Survey:

@@ -35,8 +35,7 @@ class RecorderSupervisor:
         self._progress_at = 0.0
         self._problem = ""
         self._first: tuple[object, ...] | None = None  # arguments of the process, until it is spawned
-        self.dropped = 0
-        """Windows that were not recorded."""
+        self.dropped = 0  # Windows that were not recorded
 
     @property
     def is_enabled(self) -> bool:
@@ -49,13 +48,19 @@ class RecorderSupervisor:
         return max(0, self._process.starts - self._planned_starts)
 
     def start(self, now: float) -> None:
-        """Start the recorder with a new file, if the disk has room.
+        """Start the recorder with a new file, if the disk has room; raise ServiceError for a file the caller named.
 
         The first process is spawned for the first window: it would take time from the worker, which starts as well.
-
-        Raises:
-            ServiceError: the folder cannot be created or is not writable.
+        A folder that refuses is logged and tried again: monitoring goes on without recordings.
         """
+        try:
+            self._start(now)
+        except (OtolithError, OSError) as error:
+            if self._path is not None and not self._process.starts:
+                raise
+            self._pause(f"no recording: {error}")
+
+    def _start(self, now: float) -> None:
         path, folder = self._path, None
         if path is None or self._process.starts:  # a restarted recorder must not overwrite its first file
             folder = self._folder()
@@ -81,7 +86,7 @@ class RecorderSupervisor:
         self._machine, self._first = machine, None
         if self.is_enabled:
             self._planned_starts += self._process.starts >= self._planned_starts
-            self._try_to_start(now)
+            self.start(now)
 
     def _folder(self) -> RecordingFolder:
         identity, table = self._machine.file.machine, self._machine.file.recording
@@ -123,13 +128,7 @@ class RecorderSupervisor:
         self.dropped += self._unanswered + self._unwritten
         self._unanswered = self._unwritten = 0
         if self._process.may_restart(now):
-            self._try_to_start(now)
-
-    def _try_to_start(self, now: float) -> None:
-        try:
             self.start(now)
-        except OtolithError as error:  # monitoring continues without recording
-            self._pause(f"no recording: {error}")
 
     def stop(self, seconds: float) -> None:
         """Let the recorder write what it has for up to ``seconds``."""

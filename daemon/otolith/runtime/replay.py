@@ -14,13 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from otolith.acquisition.playback import MAX_SILENT_WINDOWS, Playback, median_step
-from otolith.acquisition.recording_statistics import RecordingStatistics
+from otolith.acquisition.playback import MAX_SILENT_WINDOWS, Playback, RecordingStatistics, median_step
 from otolith.acquisition.window import Verdict, Window
 from otolith.adaptation.state import initial_state
 from otolith.health.schema import CountersDocument, Report
 from otolith.machine import LoadedMachine, RecordedMachine
-from otolith.machine_drivers import DriverConfig, driver_configs, signal_units
+from otolith.machine_file import DriverConfig, driver_configs, signal_units
 from otolith.runtime.worker import perform
 from otolith.storage.recording_files import MIN_FREE_BYTES, shortage_of
 from otolith_drivers.base import Setup, Signal
@@ -73,11 +72,7 @@ def _files_of_sources(names: Sequence[str], data: Path) -> dict[str, Path]:
 
 
 def _open_sources(machine: LoadedMachine, data: Path, files: Mapping[str, Path]) -> Reader:
-    """Open a file for each source of ``machine`` as one recording.
-
-    Raises:
-        ConfigurationError: a source has no file, or one of the files cannot be opened.
-    """
+    """Open a file for each source as one recording; raise ConfigurationError if one is missing or unusable."""
     configs = {item.name: item for item in driver_configs(machine.file, machine.twin, read(machine.path))}
     for name in configs:
         if name not in files:
@@ -103,11 +98,7 @@ def _open_as(machine: LoadedMachine, data: Path, config: DriverConfig) -> Reader
 
 
 def open_recordings(machine: LoadedMachine, files: Sequence[Path]) -> Reader:
-    """Open one file, or several of which each is a recording of its own; see :func:`open_recorded`.
-
-    Raises:
-        ConfigurationError: as :func:`open_recorded`.
-    """
+    """Open one file, or several recordings; see, and raises as, :func:`open_recorded`."""
     if len(files) == 1:
         return open_recorded(machine, files[0])
     return JoinedReader(files, lambda path: open_recorded(machine, path))
@@ -167,10 +158,8 @@ class Replay:
         identity, window = machine.file.machine, machine.file.window
         self.state = initial_state(identity.name, identity.site, machine.problem, machine.plan)
         """State after the last window."""
-        self.statistics = RecordingStatistics(machine.twin.signals)
-        """Of the rows that were read so far."""
-        self.progress = 0.0
-        """Share of the data in the windows so far, 0 to 1."""
+        self.statistics = RecordingStatistics(machine.twin.signals)  # Of the rows that were read so far
+        self.progress = 0.0  # Share of the data in the windows so far, 0 to 1
         self._data = data
         self._stopped = stopped
         self._wait = wait
@@ -200,11 +189,7 @@ class Replay:
             raise ConfigurationError(f"{self._data.path}: {self._why_no_window()}")
 
     def windows(self) -> Iterator[Window]:
-        """Yield the windows of the file as the daemon would cut them.
-
-        Raises:
-            ConfigurationError: as :meth:`reports`.
-        """
+        """Yield the windows of the file as the daemon would cut them; raises as :meth:`reports`."""
         before, begun, rows = 0.0, 0.0, None  # the shares of the file above the next and the present chunk
         checked: Path | None = None
         for rows in self._data.chunks():

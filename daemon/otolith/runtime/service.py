@@ -25,7 +25,7 @@ from otolith.acquisition.quality import time_text
 from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
-from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_sample_grid
+from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_problem, with_sample_grid
 from otolith.health.limits import MonitoringPlan
 from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
@@ -33,14 +33,14 @@ from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
-from otolith.runtime.event_command import EventCommand
-from otolith.runtime.process import SIGNALS
+from otolith.runtime.process import SIGNALS, EventCommand
 from otolith.runtime.recorder_supervisor import RecorderSupervisor
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
 from otolith.storage.history_writer import Numbers, history_of
 from otolith.storage.state_store import StateWriter, store_of
+from otolith_drivers.base import Sampling
 from otolith_drivers.errors import OtolithError
 
 log = logging.getLogger(__name__)
@@ -63,12 +63,10 @@ Key = tuple[str, ...]
 class Reload:
     """What a changed machine file changes in a running daemon: limits and recording. The rest needs a restart."""
 
-    machine: LoadedMachine
-    """The machine to go on with."""
+    machine: LoadedMachine  # The machine to go on with
     limits: bool
     recording: bool
-    needs_restart: tuple[str, ...]
-    """Keys of the file that were changed and that a running daemon does not take over."""
+    needs_restart: tuple[str, ...]  # Keys of the file that were changed and that a running daemon does not take over
 
     @property
     def text(self) -> str:
@@ -244,6 +242,9 @@ class Service:
     def _restored(self, state: AdaptationState) -> AdaptationState:
         """Return ``state`` with what was saved and decided; an unreadable file must not prevent monitoring."""
         state, note = self._store.restore(state, time.time())
+        polled = {name for name, plan in self._windower.plans.items() if plan.sampling is Sampling.POLLED}
+        changing = tuple(name for name in state.problem.changing if name not in polled)  # without those declared since
+        state = with_problem(state, replace(state.problem, changing=changing))
         notes = [note] if note else []
         try:
             state = apply_decisions(state, self._store.decisions())
@@ -256,11 +257,8 @@ class Service:
             log.info("started with what was learned up to %s", time_text(end))
         if state.adopted:
             remedy = "'otolith components forget' removes those that no longer exist"
-            log.info(
-                "started with saved components: %s; %s",
-                ", ".join(known.component.key for known in state.adopted),
-                remedy,
-            )
+            names = ", ".join(known.component.key for known in state.adopted)
+            log.info("started with saved components: %s; %s", names, remedy)
         return state
 
     def _start_history(self) -> None:

@@ -41,10 +41,8 @@ class WorkerResult:
     window_index: int
     state: AdaptationState
     report: Report | None
-    seconds: float
-    """Computing time, s."""
-    failure: str
-    """The exception, or an empty string."""
+    seconds: float  # Computing time, s
+    failure: str  # The exception, or an empty string
 
 
 class Ready(NamedTuple):
@@ -106,14 +104,11 @@ class Supervisor:
     def __init__(self, state: AdaptationState, length: float, keep: Callable[..., None] = lambda *_: None) -> None:
         """``length`` is that of the longest window, s; ``keep`` takes state, window, report and next state of each."""
         self._keep = keep
-        self.state = state
-        """State after the last finished window."""
+        self.state = state  # State after the last finished window
         self.missed = 0
         self.finished = 0
-        self.progress = 0
-        """Finished windows and compiled kernels."""
-        self.is_compiling = True
-        """Whether the worker starts, or compiles or loads a kernel."""
+        self.progress = 0  # Finished windows and compiled kernels
+        self.is_compiling = True  # Whether the worker starts, or compiles or loads a kernel
         self._is_ready = False
         self._changes: list[Callable[[AdaptationState], AdaptationState]] = []
         self._timeout = WINDOW_TIMEOUT + 2 * length

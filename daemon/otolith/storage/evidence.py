@@ -39,9 +39,8 @@ from otolith.estimation.problem import Problem
 from otolith.health.schema import EventDocument, Report
 from otolith.health.text import announcements
 from otolith.machine import FINGERPRINT_KEYS, LIBRARY, LoadedMachine
+from otolith.storage.disk import WRITE_RETRY, WriterThread, reason_of, replace_file
 from otolith.storage.recording_files import STAMP
-from otolith.storage.state_store import reason_of, replace_file
-from otolith.storage.writer_thread import WRITE_RETRY, WriterThread
 from otolith.twin.augmentation import augmented_model
 from otolith.twin.definition import Definition
 from otolith.twin.language import read_twin
@@ -174,11 +173,9 @@ def _required(condition: bool, value: Any, kind: Any) -> Any:
 class EvidenceWindow:
     """A window with the report of it."""
 
-    state: AdaptationState | None
-    """The state before it; None if it is the one after the window before."""
+    state: AdaptationState | None  # The state before it; None if it is the one after the window before
     window: Window
-    report: str
-    """JSON, without what the daemon adds when it publishes: numbers, counters, connection and computing time."""
+    report: str  # JSON, without what the daemon adds: numbers, counters, connection and computing time
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,8 +185,7 @@ class Bundle:
     version: int
     versions: Mapping[str, str]
     events: tuple[EventDocument, ...]
-    state: AdaptationState
-    """The state before the first window."""
+    state: AdaptationState  # The state before the first window
     windows: tuple[EvidenceWindow, ...]
 
 
@@ -220,11 +216,7 @@ def _bytes(window: Window) -> int:
 
 
 def read_bundle(path: Path) -> Bundle:
-    """Return the bundle in a file; nothing of it is unpacked to disk.
-
-    Raises:
-        ConfigurationError: it cannot be read, or is no bundle that this version can use.
-    """
+    """Return the bundle in a file, unpacked in memory only; raise ConfigurationError if it cannot be used."""
     try:
         return _read_bundle(path)
     except OSError as error:

@@ -74,27 +74,19 @@ class HistorySample:
 
     name: str
     unit: str
-    time: float
-    """Begin of the interval; of a window its end."""
-    count: int
-    """Windows in it."""
+    time: float  # Begin of the interval; of a window its end
+    count: int  # Windows in it
     min: float
     mean: float
     max: float
     last: float
-    low: float | None
-    """Lower end of the 95 % interval of ``last``."""
+    low: float | None  # Lower end of the 95 % interval of last
     high: float | None
-    status: str
-    """Of the last window; of a component ``adopted`` or ``fading``."""
+    status: str  # Of the last window; of a component adopted or fading
 
 
 def history_directory() -> Path:
-    """Return the folder of the databases.
-
-    Raises:
-        ServiceError: the state directory cannot be created or is not writable.
-    """
+    """Return the folder of the databases; raise ServiceError if there is no home directory."""
     return state_directory() / "history"
 
 
@@ -323,7 +315,7 @@ class HistoryReader:
         return self._rows(query, *values) if exists else []
 
     def _rows(self, query: str, *values: object) -> list[tuple[Any, ...]]:
-        if not self.path.exists():
+        if not self.path.is_file():  # a pipe would not return
             raise ConfigurationError(f"{self.path}: no such file; 'otolith run' makes the history of a machine")
         try:
             with self._opened() as connection:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.machine_file import MachineFile
+from otolith.storage.disk import WriterThread, give_to, opened_folder
 from otolith.storage.history import (
     BUSY_TIMEOUT,
     CHECKPOINT_BYTES,
@@ -32,8 +33,6 @@ from otolith.storage.history import (
     create,
     history_path,
 )
-from otolith.storage.state_store import give_to, opened_folder
-from otolith.storage.writer_thread import WriterThread
 from otolith_drivers.errors import OtolithError, ServiceError
 
 log = logging.getLogger(__name__)
@@ -62,12 +61,9 @@ PAGES_AT_ONCE = 1000  # that are given back to the file system in one transactio
 class Bounds:
     """What the history of a machine may take."""
 
-    max_bytes: int
-    """Of all its files."""
-    days: float
-    """Age of what is kept longest."""
-    resend_hours: float
-    """Age of whole reports."""
+    max_bytes: int  # Of all its files
+    days: float  # Age of what is kept longest
+    resend_hours: float  # Age of whole reports
 
 
 class Retention:
@@ -224,8 +220,7 @@ class HistoryWriter(WriterThread):
         self._pruned_at = 0.0
         self.description = ""
         """As :func:`otolith.storage.history.describe_machine` returns it; it is written with the next report."""
-        self.dropped = 0
-        """Reports that were not written."""
+        self.dropped = 0  # Reports that were not written
 
     def open(self, now: float) -> tuple[Numbers, str]:
         """Open or create the database, and return where its numbers continue, and why it begins anew; empty if not.
@@ -366,12 +361,10 @@ class HistoryWriter(WriterThread):
 
     def _limit_kept(self) -> None:
         """Delete the oldest kept databases beyond the size of a history; the newest stays."""
-        names = self._path.parent.glob(f"{self.reader.site}.{self.reader.machine}.*{KEPT}")
-        newest, *others = sorted(names, reverse=True)
-        total = newest.stat().st_size
-        for path in others:
+        total, names = 0, self._path.parent.glob(f"{self.reader.site}.{self.reader.machine}.*{KEPT}")
+        for index, path in enumerate(sorted(names, reverse=True)):
             total += path.stat().st_size
-            if total > self._bounds.max_bytes:
+            if index and total > self._bounds.max_bytes:
                 path.unlink()
                 path.with_name(f"{path.name}-wal").unlink(missing_ok=True)
 

@@ -62,10 +62,9 @@ class FilterRecord(StrictModel):
     phase: PhaseAdvance | None
     noise: tuple[float, ...]
     """Of the inputs, which older files lack, then of the outputs; empty unless accepted as larger than stated."""
-    steps: tuple[float, ...] = ()
-    """See :attr:`otolith.estimation.problem.Problem.steps`."""
-    shifts: tuple[tuple[float, ...], ...] = ()
-    """See :attr:`ParameterCusum.sums`; empty for none."""
+    steps: tuple[float, ...] = ()  # See otolith.estimation.problem.Problem.steps
+    changing: tuple[str, ...] = ()  # See otolith.estimation.problem.Problem.changing
+    shifts: tuple[tuple[float, ...], ...] = ()  # See ParameterCusum.sums; empty for none
     previous: tuple[PreviousStatus, ...]
     records: int
     learned: int
@@ -80,25 +79,18 @@ class LearnedState(StrictModel):
     machine: str = ""
     site: str = ""
     twin: str
-    signal_fingerprint: str = ""
-    """See :attr:`otolith.machine.LoadedMachine.signal_fingerprint`."""
+    signal_fingerprint: str = ""  # See otolith.machine.LoadedMachine.signal_fingerprint
     twin_fingerprint: str = ""
     configuration_fingerprint: str = ""
-    resets: dict[str, float] = Field(default_factory=dict)
-    """See :attr:`otolith.adaptation.state.AdaptationState.resets`."""
+    resets: dict[str, float] = Field(default_factory=dict)  # See otolith.adaptation.state.AdaptationState.resets
     components: Annotated[tuple[ComponentRecord, ...], Field(max_length=MAX_COMPONENTS)] = ()
     health: HealthState = Field(default_factory=HealthState)
     """Open events and states, so that a restart neither repeats nor drops them."""
-    filter: FilterRecord | None = None
-    """None in files of version 1, and where nothing but components is to be kept."""
+    filter: FilterRecord | None = None  # None in files of version 1, and where nothing but components is to be kept
 
 
 def check_version(text: str, newest: int) -> None:
-    """Check that ``text`` is JSON of a version up to ``newest``.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Check that ``text`` is JSON of a version up to ``newest``; raise ValueError if it is not."""
     version = _AnyVersion.model_validate_json(text).version
     _require(1 <= version <= newest, f"version {version} of the format: this Otolith reads 1 to {newest}")
 
@@ -128,11 +120,7 @@ def _hash(content: list[object]) -> str:
 
 
 def learned_state(state: AdaptationState, signal_fingerprint: str) -> LearnedState:
-    """Return what is to be saved of ``state``.
-
-    Raises:
-        ValueError: it would not be restored.
-    """
+    """Return what is to be saved of ``state``; raise ValueError if it would not be restored."""
     base, end = state.problem.base_model, state.posterior.belief.end
     document = LearnedState(
         machine=state.machine,
@@ -162,6 +150,7 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
         phase=state.posterior.phase,
         noise=problem.levels if problem.stated_noise else (),
         steps=problem.steps,
+        changing=problem.changing,
         shifts=_sums(state, len(labels)),
         previous=tuple(state.previous.get(label, PreviousStatus()) for label in labels),
         **{name: getattr(state, name) for name in SCALARS},
@@ -200,6 +189,8 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         known = restore_components(state, document.components)
         return replace(known, resets=document.resets, health=health)
     problem = _with_steps(_with_noise(problem, record.noise), record.steps)
+    _require(set(record.changing) <= {source.name for source in problem.base_model.inputs}, "changing: no inputs")
+    problem = replace(problem, changing=record.changing)
     posterior, window = _posterior(record, problem), problem.window
     if record.end > now:
         posterior = replace(posterior, belief=replace(posterior.belief, end=now - (record.end - now)))
@@ -228,11 +219,7 @@ def _numbers(content: object) -> Iterator[float]:
 
 
 def check_components(records: tuple[ComponentRecord, ...], twin: Definition) -> None:
-    """Check that ``twin``, the base model, can have all components at once.
-
-    Raises:
-        ValueError: it cannot.
-    """
+    """Check that ``twin``, the base model, can have all components at once; raise ValueError if it cannot."""
     places, origins = {site.name for site in sites(twin)}, {source.name for source in sources(twin)}
     keys = {record.adopted.component.key for record in records}
     _require(len(keys) == len(records), "components: the same one twice")

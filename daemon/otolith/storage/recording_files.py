@@ -36,11 +36,9 @@ class RecordingBudget:
     """What the recordings of a machine may take, and when a new file begins."""
 
     max_bytes: float
-    max_age: float
-    """s"""
+    max_age: float  # s
     rotate_bytes: float
-    rotate_age: float
-    """s"""
+    rotate_age: float  # s
 
     def is_full(self, age: float, size: int) -> bool:
         """Return whether a file of ``age`` (s) and ``size`` (bytes) is complete; the clock may have been set back."""
@@ -52,29 +50,21 @@ class RecordingFile:
     """A recording on disk."""
 
     path: Path
-    key: str
-    """Site and machine."""
-    begin: float
-    """Unix seconds, as is ``end``."""
+    key: str  # Site and machine
+    begin: float  # Unix seconds, as is end
     end: float
     size: int
-    is_marked: bool
-    """Whether it holds minutes around an event."""
+    is_marked: bool  # Whether it holds minutes around an event
 
 
 def recording_file(path: Path) -> RecordingFile | None:
-    """Return what follows from name and status of ``path``; None for a file of another name, or one that is gone.
-
-    Raises:
-        PermissionError: the folder must not be searched.
-    """
-    match = NAME.fullmatch(path.name)
+    """Return what follows from name and status of ``path``; None for another name, and where there is no status."""
+    if (match := NAME.fullmatch(path.name)) is None:
+        return None
     try:
         status = path.stat()
-        begin = datetime.strptime(match["stamp"], STAMP).replace(tzinfo=UTC).timestamp() if match else 0.0
-    except (FileNotFoundError, ValueError):
-        return None
-    if match is None:
+        begin = datetime.strptime(match["stamp"], STAMP).replace(tzinfo=UTC).timestamp()
+    except (OSError, ValueError):  # deleted meanwhile, a link to itself, a fault of the disk; no date
         return None
     return RecordingFile(path, match["key"], begin, status.st_mtime, status.st_size, bool(match["event"]))
 
@@ -120,11 +110,7 @@ class RecordingFolder:
         self.budget = budget
 
     def new_path(self, now: float, *, marked: bool = False) -> Path:
-        """Return an unused path for a file that begins ``now``, and create the folder.
-
-        Raises:
-            ServiceError: the folder cannot be created or is not writable.
-        """
+        """Return an unused path for a file that begins ``now``; raise ServiceError if the folder is not writable."""
         writable(self._folder)
         if self._set_mode:
             with contextlib.suppress(OSError):  # a folder of another user that this one may write

@@ -14,11 +14,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
 from otolith.health.prognosis import Baseline, History
 from otolith.machine import LoadedMachine
+from otolith.storage.disk import WriterThread, give_to, opened_folder, reason_of, replace_file
 from otolith.storage.learned_state import (
     VERSION,
     LearnedState,
@@ -29,11 +30,10 @@ from otolith.storage.learned_state import (
     restored,
     twin_fingerprint,
 )
-from otolith.storage.writer_thread import WriterThread
 from otolith.twin.definition import Definition
-from otolith_drivers.config_files import StrictModel
+from otolith_drivers.config_files import StrictModel, content
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
-from otolith_drivers.user_dirs import state_directory, writable
+from otolith_drivers.user_dirs import state_directory
 
 log = logging.getLogger(__name__)
 
@@ -77,11 +77,7 @@ class StateStore:
         self._is_blocked = False
 
     def lock(self) -> None:
-        """Take the lock of this machine, which this process keeps until :meth:`unlock` or its end.
-
-        Raises:
-            ServiceError: another process has it, or the lock file cannot be written.
-        """
+        """Take the lock until :meth:`unlock` or the end; raise ServiceError if another process has it."""
         if self._lock is not None:
             return
         handle = -1
@@ -119,11 +115,7 @@ class StateStore:
                 self.unlock()
 
     def components(self) -> tuple[ComponentRecord, ...]:
-        """Return the saved components of this twin in these signals; none if they are of others.
-
-        Raises:
-            ConfigurationError: the file is unreadable or damaged.
-        """
+        """Return the saved components of this twin in these signals; raise ConfigurationError for a damaged file."""
         if (learned := self._learned()) is None:
             return ()
         try:
@@ -181,11 +173,7 @@ class StateStore:
             return warm, f"{note}; {error}"
 
     def set_aside(self) -> Path:
-        """Rename the file with what was learned, and return its new path; only the newest such files stay.
-
-        Raises:
-            ServiceError: it cannot be renamed; it is not overwritten then.
-        """
+        """Rename the file with what was learned, keep the newest such; raise ServiceError if it cannot be renamed."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")
         kept = self.components_path.with_name(f"{self.components_path.stem}.{stamp}{KEPT}")
         try:
@@ -232,22 +220,14 @@ class StateStore:
             _write(self.components_path, learned, f"{self.components_path.name}.new")
 
     def decisions(self) -> OperatorDecisions:
-        """Return the operator's decisions.
-
-        Raises:
-            ConfigurationError: the file is unreadable or not a decisions file.
-        """
+        """Return the operator's decisions; raise ConfigurationError if the file is unreadable or damaged."""
         file = _read(self.decisions_path, _DecisionsFile, DECISIONS_VERSION) or _DecisionsFile()
         return OperatorDecisions(
             frozenset(file.approved), frozenset(file.rejected), file.forgotten, file.resets, file.baselines
         )
 
     def save_decisions(self, decisions: OperatorDecisions) -> None:
-        """Write the operator's decisions; a running daemon applies them with its next window.
-
-        Raises:
-            ServiceError: the file cannot be written.
-        """
+        """Write the decisions, which a running daemon applies with its next window; raise ServiceError if it cannot."""
         keys = {"approved": sorted(decisions.approved), "rejected": sorted(decisions.rejected)}
         file = _DecisionsFile.model_validate({**asdict(decisions), **keys})
         _write(self.decisions_path, file, f"{self.decisions_path.name}.{os.getpid()}.new")
@@ -307,83 +287,20 @@ def store_of(machine: LoadedMachine) -> StateStore:
 
 def _read(path: Path, model: type[StateModel], newest: int) -> StateModel | None:
     try:
-        with path.open("rb") as stream:
-            data = stream.read(MAX_STATE_BYTES + 1)
-        text = _limited(data).decode()
+        if not path.exists():
+            return None
+        text = content(path, MAX_STATE_BYTES).decode()
         check_version(text, newest)
         return model.model_validate_json(text)
-    except FileNotFoundError:
-        return None
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise ConfigurationError(f"{path}: {reason_of(error)}: {REMEDY}") from error
 
 
-def reason_of(error: Exception) -> str:
-    """Return the text of an error in one line; of a document that does not fit its schema, the first fault."""
-    if not isinstance(error, ValidationError):
-        return str(error)
-    first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}"
-
-
-def _limited(data: bytes) -> bytes:
-    if len(data) > MAX_STATE_BYTES:
-        raise ValueError(f"larger than {MAX_STATE_BYTES} bytes")
-    return data
-
-
 def _write(path: Path, model: StrictModel, temporary: str) -> None:
     """Replace a file as :func:`replace_file` does."""
-    try:
-        data = _limited((model.model_dump_json() + "\n").encode())
-    except ValueError as error:
-        raise ServiceError(f"{path}: not written: {error}") from error
+    data = (model.model_dump_json() + "\n").encode()
+    if len(data) > MAX_STATE_BYTES:
+        raise ServiceError(f"{path}: not written: larger than {MAX_STATE_BYTES} bytes")
     replace_file(path, data, temporary)
-
-
-def replace_file(path: Path, data: bytes, temporary: str) -> None:
-    """Replace a file, all or nothing, also if the computer loses power meanwhile; raise ServiceError if that fails.
-
-    ``temporary`` is a name beside it. All names are relative to the open folder: its owner could replace a path while
-    root writes there.
-    """
-    try:
-        with opened_folder(path.parent) as folder:
-            with contextlib.suppress(FileNotFoundError):  # left by a process that was killed
-                os.unlink(temporary, dir_fd=folder)
-            try:
-                handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600, dir_fd=folder)
-                with os.fdopen(handle, "wb") as stream:
-                    stream.write(data)
-                    stream.flush()
-                    give_to(os.fstat(folder), handle)
-                    os.fsync(handle)
-                os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
-                os.fsync(folder)
-            except OSError:
-                with contextlib.suppress(OSError):
-                    os.unlink(temporary, dir_fd=folder)
-                raise
-    except OSError as error:
-        raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-@contextlib.contextmanager
-def opened_folder(folder: Path) -> Iterator[int]:
-    """Descriptor of ``folder``, which is created if it is missing."""
-    is_new = not folder.exists()
-    handle = os.open(writable(folder), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
-        if is_new:
-            give_to(folder.parent.stat(), handle)
-        yield handle
-    finally:
-        os.close(handle)
-
-
-def give_to(owner: os.stat_result, handle: int) -> None:
-    """Give what root has opened to an owner: the daemon runs as another user and must be able to use it."""
-    if os.geteuid() == 0:
-        os.fchown(handle, owner.st_uid, owner.st_gid)

@@ -11,8 +11,7 @@ from otolith.twin.component_families import SourceKind
 from otolith.twin.definition import Definition, Input, Output, Parameter, Role, Site, StateVariable
 from otolith.twin.expressions import dimension_of
 
-MAX_COMPONENTS = 3
-"""Component slots of an augmented twin. Engineering choice: compile time grows with each slot."""
+MAX_COMPONENTS = 3  # Component slots of an augmented twin. Engineering choice: compile time grows with each slot.
 UNBOUNDED = 1e30  # bounds of parameters whose real bounds come with the component; any finite number would do
 ELAPSED = "_elapsed"  # input: s since the first record; no author can write a name that begins with "_"
 INTEGRAL_UNITS = {"rad/s": "rad", "m/s": "m"}
@@ -25,8 +24,7 @@ class ComponentSource:
     name: str
     unit: str
     kind: SourceKind
-    symbol: str
-    """Its name in the augmented twin; empty for no quantity."""
+    symbol: str  # Its name in the augmented twin; empty for no quantity
 
 
 @lru_cache(maxsize=64)

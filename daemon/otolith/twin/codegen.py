@@ -138,12 +138,9 @@ class Stage:
     """One stage of the classical Runge-Kutta method (Hairer, Norsett, Wanner, Solving ODE I, Table II.1.2)."""
 
     number: int
-    time: float
-    """Share of the step at which the stage evaluates the rates."""
-    length: str
-    """Variable of the kernel by which the stage advances the state along the rates of the stage before."""
-    input_prefix: str
-    """Before the name of a ``foh`` input: its value at the time of the stage."""
+    time: float  # Share of the step at which the stage evaluates the rates
+    length: str  # Variable of the kernel by which the stage advances the state along the rates of the stage before
+    input_prefix: str  # Before the name of a foh input: its value at the time of the stage
 
     def advanced(self, names: Sequence[str], rates: str) -> list[str]:
         """``names`` plus this stage's length times the ``rates`` (``k`` or ``q``) of the stage before."""
@@ -155,8 +152,7 @@ class Stage:
 STAGES = (Stage(1, 0.0, "", ""), Stage(2, 0.5, "half", "mid_"), Stage(3, 0.5, "half", "mid_"),
           Stage(4, 1.0, "step", "end_"))  # fmt: skip
 
-Blocks = dict[str, str | list[str]]
-"""What fills a template: text within a line, or lines of its own."""
+Blocks = dict[str, str | list[str]]  # What fills a template: text within a line, or lines of its own
 
 
 class KernelCode:

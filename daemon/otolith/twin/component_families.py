@@ -33,10 +33,8 @@ class SourceKind(StrEnum):
 
     NOTHING = "nothing"
     TIME = "time"
-    PLACE = "place"
-    """An angle or a position: forces of a machine are periodic in it."""
-    SPEED = "speed"
-    """Of a rotation or a motion: force times speed is a power."""
+    PLACE = "place"  # An angle or a position: forces of a machine are periodic in it
+    SPEED = "speed"  # Of a rotation or a motion: force times speed is a power
     SIGNAL = "signal"
 
 
@@ -46,10 +44,8 @@ class SourceRange:
 
     low: float
     high: float
-    smallest: float
-    """Least magnitude."""
-    step: float
-    """Largest change from record to record."""
+    smallest: float  # Least magnitude
+    step: float  # Largest change from record to record
 
     @classmethod
     def of_each(cls, x: Array) -> "list[SourceRange]":
@@ -75,12 +71,9 @@ class InnerParameter:
     """The parameter inside the shape of a family: the component is not linear in it, so a search has to find it."""
 
     meaning: str
-    unit: str
-    """``{x}`` stands for the unit of the source."""
-    bounds: Callable[[SourceRange], tuple[float, float]]
-    """Lowest and highest value that such a window can show."""
-    points: int
-    """Of the grid from which the search begins; 0 for one point per line of the spectrum."""
+    unit: str  # {x} stands for the unit of the source
+    bounds: Callable[[SourceRange], tuple[float, float]]  # Lowest and highest value that such a window can show
+    points: int  # Of the grid from which the search begins; 0 for one point per line of the spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,27 +81,19 @@ class ComponentFamily:
     """One row of the table."""
 
     name: str
-    formula: str
-    """In ``a`` the amplitude, ``x`` the source, ``b`` the inner parameter, ``c`` the phase."""
-    equation: str
-    """For people; the same letters in braces."""
-    conditions: str
-    """Working conditions under which machines show it (Table 1)."""
-    domain: str
-    """Where it is valid, in words."""
-    inputs: frozenset[SourceKind]
-    """Kinds of source that it may depend on."""
-    valid: Callable[[SourceRange], bool]
-    """Whether the window distinguishes the family from others."""
+    formula: str  # In a the amplitude, x the source, b the inner parameter, c the phase
+    equation: str  # For people; the same letters in braces
+    conditions: str  # Working conditions under which machines show it (Table 1)
+    domain: str  # Where it is valid, in words
+    inputs: frozenset[SourceKind]  # Kinds of source that it may depend on
+    valid: Callable[[SourceRange], bool]  # Whether the window distinguishes the family from others
     inner: InnerParameter | None = None
     threshold_like: bool = False
     """Whether it can hold what it depends on at zero, as dry friction does: a linear response then underrates it."""
     threshold_at_rest: bool = False
     """Whether its magnitude at zero is the amplitude although a window may show its tail only."""
-    dissipates: bool = False
-    """Whether it takes power from the machine where its source is a speed and its site the force there: friction."""
-    phases: tuple[float, ...] = (0.0,)
-    """Phases (rad) of the basis functions; two for a free phase, since both amplitudes enter linearly."""
+    dissipates: bool = False  # Whether it takes power where its source is a speed and its site the force there
+    phases: tuple[float, ...] = (0.0,)  # Of the basis functions, rad; two for a free phase: both are linear
 
     def __hash__(self) -> int:
         """Of the name alone, as each candidate form is looked up by its family."""

@@ -9,12 +9,9 @@ from typing import Literal
 class Role(StrEnum):
     """Where the value of a parameter comes from, in the paper's words."""
 
-    INSTRUMENTED = "instrumented"
-    """Instrumented known: given or measured."""
-    ESTIMATED = "estimated"
-    """Non-instrumented known: estimated from windows."""
-    SETTING = "setting"
-    """Selects a component of an augmented twin; no derivative is taken by it."""
+    INSTRUMENTED = "instrumented"  # Instrumented known: given or measured
+    ESTIMATED = "estimated"  # Non-instrumented known: estimated from windows
+    SETTING = "setting"  # Selects a component of an augmented twin; no derivative is taken by it
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +25,10 @@ class Parameter:
     high: float
     meaning: str
     role: Role = Role.INSTRUMENTED
-    part: str = ""
-    """The part of the machine that it describes, as ``winding``."""
-    watch: tuple[str | float, ...] = ()
-    """Limits beyond which the part is watched, as written: absolute or relative to the nominal value."""
-    act: tuple[str | float, ...] = ()
-    """Limits beyond which action is required."""
-    temperature_coefficient: float = 0.0
-    """Relative change per kelvin."""
+    part: str = ""  # The part of the machine that it describes, as winding
+    watch: tuple[str | float, ...] = ()  # Limits beyond which the part is watched, as written: absolute or relative
+    act: tuple[str | float, ...] = ()  # Limits beyond which action is required
+    temperature_coefficient: float = 0.0  # Relative change per kelvin
 
     @property
     def label(self) -> str:
@@ -60,8 +53,7 @@ class StateVariable:
     name: str
     unit: str
     meaning: str
-    initial: float = 0.0
-    """Where the search for the initial state begins if no output shows the state."""
+    initial: float = 0.0  # Where the search for the initial state begins if no output shows the state
     low: float = -1e3
     high: float = 1e3
 
@@ -73,13 +65,10 @@ class Input:
     name: str
     unit: str
     meaning: str
-    hold: Literal["zoh", "foh"]
-    """Between two records ``zoh`` holds the value (a command), ``foh`` interpolates linearly (a measurement)."""
-    low: float = -1.0
-    """Lower end of the range in ordinary operation."""
+    hold: Literal["zoh", "foh"]  # Between records zoh holds the value (a command), foh interpolates (a measurement)
+    low: float = -1.0  # Lower end of the range in ordinary operation
     high: float = 1.0
-    has_range: bool = True
-    """Whether the twin states the range."""
+    has_range: bool = True  # Whether the twin states the range
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +78,7 @@ class Output:
     name: str
     unit: str
     meaning: str
-    noise: float
-    """Standard deviation of the sensor in ``unit``, used where a machine file gives none."""
+    noise: float  # Standard deviation of the sensor in unit, used where a machine file gives none
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,17 +86,12 @@ class Site:
     """A place in the equations where an unknown component may enter."""
 
     name: str
-    unit: str
-    """Unit of the component; ``1`` for a multiplicative one."""
+    unit: str  # Unit of the component; 1 for a multiplicative one
     meaning: str
-    into: str
-    """``der(state)``, a definition or an output."""
-    mode: Literal["additive", "multiplicative"]
-    """Additive: the right side becomes ``right + through * U``; multiplicative: ``right * (1 + U)`` (Eq. 18)."""
-    through: str = "1"
-    """Turns the unit of the component into that of the right side: ``1/J`` for a torque in ``der(omega)``."""
-    part: str = ""
-    """The part of the machine where such a component arises; its own name by default."""
+    into: str  # der(state), a definition or an output
+    mode: Literal["additive", "multiplicative"]  # Right side: right + through * U, or right * (1 + U) (Eq. 18)
+    through: str = "1"  # Turns the unit of the component into that of the right side: 1/J for a torque in der(omega)
+    part: str = ""  # The part of the machine where such a component arises; its own name by default
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,14 +106,11 @@ class Definition:
     inputs: tuple[Input, ...]
     outputs: tuple[Output, ...]
     parameters: tuple[Parameter, ...]
-    equations: tuple[tuple[str, str], ...]
-    """Left and right sides: ``der(state)`` for every state, an output's name for every output that is no state."""
+    equations: tuple[tuple[str, str], ...]  # Left and right sides: der(state), or an output that is no state
     constants: tuple[Constant, ...] = ()
-    definitions: tuple[tuple[str, str, str], ...] = ()
-    """Name, expression and meaning of helper quantities, in the author's order."""
+    definitions: tuple[tuple[str, str, str], ...] = ()  # Name, expression and meaning, in the author's order
     sites: tuple[Site, ...] = ()
-    base: "Definition | None" = None
-    """The author's twin, if this one is augmented (see :mod:`otolith.twin.augmentation`)."""
+    base: "Definition | None" = None  # The author's twin, if this one is augmented (see otolith.twin.augmentation)
 
     def __hash__(self) -> int:
         """Of the name alone, as what is prepared once for a twin is looked up several times in each window."""

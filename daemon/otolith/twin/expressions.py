@@ -48,8 +48,7 @@ NUMERICAL_COMPARISONS: dict[type[ast.cmpop], Callable[..., Any]] = {
     ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge,
 }  # fmt: skip
 Column = NDArray[np.float64]
-Dimension = Any
-"""pint's container of dimensions and exponents; None for the number zero, which fits any dimension."""
+Dimension = Any  # pint's container of dimensions and exponents; None for the number zero, which fits any dimension
 
 NAMED_UNITS = ("V", "A", "ohm", "H", "Wb", "W", "N*m", "J", "N", "Pa", "m", "s", "kg", "m/s", "m/s^2", "rad/s^2", "1/s",
                "kg*m^2", "N*m*s", "m^3/s", "V/s", "A/s", "N/m", "N*s/m", "Pa/s", "K", "K/s", "W/K", "J/K", "W/s", "m^2",
@@ -67,11 +66,7 @@ class ExpressionError(ValueError):
 
 
 def check_name(name: str) -> None:
-    """Check the name of a quantity.
-
-    Raises:
-        ValueError: not a valid name, or a reserved one.
-    """
+    """Check the name of a quantity; raise ValueError if it is not valid, or reserved."""
     if not NAME.fullmatch(name) or keyword.iskeyword(name):
         raise ValueError(f"{name!r} is not a name: write a letter, then letters, digits and '_', at most 40 characters")
     if name in RESERVED:
@@ -306,11 +301,7 @@ def evaluate(tree: ast.expr, values: Mapping[str, list[Column]]) -> Column:
 
 
 def dimension_of(unit_text: str) -> Dimension:
-    """The dimension of a unit.
-
-    Raises:
-        ValueError: not a unit.
-    """
+    """The dimension of a unit; raise ValueError if it is none."""
     return unit(unit_text).dimensionality
 
 

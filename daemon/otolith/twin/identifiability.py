@@ -37,8 +37,7 @@ class StructuralIdentifiability:
 
     name: str
     identifiable: bool
-    reason: str
-    """Empty if it can be estimated."""
+    reason: str  # Empty if it can be estimated
 
 
 def structural_identifiability(definition: Definition, seed: int = 1) -> list[StructuralIdentifiability]:

@@ -23,8 +23,7 @@ from otolith_drivers.errors import ConfigurationError
 
 MAX_SUBSTEPS = 1024
 """Engineering choice: ends the search for substeps where the equations are too stiff for any number of them."""
-WHOLE = 1e-9
-"""Of a substep: a share that rounding leaves over a whole number, which needs no further substep."""
+WHOLE = 1e-9  # Of a substep: a share that rounding leaves over a whole number, which needs no further substep
 SPREAD_REACH = 12
 """Grid points on either side that a record reaches in a non-uniform Fourier sum: errors of 1e-12 of the largest sum."""
 MIN_SHARE_OF_MEAN = 0.5
@@ -45,16 +44,12 @@ ComplexArray = NDArray[np.complex128]
 class Excitation:
     """What drives a twin through a window, and what corrects it."""
 
-    inputs: Array
-    """(records, inputs)."""
-    grid: TimeGrid
-    """Times of the records."""
+    inputs: Array  # (records, inputs)
+    grid: TimeGrid  # Times of the records
     substeps: int = 1
     """Steps of the integrator on the longest step of the grid; a shorter one has as many as keep them no longer."""
-    measured: Array | None = None
-    """(records, outputs); a measurement that is NaN corrects nothing."""
-    gain: Array | None = None
-    """(records, states, outputs); None or all zero for open loop."""
+    measured: Array | None = None  # (records, outputs); a measurement that is NaN corrects nothing
+    gain: Array | None = None  # (records, states, outputs); None or all zero for open loop
 
     @classmethod
     def uniform(cls, inputs: Array, period: float, substeps: int = 1) -> "Excitation":
@@ -71,11 +66,7 @@ class Excitation:
 
     @cached_property
     def arguments(self) -> tuple[Array, Array, Indices, Array, Array]:
-        """Inputs, steps, counts, measurements and gain as the kernels take them; the last two are empty in open loop.
-
-        Raises:
-            ValueError: the inputs have another number of records than the grid.
-        """
+        """Inputs, steps, counts, and in closed loop measurements and gain; raise ValueError if records differ."""
         inputs = np.ascontiguousarray(self.inputs, dtype=np.float64)
         if len(inputs) != self.grid.records:
             raise ValueError(f"{len(inputs)} records of inputs at {self.grid.records} times")
@@ -111,23 +102,14 @@ def _longest(grid: TimeGrid) -> float:
 class NoiseModel:
     """Standard deviations, each in the unit of its signal or state."""
 
-    outputs: Array
-    """(outputs,) of the sensors."""
-    inputs: Array
-    """(records, inputs) of the inputs' values at a record, which the outputs of that record depend on."""
+    outputs: Array  # (outputs,) of the sensors
+    inputs: Array  # (records, inputs) of the inputs' values at a record, which the outputs of that record depend on
     held_inputs: Array
     """(records, inputs) of the inputs over the step to the next record; independent from step to step."""
-    states: Array
-    """(states,) process noise per square root of a second."""
+    states: Array  # (states,) process noise per square root of a second
     period: float | None = None
     """Time in which process noise disturbs the states once, s, where records are at times of their own. None for once
     in a step, as on a uniform grid."""
-
-    @classmethod
-    def uniform(cls, outputs: Array, inputs: Array, states: Array, records: int) -> "NoiseModel":
-        """Return the model of inputs with the same noise (inputs,) in all ``records``."""
-        every = np.tile(inputs, (records, 1))
-        return cls(outputs, every, every, states)
 
     @property
     def disturbs(self) -> bool:
@@ -144,12 +126,10 @@ class NoiseModel:
 class InnovationModel(NamedTuple):
     """The gains of the innovation form and the covariances of its innovations."""
 
-    gain: Array
-    """(records, states, outputs)."""
+    gain: Array  # (records, states, outputs)
     whitening: Array
     """(records, outputs, outputs), lower triangular: whitened innovations have the identity as covariance."""
-    log_determinant: float
-    """Sum over the records of the log determinants of the innovations' covariances."""
+    log_determinant: float  # Sum over the records of the log determinants of the innovations' covariances
 
 
 class Sensitivities(NamedTuple):
@@ -158,14 +138,10 @@ class Sensitivities(NamedTuple):
     A drift is a change by one unit per second that leaves the parameter's value at the last record.
     """
 
-    outputs: Array
-    """(records, outputs)."""
-    slopes: Array
-    """(records, outputs, columns): parameters + states [+ parameters], or those of them that are wanted."""
-    last: Array
-    """(states,) at the last record, corrected by its measurement."""
-    last_slopes: Array
-    """(states, columns)."""
+    outputs: Array  # (records, outputs)
+    slopes: Array  # (records, outputs, columns): parameters + states [+ parameters], or those of them that are wanted
+    last: Array  # (states,) at the last record, corrected by its measurement
+    last_slopes: Array  # (states, columns)
 
 
 class LinearisedModel(NamedTuple):
@@ -174,18 +150,12 @@ class LinearisedModel(NamedTuple):
     ``x[k + 1] = transition x[k] + input_now u[k] + input_next u[k + 1]``, ``y[k] = output x[k] + feedthrough u[k]``.
     """
 
-    trajectory: Array
-    """(records, states) as predicted."""
-    transition: Array
-    """(records, states, states)."""
-    input_now: Array
-    """(records, states, sites)."""
-    input_next: Array
-    """(records, states, sites)."""
-    output: Array
-    """(records, outputs, states)."""
-    feedthrough: Array
-    """(records, outputs, sites)."""
+    trajectory: Array  # (records, states) as predicted
+    transition: Array  # (records, states, states)
+    input_now: Array  # (records, states, sites)
+    input_next: Array  # (records, states, sites)
+    output: Array  # (records, outputs, states)
+    feedthrough: Array  # (records, outputs, sites)
 
 
 class Kernel:
@@ -220,10 +190,8 @@ class Kernel:
         if columns is None:
             of_parameters = len(self.definition.parameters) - self.definition.settings
             columns = range(of_parameters * (1 + drifts) + len(self.definition.states))
-        wanted = np.array(columns, dtype=np.int64)
-        times = np.ascontiguousarray(excitation.grid.before_last)
-        drive = excitation.arguments
-        return Sensitivities(*self._call("sensitivities", parameters, initial, *drive, times, wanted))
+        drive = (*excitation.arguments, excitation.grid.before_last, np.array(columns, dtype=np.int64))
+        return Sensitivities(*self._call("sensitivities", parameters, initial, *drive))
 
     def euler(self, parameters: Array, initial: Array, excitation: Excitation, step: float) -> Array:
         """As :meth:`simulate` in open loop, by explicit Euler with ``step`` (s): the paper's difference equations.
@@ -253,6 +221,25 @@ class Kernel:
         variances = (noise.outputs**2, noise.states**2)
         of_inputs = (np.ascontiguousarray(noise.inputs), np.ascontiguousarray(noise.held_inputs))
         return InnovationModel(*self._call("kalman", parameters, initial, *grid, measured, *variances, *of_inputs))
+
+    def predictor(
+        self, parameters: Array, initial: Array, excitation: Excitation, noise: NoiseModel, *, open_loop: bool = False
+    ) -> InnovationModel:
+        """Gain and whitening along ``excitation.measured``; (parameters,), (states,).
+
+        A twin that diverges there, or that has no process noise, runs in open loop as well: without a gain, and with
+        the whitening of the sensor noise alone.
+        """
+        if noise.disturbs and not open_loop:
+            model = self.innovation_model(parameters, initial, excitation, noise)
+            if np.isfinite(model.gain).all() and np.isfinite(model.whitening).all():
+                return model
+        if excitation.measured is None:
+            raise ValueError("a predictor needs measurements")
+        scales = np.where(np.isfinite(excitation.measured), 1.0 / noise.outputs, 1.0)
+        whitening = scales[:, :, None] * np.eye(len(noise.outputs))
+        gain = np.zeros((len(excitation.inputs), len(self.definition.states), len(noise.outputs)))
+        return InnovationModel(gain, whitening, float(-2.0 * np.log(scales).sum()))
 
     def linearise(self, parameters: Array, initial: Array, excitation: Excitation) -> LinearisedModel:
         """The linear system along a window, exact but for the error of the integrator; (parameters,), (states,)."""
@@ -317,7 +304,8 @@ class Kernel:
         first, second = parameters[None], initial[None]
         coarse = self.simulate(first, second, excitation)
         while count < limit:
-            fine = self._halved(first, second, excitation)
+            inputs, steps, counts, *correction = excitation.arguments
+            fine = self._call("simulate", first, second, inputs, steps, 2 * counts, *correction)
             with np.errstate(invalid="ignore"):
                 error = np.abs(coarse - fine).max(axis=(0, 1), initial=0.0) * 16.0 / 15.0  # of an order-4 method
                 allowed = np.maximum(tolerance, RELATIVE_TOLERANCE * np.abs(fine).max(axis=(0, 1), initial=0.0))
@@ -327,12 +315,6 @@ class Kernel:
             excitation = replace(excitation, substeps=count)
             coarse = fine if grid.period is not None else self.simulate(first, second, excitation)
         return count
-
-    def _halved(self, parameters: Array, initial: Array, excitation: Excitation) -> Array:
-        """As :meth:`simulate`, with each substep halved."""
-        inputs, steps, counts, measured, gain = excitation.arguments
-        halved: Array = self._call("simulate", parameters, initial, inputs, steps, 2 * counts, measured, gain)
-        return halved
 
     @cached_property
     def _module(self) -> Any:
@@ -347,9 +329,8 @@ class Kernel:
         with kernel_cache.compiling(module, function, f"{self.definition.name}.{name}"):
             try:
                 result = function(*arguments)
-            except Exception:  # noqa: BLE001 - a truncated file of the cache raises errors of any type
+            except Exception:  # noqa: BLE001 - a truncated file of the cache raises any error; others come again
                 kernel_cache.discard(module)
-                # Other errors are raised again here.
                 result = function(*arguments)
         compiled.add(name)
         return result

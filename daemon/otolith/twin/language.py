@@ -36,8 +36,7 @@ MAX_COEFFICIENT = -0.1, 0.1  # 1/K: lowest and highest temperature coefficient
 MAX_ROWS = {"states": 12, "parameters": 40, "inputs": 40, "outputs": 40, "definitions": 60}
 MAX_EXPANDED_TERMS, MAX_EXPANDED_LEVELS = 3000, 100  # of an equation with its definitions substituted
 
-Fault = Callable[[Location, str], None]
-"""Records what is wrong at a place of the file."""
+Fault = Callable[[Location, str], None]  # Records what is wrong at a place of the file
 
 
 def _unit(written: str) -> str:
@@ -128,11 +127,7 @@ class _TwinFile(StrictModel):
 
 
 def read_twin(page: SourceFile) -> Definition:
-    """The twin in the file ``page``.
-
-    Raises:
-        ConfigurationError: one line per fault, each with file, line, key and what to do.
-    """
+    """The twin in the file ``page``; raise ConfigurationError with file, line, key and remedy of each fault."""
     data = parse_toml(page)
     expect(page, data, "equations")
     faults: list[str] = []
@@ -271,8 +266,7 @@ class _EquationChecker:
         self._units = {name: dimension_of(unit) for name, unit in definition.units().items()}
         self._known: dict[str, Dimension] = {n: d for n, d in self._units.items() if n not in self._outputs}
         """Dimension of every name that an expression may use: outputs follow from the states and are not among them."""
-        self._trees: dict[str, ast.expr] = {}
-        """Of the definitions."""
+        self._trees: dict[str, ast.expr] = {}  # Of the definitions
 
     def check(self) -> None:
         """Report the faults of a stage only if the stages before have none, because they would follow from those."""

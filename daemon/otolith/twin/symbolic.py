@@ -27,8 +27,7 @@ from otolith.twin.definition import Definition, Site
 from otolith.twin.expressions import ARITHMETIC, constant, parse
 from otolith_drivers.units import to_base
 
-Values = Mapping[str, sympy.Expr]
-"""The expression of each name."""
+Values = Mapping[str, sympy.Expr]  # The expression of each name
 
 
 class sign(sympy.Function):  # type: ignore[misc]  # noqa: N801 - sympy has no types; the class name is printed
@@ -100,8 +99,7 @@ class System:
     states: tuple[sympy.Symbol, ...]
     inputs: tuple[sympy.Symbol, ...]
     parameters: tuple[sympy.Symbol, ...]
-    settings: tuple[sympy.Symbol, ...]
-    """Parameters by which no derivative is taken."""
+    settings: tuple[sympy.Symbol, ...]  # Parameters by which no derivative is taken
     rates: tuple[sympy.Expr, ...]
     outputs: tuple[sympy.Expr, ...]
 

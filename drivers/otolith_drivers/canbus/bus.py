@@ -46,10 +46,8 @@ LISTEN_ONLY: dict[str, dict[str, Any]] = {
     "vector": {"listen_only": True},
 }
 """Arguments of python-can for an interface that shall not acknowledge. For socketcan 'ip link' decides."""
-FILTERING = {"socketcan"}
-"""Interfaces that get filters. Elsewhere they cost as much as they save, or hide error frames."""
-STAMPED_BY_KERNEL = {"socketcan", "udp_multicast"}
-"""Interfaces whose frames have the kernel's times, however late they are read."""
+FILTERING = {"socketcan"}  # Interfaces that get filters: elsewhere they save nothing, or hide error frames
+STAMPED_BY_KERNEL = {"socketcan", "udp_multicast"}  # Interfaces whose frames have the kernel's times
 WAYS_OUT = {
     "socketcan": "'ip -brief link show type can' lists what there is; set driver.channel or bring the interface up",
     "udp_multicast": "it needs a multicast route: 'ip route add 239.0.0.0/8 dev lo' as root makes one",
@@ -59,20 +57,15 @@ WAYS_OUT = {
 class BusOptions(StrictModel):
     """Which CAN bus."""
 
-    interface: str = "auto"
-    """``auto``, or one of python-can: ``socketcan``, ``udp_multicast``, ``pcan``, ``kvaser``, ``slcan`` ..."""
-    channel: str | None = None
-    """Network interface of the kernel, or channel as python-can names it; by default ``vcan0``."""
+    interface: str = "auto"  # auto, or one of python-can: socketcan, udp_multicast, pcan, slcan and so on
+    channel: str | None = None  # Network interface of the kernel, or channel as python-can names it; by default vcan0
     bitrate: Annotated[float, BeforeValidator(Quantity("bit/s", 1e3, 1e6))] | None = None
     """Only for interfaces that set it themselves; that of the kernel is set with ``ip link``."""
-    fd: bool = False
-    """Whether frames of CAN FD are received as well."""
+    fd: bool = False  # Whether frames of CAN FD are received as well
     data_bitrate: Annotated[float, BeforeValidator(Quantity("bit/s", 1e3, 2e7))] | None = None
     """Bit rate of the data of FD frames; see ``bitrate``."""
-    listen_only: bool = True
-    """Whether the adapter does not even acknowledge, if it can; ``false`` if no other node would."""
-    port: Annotated[int, Field(ge=1024, le=65535)] = 43113
-    """UDP port of ``udp_multicast``: two buses on one computer differ in it, or in their group."""
+    listen_only: bool = True  # Whether the adapter does not even acknowledge, if it can; false if no other node would
+    port: Annotated[int, Field(ge=1024, le=65535)] = 43113  # Of udp_multicast: two buses differ in port or group
 
     @field_validator("interface")
     @classmethod
@@ -130,11 +123,7 @@ def kernel_has(channel: str) -> bool:
 def open_bus(
     options: BusOptions, filters: list[can.typechecking.CanFilter] | None = None, *, listen_only: bool = False
 ) -> can.BusABC:
-    """The bus, open. With ``listen_only`` the adapter does not even acknowledge, if it can and the options agree.
-
-    Raises:
-        DeviceError: the bus is missing, or cannot be opened.
-    """
+    """The bus, open; with ``listen_only`` it does not acknowledge if it can; raise DeviceError if it is missing."""
     interface, channel = options.resolved()
     arguments: dict[str, Any] = {"interface": interface, "channel": channel}
     if interface == "udp_multicast":

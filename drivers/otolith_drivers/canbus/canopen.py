@@ -18,8 +18,16 @@ from cantools.database.conversion import BaseConversion
 
 from otolith_drivers.base import Signal
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT
-from otolith_drivers.canbus.options import CLASSIC_BITS, MAX_PDOS, OBJECT, MappedObject, PdoTable
-from otolith_drivers.canbus.signals import CanSource, SignalRequest, request_for
+from otolith_drivers.canbus.options import (
+    CLASSIC_BITS,
+    MAX_PDOS,
+    OBJECT,
+    CanSource,
+    MappedObject,
+    PdoTable,
+    SignalRequest,
+    request_for,
+)
 from otolith_drivers.common.message_times import PeriodEstimator, period_text
 from otolith_drivers.config_files import content
 from otolith_drivers.errors import ConfigurationError, nearest
@@ -38,8 +46,7 @@ OBJECT_SECTION = re.compile(r"([0-9A-Fa-f]{4})(?:[Ss]ub([0-9A-Fa-f]{1,2}))?")
 TYPE_SECTION = re.compile(r"[0-9A-Fa-f]{1,3}(?:[Ss]ub[0-9A-Fa-f]{1,2})?")  # describes a data type of the vendor
 NUMBER = re.compile(r"0[xX][0-9A-Fa-f]{1,8}|\d{1,10}")
 USED_KEYS = ("ParameterName", "ObjectType", "DataType", "DefaultValue", "ParameterValue", "CompactSubObj")
-VARIABLES = {"0x2", "0x7", "2", "7", "0x02", "0x07"}
-"""Object types that have a data type of their own."""
+VARIABLES = {"0x2", "0x7", "2", "7", "0x02", "0x07"}  # Object types that have a data type of their own
 
 OPERATIONAL = 0x05
 STATES = {0x00: "starting up", 0x04: "stopped", OPERATIONAL: "operational", 0x7F: "pre-operational"}
@@ -87,11 +94,9 @@ class PdoVariable:
     index: int
     subindex: int
     address: str
-    name: str
-    """In the object dictionary; empty if it is not there."""
+    name: str  # In the object dictionary; empty if it is not there
     signal: CanSignal
-    typed: bool
-    """Whether the sheet or the machine file gives its data type."""
+    typed: bool  # Whether the sheet or the machine file gives its data type
 
     def is_named(self, written: str) -> bool:
         """Whether ``written`` is the name of the object or its address; without subindex any subindex matches."""
@@ -124,8 +129,7 @@ class CanopenDrive:
             ConfigurationError: no such file, no EDS, or the type of an object in a table is not known.
         """
         self.node = node
-        self.warnings: list[str] = []
-        """What is wrong with the sheet, a line each."""
+        self.warnings: list[str] = []  # What is wrong with the sheet, a line each
         self._title = f"node {node}" if sheet is None else f"node {node} ({sheet})"
         self._dictionary = read_eds(sheet, node, self.warnings) if sheet is not None else None
         emergency = (self._value(EMERGENCY_OBJECT, 0) or 0) & STANDARD_LIMIT
@@ -133,16 +137,11 @@ class CanopenDrive:
         pdos = self._pdos_of_sheet() | {table.number: self._pdo_of_table(table) for table in tables}
         self._pdos = [pdos[number] for number in sorted(pdos)]
         if not pdos:
-            raise ConfigurationError(
-                f"node {node}: it is not known what it sends: set eds in [driver], or write [[driver.pdo]]", ("driver",)
-            )
+            text = f"node {node}: it is not known what it sends: set eds in [driver], or write [[driver.pdo]]"
+            raise ConfigurationError(text, ("driver",))
 
     def request(self, signal: Signal) -> SignalRequest:
-        """The request for ``signal`` in what the drive sends.
-
-        Raises:
-            ConfigurationError: no enabled PDO contains the object, or it has no type, or measures something else.
-        """
+        """The request for ``signal``; raise ConfigurationError if no PDO contains it, or its type or unit is wrong."""
         source: CanSource = signal.source
         key = ("signals", signal.name)
         pdo, variable = self._find(str(source.object), key)
@@ -171,9 +170,8 @@ class CanopenDrive:
             )
         addresses = sorted({variable.address for _, variable in enabled})
         if len(addresses) > 1:
-            raise ConfigurationError(
-                f"{self._title} has {written!r} at {', '.join(addresses)}: write one of these addresses", key
-            )
+            text = f"{self._title} has {written!r} at {', '.join(addresses)}: write one of these addresses"
+            raise ConfigurationError(text, key)
         return enabled[0]
 
     def _pdos_of_sheet(self) -> dict[int, Pdo]:
@@ -220,9 +218,8 @@ class CanopenDrive:
             variables.append(_pdo_variable(mapped, self._variable(mapped.index, mapped.subindex), bits))
             bits += variables[-1].signal.length
         if bits > CLASSIC_BITS:
-            raise ConfigurationError(
-                f"node {self.node}: TPDO {number} has {bits} bits, but a frame {CLASSIC_BITS}", PDO_KEY
-            )
+            text = f"node {self.node}: TPDO {number} has {bits} bits, but a frame {CLASSIC_BITS}"
+            raise ConfigurationError(text, PDO_KEY)
         name, signals = f"node{self.node}.TPDO{number}", [variable.signal for variable in variables]
         extended = identifier > STANDARD_LIMIT
         message = Message(identifier, name, (bits + 7) // 8, signals, is_extended_frame=extended, strict=False)
@@ -265,11 +262,7 @@ def _pdo_variable(mapped: MappedObject, known: "ODVariable | None", start: int) 
 
 
 def read_eds(path: Path, node: int, warnings: list[str]) -> "ObjectDictionary":
-    """The object dictionary in the sheet at ``path``; objects that cannot be read are named in ``warnings``.
-
-    Raises:
-        ConfigurationError: no such file, or not an electronic data sheet.
-    """
+    """The dictionary in a sheet; unreadable objects go to ``warnings``; raise ConfigurationError if it is no sheet."""
     from canopen.objectdictionary import eds  # noqa: PLC0415 - a tenth of a second that only CANopen drives cost
 
     data = content(path, SIZE_LIMIT, EDS_KEY)

@@ -64,8 +64,7 @@ class CanDatabase:
     path: Path
     messages: tuple[Message, ...]
     faults: tuple[DatabaseFault, ...] = ()
-    unread: dict[str, str] = field(default_factory=dict)
-    """Names of the messages that cannot be read, and why."""
+    unread: dict[str, str] = field(default_factory=dict)  # Names of the messages that cannot be read, and why
 
     def warnings(self) -> list[str]:
         """The faults, a line each."""
@@ -77,11 +76,7 @@ class CanDatabase:
 
 
 def load_dbc(path: Path) -> Database:
-    """The readable part of the database at ``path`` as a database of cantools.
-
-    Raises:
-        ConfigurationError: no such file, or not a CAN database.
-    """
+    """The readable part of the database at ``path``; raise ConfigurationError if there is none."""
     return Database(messages=list(load_database(path).messages), strict=False)
 
 
@@ -93,9 +88,8 @@ def load_database(path: Path) -> CanDatabase:
             memory.
     """
     if path.suffix.lower() in SHEETS:
-        raise ConfigurationError(
-            f'{path}: the data sheet of a CANopen drive, not a CAN database: set eds = "..." in [driver] instead', KEY
-        )
+        text = f'{path}: the data sheet of a CANopen drive, not a CAN database: set eds = "..." in [driver] instead'
+        raise ConfigurationError(text, KEY)
     text, faults = _text(path)
     if excess := _excess(text) if text.strip() else "it is empty":
         raise ConfigurationError(f"{path}: not a CAN database: {excess}", KEY)

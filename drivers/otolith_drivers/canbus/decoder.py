@@ -31,10 +31,11 @@ from otolith_drivers.canbus.monitoring import (
     checksum_test,
     counter_by_name,
 )
-from otolith_drivers.canbus.options import FrameOptions, MessageTable
-from otolith_drivers.canbus.signals import (
+from otolith_drivers.canbus.options import (
     MAX_VALUE,
     BitRange,
+    FrameOptions,
+    MessageTable,
     RawReader,
     SignalRequest,
     bytes_needed,
@@ -55,8 +56,7 @@ MAX_CYCLE_TIME = 86_400_000  # ms; a longer one in a database is no cycle time
 MAX_WARNINGS = 20  # lines about the files; more of them do not help
 
 Condition = tuple[tuple[RawReader, frozenset[int]], ...]
-Row = tuple[str, RawReader, float, float, float, float, str]
-"""Name, reader, lowest and highest raw number, scale, offset, unit."""
+Row = tuple[str, RawReader, float, float, float, float, str]  # Name, reader, raw limits, scale, offset, unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +65,9 @@ class MessageRules:
 
     counter: FrameCounter | None = None
     checksum: ChecksumTest | None = None
-    period: float | None = None
-    """s, declared."""
-    length: int = 0
-    """Bytes that counter and checksum need."""
-    is_j1939: bool = False
-    """Whether its highest numbers are no readings."""
+    period: float | None = None  # s, declared
+    length: int = 0  # Bytes that counter and checksum need
+    is_j1939: bool = False  # Whether its highest numbers are no readings
 
 
 @dataclass(slots=True)
@@ -103,8 +100,7 @@ class MessageReader:
         self._database_period = max(min(message.cycle_time or 0, MAX_CYCLE_TIME) * 1e-3 for message in messages)
         self._rows: list[Row] = []
         self._groups: dict[tuple[object, ...], _MultiplexedGroup] = {}
-        self._rejections: defaultdict[str, PassingFault] = defaultdict(PassingFault)
-        """Frames or values that could not be used, by their kind."""
+        self._rejections: defaultdict[str, PassingFault] = defaultdict(PassingFault)  # Frames or values, by their kind
         self._standard = {request.name: request.signal for request in requests if rules.is_j1939}
         for request in requests:
             self._length = max(self._length, bytes_needed(request.signal))
@@ -245,11 +241,7 @@ def _few(values: frozenset[int]) -> str:
 
 
 def _multiplexers(message: Message, signal: CanSignal) -> list[tuple[CanSignal, frozenset[int]]]:
-    """The multiplexers on which ``signal`` depends, outermost last, each with its values.
-
-    Raises:
-        ConfigurationError: they depend on each other in a circle.
-    """
+    """The multiplexers of ``signal`` with their values, outermost last; raise ConfigurationError for a circle."""
     switches: list[tuple[CanSignal, frozenset[int]]] = []
     while signal.multiplexer_signal is not None and signal.multiplexer_ids is not None:
         if len(switches) == len(message.signals):
@@ -271,10 +263,8 @@ class FrameDecoder:
         groups: ParameterGroups | None = None,
     ) -> None:
         """``groups`` are the keys of ``readers`` whose frames may come from any node of J1939."""
-        self.faults = BusFaults()
-        """What error frames report."""
-        self.configuration_warnings = tuple(warnings)
-        """What is wrong with the files that describe the frames, a line each."""
+        self.faults = BusFaults()  # What error frames report
+        self.configuration_warnings = tuple(warnings)  # What is wrong with the files that describe the frames
         self._readers = dict(readers)
         self._groups = groups or None
         self._nodes = tuple(nodes)
@@ -374,11 +364,7 @@ class FrameDecoder:
 
 
 def decoder_of(options: FrameOptions, setup: Setup) -> FrameDecoder:
-    """A decoder of the frames that contain the signals of ``setup``.
-
-    Raises:
-        ConfigurationError: a signal is not where its source says, or a message table does not fit its message.
-    """
+    """A decoder of the signals of ``setup``; raise ConfigurationError if a source or message table does not fit."""
     databases = [load_database(setup.folder / path) for path in options.databases()]
     warnings = [line for database in databases for line in database.warnings()]
     drives = _drives(options, setup)
@@ -455,11 +441,7 @@ def _tables_by_frame(
     databases: Sequence[CanDatabase],
     warnings: list[str],
 ) -> dict[int, MessageTable]:
-    """The table of each frame; a table of a known message without requests is added to ``warnings``.
-
-    Raises:
-        ConfigurationError: a table names no known message.
-    """
+    """The table of each frame; unused ones go to ``warnings``; raise ConfigurationError for an unknown message."""
     by_frame: dict[int, MessageTable] = {}
     for name, table in tables.items():
         keys = [key for key, content in frames.items() if content.is_named(name)]
@@ -468,9 +450,8 @@ def _tables_by_frame(
             continue
         if not any(message.name == name for database in databases for message in database.messages):
             known = nearest(name, [message.name for content in frames.values() for message in content.messages])
-            raise ConfigurationError(
-                f"no message {name!r} has a signal of [signals]: {known}", ("driver", "messages", name)
-            )
+            text = f"no message {name!r} has a signal of [signals]: {known}"
+            raise ConfigurationError(text, ("driver", "messages", name))
         warnings.append(f"driver.messages.{name}: [signals] has no signal of it")
     return by_frame
 
@@ -497,17 +478,12 @@ def _rules(content: _FrameContent, table: MessageTable, is_j1939: bool) -> Messa
 
 
 def _signal(content: _FrameContent, where: str | BitRange, key: str) -> CanSignal:
-    """The signal named ``where`` in any description of the frame, or the bits ``where``.
-
-    Raises:
-        ConfigurationError: no description of the frame has such a signal.
-    """
+    """The signal or the bits ``where``; raise ConfigurationError if no description of the frame has such a signal."""
     if isinstance(where, BitRange):
         return where.as_signal(key)
     signals = {signal.name: signal for message in reversed(content.messages) for signal in message.signals}
     if where in signals:
         return signals[where]
     name = content.messages[0].name
-    raise ConfigurationError(
-        f"{name} has no signal {where!r}: {nearest(where, list(signals))}", ("driver", "messages", name, key)
-    )
+    text = f"{name} has no signal {where!r}: {nearest(where, list(signals))}"
+    raise ConfigurationError(text, ("driver", "messages", name, key))

@@ -21,8 +21,7 @@ from otolith_drivers.canbus.bus import (
     open_bus,
 )
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
-from otolith_drivers.canbus.options import FrameOptions
-from otolith_drivers.canbus.signals import CanSource
+from otolith_drivers.canbus.options import CanSource, FrameOptions
 from otolith_drivers.common.reconnection import Reconnection, ThreadedDriver
 from otolith_drivers.errors import DeviceError
 
@@ -47,11 +46,7 @@ Source = CanSource
 
 
 def build(options: CanOptions, setup: Setup) -> "CanReceiver":
-    """A receiver of the frames that contain the signals of ``setup``.
-
-    Raises:
-        ConfigurationError: see :func:`otolith_drivers.canbus.decoder.decoder_of`.
-    """
+    """A receiver of the frames with the signals of ``setup``; raises as :func:`.decoder.decoder_of`."""
     return CanReceiver(options, decoder_of(options, setup))
 
 
@@ -68,11 +63,9 @@ class CanReceiver(ThreadedDriver):
         self._drops = DropCounter()
         self._last_frame = self._opened = 0.0
         self._gathers = False
-        self._next_reopening = 0.0
-        """s of silence after which the bus is opened anew; doubles each time."""
+        self._next_reopening = 0.0  # s of silence after which the bus is opened anew; doubles each time
 
     def open(self, deliver: Deliver) -> None:
-        """See :meth:`otolith_drivers.base.Driver.open`."""
         bus = self._connect()
         self._connection.come_up("is open")
         for line in self._decoder.configuration_warnings:
@@ -82,7 +75,6 @@ class CanReceiver(ThreadedDriver):
         self._start("can-receive", self._receive, bus, deliver)
 
     def counters(self) -> Counters:
-        """See :meth:`otolith_drivers.base.Driver.counters`."""
         counters = self._decoder.counters
         return replace(
             counters,
@@ -93,7 +85,6 @@ class CanReceiver(ThreadedDriver):
         )
 
     def link(self) -> Link:
-        """See :meth:`otolith_drivers.base.Driver.link`."""
         if not self._connection.up:
             return Link(up=False, reason=self._connection.reason)
         if self._decoder.faults.bus_off:
@@ -105,7 +96,6 @@ class CanReceiver(ThreadedDriver):
         return Link(up=True, warnings=warnings, latency=self._decoder.latency)
 
     def describe(self) -> list[str]:
-        """See :meth:`otolith_drivers.base.Driver.describe`."""
         return [f"CAN bus {self._options.title()}, receive only", *self._decoder.describe()]
 
     def _connect(self) -> can.BusABC:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
 
-from otolith_drivers.canbus.signals import CLASSIC_LENGTH
+from otolith_drivers.canbus.options import CLASSIC_LENGTH
 from otolith_drivers.common.reconnection import PassingFault
 from otolith_drivers.errors import ConfigurationError
 
@@ -30,8 +30,7 @@ PACKET_BYTES, MIN_BYTES, MAX_BYTES = 7, 9, 1785
 MAX_PAUSE = 1.25  # s between two frames of a transfer: the longest timeout of the standard (T2, T3)
 
 
-NodePair = tuple[int, int]
-"""Addresses of the node that sends a frame, and of that for which it is."""
+NodePair = tuple[int, int]  # Addresses of the node that sends a frame, and of that for which it is
 
 
 class WholeMessage(NamedTuple):
@@ -40,8 +39,7 @@ class WholeMessage(NamedTuple):
     group: int
     source: int
     data: bytes | bytearray
-    time: float
-    """Of its announcement, s: the data are of then."""
+    time: float  # Of its announcement, s: the data are of then
 
 
 @dataclass(slots=True)
@@ -49,10 +47,8 @@ class _Transfer:
     group: int
     size: int
     begun: float
-    latest: float
-    """s; time of its last frame."""
-    data: bytearray = field(default_factory=bytearray)
-    """Of the packets so far."""
+    latest: float  # s; time of its last frame
+    data: bytearray = field(default_factory=bytearray)  # Of the packets so far
 
 
 class Assembler:
@@ -60,10 +56,8 @@ class Assembler:
 
     def __init__(self, groups: Collection[int]) -> None:
         """Only messages of these parameter groups are put together."""
-        self.broken = PassingFault()
-        """Messages that were announced and are incomplete."""
-        self.latency = 0.0
-        """s from the announcement of the latest message to its last frame."""
+        self.broken = PassingFault()  # Messages that were announced and are incomplete
+        self.latency = 0.0  # s from the announcement of the latest message to its last frame
         self._groups = frozenset(groups)
         self._transfers: dict[NodePair, _Transfer] = {}
 
@@ -160,13 +154,10 @@ def fault_of(raw: float, signal: CanSignal) -> str:
 class ParameterGroup:
     """The sources of a parameter group, of which one is read."""
 
-    key: int
-    """Of the reader of its frames."""
+    key: int  # Of the reader of its frames
     title: str
-    declared: int | None
-    """Address of the source that the machine file or the database gives."""
-    source: int | None
-    """The address that is read; None until a frame came, if none is declared."""
+    declared: int | None  # Address of the source that the machine file or the database gives
+    source: int | None  # The address that is read; None until a frame came, if none is declared
     others: set[int] = field(default_factory=set)
 
 
@@ -174,18 +165,13 @@ class ParameterGroups:
     """Which frames of 29 bits belong to a message of a database, whatever node sends it."""
 
     def __init__(self, messages: Sequence[tuple[int, Message]], source: int | None) -> None:
-        """``messages`` have the key of their reader; ``source`` is the address of the machine file.
-
-        Raises:
-            ConfigurationError: two messages are the same parameter group.
-        """
+        """``messages`` with readers' keys, ``source`` of the file; raise ConfigurationError if two are of one group."""
         self._groups: dict[int, ParameterGroup] = {}
         for key, message in messages:
             declared = source if names_any_source(message) else message.frame_id & ADDRESS_MASK
             self._groups[group_of(message.frame_id)] = ParameterGroup(key, message.name, declared, declared)
         long = [group_of(message.frame_id) for _, message in messages if has_several_frames(message)]
-        self.assembler = Assembler(long) if long else None
-        """Of the messages of several frames; None if there are none."""
+        self.assembler = Assembler(long) if long else None  # Of the messages of several frames, if any
         if len(self._groups) < len(messages):
             names = ", ".join(message.name for _, message in messages)
             raise ConfigurationError(f"of {names}, two have the same parameter group: read signals of one of them")

@@ -13,8 +13,7 @@ import can
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
 
-from otolith_drivers.canbus.options import ChecksumKind, ChecksumTable
-from otolith_drivers.canbus.signals import RawReader, raw_reader
+from otolith_drivers.canbus.options import ChecksumKind, ChecksumTable, RawReader, raw_reader
 from otolith_drivers.common.message_times import PeriodEstimator
 
 # Thresholds; docs/reference/thresholds-canbus.md gives the origin of each.
@@ -44,8 +43,7 @@ class FrameCounter:
         self.name = signal.name
         self.declared = declared
         self.modulo = modulo or _modulo(signal)
-        self.repeated = 0
-        """Frames in a row that have repeated the last count."""
+        self.repeated = 0  # Frames in a row that have repeated the last count
         self._read: RawReader = raw_reader(signal)
         self._trusted = declared
         self._run = 0
@@ -107,8 +105,7 @@ CRCS: dict[str, tuple[str, int]] = {
 }
 """Class in crccheck, and bits. The SAE polynomial with initial value 0 is that of AUTOSAR's profile 1."""
 
-ChecksumTest = Callable[[bytes | bytearray], bool]
-"""Whether the checksum in the data of a frame is that of the bytes it covers."""
+ChecksumTest = Callable[[bytes | bytearray], bool]  # Whether the checksum in a frame is that of its bytes
 
 
 def checksum_algorithm(kind: ChecksumKind) -> tuple[Callable[[bytes], int], int]:
@@ -124,11 +121,7 @@ def checksum_algorithm(kind: ChecksumKind) -> tuple[Callable[[bytes], int], int]
 
 
 def checksum_test(signal: CanSignal, table: ChecksumTable, length: int) -> ChecksumTest:
-    """The test for the checksum that ``table`` describes, in ``signal`` of a frame of ``length`` bytes.
-
-    Raises:
-        ValueError: the signal has not the bits of such a checksum, or the covered bytes exceed the frame.
-    """
+    """The test for the checksum of ``table`` in ``signal``; raise ValueError if it does not fit ``length`` bytes."""
     calculate, bits = checksum_algorithm(table.kind)
     own, odd = divmod(signal.start if signal.byte_order == "little_endian" else signal.start - 7, 8)
     if odd or signal.length != bits or signal.is_signed or signal.conversion.is_float:
@@ -178,14 +171,10 @@ class BusFaults:
     """Counts error frames by their class and tracks the state of the CAN controller."""
 
     def __init__(self) -> None:
-        self.bus_off = False
-        """True from a bus-off report until the next frame, or until the bus is opened anew."""
-        self.total = 0
-        """Error frames, each of which may be of several classes."""
-        self.counts: Counter[str] = Counter()
-        """Error frames of each class."""
-        self.overflows = 0
-        """How often the controller had no room for a frame."""
+        self.bus_off = False  # True from a bus-off report until the next frame, or until the bus is opened anew
+        self.total = 0  # Error frames, each of which may be of several classes
+        self.counts: Counter[str] = Counter()  # Error frames of each class
+        self.overflows = 0  # How often the controller had no room for a frame
         self._state = ""
         self._latest = ""
         self._time = 0.0

@@ -21,7 +21,7 @@ from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import STATES
 from otolith_drivers.canbus.j1939 import group_of
 from otolith_drivers.canbus.monitoring import error_classes
-from otolith_drivers.canbus.signals import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
+from otolith_drivers.canbus.options import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
 from otolith_drivers.errors import some_names
 from otolith_drivers.number_inference import FRAMES, Layout, LayoutVerdict, Part, number_text, parts, quoted, spread
 
@@ -50,8 +50,7 @@ class ObservedValue:
     latest: float
     low: float
     high: float
-    beyond: int = 0
-    """How often it was outside the range of the database."""
+    beyond: int = 0  # How often it was outside the range of the database
 
 
 @dataclass(slots=True)
@@ -60,14 +59,12 @@ class ObservedFrames:
 
     identifier: int
     extended: bool
-    message: Message | None = None
-    """Its description in the database."""
+    message: Message | None = None  # Its description in the database
     count: int = 0
     latest: bytes = b""
     fd: bool = False
     lengths: set[int] = field(default_factory=set)
-    changed: bytearray = field(default_factory=bytearray)
-    """The bits of each byte that have ever changed."""
+    changed: bytearray = field(default_factory=bytearray)  # The bits of each byte that have ever changed
     history: deque[bytes] = field(default_factory=lambda: deque(maxlen=MAX_FRAMES))
     values: dict[str, ObservedValue] = field(default_factory=dict)
     undecodable: int = 0
@@ -155,13 +152,10 @@ class Picture:
         }
         self.has_database = bool(self._messages)
         self.observed: dict[tuple[int, bool], ObservedFrames] = {}
-        self.errors: Counter[str] = Counter()
-        """Error frames of each class."""
+        self.errors: Counter[str] = Counter()  # Error frames of each class
         self.error_frames = 0
-        self.unreadable = 0
-        """Frames that the interface could not unpack."""
-        self.left_out = 0
-        """Frames of the arbitration IDs beyond ``MAX_IDENTIFIERS``."""
+        self.unreadable = 0  # Frames that the interface could not unpack
+        self.left_out = 0  # Frames of the arbitration IDs beyond MAX_IDENTIFIERS
 
     @property
     def frames(self) -> int:

@@ -18,11 +18,9 @@ class CredentialOptions(StrictModel):
     """The keys of ``[driver]`` that prove who this client is; paths are relative to the machine file."""
 
     certificate: Path | None = None
-    key: Path | None = None
-    """Certificate and private key of this client."""
+    key: Path | None = None  # Certificate and private key of this client
     user: str | None = None
-    password_file: Path | None = None
-    """A file whose first line is the password."""
+    password_file: Path | None = None  # A file whose first line is the password
 
     @model_validator(mode="after")
     def _are_pairs(self) -> Self:
@@ -33,11 +31,7 @@ class CredentialOptions(StrictModel):
 
 
 def certificate(path: Path, key: str) -> x509.Certificate:
-    """Return the first certificate of ``path``, which the table names by ``key``.
-
-    Raises:
-        ConfigurationError: the file is missing, or has other content.
-    """
+    """Return the first certificate of ``path``, at ``key`` of the table; raise ConfigurationError if there is none."""
     where = ("driver", key)
     data = content(path, SECRET_LIMIT, where)
     try:
@@ -67,11 +61,7 @@ def certificate_and_key(certificate_path: Path, key_path: Path) -> tuple[x509.Ce
 
 
 def password(path: Path | None) -> str:
-    """Return the first line of a password file; empty without one, or for a user without a password.
-
-    Raises:
-        ConfigurationError: the file cannot be read.
-    """
+    """Return the first line of a password file, empty without one; raise ConfigurationError if it is unreadable."""
     if path is None:
         return ""
     lines = content(path, SECRET_LIMIT, ("driver", "password_file")).decode(errors="replace").splitlines()

@@ -37,8 +37,7 @@ class ExchangeClock:
 
     def __init__(self) -> None:
         self._low, self._high, self._time = -math.inf, math.inf, 0.0
-        self.steps = 0
-        """How often the clock was set."""
+        self.steps = 0  # How often the clock was set
 
     @property
     def known(self) -> bool:
@@ -136,11 +135,9 @@ class PeriodEstimator:
 
     def __init__(self, declared: float | None = None) -> None:
         """``declared`` is the period (s) if the machine file gives it; it is then never estimated."""
-        self.period = declared
-        """s; None until it is known."""
+        self.period = declared  # s; None until it is known
         self.regular = declared is not None
-        self.last: float | None = None
-        """Arrival (s) of the last new frame."""
+        self.last: float | None = None  # Arrival (s) of the last new frame
         self._declared = declared is not None
         self._intervals: list[float] = []
         self._outliers = 0

@@ -63,8 +63,7 @@ class Reconnection:
 class PassingFault:
     """A fault that ends no connection, such as an unusable value: counted, and a warning while it is recent."""
 
-    text: str = ""
-    """The latest one."""
+    text: str = ""  # The latest one
     count: int = 0
     time: float = -math.inf
 
@@ -101,7 +100,6 @@ class ThreadedDriver:
         self._thread.start()
 
     def close(self) -> None:
-        """See :meth:`otolith_drivers.base.Driver.close`."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(CLOSE_TIMEOUT)

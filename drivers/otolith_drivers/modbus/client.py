@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import serial
 from pymodbus import ModbusException
@@ -25,6 +25,7 @@ from otolith_drivers.modbus.protocol import ConnectionLostError, ExceptionReplyE
 FUNCTION_CODES: Final[dict[Table, int]] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 DRAIN_STEP = 0.02  # s between looks for late bytes; engineering choice: at most 1 % of a core
 HEADER_LENGTH = 7  # bytes of a TCP answer before its function code
+READS: Final = {1: "read_coils", 2: "read_discrete_inputs", 3: "read_holding_registers", 4: "read_input_registers"}
 REPEATED_FIELDS = (("reply_transaction", "transaction", 0, 2), ("reply_device", "device", 6, 7))
 MAX_DRAIN = 5  # timeouts, after which a line that never falls silent is reopened all the same; engineering choice
 
@@ -41,11 +42,7 @@ class ReadOnlyClient:
         self._client = _client(options, self._aborted, self._headers or _EchoFilter())
 
     def connect(self) -> None:
-        """Open the connection.
-
-        Raises:
-            ConnectionLostError: it cannot be opened.
-        """
+        """Open the connection; raise ConnectionLostError if it cannot be opened."""
         try:  # not by the library, which only logs the cause of a failure
             self._client.socket = self._open()
         except (OSError, ValueError, termios.error) as error:
@@ -73,12 +70,7 @@ class ReadOnlyClient:
             ConnectionLostError: the connection failed.
         """
         client = self._client
-        read = {
-            "coil": client.read_coils,
-            "discrete": client.read_discrete_inputs,
-            "holding": client.read_holding_registers,
-            "input": client.read_input_registers,
-        }[table]
+        read = getattr(client, READS[FUNCTION_CODES[table]])
         if self._options.reply_transaction is not None:  # a second copy of an answer looks like the next answer
             self._discard()
         try:
@@ -204,6 +196,11 @@ class _HeaderFilter:
             return data
         answers, at = bytearray(data), 0
         while at + HEADER_LENGTH <= len(answers):
+            if any(data[at + 2 : at + 4]):  # the number of the protocol is 0
+                is_serial = data[at : at + 2] == self._sent[6:8]
+                kind = 'an answer of a serial line: set framing = "rtu" in [driver]' if is_serial else ""
+                self.mismatch = kind or "bytes that are no answer of Modbus TCP"
+                break
             for name, what, begin, end in REPEATED_FIELDS:
                 number, sent = (int.from_bytes(part) for part in (data[at + begin : at + end], self._sent[begin:end]))
                 if number == sent:
@@ -227,24 +224,12 @@ def _is_pseudo_terminal(port: str | None) -> bool:
 def _client(
     options: LineOptions, aborted: threading.Event, trace: Callable[[bool, bytes], bytes]
 ) -> ModbusTcpClient | ModbusSerialClient:
+    keys: dict[str, Any] = {"timeout": options.timeout, "retries": 0, "trace_packet": trace}
     if options.host is not None:
-        return ModbusTcpClient(
-            options.host,
-            port=options.port,
-            framer=FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU,
-            timeout=options.timeout,
-            retries=0,
-            trace_packet=trace,
-        )
-    client = _SerialClient(
-        options.serial or "",
-        baudrate=options.baudrate,
-        parity=options.parity,
-        stopbits=options.stop_bits,
-        timeout=options.timeout,
-        retries=0,
-        trace_packet=trace,
-    )
+        framer = FramerType.SOCKET if options.framing == "tcp" else FramerType.RTU
+        return ModbusTcpClient(options.host, port=options.port, framer=framer, **keys)
+    keys |= {"baudrate": options.baudrate, "parity": options.parity, "stopbits": options.stop_bits}
+    client = _SerialClient(options.serial or "", **keys)
     client.aborted = aborted
     return client
 

@@ -31,11 +31,7 @@ MAX_SLEEP = 0.2  # s that a stop between two rounds may go unnoticed; engineerin
 
 
 def build(options: ModbusOptions, setup: Setup) -> "ModbusPoller":
-    """Return a poller of all signals of ``setup`` at its sample period.
-
-    Raises:
-        ConfigurationError: a unit has the wrong dimension, or a register does not exist.
-    """
+    """Return a poller of all signals; raise ConfigurationError for a wrong unit, or a register that does not exist."""
     return ModbusPoller(options, [register_signal(signal, options) for signal in setup.signals], setup.sample_period)
 
 
@@ -56,30 +52,25 @@ class ModbusPoller(ThreadedDriver):
         self._answers = self._closings = 0  # since the connection was opened; connections in a row with one answer
         self._schedule = PollSchedule(period)
         self._order = OrderMonitor(signals)
-        self._unjudged: dict[str, list[Sample]] = {}
-        """Samples by signal that wait for the first judgement of the byte order."""
+        self._unjudged: dict[str, list[Sample]] = {}  # By signal, until the first judgement of the byte order
         self._staleness = StalenessMonitor()
         self._received = self._bad = self._lost = 0
         self._rate_logged = False
         self._connection = Reconnection(options.title(), log)
 
     def open(self, deliver: Deliver) -> None:
-        """See :meth:`otolith_drivers.base.Driver.open`."""
         self._connection.reason = "not connected yet"
         self._start("modbus-poll", self._run, deliver)
 
     def close(self) -> None:
-        """See :meth:`otolith_drivers.base.Driver.close`."""
         self._stop.set()
         self._client.abort()
         super().close()
 
     def counters(self) -> Counters:
-        """See :meth:`otolith_drivers.base.Driver.counters`."""
         return Counters(self._received, self._bad, self._lost, self._connection.count)
 
     def link(self) -> Link:
-        """See :meth:`otolith_drivers.base.Driver.link`."""
         schedule, requests = self._schedule, self._requests.requests
         warnings = [*self._requests.warnings(time.monotonic()), *self._order.warnings()]
         warnings += self._staleness.warnings(requests, schedule.period)
@@ -92,7 +83,6 @@ class ModbusPoller(ThreadedDriver):
         return Link(self._connection.up, self._connection.reason, tuple(warnings), plan_text, period)
 
     def describe(self) -> list[str]:
-        """See :meth:`otolith_drivers.base.Driver.describe`."""
         requests, period = self._requests.requests, self._schedule.requested
         codes = "1 to 4" if any(signal.table in BIT_TABLES for signal in self._signals) else "3 and 4"
         title = f"{self._options.title()}, read only (function codes {codes})"
@@ -178,11 +168,7 @@ class ModbusPoller(ThreadedDriver):
         return []
 
     def _request(self, request: Request) -> tuple[list[int], float]:
-        """Return the registers and the middle (s) of the round trip; reconnect once if the line was closed.
-
-        Raises:
-            ExceptionReplyError, NoReplyError, ConnectionLostError: see :meth:`ReadOnlyClient.read`.
-        """
+        """Return registers and middle (s) of the round trip; reopen a closed line once; raises as ``read``."""
         sent = time.monotonic()
         try:
             registers = self._client.read(request.device, request.table, request.address, request.count)

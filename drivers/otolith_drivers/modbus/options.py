@@ -7,8 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from otolith_drivers.base import Signal
-from otolith_drivers.common.scaled import Conversion, ScaledSource
+from otolith_drivers.base import Conversion, ScaledSource, Signal
 from otolith_drivers.config_files import StrictModel
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.modbus.protocol import Order, TypeName, bit_reader, reader, registers_of
@@ -22,8 +21,7 @@ SILENT_CHARACTERS = 3.5  # between frames (Modbus over Serial Line V1.02, sectio
 MAX_DECIMALS = 9  # digits behind the point; more are no decimals register
 
 Table = Literal["holding", "input", "coil", "discrete"]
-BIT_TABLES: dict[Table, str] = {"coil": "coil", "discrete": "discrete input"}
-"""Tables of single bits, whose values are 0 and 1, and their names in words."""
+BIT_TABLES: dict[Table, str] = {"coil": "coil", "discrete": "discrete input"}  # Tables of bits, and their names
 Device = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -32,21 +30,15 @@ class LineOptions(StrictModel):
 
     host: str | None = None
     port: Annotated[int, Field(ge=1, le=65535)] = 502
-    framing: Literal["tcp", "rtu"] = "tcp"
-    """Of a host; ``rtu`` for a gateway that forwards serial frames unchanged."""
-    serial: str | None = None
-    """The serial port, like ``/dev/ttyUSB0``."""
+    framing: Literal["tcp", "rtu"] = "tcp"  # Of a host; rtu for a gateway that forwards serial frames unchanged
+    serial: str | None = None  # The serial port, like /dev/ttyUSB0
     baudrate: Annotated[int, Field(ge=300, le=4_000_000)] = 19200
     parity: Literal["N", "E", "O"] = "E"
     stop_bits: Literal[1, 2] = 1
-    timeout: Annotated[float, BeforeValidator(Quantity("s", 0.01, 10.0))] = 0.5
-    """Longest time (s) from a request to its answer."""
-    pause: Annotated[float, BeforeValidator(Quantity("s", 0.0, 1.0))] = 0.0
-    """Time (s) between two requests, for devices that need one."""
-    reply_device: Device | None = None
-    """Device number in the answers, of a TCP device that does not repeat that of the request."""
-    reply_transaction: Annotated[int, Field(ge=0, le=65535)] | None = None
-    """Transaction number in the answers, of a TCP device that does not repeat that of the request."""
+    timeout: Annotated[float, BeforeValidator(Quantity("s", 0.01, 10.0))] = 0.5  # Longest, from request to answer
+    pause: Annotated[float, BeforeValidator(Quantity("s", 0.0, 1.0))] = 0.0  # Between requests, if a device needs one
+    reply_device: Device | None = None  # In the answers, if they do not repeat that of the request (TCP)
+    reply_transaction: Annotated[int, Field(ge=0, le=65535)] | None = None  # In the answers, if not repeated (TCP)
 
     @model_validator(mode="after")
     def _host_or_serial(self) -> Self:
@@ -79,16 +71,11 @@ class LineOptions(StrictModel):
 class ModbusOptions(LineOptions):
     """``[driver]`` with ``type = "modbus"``."""
 
-    device: Device = 1
-    """Device number (also called unit or slave) of the signals that name none."""
-    order: Order = "ABCD"
-    """Byte order of the signals that name none."""
-    first_address: Literal[0, 1] = 0
-    """Number of the first register in the manual; with 1, each address in the file is one more than on the wire."""
-    max_gap: Annotated[int, Field(ge=0, lt=MAX_REGISTERS)] = 8
-    """Most unneeded registers in a row that are read along to save a request."""
-    max_registers: Annotated[int, Field(ge=1, le=MAX_REGISTERS)] = MAX_REGISTERS
-    """Most registers that the device returns at once."""
+    device: Device = 1  # Device number (also called unit or slave) of the signals that name none
+    order: Order = "ABCD"  # Byte order of the signals that name none
+    first_address: Literal[0, 1] = 0  # Of the manual; with 1, an address in the file is one more than on the wire
+    max_gap: Annotated[int, Field(ge=0, lt=MAX_REGISTERS)] = 8  # Most unneeded registers in a row that are read along
+    max_registers: Annotated[int, Field(ge=1, le=MAX_REGISTERS)] = MAX_REGISTERS  # Most that the device returns at once
 
 
 class ModbusSource(ScaledSource):
@@ -96,15 +83,12 @@ class ModbusSource(ScaledSource):
 
     register_: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1, alias="register")]
     table: Table = "holding"
-    type: TypeName
-    """Not of a coil or discrete input, which is 0 or 1."""
+    type: TypeName  # Not of a coil or discrete input, which is 0 or 1
     unit: str
     device: Device | None = None
     order: Order | None = None
-    bits: str | None = None
-    """``"3"`` or ``"4..7"``: the number is this bit field of an integer."""
-    trusted: bool = False
-    """Whether to skip the plausibility check of the byte order."""
+    bits: str | None = None  # "3" or "4..7": the number is this bit field of an integer
+    trusted: bool = False  # Whether to skip the plausibility check of the byte order
     decimals: Annotated[int, Field(ge=0, le=HIGHEST_ADDRESS + 1)] | None = None
     """Register with the number of decimals: the number is divided by 10 to its power."""
 
@@ -132,13 +116,11 @@ class RegisterSignal:
     target_unit: str
     device: int
     table: Table
-    address: int
-    """On the wire, from 0."""
+    address: int  # On the wire, from 0
     kind: TypeName
     order: Order
     source: ModbusSource
-    number: Callable[[Sequence[int]], float]
-    """From registers to the number in them."""
+    number: Callable[[Sequence[int]], float]  # From registers to the number in them
     conversion: Conversion
     decimals: "RegisterSignal | None" = None  # the register with their number
     is_sampled: bool = True  # False for a register of decimals, which is no signal of its own
@@ -188,9 +170,8 @@ def register_signal(signal: Signal, options: ModbusOptions) -> RegisterSignal:
         bounds = f"registers go from {options.first_address} to {HIGHEST_ADDRESS + options.first_address}"
         raise ConfigurationError(f"register {source.register_} as {source.type}: {bounds}", key)
     if count > options.max_registers:
-        raise ConfigurationError(
-            f"{source.type} has {count} registers, more than driver.max_registers = {options.max_registers}", key
-        )
+        text = f"{source.type} has {count} registers, more than driver.max_registers = {options.max_registers}"
+        raise ConfigurationError(text, key)
     order = source.order or options.order
     decimals = None
     if source.decimals is not None:

@@ -56,8 +56,7 @@ class OrderVerdict:
 
     plausible: bool
     reason: str = ""
-    better: Order | None = None
-    """An order in which the number is plausible, if it is not in its own."""
+    better: Order | None = None  # An order in which the number is plausible, if it is not in its own
 
 
 def judge_order(
@@ -79,6 +78,8 @@ def judge_order(
     if not reason:
         return OrderVerdict(plausible=True)
     others = [other for other in orders if other != chosen and not _fault(numbers, kind, other)]
+    if not np.isfinite(numbers[chosen]).any() and len(set(map(tuple, history))) == 1:
+        others = []  # what a device writes that has no reading is plausible in some wrong orders
     if usual_size and is_float(kind) and _size(numbers[chosen]) < SMALLEST:
         low, high = usual_size / USUAL_SIZE_RATIO, usual_size * USUAL_SIZE_RATIO
         others = [other for other in others if low < _size(numbers[other]) < high]
@@ -160,8 +161,7 @@ class OrderMonitor:
         self._history: dict[str, deque[Sequence[int]]] = {name: deque(maxlen=READINGS) for name in self._signals}
         self._verdicts: dict[str, OrderVerdict] = {}
         self._usual_sizes: dict[str, float] = {}
-        self.withheld: frozenset[str] = frozenset()
-        """Names of the signals that are not plausible now."""
+        self.withheld: frozenset[str] = frozenset()  # Names of the signals that are not plausible now
         self._next = cycle(self._signals or [""])
         self._rounds = 0
 
@@ -217,14 +217,10 @@ class _Repeats:
 
     image: Sequence[int] | None = None
     readings: int = 0
-    run: int = 0
-    """Repeated images in a row."""
-    share: float = 1.0
-    """Share of readings that repeat the previous one."""
-    run_share: float = 1.0
-    """The same with each run counted once."""
-    coarse_share: float = 1.0
-    """Share of changes by a few steps only."""
+    run: int = 0  # Repeated images in a row
+    share: float = 1.0  # Share of readings that repeat the previous one
+    run_share: float = 1.0  # The same with each run counted once
+    coarse_share: float = 1.0  # Share of changes by a few steps only
 
 
 class StalenessMonitor:

@@ -50,12 +50,9 @@ MIN_PERIOD = 0.01  # s from round to round: fast enough to see noise, without lo
 RATES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1)  # usual rates in Hz
 MAX_LOAD = 0.9  # share of a period that requests may take at a possible rate
 MAX_SPANS = 8  # ranges of registers that are listed
-Words = NDArray[np.uint16]
-"""Readings by registers."""
-Stopped = Callable[[], bool]
-"""Whether the user has ended the probe."""
-ProgressCallback = Callable[[str], None]
-"""Takes a line about what is being done."""
+Words = NDArray[np.uint16]  # Readings by registers
+Stopped = Callable[[], bool]  # Whether the user has ended the probe
+ProgressCallback = Callable[[str], None]  # Takes a line about what is being done
 # A device that has one byte order for some numbers seldom has another for others. Engineering choices, guarded by
 # tests/drivers/test_number_inference.py (adjacent numbers of all types).
 OTHER_ORDER_BITS, OTHER_ORDER_BITS_PER_READING = 8.0, 1.5
@@ -75,10 +72,8 @@ class ProbeClient:
     def __init__(self, line: ReadOnlyClient, options: LineOptions, device: int, table: Table) -> None:
         self._line = line
         self.options, self.device, self.table = options, device, table
-        self.round_trips: dict[int, deque[float]] = {}
-        """Round-trip times in s by the number of registers."""
-        self.alive = False
-        """Whether the device has ever answered, if only with an exception."""
+        self.round_trips: dict[int, deque[float]] = {}  # Round-trip times in s by the number of registers
+        self.alive = False  # Whether the device has ever answered, if only with an exception
         self._answered: int | None = None
 
     def read(self, address: int, count: int) -> list[int]:
@@ -126,11 +121,7 @@ class ProbeClient:
 
 
 def open_line(line: ReadOnlyClient, options: LineOptions) -> None:
-    """Open the connection.
-
-    Raises:
-        DeviceError: it cannot be opened; the message has cause and remedy.
-    """
+    """Open the connection; raise DeviceError if it cannot be opened; the message has cause and remedy."""
     try:
         line.connect()
     except ConnectionLostError as error:
@@ -139,11 +130,7 @@ def open_line(line: ReadOnlyClient, options: LineOptions) -> None:
 
 @contextmanager
 def opened(options: LineOptions, progress: ProgressCallback) -> Iterator[ReadOnlyClient]:
-    """Open the connection, and close it at the end.
-
-    Raises:
-        DeviceError: it cannot be opened; the message has cause and remedy.
-    """
+    """Open the connection, and close it at the end; raise DeviceError, with the remedy, if it cannot be opened."""
     line = ReadOnlyClient(options)
     progress(f"opening {options.title()}")
     open_line(line, options)
@@ -173,18 +160,13 @@ class Answer:
     """A device that answers."""
 
     device: int
-    reply: str
-    """The exception with which it refuses the register; empty if it returns it."""
+    reply: str  # The exception with which it refuses the register; empty if it returns it
 
 
 def scan(
     client: ProbeClient, devices: Sequence[int], register: int, stopped: Stopped, progress: ProgressCallback
 ) -> list[Answer]:
-    """Return those of ``devices`` that answer a request for one register.
-
-    Raises:
-        DeviceError: the connection is lost.
-    """
+    """Return which ``devices`` answer a request for one register; raise DeviceError if the connection is lost."""
     answers: list[Answer] = []
     for device in devices:
         if stopped():
@@ -224,10 +206,8 @@ class Survey:
     """Which registers a device has."""
 
     blocks: list[Block] = field(default_factory=list)
-    refused: dict[int, str] = field(default_factory=dict)
-    """Reasons by address."""
-    max_registers: int = MAX_REGISTERS
-    """Registers that the device returns at once, as far as tried."""
+    refused: dict[int, str] = field(default_factory=dict)  # Reasons by address
+    max_registers: int = MAX_REGISTERS  # Registers that the device returns at once, as far as tried
 
     def describe(self, first_address: int = 0) -> list[str]:
         """Return a line for the readable registers and for each reason, numbered as in the machine file."""
@@ -262,11 +242,7 @@ def survey(client: ProbeClient, first: int, last: int, stopped: Stopped, progres
 
 
 def _refusal(client: ProbeClient, block: Block) -> str | None:
-    """Return why ``block`` cannot be read; None if it can.
-
-    Raises:
-        DeviceError: the device is not there.
-    """
+    """Return why ``block`` cannot be read; None if it can; raise DeviceError if the device is not there."""
     try:
         client.read(block.address, block.count)
     except ExceptionReplyError as error:
@@ -344,8 +320,7 @@ class Speed:
 
     registers: int
     median: float
-    slow: float
-    """Time in s that 99 of 100 requests do not exceed."""
+    slow: float  # Time in s that 99 of 100 requests do not exceed
 
     def describe(self) -> str:
         """Return length and times in words."""
@@ -375,8 +350,7 @@ class Number:
 
     address: int
     part: Part
-    word: int
-    """The latest content of its first register."""
+    word: int  # The latest content of its first register
 
     @property
     def count(self) -> int:
@@ -428,8 +402,7 @@ class Reading:
     latest: float
     low: float
     high: float
-    fault: str
-    """Why no machine has these numbers; empty if one could."""
+    fault: str  # Why no machine has these numbers; empty if one could
 
 
 def readings_at(data: Bytes, at: int, kinds: Iterable[TypeName]) -> Iterator[Reading]:

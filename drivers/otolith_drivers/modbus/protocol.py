@@ -22,41 +22,22 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target device failed to respond",
 }
-ILLEGAL_FUNCTION = 1
-"""Exception of a device that does not serve the function, such as reading a table that it lacks."""
-PERMANENT_CODES = (ILLEGAL_FUNCTION, 2, 3)
-"""Exceptions that a repeated request will meet again."""
-BUSY_CODES = (5, 6)
-"""Exceptions that ask to repeat the request later."""
-GATEWAY_CODES = (10, 11)
-"""Exceptions by which a gateway reports that the device does not answer."""
+ILLEGAL_FUNCTION = 1  # Exception of a device that does not serve the function, such as reading a table that it lacks
+PERMANENT_CODES = (ILLEGAL_FUNCTION, 2, 3)  # Exceptions that a repeated request will meet again
+BUSY_CODES = (5, 6)  # Exceptions that ask to repeat the request later
+GATEWAY_CODES = (10, 11)  # Exceptions by which a gateway reports that the device does not answer
 
 TypeName = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
 ORDERS: tuple[Order, ...] = get_args(Order)
-WORDS_SWAPPED: frozenset[Order] = frozenset({"CDAB", "DCBA"})
-"""Orders with the lowest register first."""
-BYTES_SWAPPED: frozenset[Order] = frozenset({"BADC", "DCBA"})
-"""Orders with the low byte of each register first."""
-LETTERS: dict[TypeName, str] = {
-    "int16": "h",
-    "uint16": "H",
-    "int32": "i",
-    "uint32": "I",
-    "int64": "q",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
-"""Format characters of ``struct`` by type."""
+WORDS_SWAPPED: frozenset[Order] = frozenset({"CDAB", "DCBA"})  # Orders with the lowest register first
+BYTES_SWAPPED: frozenset[Order] = frozenset({"BADC", "DCBA"})  # Orders with the low byte of each register first
+LETTERS: dict[TypeName, str] = dict(zip(get_args(TypeName), "hHiIqQfd", strict=True))  # Of struct, by type
 BITS = re.compile(r"(\d{1,2})(?:\.\.(\d{1,2}))?")
 
 
 class ExceptionReplyError(Exception):
-    """The device answers with an exception.
-
-    Examples: it does not have the registers, returns fewer at once, or is busy.
-    """
+    """The device answers with an exception: it does not have the registers, returns fewer at once, or is busy."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
@@ -69,17 +50,11 @@ class ExceptionReplyError(Exception):
 
 
 class NoReplyError(Exception):
-    """No valid answer to the request arrives in time; the connection itself stands.
-
-    Examples: device switched off, wrong device number, wrong baud rate, a late answer to an earlier request.
-    """
+    """No valid answer arrives in time, as from a device that is off or late; the connection itself stands."""
 
 
 class ConnectionLostError(Exception):
-    """The connection fails.
-
-    Examples: connection refused or closed, host unreachable, serial adapter unplugged.
-    """
+    """The connection fails: it is refused or closed, the host unreachable, or the serial adapter unplugged."""
 
 
 def registers_of(kind: TypeName) -> int:

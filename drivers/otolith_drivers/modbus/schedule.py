@@ -49,8 +49,7 @@ class Request:
     table: Table
     address: int
     count: int
-    signals: tuple[RegisterSignal, ...]
-    """In the order of their addresses."""
+    signals: tuple[RegisterSignal, ...]  # In the order of their addresses
 
     @property
     def samples(self) -> int:
@@ -113,10 +112,8 @@ class Backoff:
 
     failures: int = 0
     fault: str = ""
-    since: float = 0.0
-    """Time of the first failure in s."""
-    until: float = 0.0
-    """End of the pause in s; 0 if there is none."""
+    since: float = 0.0  # Time of the first failure in s
+    until: float = 0.0  # End of the pause in s; 0 if there is none
 
     def fail(self, fault: str, now: float, max_failures: float) -> None:
         """Count a failure; from ``max_failures`` in a row on, pause, each time twice as long."""
@@ -217,8 +214,7 @@ class PollSchedule:
         self.requested = requested
         self.period = requested
         self.due = math.inf
-        self.known = False
-        """Whether enough rounds have passed to know that the line keeps the period."""
+        self.known = False  # Whether enough rounds have passed to know that the line keeps the period
         self._starts: deque[float] = deque(maxlen=DECISION_ROUNDS + 1)
         self._durations: list[float] = []
         self._skipped = self._slow = self._fast = 0

@@ -19,10 +19,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from pydantic import BeforeValidator, Field, model_validator
 
+from otolith_drivers.base import ScaledSource
 from otolith_drivers.common.credentials import CredentialOptions, certificate, certificate_and_key, password
 from otolith_drivers.common.message_times import ExchangeClock, unix_time
 from otolith_drivers.common.reconnection import cause_of
-from otolith_drivers.common.scaled import ScaledSource
 from otolith_drivers.errors import nearest
 from otolith_drivers.units import Quantity
 
@@ -43,18 +43,13 @@ logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs a traceback f
 class OpcuaOptions(CredentialOptions):
     """``[driver]`` with ``type = "opcua"``."""
 
-    endpoint: str
-    """``opc.tcp://host:port`` with the path that the server asks for."""
+    endpoint: str  # opc.tcp://host:port with the path that the server asks for
     security: Literal["none", "Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss"] = "none"
     mode: Literal["sign", "sign and encrypt"] = "sign and encrypt"
-    server_certificate: Path | None = None
-    """The only certificate that is accepted from the server; without it, any."""
-    timeout: Annotated[float, BeforeValidator(Quantity("s", 0.1, 60.0))] = 4.0
-    """Longest time (s) from a request to its answer."""
-    interval: Annotated[float, BeforeValidator(Quantity("s", 0.005, 10.0))] = 0.05
-    """Time (s) from one message with new values to the next."""
-    stamps: Literal["source", "server"] = "source"
-    """Whose time stamps are used; values without a source time stamp have that of the server."""
+    server_certificate: Path | None = None  # The only certificate that is accepted from the server; without it, any
+    timeout: Annotated[float, BeforeValidator(Quantity("s", 0.1, 60.0))] = 4.0  # Longest, from request to answer
+    interval: Annotated[float, BeforeValidator(Quantity("s", 0.005, 10.0))] = 0.05  # From one message to the next
+    stamps: Literal["source", "server"] = "source"  # Whose time stamps; a value without the source's has the server's
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -62,9 +57,8 @@ class OpcuaOptions(CredentialOptions):
         if place.scheme != "opc.tcp" or not place.hostname or "@" in place.netloc:
             raise ValueError(f'{self.endpoint!r} is no endpoint: write "opc.tcp://192.168.0.10:4840"')
         if (self.security == "none") == bool(self.certificate or self.key):
-            raise ValueError(
-                'certificate and key belong to security = "Basic256Sha256" or another policy: set all three'
-            )
+            text = 'certificate and key belong to security = "Basic256Sha256" or another policy: set all three'
+            raise ValueError(text)
         return self
 
     def describe(self) -> list[str]:
@@ -106,11 +100,7 @@ class OpcUaCredentials:
 
     @classmethod
     def load(cls, options: OpcuaOptions, folder: Path) -> Self:
-        """Return what the files of ``options``, relative to ``folder``, contain.
-
-        Raises:
-            ConfigurationError: a file is missing, has other content, or key and certificate do not belong together.
-        """
+        """Return the content of the files of ``options`` in ``folder``; raise ConfigurationError if one is wrong."""
         own = key = server = None
         if options.certificate is not None and options.key is not None:
             own, key = certificate_and_key(folder / options.certificate, folder / options.key)
@@ -176,9 +166,8 @@ async def _secure(client: Client, options: OpcuaOptions, credentials: OpcUaCrede
     ]
     if not suited:
         offered = {f"{(one.SecurityPolicyUri or '').rpartition('#')[2]} {one.SecurityMode.name}" for one in endpoints}
-        raise RefusedError(
-            f"the server has not {options.security}, {options.mode}; it offers {', '.join(sorted(offered))}"
-        )
+        text = f"the server has not {options.security}, {options.mode}; it offers {', '.join(sorted(offered))}"
+        raise RefusedError(text)
     try:
         presented = x509.load_der_x509_certificate(suited[0].ServerCertificate)
     except ValueError:  # the certificate is followed by those of its issuers
@@ -250,11 +239,7 @@ async def exchange(client: Client, clock: ExchangeClock) -> None:
 
 
 async def node_id(client: Client, text: str) -> ua.NodeId:
-    """Return the node that ``text`` names; a namespace may be given by its URI.
-
-    Raises:
-        ValueError: the server has no such namespace.
-    """
+    """Return the node that ``text`` names; raise ValueError if the server lacks the URI of its namespace."""
     node = ua.NodeId.from_string(text)
     if (uri := getattr(node, "NamespaceUri", None)) is None:
         return node
@@ -279,13 +264,10 @@ class Variable:
     """A variable of a server."""
 
     node: str
-    path: str
-    """Names from the folder of objects down to it."""
-    value: Any
-    """The present value; None if it has none."""
+    path: str  # Names from the folder of objects down to it
+    value: Any  # The present value; None if it has none
     type: str
-    unit: str
-    """Empty if it has none."""
+    unit: str  # Empty if it has none
     status: str
 
 

@@ -18,10 +18,9 @@ from typing import Any
 
 from asyncua import Client, ua
 
-from otolith_drivers.base import Counters, Deliver, Link, Sample, Sampling, Setup, Signal
+from otolith_drivers.base import Conversion, Counters, Deliver, Link, Sample, Sampling, Setup, Signal
 from otolith_drivers.common.message_times import ExchangeClock, PeriodEstimator, unix_time
 from otolith_drivers.common.reconnection import PassingFault, Reconnection, ThreadedDriver
-from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.errors import counted
 from otolith_drivers.opcua.connection import (
     OpcUaCredentials,
@@ -52,22 +51,14 @@ class NodeSignal:
     """A signal, its variable, and what has come of it."""
 
     signal: Signal
-    conversion: Conversion | None = None
-    """None until the unit is known."""
-    node: Any = None
-    """Its variable on the server, a ``ua.NodeId``; None until it is looked up."""
-    fault: str = ""
-    """Why the server does not send it; empty if it does."""
-    value: float = math.nan
-    """The latest value in the unit of the twin."""
-    time: float = -math.inf
-    """Of the latest sample, s."""
-    known: float = -math.inf
-    """When the latest value arrived, s."""
-    is_held: bool = False
-    """Whether the latest sample was a repeated one."""
-    unusable: PassingFault = field(default_factory=PassingFault)
-    """Values that could not be used."""
+    conversion: Conversion | None = None  # None until the unit is known
+    node: Any = None  # Its variable on the server, a ua.NodeId; None until it is looked up
+    fault: str = ""  # Why the server does not send it; empty if it does
+    value: float = math.nan  # The latest value in the unit of the twin
+    time: float = -math.inf  # Of the latest sample, s
+    known: float = -math.inf  # When the latest value arrived, s
+    is_held: bool = False  # Whether the latest sample was a repeated one
+    unusable: PassingFault = field(default_factory=PassingFault)  # Values that could not be used
     periods: PeriodEstimator = field(default_factory=PeriodEstimator)
 
     @property
@@ -90,8 +81,7 @@ class Readings:
         self.signals = [NodeSignal(signal) for signal in signals]
         self.clock = ExchangeClock()
         self.received = self.bad = self.lost = 0
-        self.server_stamped = 0
-        """Values without a source time stamp, although those are asked for."""
+        self.server_stamped = 0  # Values without a source time stamp, although those are asked for
         self._period, self._use_server_stamps = period, use_server_stamps
         self._interval = math.inf  # s between messages
         self._sequence: int | None = None
@@ -191,11 +181,7 @@ Options, Source = OpcuaOptions, OpcuaSource  # for base.DriverType
 
 
 def build(options: OpcuaOptions, setup: Setup) -> "OpcuaSubscriber":
-    """Return a subscriber to all signals of ``setup``.
-
-    Raises:
-        ConfigurationError: a unit has the wrong dimension, or a certificate, key or password cannot be read.
-    """
+    """Return a subscriber to all signals; raise ConfigurationError for a wrong unit, certificate, key or password."""
     credentials = OpcUaCredentials.load(options, setup.folder)
     readings = Readings(setup.signals, setup.sample_period, use_server_stamps=options.stamps == "server")
     for node in readings.signals:
@@ -224,24 +210,20 @@ class OpcuaSubscriber(ThreadedDriver):
         self._task: asyncio.Task[None] | None = None
 
     def open(self, deliver: Deliver) -> None:
-        """See :meth:`otolith_drivers.base.Driver.open`."""
         self._connection.reason = "not connected yet"
         self._start("opcua-subscribe", lambda: asyncio.run(self._run(deliver)))
 
     def close(self) -> None:
-        """See :meth:`otolith_drivers.base.Driver.close`."""
         self._stop.set()
         if self._loop is not None and self._task is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._task.cancel)
         super().close()
 
     def counters(self) -> Counters:
-        """See :meth:`otolith_drivers.base.Driver.counters`."""
         readings = self._readings
         return Counters(readings.received, readings.bad, readings.lost, self._connection.count)
 
     def link(self) -> Link:
-        """See :meth:`otolith_drivers.base.Driver.link`."""
         readings, connection, now = self._readings, self._connection, time.monotonic()
         lines = self._certificate_warnings + [line for node in readings.signals for line in node.warnings(now)]
         if readings.server_stamped:
@@ -258,7 +240,6 @@ class OpcuaSubscriber(ThreadedDriver):
         )
 
     def describe(self) -> list[str]:
-        """See :meth:`otolith_drivers.base.Driver.describe`."""
         nodes = [
             f"{node.signal.name} [{node.signal.unit}] from {node.source.node}"
             f" [{node.source.unit or 'the unit that the server gives'}]"

@@ -42,22 +42,18 @@ class CanNode(Node):
             raise
 
     def title(self) -> str:
-        """See :meth:`otolith_drivers.plant.realtime.Node.title`."""
         return f"{self._scenario.plant} on {self._scenario.bus.title()}, frames of {self._scenario.dbc.name}"
 
     def close(self) -> None:
-        """See :meth:`otolith_drivers.plant.realtime.Node.close`."""
         self._bus.shutdown()
 
     def summary_line(self, summary: NodeSummary) -> str:
-        """See :meth:`otolith_drivers.plant.realtime.Node.summary_line`."""
         withheld = f", {summary.withheld} withheld" if summary.faults else ""
         return (
             f"{summary.frames} frames in {summary.seconds:.1f} s of simulated time, {summary.stalls} stalls{withheld}"
         )
 
     def publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
-        """See :meth:`otolith_drivers.plant.realtime.Node.publish`."""
         if scheduled.effect.withheld is None:
             for message in self._messages:
                 self._send(self._frame(message, scheduled))

@@ -22,15 +22,11 @@ EULER_STEP = 1e-4  # s, as in the paper
 # A parameter is constant for a step: a drift of 1 % per second adds 1e-8. Guarded by test_scenario.py.
 RUNGE_KUTTA_STEP = 1e-3  # s
 
-State = tuple[Any, Any, Any]
-"""Current (A), speed (rad/s) and angle (rad): numbers, or arrays of several runs side by side."""
-Steps = Iterable[tuple[Any, ...]]
-"""The steps of the integrator: the time (s) and the coefficients of :func:`_coefficients` of each."""
-Shake = Callable[[Any, Any], float]
-"""Acceleration of the shaft by unbalances (rad/s²) at a time (s) and an angle (rad)."""
+State = tuple[Any, Any, Any]  # Current (A), speed (rad/s), angle (rad): numbers, or arrays of several runs
+Steps = Iterable[tuple[Any, ...]]  # Time (s) and coefficients (see _coefficients) of each step
+Shake = Callable[[Any, Any], float]  # Acceleration by unbalances (rad/s²) at a time (s) and an angle (rad)
 Integrate = Callable[[State, Any, float, Steps, Shake], State]
-Advance = Callable[[int, State, float], State]
-"""Maps the number of a sample period in its chunk, the state at its start and the voltage to the state at its end."""
+Advance = Callable[[int, State, float], State]  # From number of the period, state and voltage to the next state
 
 SIGNALS = {"ArmatureVoltage": "V", "ArmatureCurrent": "A", "RotorSpeed": "rad/s", "LoadTorque": "N*m"}
 UNITS = {"R_a": "ohm", "L_a": "H", "J": "kg*m^2", "K_e": "V*s/rad", "K_t": "N*m/A", "D": "N*m*s/rad"}
@@ -79,12 +75,10 @@ class MotorScenario(Scenario):
 
     plant: Literal["dc_motor"]
     parameters: MotorParameters = MotorParameters()
-    load: Annotated[float, BeforeValidator(Quantity("N*m*s/rad", 0.0))] = 0.006
-    """Load torque divided by speed."""
+    load: Annotated[float, BeforeValidator(Quantity("N*m*s/rad", 0.0))] = 0.006  # Load torque divided by speed
     controller: SpeedController = SpeedController()
     set_points: Annotated[tuple[SetPoint, ...], Field(min_length=1)]
-    repeat_every: Seconds | None = None
-    """The set-points are repeated with this period; without it the last one stays."""
+    repeat_every: Seconds | None = None  # The set-points are repeated with this period; without it the last one stays
     noise: MotorNoise = MotorNoise()
 
     @model_validator(mode="after")

@@ -20,8 +20,7 @@ from otolith_drivers.units import Quantity
 
 Array = NDArray[np.float64]
 Seconds = Annotated[float, BeforeValidator(Quantity("s", 0.0, 1e9))]
-Share = Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))]
-"""Share of the samples that are hit, each with this probability."""
+Share = Annotated[float, BeforeValidator(Quantity("1", 0.0, 1.0))]  # Of the samples that are hit, as a probability
 
 ROUNDING = 1e-9  # s; rounding error of a sample's time, a multiple of the sample period
 # Engineering choice: jitter delays by 3 standard deviations on average, so only 0.13 % are clipped at zero. Guarded by
@@ -39,12 +38,9 @@ Transport = Literal["can", "modbus-tcp", "modbus-rtu", "in-process"]
 class PlantSample:
     """The machine at one sampling instant."""
 
-    time: float
-    """s since the start of the scenario."""
-    measured: dict[str, float]
-    """Signals by their name on the bus, as the sensors measure them."""
-    truth: dict[str, float]
-    """The parameters, and the states without noise."""
+    time: float  # s since the start of the scenario
+    measured: dict[str, float]  # Signals by their name on the bus, as the sensors measure them
+    truth: dict[str, float]  # The parameters, and the states without noise
 
 
 def fault_random(seed: int, number: int) -> np.random.Generator:
@@ -61,11 +57,9 @@ class Drift(StrictModel):
     kind: Literal["drift"]
     parameter: str
     start: Seconds
-    amount: str
-    """In a unit of the parameter."""
+    amount: str  # In a unit of the parameter
     rate: Annotated[float, BeforeValidator(Quantity("1/s", -10.0, 10.0))]
-    until: Seconds = 1e9
-    """From then on the parameter stays constant."""
+    until: Seconds = 1e9  # From then on the parameter stays constant
 
     def change(self, times: Array, amount: float) -> Array:
         """What is added to the parameter at ``times`` (s), in its unit."""
@@ -78,8 +72,7 @@ class Step(StrictModel):
     kind: Literal["step"]
     parameter: str
     start: Seconds
-    amount: str
-    """In a unit of the parameter."""
+    amount: str  # In a unit of the parameter
 
     def change(self, times: Array, amount: float) -> Array:
         """What is added to the parameter at ``times`` (s), in its unit."""
@@ -112,8 +105,7 @@ def shaking(unbalances: Iterable[Unbalance]) -> Callable[[float, float], float]:
 
 # Faults of a sensor
 
-Distortion = Callable[[float], float]
-"""Maps what the sensor measures to what the bus carries; called once per sample, in order."""
+Distortion = Callable[[float], float]  # From what the sensor measures to what the bus carries; once per sample
 
 
 class Span(StrictModel):
@@ -134,8 +126,7 @@ class Span(StrictModel):
 
 
 class _SignalSpan(Span):
-    signal: str
-    """Name on the bus."""
+    signal: str  # Name on the bus
 
 
 class Frozen(_SignalSpan):
@@ -170,8 +161,7 @@ class Offset(_SignalSpan):
     """``amount`` is added to the signal: a shifted zero."""
 
     kind: Literal["offset"]
-    amount: str
-    """In a unit of the signal."""
+    amount: str  # In a unit of the signal
 
     def distortion(self, amount: float, _random: np.random.Generator) -> Distortion:
         """Adds ``amount``."""
@@ -183,8 +173,7 @@ class Spikes(_SignalSpan):
 
     kind: Literal["spikes"]
     share: Share
-    amount: str
-    """In a unit of the signal."""
+    amount: str  # In a unit of the signal
 
     def distortion(self, amount: float, random: np.random.Generator) -> Distortion:
         """Adds or subtracts ``amount`` at random."""
@@ -219,20 +208,13 @@ def distorted(samples: Iterable[PlantSample], faults: list[tuple[SensorFault, Di
 class BusEffect:
     """What the faults of the bus do to one sample."""
 
-    acting: tuple[int, ...] = ()
-    """Numbers of the faults that act, counted over all faults of the scenario."""
-    delay: float = 0.0
-    """s by which the sample is sent late."""
-    withheld: int | None = None
-    """Number of the first fault that withholds the sample."""
-    gone: bool = False
-    """Whether the device is off the bus."""
-    order: Order | None = None
-    """Order of bytes and words instead of the scenario's."""
-    refusals: tuple[tuple[int, "Refusal"], ...] = ()
-    """Refusals of reads, each with its number."""
-    garbage: tuple[bytes, ...] = ()
-    """Bytes that are put on the bus."""
+    acting: tuple[int, ...] = ()  # Numbers of the faults that act, counted over all faults of the scenario
+    delay: float = 0.0  # s by which the sample is sent late
+    withheld: int | None = None  # Number of the first fault that withholds the sample
+    gone: bool = False  # Whether the device is off the bus
+    order: Order | None = None  # Order of bytes and words instead of the scenario's
+    refusals: tuple[tuple[int, "Refusal"], ...] = ()  # Refusals of reads, each with its number
+    garbage: tuple[bytes, ...] = ()  # Bytes that are put on the bus
 
     def withhold(self, number: int, *, gone: bool = False) -> "BusEffect":
         """This effect, with the sample withheld by fault ``number`` unless another has done so."""
@@ -241,8 +223,7 @@ class BusEffect:
 
 class _BusSpan(Span):
     ACTS_ON: ClassVar[frozenset[str]] = ALL_TRANSPORTS
-    on: Transport | None = None
-    """Transport that is hit, if the machine is on several; without it all are."""
+    on: Transport | None = None  # Transport that is hit, if the machine is on several; without it all are
 
 
 class Dropouts(_BusSpan):
@@ -323,8 +304,7 @@ class Refusal(_BusSpan):
 
     ACTS_ON: ClassVar[frozenset[str]] = MODBUS
     kind: Literal["exception"]
-    code: Annotated[int, Field(ge=1, le=11)]
-    """2: illegal data address, 4: device failure, 6: device busy ..."""
+    code: Annotated[int, Field(ge=1, le=11)]  # 2: illegal data address, 4: device failure, 6: device busy
     first: Annotated[int, Field(ge=0, lt=REGISTERS)] = 0
     last: Annotated[int, Field(ge=0, lt=REGISTERS)] = REGISTERS - 1
 

@@ -10,12 +10,16 @@ import errno
 import logging
 import math
 import os
+import pty
 import socket
 import sys
+import tempfile
 import threading
+import tty
 from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 from pymodbus import FramerType
@@ -24,10 +28,10 @@ from pymodbus.pdu import ExceptionResponse, ModbusPDU
 from pymodbus.server import ModbusTcpServer
 from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import DataType, SimData, SimDevice
+from pymodbus.transport import ModbusProtocol
 
 from otolith_drivers.errors import DeviceError
 from otolith_drivers.plant.faults import BusEffect
-from otolith_drivers.plant.pseudo_terminal import LineTransport, SerialLine
 from otolith_drivers.plant.realtime import Node, NodeSummary, ScheduledSample
 from otolith_drivers.plant.scenario import NodeModbusOptions, RegisterMap, Scenario
 
@@ -37,6 +41,15 @@ UNDECODABLE = 0  # function code under which requests are counted that cannot be
 # No test guards it.
 SWITCH_INTERVAL = 2e-4  # s
 SERVER_TIMEOUT = 30.0  # s; engineering choice; a hanging server thread ends with an error instead of a hanging node
+BITS_PER_BYTE = 10  # 8N1: start, eight of data, stop
+# End of a frame by the Modbus serial line specification: a silence of 3.5 characters, 1.75 ms above 19200 baud.
+SILENCE = 3.5  # bytes
+MIN_SILENCE = 1.75e-3  # s
+# Engineering choices; test_modbus_node.py guards the second.
+UNPACED_SILENCE = 0.05  # s; end of a frame on a line without timing: longer than a pause within a write
+WRITE_INTERVAL = 1e-3  # s; bytes are written in pieces of this length, the resolution of the event loop's clock
+MAX_READ = 4096  # bytes; the kernel buffers no more for a terminal
+DEFAULT_NAME = "ttyOtolith"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +58,7 @@ class _DriveState:
 
     registers: list[int]
     effect: BusEffect
-    summary: NodeSummary
-    """In which requests are counted."""
+    summary: NodeSummary  # In which requests are counted
 
 
 class ModbusDrive:
@@ -143,8 +155,7 @@ class DriveRequestHandler(ServerRequestHandler):
             self.pdu_send(response)
 
 
-Attach = Callable[["DriveServer"], Awaitable[Any]]
-"""Attaches a server to its line: returns a listening server, or a transport and its protocol."""
+Attach = Callable[["DriveServer"], Awaitable[Any]]  # Returns a listening server, or transport and protocol
 
 
 class DriveServer(ModbusTcpServer):
@@ -181,8 +192,7 @@ class _ModbusNode(Node):
     """A node over a server of pymodbus."""
 
     FRAMER: ClassVar[FramerType]
-    CLOSES_WHEN_GONE: ClassVar[bool]
-    """Whether the line itself disappears with the device."""
+    CLOSES_WHEN_GONE: ClassVar[bool]  # Whether the line itself disappears with the device
 
     def __init__(self, scenario: Scenario, *, point_to_point: bool) -> None:
         logging.getLogger("pymodbus").setLevel(
@@ -194,7 +204,6 @@ class _ModbusNode(Node):
         self._server: DriveServer | None = None
 
     def title(self) -> str:
-        """See :meth:`otolith_drivers.plant.realtime.Node.title`."""
         options, units = self._scenario.modbus, self._scenario.SIGNALS
         registers = [f"{address} {name} [{units[name]}]" for name, address in self._map.addresses.items()]
         what = f"{self._scenario.plant} on {self._place()}, device {options.device}, {options.type} {options.order}"
@@ -202,7 +211,6 @@ class _ModbusNode(Node):
 
     @contextlib.contextmanager
     def online(self) -> Iterator[None]:
-        """See :meth:`otolith_drivers.plant.realtime.Node.online`."""
         with _short_switch_interval(), _LoopThread() as self._loop:
             try:
                 yield
@@ -210,7 +218,6 @@ class _ModbusNode(Node):
                 self._set_online(online=False)
 
     def publish(self, scheduled: ScheduledSample, summary: NodeSummary) -> None:
-        """See :meth:`otolith_drivers.plant.realtime.Node.publish`."""
         self._drive.update(scheduled, summary)
         self._set_online(online=not (scheduled.effect.gone and self.CLOSES_WHEN_GONE))
         if self._server is not None:
@@ -218,7 +225,6 @@ class _ModbusNode(Node):
                 self._loop.call(self._server.send_garbage, data)
 
     def summary_line(self, summary: NodeSummary) -> str:
-        """See :meth:`otolith_drivers.plant.realtime.Node.summary_line`."""
         functions = ", ".join(f"{count} of function {code}" for code, count in sorted(summary.functions.items()))
         return (
             f"{summary.answers} answers to {summary.functions.total()} requests ({functions or 'none'}), "
@@ -246,11 +252,7 @@ class _ModbusNode(Node):
 
     @abstractmethod
     def _open_line(self) -> Attach:
-        """Open the line if it is closed.
-
-        Raises:
-            DeviceError: it cannot be opened.
-        """
+        """Open the line if it is closed; raise DeviceError if it cannot be opened."""
 
 
 class TcpNode(_ModbusNode):
@@ -260,16 +262,11 @@ class TcpNode(_ModbusNode):
     CLOSES_WHEN_GONE = True
 
     def __init__(self, scenario: Scenario) -> None:
-        """Listen on the port.
-
-        Raises:
-            DeviceError: it is in use, or not permitted.
-        """
+        """Listen on the port; raise DeviceError if it is in use, or not permitted."""
         super().__init__(scenario, point_to_point=True)
         self._socket: socket.socket | None = self._listen()
 
     def close(self) -> None:
-        """See :meth:`otolith_drivers.plant.realtime.Node.close`."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -306,16 +303,11 @@ class RtuNode(_ModbusNode):
     CLOSES_WHEN_GONE = False
 
     def __init__(self, scenario: Scenario) -> None:
-        """Create the line.
-
-        Raises:
-            DeviceError: its path exists, or the kernel has no terminal left.
-        """
+        """Create the line; raise DeviceError if its path exists, or the kernel has no terminal left."""
         super().__init__(scenario, point_to_point=False)
         self._line = SerialLine(scenario.modbus.line)
 
     def close(self) -> None:
-        """See :meth:`otolith_drivers.plant.realtime.Node.close`."""
         self._line.close()
 
     def _place(self) -> str:
@@ -366,3 +358,127 @@ def _short_switch_interval() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(before)
+
+
+class SerialLine:
+    """Both ends of a pseudo-terminal, and a link to the one that a client opens."""
+
+    def __init__(self, link: Path | None) -> None:
+        """Create the line; by default ``link`` is in this user's runtime folder, else in that of temporary files.
+
+        Raises:
+            DeviceError: the path exists or cannot be created, or the kernel has no terminal left.
+        """
+        link = link or Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / DEFAULT_NAME
+        try:
+            # This process keeps the client's end open too: Linux returns EIO to a reader if no process has it open.
+            self.device_end, self._client_end = pty.openpty()
+        except OSError as error:
+            text = f"no pseudo-terminal for the serial line: {error.strerror}; is /dev/pts mounted?"
+            raise DeviceError(text) from error
+        tty.setraw(self._client_end)
+        os.set_blocking(self.device_end, False)
+        self.link = link
+        try:
+            _create_link(link, os.ttyname(self._client_end))
+        except (DeviceError, OSError) as error:
+            os.close(self.device_end)
+            os.close(self._client_end)
+            if isinstance(error, DeviceError):
+                raise
+            text = f"{link}: the serial line cannot be created: {error.strerror}; set modbus.line"
+            raise DeviceError(text) from error
+
+    def close(self) -> None:
+        """Close both ends and remove the link."""
+        with contextlib.suppress(OSError):
+            self.link.unlink()
+        os.close(self.device_end)
+        os.close(self._client_end)
+
+
+def _create_link(link: Path, terminal: str) -> None:
+    if link.is_symlink() and (not link.exists() or str(link.readlink()) == terminal):
+        link.unlink()  # left by a node that was killed: its terminal is gone, or is now this one
+    try:
+        link.symlink_to(terminal)
+    except FileExistsError:
+        text = f"{link}: exists already: is a second plant running? Stop it, remove the file, or set modbus.line"
+        raise DeviceError(text) from None
+
+
+class LineTransport(asyncio.Transport):
+    """The end of the drive, for a protocol of pymodbus.
+
+    A silence ends a frame, as in Modbus RTU, so bytes that are no frame do not spoil the next frame. An answer that
+    no client reads is lost if the terminal is full, as on a wire.
+    """
+
+    def __init__(self, end: int, receiver: ModbusProtocol, baudrate: float) -> None:
+        """``end`` is the file descriptor of the drive's end; ``baudrate`` in bit/s, infinite for no timing."""
+        super().__init__()
+        self._end, self._receiver = end, receiver
+        self._byte_time = BITS_PER_BYTE / baudrate  # s
+        self._paced = math.isfinite(baudrate)
+        self._silence = max(SILENCE * self._byte_time, MIN_SILENCE) if self._paced else UNPACED_SILENCE
+        self._loop = asyncio.get_running_loop()
+        self._received = bytearray()
+        self._received_until = -math.inf  # s, clock of the loop
+        self._frame_timer: asyncio.TimerHandle | None = None
+        self._unsent = bytearray()
+        self._sent_until = 0.0  # s, clock of the loop
+        self._write_timer: asyncio.TimerHandle | None = None
+        self._loop.add_reader(end, self._read)
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Send bytes."""
+        if not self._unsent:
+            self._sent_until = self._loop.time()
+        self._unsent += data
+        if self._write_timer is None:
+            self._write_due()
+
+    def close(self) -> None:
+        """Stop reading and writing; the line itself stays. May be called twice."""
+        self._loop.remove_reader(self._end)
+        for timer in (self._frame_timer, self._write_timer):
+            if timer is not None:
+                timer.cancel()
+
+    def _read(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            data = os.read(self._end, MAX_READ)
+            now = self._loop.time()
+            if not self._paced:
+                if now > self._received_until + self._silence:
+                    self._receiver.recv_buffer = b""
+                self._received_until = now
+                self._receiver.data_received(data)
+                return
+            self._received += data
+            self._received_until = max(now, self._received_until) + len(data) * self._byte_time
+            if self._frame_timer is not None:
+                self._frame_timer.cancel()
+            self._frame_timer = self._loop.call_at(self._received_until + self._silence, self._end_frame)
+
+    def _end_frame(self) -> None:
+        self._frame_timer = None
+        data = bytes(self._received)
+        self._received.clear()
+        self._receiver.recv_buffer = b""
+        self._receiver.data_received(data)
+
+    def _write_due(self) -> None:
+        """Write the bytes whose time on the line has passed, and set a timer for the rest."""
+        self._write_timer = None
+        now = self._loop.time()
+        due = min(math.floor((now - self._sent_until) / self._byte_time), len(self._unsent)) if self._paced else None
+        ready = bytes(self._unsent[:due])
+        if ready:
+            with contextlib.suppress(BlockingIOError):
+                os.write(self._end, ready)
+            del self._unsent[:due]
+            self._sent_until += len(ready) * self._byte_time
+        if self._unsent:
+            piece = min(max(math.ceil(WRITE_INTERVAL / self._byte_time), 1), len(self._unsent))
+            self._write_timer = self._loop.call_at(self._sent_until + piece * self._byte_time, self._write_due)

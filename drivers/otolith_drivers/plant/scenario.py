@@ -57,19 +57,15 @@ RANGES: dict[Type, tuple[float, float]] = {
 class NodeModbusOptions(StrictModel):
     """``[modbus]`` of a scenario."""
 
-    host: str = "127.0.0.1"
-    """Address on which Modbus TCP listens; the default is reachable from this computer only."""
+    host: str = "127.0.0.1"  # Address on which Modbus TCP listens; the default is reachable from this computer only
     port: Annotated[int, Field(ge=1, le=65535)] = 1502
     device: Annotated[int, Field(ge=1, le=247)] = 1
     order: Order = "ABCD"
     type: Type = "float32"
-    scale: dict[str, str] = Field(default_factory=dict)
-    """Value of one count of each signal, like ``"1 mA"``; needed for integers."""
-    line: Path | None = None
-    """Modbus RTU: path of the serial line for the client, relative to the scenario."""
+    scale: dict[str, str] = Field(default_factory=dict)  # Value of one count, like "1 mA"; needed for integers
+    line: Path | None = None  # Modbus RTU: path of the serial line for the client, relative to the scenario
     baudrate: Annotated[int, Field(ge=300, le=4_000_000)] = 115200
-    pace_line: bool = True
-    """Whether bytes take the time of 8N1 at ``baudrate``; otherwise they arrive at once."""
+    pace_line: bool = True  # Whether bytes take the time of 8N1 at baudrate; otherwise they arrive at once
 
     @model_validator(mode="after")
     def _type_fits(self) -> Self:
@@ -115,9 +111,8 @@ def _scales(options: NodeModbusOptions, signals: dict[str, str]) -> dict[str, fl
     if options.type == "float32":
         return dict.fromkeys(signals, 1.0)
     if unknown := options.scale.keys() - signals.keys():
-        raise ValueError(
-            f"modbus.scale names {min(unknown)!r}, which is no signal; the signals are {', '.join(signals)}"
-        )
+        text = f"modbus.scale names {min(unknown)!r}, which is no signal; the signals are {', '.join(signals)}"
+        raise ValueError(text)
     if missing := [name for name in signals if name not in options.scale]:
         raise ValueError(f"type {options.type!r} needs modbus.scale of {', '.join(missing)}: the value of one count")
     scales = {name: Quantity(unit, difference=True)(options.scale[name]) for name, unit in signals.items()}
@@ -130,24 +125,19 @@ def _scales(options: NodeModbusOptions, signals: dict[str, str]) -> dict[str, fl
 class Scenario(StrictModel):
     """The part of a scenario file that all machines share."""
 
-    UNITS: ClassVar[dict[str, str]]
-    """Unit of each parameter that a fault may change."""
-    SIGNALS: ClassVar[dict[str, str]]
-    """Unit of each signal that the machine measures."""
-    HAS_SHAFT: ClassVar[bool] = False
-    """Whether the machine can have an unbalance."""
+    UNITS: ClassVar[dict[str, str]]  # Unit of each parameter that a fault may change
+    SIGNALS: ClassVar[dict[str, str]]  # Unit of each signal that the machine measures
+    HAS_SHAFT: ClassVar[bool] = False  # Whether the machine can have an unbalance
 
     plant: str
     seed: int = 1
-    integrator: Literal["accurate", "euler"] = "accurate"
-    """``euler`` at 0.1 ms is the paper's plant; a real machine is continuous."""
+    integrator: Literal["accurate", "euler"] = "accurate"  # euler at 0.1 ms is the paper's plant
     sample_period: Annotated[float, BeforeValidator(Quantity("s", 1e-3, 1.0))] = 0.01
     dbc: Path
     bus: BusOptions = BusOptions()
     modbus: NodeModbusOptions = NodeModbusOptions()
     parameters: Any
-    noise: Any
-    """Standard deviation of each sensor."""
+    noise: Any  # Standard deviation of each sensor
     faults: tuple[Fault, ...] = ()
 
     @model_validator(mode="after")
@@ -229,16 +219,11 @@ def simulate(scenario: Scenario) -> Iterator[PlantSample]:
 class SimulationChunk:
     """Some sample periods in a row, with all that does not depend on the state of the machine."""
 
-    times: Array
-    """(periods,) sampling instants, s."""
-    noise: list[list[float]]
-    """Noise of each sensor at each instant, in standard deviations."""
-    truth: list[dict[str, float]]
-    """The parameters at each instant."""
-    step_times: Array
-    """(steps, periods) start of each step of the integrator, s."""
-    parameters: dict[str, Any]
-    """The parameters in each step: an array like ``step_times``, or a number if constant."""
+    times: Array  # (periods,) sampling instants, s
+    noise: list[list[float]]  # Noise of each sensor at each instant, in standard deviations
+    truth: list[dict[str, float]]  # The parameters at each instant
+    step_times: Array  # (steps, periods) start of each step of the integrator, s
+    parameters: dict[str, Any]  # The parameters in each step: an array like step_times, or a number if constant
 
     def steps(self, index: int, columns: Iterable[Any]) -> Iterator[tuple[float, ...]]:
         """The steps of a sample period: for each its time (s) and its values of ``columns``, shaped like parameters."""

@@ -63,11 +63,7 @@ class CanLogReader(Reader):
     sampling = Sampling.CYCLIC
 
     def __init__(self, path: Path, signals: tuple[str, ...], decoder: FrameDecoder) -> None:
-        """Open ``path``.
-
-        Raises:
-            ConfigurationError: the file is missing, or its format cannot be read.
-        """
+        """Open ``path``; raise ConfigurationError if the file is missing, or its format cannot be read."""
         data = DataFile(path)
         super().__init__(path, data)
         try:
@@ -89,11 +85,9 @@ class CanLogReader(Reader):
 
     @property
     def lost(self) -> int:
-        """See :attr:`otolith_drivers.replay.readers.Reader.lost`."""
         return self._decoder.counters.lost
 
     def chunks(self) -> Iterator[Rows]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.chunks`."""
         wants = self._decoder.wants
         chunk = _FrameChunk(self._signals)
         for place, frame in self._source.frames():
@@ -154,17 +148,14 @@ class CanLogReader(Reader):
         return f": none of its {self._frames} frames is one of {wanted}"
 
     def describe(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.describe`."""
         return self._decoder.describe()
 
     def summary_lines(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.summary_lines`."""
         lines = [f"{counted(self._frames, 'frame')} read", f"{self._others} of other messages", f"{self.bad} bad"]
         passed = self._source.passed
         return lines + ([f"{counted(passed, self.place)} without a frame"] if passed else [])
 
     def warnings(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.warnings`."""
         lines = []
         if self._first_bad is not None:
             place, cause = self._first_bad
@@ -210,8 +201,7 @@ class TextFormat:
 
     reader: type[Any]
     title: str
-    prelude: str = ""
-    """A line that the reader skips when it is started again in the middle of the file."""
+    prelude: str = ""  # A line that the reader skips when it is started again in the middle of the file
 
 
 class _TrcReader(can.TRCReader):
@@ -233,11 +223,7 @@ TEXT_FORMATS = {
 
 
 def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFrames | Mf4Frames":
-    """The frames of a log, in the format of its suffix or of its first line.
-
-    Raises:
-        ConfigurationError: it is of another format, which the message names.
-    """
+    """The frames of a log, by suffix or first line; raise ConfigurationError, with the format, for another one."""
     suffix, head = suffix_of(path), head_of(path)
     if suffix == ".mf4":
         return Mf4Frames(path, head)
@@ -247,9 +233,8 @@ def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFr
         return BlfFrames(path, data.stream)
     name = suffix if suffix in TEXT_FORMATS else text_log(head) or CANDUMP_LOG
     if name == DIFFERENCES:
-        raise ConfigurationError(
-            f"{path}: is of {name}, of which a lost line would shift the rest: log with candump -L"
-        )
+        cause = f"{path}: is of {name}, of which a lost line would shift the rest: log with candump -L"
+        raise ConfigurationError(cause)
     text = io.TextIOWrapper(data.stream, encoding="utf-8-sig", errors="replace")
     return TextFrames(path, TEXT_FORMATS[name], text)
 
@@ -328,9 +313,8 @@ class TextFrames:
     def _refuse_relative_times(self, reader: Any) -> None:
         """Only ASC may have time differences; python-can would take them for times."""
         if getattr(reader, "timestamps_format", None) == "relative":
-            raise ConfigurationError(
-                f"{self._path}: its times count from frame to frame ('timestamps relative'): export them absolute"
-            )
+            text = f"{self._path}: its times count from frame to frame ('timestamps relative'): export them absolute"
+            raise ConfigurationError(text)
 
     def _quoted(self, what: str) -> str:
         text = self._lines.line.strip()

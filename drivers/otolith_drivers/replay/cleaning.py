@@ -7,7 +7,8 @@ passes. Commands jump, so for an input it must be far from its ordinary range as
 Rows of a coarse clock have one time, but other values. They are spread evenly if they come regularly. Then their number
 is proportional to time, and each time of the file is that of the last step of the clock before the row:
 ``time <= start + number * interval < time + step`` holds for all rows with one start and one interval. Otherwise the
-times of the rows are not known, and they keep those of the file.
+times of the rows are not known, and they keep those of the file. So it is with times that are rounded to steps below
+the interval: 0, 3, 7, 10 ms are rows that come every 3.5 ms.
 """
 
 import math
@@ -18,6 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from otolith_drivers.config_files import Range
 from otolith_drivers.errors import counted
 from otolith_drivers.replay.readers import Array, Integers, Mask, Rows
 
@@ -27,6 +29,10 @@ MIN_ROWS, MIN_STEPS = 200, 8  # in which a regular interval can be recognised
 MIN_COARSE = 0.01  # share of rows with the time, but not the values of the row above: fewer are accidents
 TOLERANCE = 0.1  # intervals of the rows by which a row may be off
 MAX_SPREAD = 0.33  # intervals: standard deviation of the times from the steps of the clock to the row after it
+MIN_ROUNDING = 0.01  # intervals: steps to which times are rounded; finer ones move no estimate
+WHOLE = 0.05  # steps of the clock by which an interval may differ from a whole number of them
+ROUNDED_SHARE = 0.9  # of the intervals that must be one of two neighbours; where rows are missing they are longer
+EQUAL_INTERVALS = 4.0  # spacings of floating-point numbers by which equal intervals may differ
 MISSING_STEP = 1.5  # usual steps of the clock: after a longer one, rows are missing
 UNEVEN = 2.0  # ratio of mean squared changes from row to row that rows at even times do not have
 ENDS_OF_INTEGERS = frozenset({"32767", "32768", "65535", "2147483647", "2147483648", "4294967295"})
@@ -36,8 +42,6 @@ BEYOND_MACHINES = 1e9
 MAX_SENTINELS = 4
 SENTINEL_DISTANCE = 2.0
 MIN_LEVELS = 20
-
-Range = tuple[float, float]
 
 
 def is_sentinel_number(value: float) -> bool:
@@ -104,10 +108,8 @@ class NoReadings:
 class CoarseClock:
     """The clock of some rows that were spread."""
 
-    step: float
-    """s."""
-    interval: float
-    """Time between two rows, s."""
+    step: float  # s
+    interval: float  # Time between two rows, s
 
 
 class EvenTimes:
@@ -118,9 +120,14 @@ class EvenTimes:
         self._known: CoarseClock | None = None  # that of the last rows that were spread
         self._spread_rows, self._first, self._is_spreading = 0, "", False
 
+    @property
+    def waiting(self) -> int:
+        """Number of the rows that wait for those that follow."""
+        return 0 if self._held is None else len(self._held.times)
+
     def text(self) -> str | None:
         """Return what was done, in a sentence; None if nothing."""
-        return f"rows that share times: {self._spread_rows} were spread evenly; {self._first}" if self._first else None
+        return f"rows of a coarse clock: {self._spread_rows} were spread evenly; {self._first}" if self._first else None
 
     def of(self, rows: Rows) -> Iterator[Rows]:
         """Yield rows with their times; the last ones wait for those that follow."""
@@ -129,8 +136,7 @@ class EvenTimes:
         times, done = rows.times.copy(), 0
         while done < len(steps) - 1:  # the last edge is the end of the rows
             if not self._is_spreading:
-                several = np.flatnonzero(np.diff(steps[done:]) > 1)
-                done += int(several[0]) if len(several) else len(steps) - 2 - done
+                done = max(done, _first_suspect(rows.times, steps, done))
             enough = max(int(np.searchsorted(steps, steps[done] + BLOCK_ROWS)), done + BLOCK_STEPS)
             if enough >= len(steps) - 1:
                 break
@@ -152,12 +158,14 @@ class EvenTimes:
         """Return the times (rows,) of a block, s."""
         spread_before, differing = self._spread_rows, _differs_at_one_time(rows)
         self._is_spreading = False
-        if np.count_nonzero(differing) <= MIN_COARSE * len(rows.times):
-            return rows.times
         times, steps = rows.times.copy(), np.diff(rows.times)
         forward = steps[steps > 0.0]
-        usual = float(np.median(forward)) if len(forward) else np.inf
-        breaks = np.flatnonzero((steps < 0.0) | (steps > MISSING_STEP * usual) | rows.begins[1:]) + 1
+        longest = MISSING_STEP * float(np.median(forward)) if len(forward) else np.inf
+        if np.count_nonzero(differing) <= MIN_COARSE * len(times):
+            if (rounded := _rounded_intervals(times)) is None or not _share_signals(rows):
+                return times
+            longest = rounded[1] + 0.5 * (rounded[1] - rounded[0])
+        breaks = np.flatnonzero((steps < 0.0) | (steps > longest) | rows.begins[1:]) + 1
         edges = [0, *breaks.tolist(), len(times)]
         for piece in (slice(*edge) for edge in pairwise(edges)):
             times[piece] = self._spread(rows.part(piece))
@@ -167,8 +175,8 @@ class EvenTimes:
     def _spread(self, rows: Rows) -> Array:
         """Return the times of consecutive rows without a gap: those of the file where the rows are not regular."""
         times, starts = rows.times, np.flatnonzero(np.diff(rows.times, prepend=np.nan))
-        is_short = len(times) < MIN_ROWS or len(starts) < MIN_STEPS
-        if len(starts) < 2 or not _is_even(rows) or (is_short and self._known is None):
+        is_short, share = len(times) < MIN_ROWS or len(starts) < MIN_STEPS, len(starts) < len(times)
+        if len(starts) < 2 or (share and not _is_even(rows)) or (is_short and self._known is None):
             return times
         clock = self._known if is_short else _clock_of(times)
         if clock is not None and (even := _even_times(times, clock)) is not None:
@@ -185,6 +193,19 @@ class EvenTimes:
         if not self._first:
             steps = f"steps of {1e3 * clock.step:.4g} ms, but a row comes every {1e3 * clock.interval:.4g} ms"
             self._first = f"from line {rows.lines[0]} on t has {steps}"
+
+
+def _first_suspect(times: Array, steps: Integers, done: int) -> int:
+    """Return the first step of the clock from ``done`` on in which rows must be judged.
+
+    It is one with several rows. Where intervals differ, rows before belong to the same clock. The last step may get
+    further rows.
+    """
+    intervals = np.diff(times[steps[done:-1]], prepend=np.nan, append=np.nan)
+    uneven, several = np.abs(np.diff(intervals)) > _rounding_error(times), np.diff(steps[done:]) > 1
+    suspect = np.flatnonzero(several | uneven)
+    first = done + int(suspect[0]) if len(suspect) else len(steps) - 2
+    return first if len(suspect) and several[suspect[0]] else first - MIN_ROWS
 
 
 def _with_times(rows: Rows, times: Array) -> Rows:
@@ -220,9 +241,39 @@ def _is_even(rows: Rows) -> bool:
     return 2 * sum(jumps) <= len(jumps)  # a command may change with the clock
 
 
+def _share_signals(rows: Rows) -> bool:
+    """Whether most rows have a signal of the row above: those of signals with clocks of their own alternate."""
+    present = np.isfinite(np.array(list(rows.columns.values())))
+    return bool(np.mean((present[:, 1:] & present[:, :-1]).any(axis=0)) > 0.5)
+
+
 def _mean_square(changes: Array) -> float:
     finite = changes[np.isfinite(changes)]
     return float(np.mean(finite**2)) if len(finite) else 0.0
+
+
+def _rounding_error(times: Array) -> float:
+    """Return by how much equal intervals between ``times`` may differ, s."""
+    return EQUAL_INTERVALS * float(np.spacing(np.abs(times).max(initial=1.0)))
+
+
+def _rounded_intervals(times: Array) -> tuple[float, float] | None:
+    """Return the two intervals, s, between rows whose times are rounded to steps below their interval; None if not."""
+    steps = np.sort(np.diff(times))
+    if not len(steps) or (steps == 0.0).any():
+        return None
+    steps = steps[steps > 0.0]
+    edges = [0, *(np.flatnonzero(np.diff(steps) > _rounding_error(times)) + 1).tolist(), len(steps)]
+    sizes = np.diff(edges)
+    if len(sizes) < 2:
+        return None
+    first = int(np.argmax(sizes[:-1] + sizes[1:]))
+    low, high = (float(steps[edges[at] : edges[at + 1]].mean()) for at in (first, first + 1))
+    is_step = MIN_ROUNDING * low <= high - low <= low + _rounding_error(times)  # a longer interval is a gap
+    is_whole = abs((ratio := low / (high - low)) - round(ratio)) < WHOLE  # both are whole numbers of steps
+    return (
+        (low, high) if is_step and is_whole and sizes[first : first + 2].sum() >= ROUNDED_SHARE * len(steps) else None
+    )
 
 
 def _clock_of(times: Array) -> CoarseClock | None:
@@ -235,11 +286,13 @@ def _clock_of(times: Array) -> CoarseClock | None:
     numbers, since = starts - starts.mean(), times[starts] - times[0]
     step = float(np.diff(since).mean())
     interval = float(numbers @ since / (numbers @ numbers))
+    if len(starts) == len(times) - 1:
+        rounded = _rounded_intervals(times)
+        return None if rounded is None else CoarseClock(rounded[1] - rounded[0], interval)
     if not 0.0 < interval < step:
         return None
     whole = step / round(step / interval)
-    is_whole = abs(interval - whole) * len(times) < TOLERANCE * step
-    return CoarseClock(step, whole if is_whole else interval)
+    return CoarseClock(step, whole if abs(interval - whole) * len(times) < TOLERANCE * step else interval)
 
 
 def _even_times(times: Array, clock: CoarseClock) -> Array | None:
@@ -251,8 +304,11 @@ def _even_times(times: Array, clock: CoarseClock) -> Array | None:
     since = times - clock.interval * numbers
     starts = np.flatnonzero(np.diff(times)) + 1
     firsts, rounding = since[starts], float(np.ptp(np.diff(times[starts]))) if len(starts) > 1 else 0.0
-    if np.ptp(firsts) > (1.0 + TOLERANCE) * clock.interval + rounding:
+    if clock.step < clock.interval:
+        firsts, rounding = since, 0.0
+    limit = min(clock.step, clock.interval)
+    if np.ptp(firsts) > (1.0 + TOLERANCE) * limit + rounding:
         return None
-    if firsts.std() > MAX_SPREAD * clock.interval + rounding:
+    if limit == clock.interval and firsts.std() > MAX_SPREAD * limit + rounding:
         return None
     return np.asarray(clock.interval * numbers + 0.5 * (firsts.min() + firsts.max()))

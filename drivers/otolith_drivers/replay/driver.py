@@ -36,13 +36,10 @@ log = logging.getLogger(__name__)
 class ReplayOptions(StrictModel):
     """``[driver]`` with ``type = "replay"``."""
 
-    file: Path
-    """A table, a CAN log or a recording of Otolith."""
+    file: Path  # A table, a CAN log or a recording of Otolith
     pace: Literal["real time", "as fast as possible"] = "real time"
-    repeat: bool = False
-    """Start again at the end of the file; time goes on."""
-    can: dict[str, Any] | None = None
-    """For a CAN log: the keys that ``[driver]`` with ``type = "can"`` would have."""
+    repeat: bool = False  # Start again at the end of the file; time goes on
+    can: dict[str, Any] | None = None  # For a CAN log: the keys that [driver] with type = "can" would have
 
 
 class ReplaySource(StrictModel):
@@ -69,20 +66,15 @@ def build(options: ReplayOptions, setup: Setup) -> "ReplayDriver":
 
 
 def opener(path: Path, options: ReplayOptions, setup: Setup) -> Callable[[], Reader]:
-    """A function that opens ``path``; the sources of ``setup`` are validated for its format.
-
-    Raises:
-        ConfigurationError: a source, or the table ``can``, does not fit the format.
-    """
+    """A function that opens ``path``; raise ConfigurationError if a source or ``can`` does not fit its format."""
     kind = format_of(path)
     can = None
     if holds_frames(path):
         from otolith_drivers.canbus.driver import Options as CanOptions  # noqa: PLC0415 - a table needs no python-can
 
         if options.can is None:
-            raise ConfigurationError(
-                "missing: the description of the frames in the log: can = { dbc = ... }", ("driver", "can")
-            )
+            text = "missing: the description of the frames in the log: can = { dbc = ... }"
+            raise ConfigurationError(text, ("driver", "can"))
         keys = {key: value for key, value in options.can.items() if key != "type"}
         can = validated(keys, CanOptions, ("driver", "can"))
     signals = tuple(
@@ -126,7 +118,6 @@ class ReplayDriver(ThreadedDriver):
         self._clock = -math.inf  # s, monotonic; time of the next row, or of the last one delivered
 
     def open(self, deliver: Deliver) -> None:
-        """See :meth:`otolith_drivers.base.Driver.open`."""
         try:
             reader = self._open_file()
         except OtolithError as error:
@@ -135,13 +126,11 @@ class ReplayDriver(ThreadedDriver):
         self._start("replay", self._run, reader, deliver)
 
     def counters(self) -> Counters:
-        """See :meth:`otolith_drivers.base.Driver.counters`."""
         reader = self._reader
         lost = self._lost_before + (0 if reader is None else reader.lost)
         return Counters(received=self._received, bad=self._bad, lost=lost)
 
     def link(self) -> Link:
-        """See :meth:`otolith_drivers.base.Driver.link`."""
         reader = self._reader
         warnings = [] if reader is None else reader.warnings()
         silence = self._clock - time.monotonic()
@@ -150,7 +139,6 @@ class ReplayDriver(ThreadedDriver):
         return Link(up=not self._down_reason, reason=self._down_reason, warnings=tuple(warnings))
 
     def describe(self) -> list[str]:
-        """See :meth:`otolith_drivers.base.Driver.describe`."""
         return self._description
 
     def _run(self, reader: Reader, deliver: Deliver) -> None:

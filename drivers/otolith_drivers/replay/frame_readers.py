@@ -13,7 +13,7 @@ from typing import Any
 
 from otolith_drivers.canbus import can
 from otolith_drivers.canbus.database import EXTENDED_LIMIT, STANDARD_LIMIT
-from otolith_drivers.canbus.signals import CLASSIC_LENGTH
+from otolith_drivers.canbus.options import CLASSIC_LENGTH
 from otolith_drivers.common.message_times import unix_time
 from otolith_drivers.errors import ConfigurationError, installation_of, some_names
 from otolith_drivers.replay.readers import GZIP, seen

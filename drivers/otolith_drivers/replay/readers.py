@@ -34,15 +34,8 @@ BUFFER = 1 << 16  # bytes; the start of the file from which its encoding is reco
 
 # Formats by the end of the file name. The module is imported only when a file asks for it.
 CAN_LOG = "otolith_drivers.replay.can_log"
-READERS: dict[str, str] = {
-    ".asc": CAN_LOG,
-    ".blf": CAN_LOG,
-    ".db": CAN_LOG,
-    ".log": CAN_LOG,
-    ".mf4": CAN_LOG,
-    ".trc": CAN_LOG,
-    ".rrd": "otolith_drivers.replay.recording",
-}
+READERS = dict.fromkeys((".asc", ".blf", ".db", ".log", ".mf4", ".trc"), CAN_LOG)
+READERS[".rrd"] = "otolith_drivers.replay.recording"
 TABLE = "otolith_drivers.replay.tables"  # all other files
 
 # Formats by the first bytes: text logs of a CAN bus, and what a refusal names.
@@ -80,6 +73,10 @@ OTHERS = {
     "PEAK TRC": rb";\$FILEVERSION|;\s*\$STARTTIME",
     "Vector ASC": rb"date .*\n(?:base|internal)",
     "BUSMASTER log": rb"\*\*\*BUSMASTER",
+    "candump without times: log with candump -L": rb"\w+\s+(?:[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[\d+\]\s",
+    "a CAN log of another tool: export it as candump -L writes": (
+        rb"(?i)(?>[^\n]*?\b(?:can[ _]?)?id(?:entifier)?\b)[^\n]*\b(?:dlc|length|data\w*|d0)\b"
+    ),
     "JSON": rb"[\[{]\s*[\"{\[]",
     "XML": rb"<\?xml",
 }
@@ -130,14 +127,10 @@ def seen(head: bytes) -> str:
 class Rows:
     """A chunk of recorded data, in the order of the file."""
 
-    times: Array
-    """(rows,) s, finite."""
-    columns: dict[str, Array]
-    """(rows,) of each signal in its unit, NaN where there is no reading."""
-    lines: Integers
-    """(rows,) numbers of their lines, frames or records, from 1."""
-    bad: Integers
-    """(rows,) number of bad lines, cells or frames up to and with each row."""
+    times: Array  # (rows,) s, finite
+    columns: dict[str, Array]  # (rows,) of each signal in its unit, NaN where there is no reading
+    lines: Integers  # (rows,) numbers of their lines, frames or records, from 1
+    bad: Integers  # (rows,) number of bad lines, cells or frames up to and with each row
     marks: Mask | None = None
     """(rows,) true for the first row of each recording, in a file with several of them; None for a file without marks.
     """
@@ -158,21 +151,17 @@ class Rows:
         columns = {name: np.concatenate([values, other.columns[name]]) for name, values in self.columns.items()}
         times, lines = np.concatenate([self.times, other.times]), np.concatenate([self.lines, other.lines])
         bad, marked = np.concatenate([self.bad, other.bad]), self.marks is not None or other.marks is not None
-        marks = np.concatenate([self.begins, other.begins]) if marked else None
-        return Rows(times, columns, lines, bad, marks)
+        return Rows(times, columns, lines, bad, np.concatenate([self.begins, other.begins]) if marked else None)
 
 
 class Reader(ABC):
     """An open file of recorded data; a context manager that closes it."""
 
-    place: str
-    """What ``Rows.lines`` numbers: ``line``, ``frame`` or ``record``."""
-    is_table = False
-    """Whether the file is a text table, whose times may be in a unit that it does not name."""
+    place: str  # What Rows.lines numbers: line, frame or record
+    is_table = False  # Whether the file is a text table, whose times may be in a unit that it does not name
     sampling: Sampling | Mapping[str, Sampling] = Sampling.TRUE
     """Meaning of the times of the file, the same for all signals or by signal."""
-    ignored: tuple[str, ...] = ()
-    """Names of the columns that no signal uses."""
+    ignored: tuple[str, ...] = ()  # Names of the columns that no signal uses
 
     def __init__(self, path: Path, data: "DataFile | None" = None) -> None:
         self.path = path
@@ -233,15 +222,10 @@ class Reader(ABC):
 class Format(Protocol):
     """What a module of the table of formats has."""
 
-    Source: type[StrictModel]
-    """The place of a signal in such a file."""
+    Source: type[StrictModel]  # The place of a signal in such a file
 
     def open_log(self, path: Path, setup: Setup, can: Any | None) -> Reader:
-        """The open file; ``can`` describes the frames of a CAN log.
-
-        Raises:
-            ConfigurationError: the file is missing, or does not have the signals of ``setup``.
-        """
+        """The open file; ``can`` describes the frames of a CAN log; raise ConfigurationError if it lacks a signal."""
 
 
 def suffix_of(path: Path) -> str:
@@ -270,11 +254,7 @@ class DataFile:
     """The bytes of a file, decompressed if its name ends in ``.gz``."""
 
     def __init__(self, path: Path) -> None:
-        """Open ``path``.
-
-        Raises:
-            ConfigurationError: the file is missing or cannot be read.
-        """
+        """Open ``path``; raise ConfigurationError if the file is missing or cannot be read."""
         try:
             if path.exists() and not path.is_file():
                 raise ConfigurationError(f"{path}: is a directory or a device, not a file")

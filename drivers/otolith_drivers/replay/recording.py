@@ -51,11 +51,7 @@ def packed(times: Integers, columns: Sequence[Array], *, good: bool) -> bytes:
 
 
 def unpacked(data: bytes, signals: int) -> tuple[bool, Integers, Array]:
-    """Return whether the window was good, the times in ns and the values (signals, records), bit for bit.
-
-    Raises:
-        ValueError: not the records of a window of so many signals.
-    """
+    """Return good or not, times (ns) and values (signals, records), bit for bit; raise ValueError for other data."""
     if len(data) < HEADER.size:
         raise ValueError("too short")
     count, good = HEADER.unpack_from(data)
@@ -82,12 +78,9 @@ def _transposed(numbers: Integers) -> bytes:
 class TimesRecord(StrictModel):
     """What the times and the packed records of a recording mean, as the recorder writes it."""
 
-    sampling: Sampling | dict[str, Sampling]
-    """Of all signals, or by signal."""
-    delays: dict[str, float]
-    """By signal, s."""
-    signals: dict[str, str]
-    """Unit of each packed signal, in their order."""
+    sampling: Sampling | dict[str, Sampling]  # Of all signals, or by signal
+    delays: dict[str, float]  # By signal, s
+    signals: dict[str, str]  # Unit of each packed signal, in their order
 
 
 class RecordingSource(StrictModel):
@@ -132,11 +125,7 @@ class RecordingReader(Reader):
         self._scales = {name: self._scale(name, unit) for name, unit in units.items()}
 
     def _check_in_a_child(self) -> None:
-        """Read the file once in a child process: the library's native code aborts on some damaged files.
-
-        Raises:
-            ConfigurationError: the child was killed by a signal.
-        """
+        """Raise ConfigurationError if the library's native code aborts on the file: a child process reads it first."""
         command = [sys.executable, "-c", READ_ALL, str(self.path)]
         # In a process group of its own: Ctrl-C would end it, which does not mean that the file is damaged.
         child = subprocess.run(command, capture_output=True, check=False, process_group=0)  # noqa: S603 - our own interpreter
@@ -196,7 +185,6 @@ class RecordingReader(Reader):
             raise ConfigurationError(f"{self.path}: signal {name!r}: {error}") from error
 
     def chunks(self) -> Iterator[Rows]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.chunks`."""
         buffers = {name: _SignalBuffer() for name in self._units}
         fresh, until = 0, 0
         for times, values in self._read_windows():
@@ -248,15 +236,12 @@ class RecordingReader(Reader):
         yield Rows(grid / 1e9, columns, numbers, np.full(len(grid), self.bad, dtype=np.int64))
 
     def describe(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.describe`."""
         return [f"{name} [{unit}] from {SAMPLES}" for name, unit in self._units.items()]
 
     def summary_lines(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.summary_lines`."""
         return [f"{self._records} records read", f"{self.bad} bad"]
 
     def warnings(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.warnings`."""
         lines = [] if self._closed else ["never closed by the recorder: its last records may be missing"]
         if self._windows_bad:
             lines.append(f"windows that were bad when they were recorded, left out: {self._windows_bad}")

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -18,11 +17,7 @@ class ReaderGroup(Reader):
     """Several files as one; a file that cannot be opened is named before any is read."""
 
     def __init__(self, path: Path, opening: Iterable[tuple[str, Callable[[], Reader]]]) -> None:
-        """``opening`` has a title for each file and what opens it; ``path`` stands for all files in messages.
-
-        Raises:
-            ConfigurationError: a file cannot be opened.
-        """
+        """``opening`` has a title for each file and what opens it; ``path`` stands for all files in messages."""
         super().__init__(path)
         with ExitStack() as opened:
             self._readers = [(title, opened.enter_context(open_file())) for title, open_file in opening]
@@ -30,7 +25,7 @@ class ReaderGroup(Reader):
         self.place = f"its file's {self._readers[0][1].place}"
         self.ignored = tuple(dict.fromkeys(name for _, reader in self._readers for name in reader.ignored))
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self._opened.close()
 
     @property
@@ -40,20 +35,16 @@ class ReaderGroup(Reader):
 
     @property
     def bad(self) -> int:
-        """See :attr:`Reader.bad`."""
         return sum(reader.bad for _, reader in self._readers)
 
     @property
     def lost(self) -> int:
-        """See :attr:`Reader.lost`."""
         return sum(reader.lost for _, reader in self._readers)
 
     def summary_lines(self) -> list[str]:
-        """See :meth:`Reader.summary_lines`."""
         return [f"{title}: {', '.join(reader.summary_lines())}" for title, reader in self._readers]
 
     def warnings(self) -> list[str]:
-        """See :meth:`Reader.warnings`."""
         return [f"{reader.path}: {line}" for _, reader in self._readers for line in reader.warnings()]
 
 
@@ -61,11 +52,7 @@ class JoinedReader(ReaderGroup):
     """Reads files one after the other, in the order given."""
 
     def __init__(self, paths: Sequence[Path], open_file: Callable[[Path], Reader]) -> None:
-        """Open all files.
-
-        Raises:
-            ConfigurationError: a file cannot be opened, or the times of the files have different meanings.
-        """
+        """Open all files; raise ConfigurationError if one cannot be opened, or their times have different meanings."""
         super().__init__(paths[0], ((path.name, partial(open_file, path)) for path in paths))
         readers = [reader for _, reader in self._readers]
         first = readers[0]
@@ -79,7 +66,6 @@ class JoinedReader(ReaderGroup):
 
     @property
     def file(self) -> Path:
-        """See :attr:`Reader.file`."""
         return self._readers[min(self._finished, len(self._readers) - 1)][1].path
 
     def chunks(self) -> Iterator[Rows]:
@@ -96,7 +82,6 @@ class JoinedReader(ReaderGroup):
             self._finished += 1
 
     def describe(self) -> list[str]:
-        """See :meth:`Reader.describe`."""
         return [*self._readers[0][1].describe(), f"from {len(self._readers)} files, each a recording of its own"]
 
 
@@ -116,8 +101,7 @@ class _Feed:
         self._latest = -math.inf
         self._bad = 0
         self._rows: Rows | None = None
-        self.end = -math.inf
-        """Time of the latest row that was read, s; infinity at the end of the file."""
+        self.end = -math.inf  # Time of the latest row that was read, s; infinity at the end of the file
         self.read()
         self.begin = float(self._clock[0]) if len(self._clock) else math.inf
 
@@ -157,11 +141,7 @@ class MergedReader(ReaderGroup):
     """Reads the files of all sources at the same time; their times must be those of one clock."""
 
     def __init__(self, path: Path, signals: Mapping[str, Sequence[str]], open_source: Callable[[str], Reader]) -> None:
-        """Open the file of each source; ``signals`` has those of each, and ``path`` stands for all files in messages.
-
-        Raises:
-            ConfigurationError: a file cannot be opened.
-        """
+        """Open the file of each source; ``signals`` has those of each; ``path`` stands for all files in messages."""
         super().__init__(path, ((name, partial(open_source, name)) for name in signals))
         self._signals = [signal for names in signals.values() for signal in names]
         self.sampling = {
@@ -170,11 +150,7 @@ class MergedReader(ReaderGroup):
         self._bad = 0
 
     def chunks(self) -> Iterator[Rows]:
-        """See :meth:`Reader.chunks`; the rows of all files in the order of their times.
-
-        Raises:
-            ConfigurationError: also if one file ends before another one begins.
-        """
+        """The rows of all files by time; raise ConfigurationError also if one file ends before another begins."""
         feeds = [_Feed(reader, self._signals) for _, reader in self._readers]
         last = max(feeds, key=lambda feed: feed.begin)
         for feed in feeds:
@@ -207,7 +183,6 @@ class MergedReader(ReaderGroup):
         return Rows(rows.times[order], columns, rows.lines[order], bad, rows.begins[order])
 
     def describe(self) -> list[str]:
-        """See :meth:`Reader.describe`."""
         return [
             line for name, reader in self._readers for line in (f"source {name}: {reader.path}", *reader.describe())
         ]

@@ -8,26 +8,29 @@ without its line, lets an open quote swallow the lines below, and knows neither 
 """
 
 import codecs
+import contextlib
 import csv
 import io
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from pydantic import field_validator
 
+from otolith_drivers import keep_pandas_out
 from otolith_drivers.base import Setup
-from otolith_drivers.config_files import StrictModel
+from otolith_drivers.common.message_times import unix_time
+from otolith_drivers.config_files import Range, StrictModel
 from otolith_drivers.errors import ConfigurationError, counted, nearest
-from otolith_drivers.refused_imports import keep_pandas_out
-from otolith_drivers.replay.cleaning import EvenTimes, NoReadings, Range
+from otolith_drivers.replay.cleaning import EvenTimes, NoReadings
 from otolith_drivers.replay.readers import MAX_TIME, Array, DataFile, Integers, Mask, Reader, Rows, seen
-from otolith_drivers.units import factor
+from otolith_drivers.units import factor, is_unit
 
 # Engineering choice: small in memory, large against pyarrow's overhead per chunk. Guarded by test_replay.py (memory)
 # and test_replay_tables.py (the result does not depend on it).
@@ -38,9 +41,12 @@ MAX_LINE = 100_000  # characters
 TIME, SECONDS = "t", "s"  # column of the time, and its unit if the header names none
 SEGMENT = "segment"  # optional column: a change of its text begins a new recording
 SEPARATORS = (";", "\t", ",")  # in this order: a comma may be a decimal sign
-HEADER_CELL = re.compile(r"(.*?)\s*(?:\[(.*)\])?")  # name and unit
-# Other names of the column of the time, if none is 't'; parentheses are as common around its unit as brackets.
-TIME_CELL = re.compile(r"(?:t|time|timestamp|zeit)\s*(?:[\[(](.*)[\])])?", re.IGNORECASE)
+HEADER_CELL = re.compile(r"^(.*?)\s*(?:\[(.*)\]|\((.*)\))?$", re.DOTALL)  # name and unit
+# Other names of the column of the time, if none is 't'; its unit also stands behind an underscore.
+TIME_NAME = re.compile(r"(?:t|_?time|time[ _]?stamp|date[ _/]?time|zeit(?:stempel)?)(?:_(s|ms|us))?", re.IGNORECASE)
+DATE = "2026-03-29T01:59:58.25Z"  # an example
+MAX_PREAMBLE = 100  # lines above the header that are no comments; engineering choice: oscilloscopes write some twenty
+DAY_FIRST = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})")  # no country writes the month first with points
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
 NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
 BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
@@ -52,22 +58,13 @@ keep_pandas_out()  # only the reader of MF4 logs needs it, which imports it itse
 class TableSource(StrictModel):
     """The column of a signal."""
 
-    column: str | None = None
-    """Name of the column; without it, the name of the signal."""
-    unit: str | None = None
-    """Unit of the numbers in the column, if its header does not name it."""
-    range: Range | None = None
-    """In the unit of the column; a number outside is no reading."""
-
-    @field_validator("range")
-    @classmethod
-    def _is_increasing(cls, limits: Range | None) -> Range | None:
-        if limits is not None and not limits[0] < limits[1]:
-            raise ValueError(f"range {list(limits)}: the lower end comes first")
-        return limits
+    column: str | None = None  # Name of the column; without it, the name of the signal
+    unit: str | None = None  # Unit of the numbers in the column, if its header does not name it
+    range: Range | None = None  # In the unit of the column; a number outside is no reading
 
 
 Source = TableSource  # for readers.Format
+Place = tuple[int, str | None]  # position of a column in a row, from 0, and its unit if the header has it
 
 
 class Column(NamedTuple):
@@ -101,37 +98,28 @@ class ColumnRequest(NamedTuple):
 class Header:
     """The line with the names of the columns."""
 
-    line: int
-    """Line number, from 1."""
+    line: int  # Line number, from 1
     separator: str
     widths: tuple[int, int]
     """Minimum and maximum number of cells in a row: columns without a name at the end may be absent."""
-    columns: dict[str, Column]
-    """Of the time and of every signal."""
-    ignored: tuple[str, ...]
-    """Names of the columns that no signal uses."""
-    segment: int | None = None
-    """Position of the column of segments in a row, from 0."""
+    columns: dict[str, Column]  # Of the time and of every signal
+    ignored: tuple[str, ...]  # Names of the columns that no signal uses
+    segment: int | None = None  # Position of the column of segments in a row, from 0
+    below: str = ""  # The line below it, which was read, if that is a row
 
 
 @dataclass(slots=True)
 class TableCounts:
     """Rows and cells read so far."""
 
-    rows: int = 0
-    """Rows that were used."""
-    blank: int = 0
-    """Cells without a reading."""
+    rows: int = 0  # Rows that were used
+    blank: int = 0  # Cells without a reading
     bad_cells: int = 0
     bad_rows: int = 0
-    first_bad: tuple[int, str] | None = None
-    """Line number and cause of the first bad row or cell."""
-    decimal: str = ""
-    """The decimal sign; empty until a chunk has one."""
-    segment: str | None = None
-    """Text of the present segment; None until a row has one."""
-    no_readings: dict[str, NoReadings] = field(default_factory=dict)
-    """Numbers of each signal that are left out."""
+    first_bad: tuple[int, str] | None = None  # Line number and cause of the first bad row or cell
+    decimal: str = ""  # The decimal sign; empty until a chunk has one
+    segment: str | None = None  # Text of the present segment; None until a row has one
+    no_readings: dict[str, NoReadings] = field(default_factory=dict)  # Numbers of each signal that are left out
 
     @property
     def bad(self) -> int:
@@ -186,13 +174,17 @@ class TableReader(Reader):
             self.counts.no_readings[name] = NoReadings(source.range, limits)
 
     @property
+    def progress(self) -> float:
+        """Share of the file that was read and whose times are known, 0 to 1."""
+        return super().progress * (1.0 - self._times.waiting / max(self.counts.rows, 1))
+
+    @property
     def bad(self) -> int:
         """Number of bad rows and bad cells."""
         return self.counts.bad
 
     def chunks(self) -> Iterator[Rows]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.chunks`."""
-        number, rest = self._header.line + 1, ""
+        number, rest = self._header.line + 1, self._header.below
         while text := self._text.read(CHUNK):
             text, end, rest = (rest + text).rpartition("\n")
             if end:
@@ -219,17 +211,14 @@ class TableReader(Reader):
         return f":{line}: {cause}; none of the {self.counts.bad_rows} rows can be used"
 
     def describe(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.describe`."""
         return [f"{name} [{wanted.unit}] from column {wanted.column!r}" for name, wanted in self._wanted.items()]
 
     def summary_lines(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.summary_lines`."""
         counts = self.counts
         parts = [f"{counted(counts.rows, 'row')} read", counted(counts.bad_rows, "bad row")]
         return [*parts, counted(counts.bad_cells, "bad cell"), f"{counted(counts.blank, 'cell')} blank"]
 
     def warnings(self) -> list[str]:
-        """See :meth:`otolith_drivers.replay.readers.Reader.warnings`."""
         lines = self._cut_off()
         for name, no_readings in self.counts.no_readings.items():
             lines += no_readings.warnings(name)
@@ -243,8 +232,10 @@ class TableReader(Reader):
 
 
 def _decoded(path: Path, data: DataFile) -> TextIO:
-    """The text of a table with any line ends, in UTF-8 or Windows-1252."""
+    """The text of a table with any line ends, in UTF-8, UTF-16 with its mark, or Windows-1252."""
     start = data.stream.peek()
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return io.TextIOWrapper(data.stream, encoding="utf-16", errors="replace")
     if b"\0" in start:
         kind = seen(start) or "compressed, a spreadsheet or UTF-16"
         raise ConfigurationError(f"{path}: is not text ({kind}): save it as CSV in UTF-8")
@@ -262,94 +253,122 @@ def _check_length(place: str, length: int) -> None:
 
 
 def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -> Header:
-    """The header of ``file``, which is read up to the end of that line.
+    """The header of ``file``, which is read to the line below: the first line with the time and all wanted columns.
 
     Raises:
         ConfigurationError: no header, a column that is missing or not unique, or a unit of another dimension.
     """
-    number, line, separator = _header_line(path, file)
-    cells = [cell.strip() for cell in _split_quoted(line, separator)]
-    place = f"{path}:{number}"
     wanted = {TIME: ColumnRequest(TIME, SECONDS), **wanted}
-    known = list(dict.fromkeys(request.column for request in wanted.values()))
-    if any(cells) and all(re.match(NUMBER, cell.replace(",", ".")) for cell in cells if cell):
-        raise ConfigurationError(f"{place}: numbers, but a header must name the columns: {', '.join(known)}")
-    places: dict[str, tuple[int, str | None]] = {}
-    others = []
-    for index, cell in enumerate(cells):
-        name, written = _name(cell), _unit(cell)
-        if name not in known and name != SEGMENT:
-            others += [name] if name else []
-        elif name in places:
-            raise ConfigurationError(f"{place}: column {index + 1} ({cell!r}): a second column {name}: remove one")
-        else:
-            places[name] = (index, written)
-    if TIME not in places and (times := _times(place, cells, places)):
-        places[TIME] = times
-        others.remove(_name(cells[times[0]]))
-    columns: dict[str, Column] = {}
-    for signal, request in wanted.items():
-        if request.column not in places:
-            raise ConfigurationError(f"{place}: {_missing(request, others, cells)}")
-        index, written = places[request.column]
-        unit = request.written or written
-        try:
-            columns[signal] = Column(index) if unit is None else Column(index, *factor(unit, request.unit))
-        except ValueError as error:
-            raise ConfigurationError(f"{place}: column {index + 1} ({cells[index]!r}): {error}") from error
-    named = max(index for index, cell in enumerate(cells) if cell) + 1
-    segment = None if SEGMENT in known or SEGMENT not in places else places[SEGMENT][0]
-    return Header(number, separator, (named, len(cells)), columns, tuple(others), segment)
-
-
-def _name(cell: str) -> str:
-    match = HEADER_CELL.fullmatch(cell)
-    return match[1] if match else cell
-
-
-def _unit(cell: str) -> str | None:
-    match = HEADER_CELL.fullmatch(cell)
-    return match[2] if match else None
-
-
-def _times(place: str, cells: list[str], used: Mapping[str, tuple[int, str | None]]) -> tuple[int, str | None] | None:
-    """Position and unit of the column of the time in a header without a column ``t``; None if no name says time."""
-    taken = {index for index, _ in used.values()}
-    matches = [(index, TIME_CELL.fullmatch(cell)) for index, cell in enumerate(cells) if index not in taken]
-    times = [(index, match[1]) for index, match in matches if match is not None]
-    if len(times) > 1:
-        names = ", ".join(repr(cells[index]) for index, _ in times)
-        raise ConfigurationError(f"{place}: {names} may be the column of the time: rename one to 't [s]' or the like")
-    return times[0] if times else None
-
-
-def _header_line(path: Path, file: TextIO) -> tuple[int, str, str]:
-    """Number, text and separator of the first line that is neither blank nor a comment."""
-    number, separator = 0, ""
-    while line := file.readline(MAX_LINE + 1):
+    number, separator, faults = 0, "", list[tuple[int, ConfigurationError]]()
+    while len(faults) < MAX_PREAMBLE and (line := file.readline(MAX_LINE + 1)):
         number += 1
         _check_length(f"{path}:{number}", len(line))
-        line = line.strip("\n")
         if excel := EXCEL_SEPARATOR.fullmatch(line.strip()):
             separator = excel[1]
         elif line.strip() and not line.lstrip().startswith("#"):
-            return number, line, separator or next((sign for sign in SEPARATORS if sign in line), ",")
-    raise ConfigurationError(f"{path}: {'has only comments' if number else 'is empty'}: a header line is needed")
+            sign = separator or next((sign for sign in SEPARATORS if sign in line), ",")
+            cells = _split_quoted(line, sign)
+            try:
+                places, others = _places(f"{path}:{number}", cells, wanted)
+                break
+            except ConfigurationError as error:
+                faults.append((sum(not _is_number(cell) for cell in cells if cell), error))
+    else:
+        empty = ConfigurationError(f"{path}: is empty, or has only comments: a header line is needed")
+        raise max(faults, key=lambda fault: fault[0], default=(0, empty))[1]
+    below = file.readline(MAX_LINE + 1)
+    units = _units_below(_split_quoted(below, sign), wanted, places)
+    columns: dict[str, Column] = {}
+    for signal, request in wanted.items():
+        index, written = places[request.column]
+        unit = request.written or written or units.get(index)
+        try:
+            columns[signal] = Column(index) if unit is None else Column(index, *factor(unit, request.unit))
+        except ValueError as error:
+            raise ConfigurationError(f"{path}:{number}: column {index + 1} ({cells[index]!r}): {error}") from error
+    named = max(index for index, cell in enumerate(cells) if cell) + 1
+    is_wanted = SEGMENT in {request.column for request in wanted.values()}
+    segment = None if is_wanted or SEGMENT not in places else places[SEGMENT][0]
+    widths, below = (named, len(cells)), "" if units else below
+    return Header(number + bool(units), sign, widths, columns, others, segment, below)
+
+
+def _places(
+    place: str, cells: list[str], wanted: Mapping[str, ColumnRequest]
+) -> tuple[dict[str, Place], tuple[str, ...]]:
+    """The place of each wanted column, and of that of segments if there is one; the names of the other columns."""
+    known = list(dict.fromkeys(request.column for request in wanted.values()))
+    if all(_is_number(cell) for cell in cells if cell):
+        raise ConfigurationError(f"{place}: numbers, but a header must name the columns: {', '.join(known)}")
+    places: dict[str, Place] = {}
+    others, times = list[str](), list[tuple[str, Place]]()
+    for index, cell in enumerate(cells):
+        name, written = _name_and_unit(cell)
+        name = cell if cell in known else name
+        if name in places:
+            raise ConfigurationError(f"{place}: column {index + 1} ({cell!r}): a second column {name}: remove one")
+        if name in known or name == SEGMENT:
+            places[name] = (index, written)
+        else:
+            others += [name] if name else []
+            match = TIME_NAME.fullmatch(name)
+            times += [(name, (index, written or (match[1] and match[1].lower())))] if match else []
+    if TIME not in places and times:
+        if len(times) > 1:
+            names = ", ".join(repr(cells[index]) for _, (index, _) in times)
+            raise ConfigurationError(
+                f"{place}: {names} may be the column of the time: rename one to 't [s]' or the like"
+            )
+        ((name, places[TIME]),) = times
+        others.remove(name)
+    for request in wanted.values():
+        if request.column not in places:
+            raise ConfigurationError(f"{place}: {_missing(request, others, cells)}")
+    return places, tuple(others)
+
+
+def _is_number(cell: str) -> bool:
+    return re.match(NUMBER, cell.replace(",", ".")) is not None
+
+
+def _name_and_unit(cell: str) -> tuple[str, str | None]:
+    """The name in a cell of the header, and its unit if it has one; other parentheses belong to the name."""
+    name, unit, in_parentheses = HEADER_CELL.findall(cell)[0]
+    if in_parentheses and (_is_number(in_parentheses) or not is_unit(in_parentheses)):
+        return cell, None
+    return name, unit or in_parentheses or None
+
+
+def _units_below(cells: list[str], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]) -> dict[int, str]:
+    """The units in the line below the header, by the position of their columns; empty if that is a row."""
+    texts, fitting = dict[int, str](), 0
+    for request in wanted.values():
+        index = places[request.column][0]
+        text = cells[index].strip("[]()") if index < len(cells) else ""
+        if re.match(BLANK, text):
+            continue
+        if _is_number(text) or not is_unit(text):
+            return {}
+        texts[index] = text
+        with contextlib.suppress(ValueError):
+            factor(text, request.unit)
+            fitting += 1
+    return texts if 2 * fitting >= len(texts) else {}  # single letters are units of something
 
 
 def _missing(request: ColumnRequest, others: list[str], cells: list[str]) -> str:
     unit = "seconds, also called 'time'" if request.column == TIME else request.unit
     what = f"no column {request.column!r} ({unit})"
     kind = seen(",".join(cells).encode())
-    other = f"; is the file {kind} instead of a table?" if kind else ""
+    other = f"; the file looks like {kind}" if kind else ""
     if len(cells) < 2:
         return f"{what}, and no ',', ';' or tab between columns{other}"
     return f"{what}: {nearest(request.column, others) if others else 'add it'}{other}"
 
 
 def _split_quoted(line: str, separator: str) -> list[str]:
-    """The cells of one line; a quote that is not closed ends with the line."""
-    return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    """The cells of one line, without spaces around them; a quote that is not closed ends with the line."""
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
 class _TableChunk:
@@ -368,8 +387,11 @@ class _TableChunk:
         kept = np.flatnonzero(self._right_width(cells))
         cells = cells if len(kept) == len(cells) else cells.take(pa.array(kept))
         texts = {name: pc.list_element(cells, column.place) for name, column in columns.items()}
-        counts.decimal = counts.decimal or _decimal_sign(list(texts.values()))
+        signs = (_decimal_sign([text for name, text in texts.items() if name != TIME]), _decimal_sign([texts[TIME]]))
+        counts.decimal = counts.decimal or signs[0] or signs[1]  # a date may have points and a comma
         times = columns[TIME].scaled(_numbers(texts[TIME], counts.decimal))
+        dates = np.flatnonzero(np.isinf(times))
+        times[dates] = list(map(_date, texts[TIME].take(pa.array(dates)).to_pylist()))
         timed = self._timed(times, texts.pop(TIME), cells, kept)
         kept = kept[timed]
         if not len(kept):
@@ -428,7 +450,7 @@ class _TableChunk:
             first, cause = wrong[0], "a row without t"
             if not np.isnan(times[first]):
                 cell = texts[int(first)].as_py()
-                cause = f"t is {cell!r}: write seconds, relative or Unix, or name the unit like 't [ms]'"
+                cause = f"t is {cell!r}: write seconds, relative or Unix, a date like {DATE}, or the unit: 't [ms]'"
             self._count_rows(lines[wrong], cause)
         return timed
 
@@ -482,3 +504,10 @@ def _numbers(texts: pa.StringArray, decimal: str) -> Array:
         numbers = pc.if_else(pc.match_substring_regex(texts, NUMBER), texts, known).cast(pa.float64())
     array: Array = numbers.to_numpy()
     return array
+
+
+def _date(text: str) -> float:
+    """The Unix time (s) of a date, in UTC if it names no zone; infinity for another text."""
+    with contextlib.suppress(ValueError):
+        return unix_time(datetime.fromisoformat(DAY_FIRST.sub(r"\3-\2-\1", text.strip()).replace("/", "-")))
+    return math.inf

@@ -19,8 +19,8 @@ from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import read_eds
 from otolith_drivers.canbus.database import CanDatabase, load_database
 from otolith_drivers.canbus.decoder import MessageReader, MessageRules
+from otolith_drivers.canbus.options import CanSource, SignalRequest, request_from_databases
 from otolith_drivers.canbus.probe import Picture
-from otolith_drivers.canbus.signals import CanSource, SignalRequest, request_from_databases
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.drivers.can_frames import decoder, frame

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from otolith_drivers.base import Signal
 from otolith_drivers.canbus.database import CanDatabase, load_database, load_dbc
-from otolith_drivers.canbus.signals import CanSource, request_from_databases
+from otolith_drivers.canbus.options import CanSource, request_from_databases
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 from tests.drivers.can_frames import dbc, decoder, frame, values

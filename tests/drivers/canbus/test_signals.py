@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from otolith_drivers.canbus.decoder import FrameDecoder
-from otolith_drivers.canbus.options import FrameOptions
-from otolith_drivers.canbus.signals import CanSource
+from otolith_drivers.canbus.options import CanSource, FrameOptions
 from otolith_drivers.errors import ConfigurationError
 from tests.drivers.can_frames import dbc, decoder, frame, values
 

@@ -11,7 +11,7 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith_drivers.canbus.signals import bytes_needed, raw_reader
+from otolith_drivers.canbus.options import bytes_needed, raw_reader
 
 
 @st.composite

@@ -40,6 +40,15 @@ def test_swapped_words_are_detected(name: str, kind: TypeName, order: Order) -> 
     assert judgement.better is not None
 
 
+@pytest.mark.parametrize("words", [[0x7FC0, 0], [0x7F80, 0], [0xFFFF, 0xFFFF]])
+def test_a_device_without_a_reading_is_told_no_other_order(words: list[int]) -> None:
+    """Constant not-a-number has a plausible number in some wrong order, as 0x7FC00000 has -3.98 in BADC."""
+    judgement = judge_order([words] * 20, "float32", "ABCD")
+    assert not judgement.plausible
+    assert judgement.better is None
+    assert "none of the readings is a number" in judgement.reason
+
+
 COUNT = np.arange(20)
 
 FLOATS = {

@@ -227,6 +227,23 @@ def test_reply_numbers_are_of_tcp_only() -> None:
         Options(serial="/dev/ttyUSB0", reply_device=3)
 
 
+@pytest.mark.parametrize(
+    ("corrupt", "said"),
+    [
+        (lambda reply: reply[6:] + b"\x12\x34", 'an answer of a serial line: set framing = "rtu" in [driver]'),
+        (lambda reply: b"hello\r\n" + reply, "bytes that are no answer of Modbus TCP"),
+        (lambda reply: reply[:2] + b"\x12\x34" + reply[4:], "bytes that are no answer of Modbus TCP"),
+    ],
+    ids=["serial frames", "a greeting", "another protocol"],
+)
+def test_what_is_no_answer_of_modbus_tcp_is_said_to_be_none(corrupt: Callable[[bytes], bytes], said: str) -> None:
+    """Not an answer with another device number, whose declaration would never help."""
+    port = free_port(socket.SOCK_STREAM)
+    with odd_server(Behaviour(WORDS, corrupt=corrupt), port), Listener(poller(port, TWO)) as listener:
+        wait_for(lambda: any(said in warning for warning in listener.driver.link().warnings))
+        assert not any("reply_device" in warning for warning in listener.driver.link().warnings)
+
+
 def test_a_second_copy_of_an_answer_is_not_the_next_answer() -> None:
     """Without a transaction number that would tell."""
     numbers = count()

@@ -6,9 +6,8 @@ from datetime import UTC, datetime
 import pytest
 from asyncua import ua
 
-from otolith_drivers.base import Sample, Signal
+from otolith_drivers.base import Conversion, Sample, Signal
 from otolith_drivers.common.message_times import ArrivalClock, ExchangeClock
-from otolith_drivers.common.scaled import Conversion
 from otolith_drivers.opcua.connection import OpcuaSource
 from otolith_drivers.opcua.driver import OVERFLOW, Readings
 

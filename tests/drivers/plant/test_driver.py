@@ -10,8 +10,8 @@ import pytest
 
 from otolith_drivers.base import Driver, Sample, Setup, Signal
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.plant.driver import Options, Source, build
 from otolith_drivers.plant.faults import FaultInjector
+from otolith_drivers.plant.realtime import Options, Source, build
 from otolith_drivers.plant.scenario import load_scenario, simulate
 from tests.conftest import EXAMPLES
 from tests.waiting import PATIENCE

@@ -20,7 +20,7 @@ from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.pdu import ModbusPDU
 
 from otolith_drivers.errors import DeviceError
-from otolith_drivers.plant.pseudo_terminal import _create_link
+from otolith_drivers.plant.modbus_node import _create_link
 from otolith_drivers.plant.realtime import open_node, run_nodes
 from otolith_drivers.plant.scenario import load_scenario
 from tests.conftest import EXAMPLES

@@ -58,8 +58,64 @@ def test_rows_of_a_coarse_clock_are_spread_evenly(name: str) -> None:
     assert np.ptp(off) < 0.25 * interval
     assert np.ptp(np.diff(even)) < 0.3 * interval
     assert (clock.text() or "").startswith(
-        f"rows that share times: {ROWS} were spread evenly; from line 2 on t has steps"
+        f"rows of a coarse clock: {ROWS} were spread evenly; from line 2 on t has steps"
     )
+
+
+ROUNDED: dict[str, tuple[float, float]] = {
+    "3.5 ms in ms": (0.0035, 0.001),
+    "300 Hz in ms": (1.0 / 300.0, 0.001),
+    "60 Hz in ms": (1.0 / 60.0, 0.001),
+    "10.7 ms in 10 ms": (0.0107, 0.01),
+    "clock of a PC": (0.02, 0.015625),
+}
+
+
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+@pytest.mark.parametrize("name", ROUNDED)
+def test_times_rounded_to_steps_below_the_interval_are_spread_evenly(name: str, start: float) -> None:
+    """Half a millisecond of a step of 10 V is more than the noise of a current."""
+    interval, step = ROUNDED[name]
+    times, columns = regular(interval)
+    even, clock = spread(rows_at(np.rint(times / step) * step + start, columns))
+    off = even - start - times
+    assert np.ptp(off) < 0.1 * step
+    assert f"t has steps of {1e3 * step:.4g} ms, but a row comes every" in (clock.text() or "")
+
+
+@pytest.mark.parametrize("kind", ["two intervals at random", "about a clock", "rows missing", "on the grid"])
+def test_times_that_no_regular_clock_rounds_are_kept(kind: str) -> None:
+    random = np.random.default_rng(SEED)
+    times: Array = 0.01 * np.arange(ROWS, dtype=np.float64)
+    match kind:
+        case "two intervals at random":
+            times = np.asarray(np.cumsum(random.choice([0.015, 0.016], ROWS)))
+        case "about a clock":
+            times = np.round(times + random.uniform(-0.002, 0.002, ROWS), 3)
+        case "rows missing":
+            times = times[random.uniform(size=ROWS) > 0.05]
+    even, clock = spread(rows_at(times, signals(times, random)), len(times))
+    assert even.tolist() == times.tolist()
+    assert clock.text() is None
+
+
+@pytest.mark.parametrize("offset", [0.00348, 0.01 / 3.0, 0.005, 0.008])
+def test_signals_that_come_in_turn_keep_their_times(offset: float) -> None:
+    """Rows of two signals with one interval alternate: theirs are two intervals, as those of rounded times."""
+    times = (3.0 + 0.01 * np.arange(ROWS // 2)[:, np.newaxis] + np.array([0.0, offset])).ravel()
+    columns = signals(times, np.random.default_rng(SEED))
+    columns["u"][1::2] = columns["y"][::2] = np.nan
+    even, clock = spread(rows_at(times, columns))
+    assert even.tolist() == times.tolist()
+    assert clock.text() is None
+
+
+def test_rounded_times_with_missing_rows_are_spread_between_them() -> None:
+    times, _ = regular(0.0035)
+    times = times[np.random.default_rng(SEED).uniform(size=ROWS) > 0.001]
+    columns = signals(times, np.random.default_rng(SEED))
+    even, _ = spread(rows_at(np.floor(times / 0.001 + 1e-6) * 0.001, columns), len(times))
+    assert np.mean(np.abs(even - times - np.median(even - times)) < 0.0003) > 0.95
 
 
 def test_the_result_does_not_depend_on_chunks() -> None:

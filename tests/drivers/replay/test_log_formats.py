@@ -21,6 +21,7 @@ from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import frame_readers
 from otolith_drivers.replay.readers import HEAD, OTHERS, TEXT_LOGS, Rows, holds_frames, seen, text_log
+from otolith_drivers.replay.tables import TableReader
 from tests.drivers.logs import frames_of, live, opened, samples_of
 
 Frames = list[can.Message]
@@ -201,6 +202,24 @@ def test_a_refusal_names_the_format(tmp_path: Path, name: str, start: bytes, kin
     path.write_bytes(start + bytes(2000))
     with pytest.raises(ConfigurationError, match=kind):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "kind"),
+    [
+        ("bus.log", "  can0  123   [8]  00 00 F4 01 00 00 00 00", "candump without times"),
+        ("bus.csv", "Time,Channel,ID,Flags,DLC,Data0,Data1", "CAN log of another tool"),
+        ("bus.txt", "Timestamp;Type;ID;Data", "CAN log of another tool"),
+        ("bus.csv", "Time[s],Send Type,CAN ID,Direction,Data Length,Data Bytes", "CAN log of another tool"),
+        ("bus.txt", "Chn Identifier Flg   DLC  D0...1...2...3", "CAN log of another tool"),
+        ("bus.csv", "t,omega,id,kind", "no column 'x' \\(1\\): known: id, kind, omega$"),
+    ],
+)
+def test_a_refusal_of_a_text_names_the_log_that_it_seems_to_be(tmp_path: Path, name: str, line: str, kind: str) -> None:
+    path = tmp_path / name
+    path.write_text(f"{line}\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=kind):
+        _ = read(path) if name == "bus.log" else TableReader(path, {"x": "1"})
 
 
 def test_a_text_log_with_the_suffix_of_another_is_named(tmp_path: Path, frames: Frames) -> None:

@@ -11,12 +11,24 @@ from hypothesis import strategies as st
 from otolith_drivers.errors import ConfigurationError
 from otolith_drivers.replay import tables
 from otolith_drivers.replay.readers import Rows
-from otolith_drivers.replay.tables import TableReader, TableSource
+from otolith_drivers.replay.tables import MAX_PREAMBLE, TableReader, TableSource
 
 
 def read(path: Path, sources: dict[str, TableSource] | None = None) -> tuple[list[Rows], TableReader]:
     with TableReader(path, {"x": "1"}, sources) as reader:
         return list(reader.chunks()), reader
+
+
+def numbers(rows: list[Rows], name: str = "x") -> list[float]:
+    return list(map(float, np.concatenate([part.columns[name] for part in rows])))
+
+
+def times(rows: list[Rows]) -> list[float]:
+    return list(map(float, np.concatenate([part.times for part in rows])))
+
+
+def lines(rows: list[Rows]) -> list[int]:
+    return list(map(int, np.concatenate([part.lines for part in rows])))
 
 
 def table(folder: Path, segments: list[str], heading: str = "t,segment,x") -> Path:
@@ -83,3 +95,121 @@ def test_a_signal_may_have_the_column(tmp_path: Path) -> None:
 def test_a_second_column_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="a second column segment: remove one"):
         read(table(tmp_path, ["1,1"], heading="t,segment,segment,x"))
+
+
+MORNING = 1774749598.25  # s since 1970: 2026-03-29 01:59:58.25 UTC
+
+
+@pytest.mark.parametrize(
+    ("written", "heading"),
+    [
+        ("2026-03-29T01:59:58.250Z", "timestamp"),
+        ("2026-03-29 01:59:58.25", "DateTime"),
+        ("2026-03-29 03:59:58.250+02:00", "_time"),
+        ("2026-03-29T01:59:58.250000000+00:00", "t"),
+        ("2026/03/29 01:59:58.250", "Time"),
+        ("29.03.2026 01:59:58,250", "Zeitstempel"),
+    ],
+)
+def test_times_may_be_dates(tmp_path: Path, written: str, heading: str) -> None:
+    path = tmp_path / "table.csv"
+    later = written.replace("58", "59")
+    path.write_text(f"{heading};x\n{written};1,5\n{later};2,5\n", encoding="utf-8")
+    rows, reader = read(path)
+    assert reader.warnings() == []
+    assert times(rows) == [MORNING, MORNING + 1.0]
+    assert numbers(rows) == [1.5, 2.5]
+
+
+@pytest.mark.parametrize("written", ["03/29/2026 01:59:58", "01:59:58.25", "2026-13-29 01:59:58", "today"])
+def test_dates_that_leave_open_the_day_are_refused(tmp_path: Path, written: str) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(f"t,x\n{written},1.5\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"table.csv:2: t is .*write seconds, relative or Unix, a date like"):
+        read(path)
+
+
+def test_the_line_below_the_header_may_have_the_units(tmp_path: Path) -> None:
+    """A column of ms taken for s would make each parameter of a dimension with time wrong, silently."""
+    path = tmp_path / "table.csv"
+    path.write_text("time,i,omega\nms,[mA],(rpm)\n0,1500,60\n10,2500,\n", encoding="utf-8")
+    with TableReader(path, {"i": "A", "omega": "rad/s"}) as reader:
+        rows = list(reader.chunks())
+    assert reader.warnings() == []
+    assert times(rows) == [0.0, 0.01]
+    assert lines(rows) == [3, 4]
+    assert numbers(rows, "i") == pytest.approx([1.5, 2.5])
+    assert numbers(rows, "omega")[0] == pytest.approx(2.0 * np.pi)
+
+
+@pytest.mark.parametrize("line", ["ms,V", "s,words", "1,1", "nan,nan", ","])
+def test_the_line_below_the_header_is_a_row_or_an_error_if_it_has_no_units(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(f"t,i\n{line}\n2,5\n", encoding="utf-8")
+    try:
+        with TableReader(path, {"i": "A"}) as reader:
+            rows = list(reader.chunks())
+    except ConfigurationError as error:
+        assert line == "ms,V"
+        assert "table.csv:1: column 2 ('i'): unit 'V'" in str(error)  # noqa: PT017 - which it is depends on the line
+    else:
+        assert times(rows)[-1] == 2.0
+        assert numbers(rows, "i")[-1] == 5.0
+
+
+def test_a_header_may_have_units_in_parentheses_and_names_with_them(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(
+        "Time (ms),u (mV),x (left),x (right) [mV],v (axis 2),y (1),y (2)\n10,2000,3,4000,5,6,7\n", encoding="utf-8"
+    )
+    sources = {
+        "a": TableSource(column="x (right)"), "b": TableSource(column="x (left)"), "c": TableSource(column="u (mV)"),
+        "d": TableSource(column="v (axis 2)", unit="kV"), "e": TableSource(column="y (1)"),
+    }  # fmt: skip
+    with TableReader(path, dict.fromkeys(sources, "V"), sources) as reader:
+        (rows,) = reader.chunks()
+    values = {name: float(column[0]) for name, column in rows.columns.items()}
+    assert values == pytest.approx({"a": 4.0, "b": 3.0, "c": 2.0, "d": 5000.0, "e": 6.0})
+    assert rows.times[0] == 0.01
+
+
+def test_lines_above_the_header_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    above = "Model,XY4054\nFirmware Version,2.68\n\n% comment\nSample Interval,2e-2\nLabel,,\n"
+    path.write_text(f"{above}TIME,x\n0.00,1.5\n0.01,2.5\n", encoding="utf-8")
+    rows, reader = read(path)
+    assert lines(rows) == [8, 9]
+    assert reader.bad == 0
+
+
+def test_what_is_missing_is_named_in_the_line_with_most_names(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("Model,XY4054\n\nTIME,CH1,CH2\n0.00,1.5,2\n0.01,2.5,3\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"table.csv:3: no column 'x' \(1\): known: CH1, CH2"):
+        read(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig", "cp1252"])
+def test_a_table_may_have_any_usual_encoding(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "table.csv"
+    mark = "\ufeff" if encoding in {"utf-16-le", "utf-16-be"} else ""
+    path.write_bytes(f"{mark}t,x,größe\r\n0.5,1.5,2\r\n".encode(encoding))
+    rows, reader = read(path)
+    assert numbers(rows) == [1.5]
+    assert reader.ignored == ("größe",)
+
+
+@pytest.mark.parametrize("heading", ["Time,x,Time,y", "Time [s],x,Time [ms],y", "time,x,Timestamp,y"])
+def test_two_columns_of_times_are_refused(tmp_path: Path, heading: str) -> None:
+    """Trends are exported with a time beside each signal: that of another one would be taken."""
+    path = tmp_path / "table.csv"
+    path.write_text(f"{heading}\n0,1,5,2\n1,2,6,3\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"table.csv:1: '[Tt]ime.*', 'Time.*' may be the column"):
+        read(path)
+
+
+def test_any_number_of_comments_may_be_above_the_header(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("# made by a logger\n\n" * MAX_PREAMBLE + "t,x\n0,1\n", encoding="utf-8")
+    rows, _ = read(path)
+    assert lines(rows) == [2 * MAX_PREAMBLE + 2]

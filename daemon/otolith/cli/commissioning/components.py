@@ -133,11 +133,7 @@ def forget(file: Path, component: str) -> None:
 
 
 def _decide(file: Path, component: str, decision: str, add: "Callable[[OperatorDecisions], OperatorDecisions]") -> None:
-    """Replace the decision on ``component``; ``add`` takes the decisions without it.
-
-    Raises:
-        ConfigurationError: no such component was ever found; the message has the nearest one.
-    """
+    """Apply ``add`` to the decisions without ``component``; raise ConfigurationError if it was never found."""
     from otolith_drivers.errors import ConfigurationError, nearest
 
     _, store = _store(file)
@@ -351,11 +347,7 @@ def baseline(file: Path, clear: bool) -> None:
 
 
 def keep_baseline(machine: "LoadedMachine", store: "StateStore", histories: "Mapping[str, History]") -> None:
-    """Store the baselines of ``histories``, and print them.
-
-    Raises:
-        ConfigurationError: no parameter with limits has enough estimates.
-    """
+    """Store and print the baselines of ``histories``; raise ConfigurationError if there are too few estimates."""
     from otolith.health.limits import Level
     from otolith.health.prognosis import MIN_POINTS, baselines
     from otolith.health.text import interval_text, number_text

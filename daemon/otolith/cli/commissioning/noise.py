@@ -52,10 +52,8 @@ class HealthyRecord:
 
     delays: "IdentifiedDelays"
     noise: "IdentifiedNoise"
-    structure: "Sequence[Structure]"
-    """Components that all windows show and the twin lacks."""
-    windows: "Sequence[Window]"
-    """Without the delays."""
+    structure: "Sequence[Structure]"  # Components that all windows show and the twin lacks
+    windows: "Sequence[Window]"  # Without the delays
 
     @property
     def offered(self) -> "list[Structure]":
@@ -73,11 +71,7 @@ class HealthyRecord:
 
 
 def identified_record(machine: "LoadedMachine", data: Path, count: int) -> HealthyRecord:
-    """Delays, noise levels without them, and what the twin lacks, from at most ``count`` windows of the data.
-
-    Raises:
-        ConfigurationError: no window can be used.
-    """
+    """Identify delays, noise and structure from ``count`` windows; raise ConfigurationError if none can be used."""
     from otolith.commissioning.delays import identify_delays_and_noise, without_delays
     from otolith.commissioning.identification import identify_noise
     from otolith.commissioning.structure import remaining_structure
@@ -104,11 +98,7 @@ def identified_record(machine: "LoadedMachine", data: Path, count: int) -> Healt
 
 
 def _good_windows(machine: "LoadedMachine", data: Path, count: int) -> list["Window"]:
-    """At most ``count`` windows of good quality, spread over the data.
-
-    Raises:
-        ConfigurationError: there is none; the message has the reason of the last bad one.
-    """
+    """At most ``count`` good windows, spread over the data; raise ConfigurationError, with why, if there is none."""
     from otolith.runtime.preview import EvenSpread
     from otolith.runtime.replay import Replay, open_recorded
     from otolith_drivers.errors import ConfigurationError
@@ -176,6 +166,8 @@ def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
             if not row.is_white and row.bands:
                 bands = (f"{band.ratio:.2g} to {band.high:.3g} Hz" for band in row.bands)
                 yield f"#   power over that of white noise, from {row.bands[0].low:.3g} Hz: {', '.join(bands)}"
+    if inflated and not all(row.is_white for row in identified.whiteness):
+        yield "# process noise contains what the twin lacks, and may bias parameters: a replay without it names causes"
 
 
 def structure_lines(machine: "LoadedMachine", structure: "Sequence[Structure]") -> Iterator[str]:

@@ -160,11 +160,7 @@ def _address(target: str) -> dict[str, Any]:
 
 
 def _scan(place: "Place", devices: Span, address: int, stop: StopSignal) -> "list[Answer]":
-    """The devices on a line that answer a request for the register at ``address`` (on the wire).
-
-    Raises:
-        DeviceError: the line cannot be opened.
-    """
+    """The devices that answer for the register at ``address`` (on the wire); raise DeviceError if the line fails."""
     from otolith_drivers.modbus.probe import ProbeClient, opened, scan
 
     with progress_line("opening") as show, opened(place.options, show) as line:
@@ -189,11 +185,7 @@ def _scan_lines(place: "Place", devices: Span, answers: "list[Answer]") -> Itera
 
 
 def _read(place: "Place", addresses: Span, seconds: float, stop: StopSignal) -> "DeviceProbe":
-    """What the registers at ``addresses`` (on the wire) of a device hold over ``seconds`` s.
-
-    Raises:
-        DeviceError: the line cannot be opened, or the device does not answer.
-    """
+    """What the registers at ``addresses`` (on the wire) hold for ``seconds``; raise DeviceError without an answer."""
     from otolith.cli.commissioning.probe_view import DeviceProbe
     from otolith_drivers.modbus.options import HIGHEST_ADDRESS
     from otolith_drivers.modbus.probe import ProbeClient, numbers_of, opened, speeds, survey, watch

@@ -32,8 +32,7 @@ MODBUS_LEGEND = "* inferred from its changes    ? likely, but it hardly changes 
 SINGLE_LEGEND = "a single register may be half of a longer number: probe its neighbours as well"
 CAN_LEGEND = "[..] bytes that have changed    ± half of the width that holds 19 of 20 periods"
 
-Row = dict[str, str]
-"""Cells by the name of their column; a header has one line for each word of the name."""
+Row = dict[str, str]  # Cells by the name of their column; a header has one line for each word of the name
 
 
 def stdout_console() -> Console:
@@ -87,13 +86,11 @@ class DeviceProbe:
     """What was read from a Modbus device."""
 
     place: modbus.Place
-    registers: tuple[int, int]
-    """Addresses (on the wire) of the first and the last register asked for."""
+    registers: tuple[int, int]  # Addresses (on the wire) of the first and the last register asked for
     survey: modbus.Survey
     readings: dict[modbus.Block, modbus.Words]
     speeds: list[modbus.Speed]
-    seconds: float
-    """Time spent reading."""
+    seconds: float  # Time spent reading
     numbers: list[modbus.Number]
 
     @property

@@ -1,4 +1,7 @@
-"""``otolith install``: the service of one machine. Each step is idempotent, and shown by ``--dry-run``."""
+"""``otolith install``: the service of one machine, step by step; ``keys``: the certificates of a site.
+
+Each step of the installation is idempotent, and shown by ``--dry-run``.
+"""
 
 import contextlib
 import os
@@ -25,6 +28,7 @@ PROGRAM = Path("/opt/otolith/bin/otolith")  # that the unit starts
 Table = Mapping[str, Any]
 Endpoints = Sequence[str]  # of Zenoh
 USER, ETC = "otolith", Path("etc/otolith")
+FOLDER = click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 # Drivers whose addresses are in the keys 'host', 'endpoint' and 'channel'.
 KNOWN_DRIVERS = {"can", "modbus", "mqtt", "opcua", "plant", "replay"}
 # Interfaces of python-can that need a bus of the kernel, multicast, or the serial port that the channel names.
@@ -37,8 +41,7 @@ class InstalledFile:
 
     path: Path
     content: bytes
-    is_private: bool = False
-    """Readable by root and the service only."""
+    is_private: bool = False  # Readable by root and the service only
 
 
 @click.command()
@@ -77,11 +80,7 @@ def install(file: Path, dry_run: bool, root: Path) -> None:
 
 
 def _files(file: Path) -> Iterator[InstalledFile]:
-    """Yield the files of the service of one machine.
-
-    Raises:
-        ConfigurationError: the machine file is wrong, or it cannot be installed under its name.
-    """
+    """Yield the files of the service of one machine; raise ConfigurationError if its file or its name is wrong."""
     from otolith.machine import load_machine
 
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", file.stem) or file.suffix != ".toml":
@@ -102,11 +101,7 @@ def _files(file: Path) -> Iterator[InstalledFile]:
 
 
 def named_files(file: Path) -> list[Path]:
-    """Return the files that a machine file names, relative to it.
-
-    Raises:
-        ConfigurationError: one of them is not in its folder, so that it cannot be copied along.
-    """
+    """Return the files that a machine file names, relative to it; raise ConfigurationError if one is elsewhere."""
     names = []
     for text in _strings(tomllib.loads(file.read_text(encoding="utf-8"))):
         name = Path(text)
@@ -228,3 +223,74 @@ def _run(command: list[str], user: str | None, name: str) -> None:
     )
     if done.returncode:
         raise ServiceError(f"{shlex.join(command)}: ended with exit code {done.returncode}; repeat the installation")
+
+
+def _name(_: click.Context, __: click.Parameter, name: str) -> str:
+    from otolith.machine_file import check_name
+
+    try:
+        return check_name(name)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error
+
+
+def _hosts(_: click.Context, __: click.Parameter, hosts: tuple[str, ...]) -> tuple[str, ...]:
+    for host in hosts:
+        if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.\-]*[A-Za-z0-9])?|[0-9a-fA-F:]+", host):
+            raise click.BadParameter(f"{host!r} is no host name or address")
+    return hosts
+
+
+@click.group()
+def keys() -> None:
+    """Make certificates for daemons and readers.
+
+    \b
+    Examples:
+      otolith keys init keys
+      otolith keys add keys press-3 --host press-3.local --host 10.0.0.7
+      otolith keys add keys control-room
+    """
+
+
+@keys.command("init")
+@FOLDER
+def init(folder: Path) -> int:
+    """Make the certificate authority of a site in DIR.
+
+    Keep DIR/ca.key where no daemon runs: with it, anyone can make certificates that daemons accept.
+
+    \b
+    Examples:
+      otolith keys init keys
+    """
+    from otolith.publishing.certificates import make_authority, utc_now
+
+    expiry = make_authority(folder, utc_now())
+    click.echo(f"{folder / 'ca.crt'}: certificate of the authority, for every daemon and reader; expires {expiry:%F}")
+    click.echo(f"{folder / 'ca.key'}: its private key; keep it where no daemon runs")
+    return 0
+
+
+@keys.command("add")
+@FOLDER
+@click.argument("name", callback=_name)
+@click.option("--host", "hosts", multiple=True, callback=_hosts, metavar="HOST",
+              help="Name or address of a computer with a daemon; may be repeated.")  # fmt: skip
+def add(folder: Path, name: str, hosts: tuple[str, ...]) -> int:
+    """Make a certificate for NAME with the authority in DIR.
+
+    With --host it is for a daemon that listens there, without for a reader.
+
+    \b
+    Examples:
+      otolith keys add keys press-3 --host press-3.local --host 10.0.0.7
+      otolith keys add keys control-room
+    """
+    from otolith.publishing.certificates import make_certificate, utc_now
+
+    expiry = make_certificate(folder, name, hosts, utc_now())
+    purpose = f"a daemon at {', '.join(hosts)}" if hosts else "a reader"
+    click.echo(f"{folder / name}.crt: certificate of {purpose}; expires {expiry:%F}")
+    click.echo(f"{folder / name}.key: its private key, for {name} alone")
+    return 0

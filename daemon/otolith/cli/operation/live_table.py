@@ -25,10 +25,10 @@ from otolith.health.limits import Level
 from otolith.health.schema import DriverDocument, EventDocument, ParameterDocument, ReportDocument, Status
 from otolith.health.text import (
     duration_text,
-    event_text,
     forecast_text,
     headline,
     interval_text,
+    probability_text,
     state_word,
     value_cells,
     value_text,
@@ -65,8 +65,7 @@ class _Machine:
     """What is shown of one machine."""
 
     document: ReportDocument
-    received: float
-    """Monotonic s."""
+    received: float  # Monotonic s
     histories: dict[str, deque[float]] = field(default_factory=dict)
 
     def draw(self, state: str, width: int, *, in_short: bool) -> list[RenderableType]:
@@ -162,17 +161,23 @@ def event_style(event: EventDocument) -> str:
 
 
 def state_lines(document: ReportDocument) -> list[Text]:
-    """State of the machine, then its parts, then the events that are not cleared."""
-    health = document.health
-    if health is None:
+    """State of the machine, then its parts, then of each event that is not cleared: what, how sure, and what to do."""
+    if (health := document.health) is None:
         return []
-    parts = Text()
-    say = texts_in(health.language).translated
+    texts, parts = texts_of(document), Text()
+    say = texts.translated
     for name, part in health.parts.items():
         parts.append(f"{say(name)} ").append(say(state_word(part)), style=LEVEL_STYLES[part.state]).append("  ")
     current = [event for event in document.events if event.end is None]
-    events = [Text(event_text(event, local_time), style=event_style(event)) for event in current]
-    return [Text(headline(health, local_time), style=LEVEL_STYLES[health.state]), parts, *events]
+    lines = [Text(headline(health, local_time), style=LEVEL_STYLES[health.state]), parts]
+    for event in current:
+        if len(current) > 1 or event.state is not health.state:  # otherwise the first line has said so
+            what, since = f"{say(event.state)}: {say(event.part)}: {event.condition}", local_time(event.since)
+            lines.append(Text(f"{what} {texts('since', time=since)}", style=event_style(event)))
+        sure = f" ({probability})" if (probability := probability_text(event)) else ""
+        lines.append(Text(f"{event.text}{sure}"))
+        lines += [Text(f"{texts('what_to_do')}: {event.advice}", style="bold")] if event.advice else []
+    return lines
 
 
 def parameter_table(*columns: str, width: int, texts: Texts | None = None) -> Table:

@@ -78,8 +78,7 @@ class Recordings:
     machine: str
     places: tuple[Path, ...]
     files: tuple[RecordingFile, ...]
-    unreadable: tuple[str, ...]
-    """Folders that this user must not read, and the way out, a line each."""
+    unreadable: tuple[str, ...]  # Folders that this user must not read, and the way out, a line each
 
     @classmethod
     def search(cls, machine: str) -> "Recordings":
@@ -221,11 +220,7 @@ def _newest(machine: str, first: RecordingFile) -> Path:
 
 
 def _viewer(path: Path, *, web: bool) -> tuple[list[str], dict[str, str]]:
-    """Return command and environment of the viewer of ``path``.
-
-    Raises:
-        ServiceError: there is no display, or the viewer is not installed.
-    """
+    """Return command and environment of the viewer; raise ServiceError without a display or viewer."""
     if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         remedy = "'otolith view --web' serves it to a browser, through a tunnel like 'ssh -L'"
         raise ServiceError(f"no display here: {remedy}; or copy {path} to a computer with one")

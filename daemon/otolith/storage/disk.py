@@ -1,0 +1,133 @@
+"""Writing to disk: a thread does it for the main thread, which never waits; files are replaced as a whole.
+
+After an error the thread tries again. What root writes belongs to the owner of the folder.
+"""
+
+import contextlib
+import logging
+import os
+import sqlite3
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from otolith_drivers.errors import ServiceError
+from otolith_drivers.user_dirs import writable
+
+log = logging.getLogger(__name__)
+
+WRITE_RETRY = 30.0  # s from an error to the next try; docs/reference/thresholds-storage.md has its origin
+
+
+class WriterThread(ABC):
+    """Calls :meth:`write` when something is to be written, and once per interval."""
+
+    def __init__(self, name: str, interval: float, loss: str) -> None:
+        """``interval`` in s; ``loss`` names for the log what an error keeps from being written."""
+        self._interval, self._loss = interval, loss
+        self._wakeup, self._stopping = threading.Event(), threading.Event()
+        self._retry_at, self._last_error = 0.0, ""
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self, seconds: float) -> None:
+        """Write what is waiting, for up to ``seconds``, and end the thread."""
+        self._stopping.set()
+        self._wakeup.set()
+        if self._thread.is_alive():
+            self._thread.join(seconds)
+            if self._thread.is_alive():
+                log.warning("%s: writing took over %.1f s: check the disk", self._loss, seconds)
+
+    @abstractmethod
+    def write(self) -> None:
+        """Write what is waiting; after an exception the next call comes ``WRITE_RETRY`` later, or from :meth:`stop`."""
+
+    def read(self) -> None:  # noqa: B027 - what has nothing to read does nothing
+        """Read what other processes have written; called as often as :meth:`write`, and after its errors as well."""
+
+    def fail(self, error: Exception) -> None:
+        """Log an error, once while it stays the same."""
+        text = str(error) or type(error).__name__
+        if isinstance(error, OSError | sqlite3.Error):
+            text += ": check the disk and its permissions"
+        if text != self._last_error:
+            log.warning("%s: %s", self._loss, text)
+        self._last_error, self._retry_at = text, time.monotonic() + WRITE_RETRY
+
+    def _run(self) -> None:
+        while True:
+            self._wakeup.wait(self._interval)
+            self._wakeup.clear()
+            is_last = self._stopping.is_set()
+            if is_last or time.monotonic() >= self._retry_at:
+                try:
+                    self.write()
+                except Exception as error:  # noqa: BLE001 - OSError, sqlite3.Error, OtolithError, or a bug: none ends it
+                    self.fail(error)
+                else:
+                    self._last_error, self._retry_at = "", 0.0
+            if is_last:
+                return
+            self.read()
+
+
+def reason_of(error: Exception) -> str:
+    """Return the text of an error in one line; of a document that does not fit its schema, the first fault."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}"
+
+
+def replace_file(path: Path, data: bytes, temporary: str) -> None:
+    """Replace a file, all or nothing, also if the computer loses power meanwhile; raise ServiceError if that fails.
+
+    ``temporary`` is a name beside it. All names are relative to the open folder: its owner could replace a path while
+    root writes there.
+    """
+    try:
+        with opened_folder(path.parent) as folder:
+            with contextlib.suppress(FileNotFoundError):  # left by a process that was killed
+                os.unlink(temporary, dir_fd=folder)
+            try:
+                handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600, dir_fd=folder)
+                with os.fdopen(handle, "wb") as stream:
+                    stream.write(data)
+                    stream.flush()
+                    give_to(os.fstat(folder), handle)
+                    os.fsync(handle)
+                os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+                os.fsync(folder)
+            except OSError:
+                with contextlib.suppress(OSError):
+                    os.unlink(temporary, dir_fd=folder)
+                raise
+    except OSError as error:
+        raise ServiceError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def opened_folder(folder: Path) -> Iterator[int]:
+    """Descriptor of ``folder``, which is created if it is missing."""
+    is_new = not folder.exists()
+    handle = os.open(writable(folder), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        if is_new:
+            give_to(folder.parent.stat(), handle)
+        yield handle
+    finally:
+        os.close(handle)
+
+
+def give_to(owner: os.stat_result, handle: int) -> None:
+    """Give what root has opened to an owner: the daemon runs as another user and must be able to use it."""
+    if os.geteuid() == 0:
+        os.fchown(handle, owner.st_uid, owner.st_gid)
