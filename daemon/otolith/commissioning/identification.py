@@ -23,6 +23,7 @@ from otolith.commissioning.consistency import (
     sqrt_information,
     whiteness,
 )
+from otolith.commissioning.input_noise import InputNoise, input_noise
 from otolith.commissioning.likelihood import (
     Fits,
     FittedWindow,
@@ -34,6 +35,7 @@ from otolith.commissioning.likelihood import (
     with_levels,
 )
 from otolith.discovery.noise_hypothesis import MAX_NOISE_FACTOR
+from otolith.discovery.screening import DECISIVE
 from otolith.estimation.data_checks import DIFFERENCE_ORDER, MAD_TO_SD, sample_differences
 from otolith.estimation.minimisers import search_parameters
 from otolith.estimation.objective import Objective
@@ -114,18 +116,50 @@ class IdentifiedNoise:
     """Restricted, before inflation, up to a constant; None if nothing was identified."""
     windows: int = 0  # How many were used
     evaluations: int = 0  # Linearisations of a window, for all its fits
+    inputs: tuple[InputNoise, ...] = ()  # Of inputs whose samples show what may be noise
 
     def applied(self, problem: Problem) -> Problem:
         """The problem with these levels."""
         levels = np.array([level.value for level in (*self.outputs, *self.states)])
-        return replace(with_levels(problem, levels), open_loop=problem.open_loop)
+        wider = replace(with_levels(problem, levels), open_loop=problem.open_loop)
+        return replace(wider, input_noise=_input_levels(problem, self.inputs)) if self.inputs else wider
 
 
 def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progress = lambda _: None) -> IdentifiedNoise:
-    """Noise levels of ``problem`` from ``windows``, given the noise of inputs; deterministic.
+    """Noise levels of ``problem`` from ``windows``; deterministic.
 
-    A level that cannot be identified is unchanged. ``progress`` is called with a line of text from time to time.
+    A level that cannot be identified is unchanged. Process noise is identified again beside the noise of inputs, which
+    it contained. ``progress`` is called with a line of text from time to time.
     """
+    identified = _identify(problem, windows, progress)
+    if not any(source.is_significant for source in identified.inputs):
+        return identified
+    progress("beside the noise of " + ", ".join(source.name for source in identified.inputs if source.is_significant))
+    beside = _identify(replace(problem, input_noise=_input_levels(problem, identified.inputs)), windows, progress)
+    before, after = identified.log_likelihood, beside.log_likelihood
+    is_as_likely = before is not None and after is not None and after >= before - DECISIVE
+    return replace(beside, inputs=identified.inputs) if is_as_likely else replace(identified, inputs=())
+
+
+def _input_levels(problem: Problem, inputs: Sequence[InputNoise]) -> tuple[float, ...]:
+    """Return the noise of each input of ``problem``: as identified where it is significant, else as it was."""
+    stated = problem.levels[: len(problem.base_model.inputs)]
+    shown = {source.name: source.level for source in inputs if source.is_significant}
+    return tuple(shown.get(own.name, level) for own, level in zip(problem.base_model.inputs, stated, strict=True))
+
+
+def _shown_input_noise(problem: Problem, fits: Fits) -> Iterator[InputNoise]:
+    """Yield what the fitted windows show of the noise of each input that changes from sample to sample."""
+    windows = [fit.window for fit in fits]
+    for source in problem.base_model.inputs:
+        if (shown := sample_noise(source.name, windows)) > 0.0:
+            noise = input_noise(fits, source, shown, problem.seed)
+            if noise is not None:
+                yield noise
+
+
+def _identify(problem: Problem, windows: Sequence[Window], progress: Progress) -> IdentifiedNoise:
+    """Return the noise levels of outputs and states, given that of inputs."""
     likelihood = Likelihood(problem)
     guess = _initial_guess(likelihood, windows, progress)
     twin = problem.base_model
@@ -148,6 +182,7 @@ def identify_noise(problem: Problem, windows: Sequence[Window], progress: Progre
         log_likelihood=-0.5 * best.deviance,
         windows=len(guess.fits),
         evaluations=likelihood.evaluations,
+        inputs=tuple(_shown_input_noise(problem, best.fits)),
     )
 
 

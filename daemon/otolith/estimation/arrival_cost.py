@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array
+from otolith.estimation.information import without_input_noise
 from otolith.estimation.minimisers import FitResult
 from otolith.estimation.objective import Objective
 from otolith.estimation.problem import Problem
@@ -107,11 +108,14 @@ class MapObjective:
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
         constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])
         curvature = second_order_change(self._objective, fit.guess[constant], fit.jacobian[:, constant])
-        columns = np.column_stack([jacobian[:, :count], residuals, curvature])
-        columns = eliminate_states(columns, jacobian[:, count:] * (self.high - self.low)[count:])
+        of_states = jacobian[:, count:] * (self.high - self.low)[count:]
+        columns = eliminate_states(np.column_stack([jacobian[:, :count], residuals, curvature]), of_states)
         basis, root = np.linalg.qr(columns[:, :count])
         rotated = basis.T @ columns[:, count:]
         residual, noise = rotated[:, 0], rotated[:, 1:]
+        moved = self._objective.changes_by_input_noise(fit.guess, residuals, jacobian)
+        parts = (eliminate_states(np.delete(rows, np.s_[count:-1], axis=1), of_states) for rows in moved)
+        root, residual = without_input_noise(root, residual, parts)
         root, residual = _with_noise(root / inflation, residual / inflation, noise)
         return Evidence(fit.guess[:count], root, residual)
 

@@ -1,8 +1,9 @@
 """The information of one window about each parameter: Fisher information from the sensitivities of the prediction."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import islice
 
 import numpy as np
 
@@ -19,6 +20,10 @@ PRESSED = 3.0  # standard deviations by which a step without bounds must pass a 
 TRADED = 0.95  # correlation above which two parameters cannot be distinguished
 MIN_INFLATED_COST = 1.1  # cost above which the residual is tested for autocorrelation: noise alone hardly reaches it
 MAX_LAG = 0.25  # share of a window: largest lag of the autocorrelation
+NOISE_DRAWS = 8  # of the noise of inputs, by which its bias is estimated
+NEGLIGIBLE_BIAS = 0.02  # standard deviations of a window: a smaller bias is not corrected
+MIN_KEPT_INFORMATION = 0.5  # share of the information of a direction that is not by the noise of inputs; less is noise
+INFORMATION_OF_NOISE = 0.01  # share of the information of a direction that noise has determined: far less than stated
 CORRELATED = 2.0  # long-run variance over variance above which an autocorrelation is not chance
 
 
@@ -87,6 +92,33 @@ def information(jacobian: Array, width: Array, inflation: float) -> Information:
             np.outer(blind, blind), 1.0, covariance / np.outer(deviation, deviation)
         )
     return Information(sd, correlation)
+
+
+def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) -> tuple[Array, Array]:
+    """Return square-root information ``root`` and ``residual`` (rows,) without the bias by the noise of inputs.
+
+    Noise of an input moves the residuals and their sensitivities alike, so that the mean of their product is not zero
+    at the true parameters: errors in variables (W. A. Fuller, Measurement Error Models, section 1.1). ``changes`` are
+    those (rows, columns + 1) of sensitivities and residuals by further noise of the same size (corrected score: T.
+    Nakamura, Biometrika 77, 1990). A direction that mostly noise has determined has hardly any information.
+    ``docs/explanation/filter.md`` has the equations.
+    """
+    size = np.linalg.norm(root, axis=0)
+    size[size == 0.0] = np.inf  # a direction without information has no bias
+    inverse = np.linalg.pinv(root / size, rcond=MIN_SINGULAR)
+    moments, bias = np.zeros((len(size) + 1, len(size) + 1)), np.zeros(len(residual))
+    scale, draws = np.append(size, 1.0), 0
+    for change in islice(changes, NOISE_DRAWS):
+        moments, draws = moments + (change / scale).T @ (change / scale), draws + 1
+        bias = inverse.T @ moments[:-1, -1] / draws
+        if np.abs(bias).max(initial=0.0) < NEGLIGIBLE_BIAS:
+            return root, residual
+    if not np.isfinite(moments).all():
+        return root, residual
+    shares, directions = np.linalg.eigh(np.eye(len(bias)) - inverse.T @ moments[:-1, :-1] @ inverse / max(draws, 1))
+    kept = directions[:, shares >= MIN_KEPT_INFORMATION]
+    shares = np.where(shares >= MIN_KEPT_INFORMATION, np.minimum(shares, 1.0), INFORMATION_OF_NOISE)
+    return (directions * shares) @ directions.T @ root, kept @ (kept.T @ (residual - bias))
 
 
 def orthonormal_basis(jacobian: Array) -> Array:

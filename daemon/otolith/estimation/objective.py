@@ -8,6 +8,7 @@ record a Kalman gain corrects the state. The gain weighs process noise, which co
 states, against sensor noise. Without process noise the gain is zero, and the twin runs in open loop: the paper's cost.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -52,6 +53,7 @@ class Objective:
         self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
         self.count = max(float(self.present.sum()), 1.0)  # Measured values of all outputs
         self.is_complete = bool(self.present.all())  # Whether every output was measured in every record
+        self._seed, self._sample_noise = problem.seed + window.index, np.zeros((0, 0))
         self.noise = self._noise_model(problem, window)
         lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
         if problem.components:  # a faulty sensor shows the first state far from where it is
@@ -145,18 +147,44 @@ class Objective:
 
         A prediction that diverges gives very large residuals and zero derivatives.
         """
-        return self._linearise(guess, self._columns)
+        return self._linearise(guess, self._columns, self.excitation)
 
     def linearise_with_trends(self, guess: Array) -> tuple[Array, Array]:
         """Return the same for a guess with trends, which enter to first order: they move a parameter by little."""
+        return self._linearise_with_trends(guess, self.excitation)
+
+    def changes_by_input_noise(self, guess: Array, residuals: Array, jacobian: Array) -> Iterator[Array]:
+        """Yield changes (residuals, guess + 1) of ``jacobian`` and ``residuals`` by further noise of the inputs.
+
+        Each is of other noise, as large as that of the samples; there is none if no input is noisy. Residuals and
+        Jacobian are those at ``guess``, with or without trends. It ends where the prediction diverges.
+        """
+        random = np.random.default_rng(self._seed)
+        has_trends = len(guess) > self.free + self._states
+        while self._sample_noise.any():
+            inputs = self.excitation.inputs.copy()
+            inputs[:, : self._sample_noise.shape[1]] += self._sample_noise * random.standard_normal(
+                self._sample_noise.shape
+            )
+            noisier = replace(self.excitation, inputs=inputs)
+            moved = (
+                self._linearise_with_trends(guess, noisier)
+                if has_trends
+                else self._linearise(guess, self._columns, noisier)
+            )
+            if not moved[1].any():
+                return
+            yield np.column_stack([moved[1] - jacobian, moved[0] - residuals])
+
+    def _linearise_with_trends(self, guess: Array, excitation: Excitation) -> tuple[Array, Array]:
         trends = slice(self.free, 2 * self.free)
-        residuals, jacobian = self._linearise(self.without_trends(guess), self._columns_with_trends)
+        residuals, jacobian = self._linearise(self.without_trends(guess), self._columns_with_trends, excitation)
         return residuals + jacobian[:, trends] @ guess[trends], jacobian
 
-    def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
+    def _linearise(self, guess: Array, columns: Indices, excitation: Excitation) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
         with np.errstate(over="ignore", invalid="ignore"):
-            prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
+            prediction = self.kernel.sensitivities(parameters, initial, excitation, columns)
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
             slopes = prediction.slopes
             if not self.is_complete:
@@ -232,11 +260,12 @@ class Objective:
         states = np.array(problem.process_noise or [0.0] * len(twin.states))
         inputs = np.array(problem.input_noise or [0.0] * len(twin.inputs))
         error = window.bridge_error
-        at_records = held = np.tile(inputs, (window.records, 1))
+        at_records = held = self._sample_noise = np.tile(inputs, (window.records, 1))  # without that of bridges
         if error is not None:
             columns = [window.signals.index(driven.name) for driven in twin.inputs]
+            self._sample_noise = inputs * np.sqrt(error.noise_ratio[:, columns])
             at_records = np.sqrt(inputs**2 + error.variance[:, columns])
-            held = np.sqrt(inputs**2 * error.noise_ratio[:, columns] + error.held_variance[:, columns])
+            held = np.sqrt(self._sample_noise**2 + error.held_variance[:, columns])
         return NoiseModel(outputs, at_records, held, states, problem.window.sample_period)
 
 

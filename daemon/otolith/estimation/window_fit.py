@@ -21,6 +21,7 @@ from otolith.estimation.information import (
     classify,
     inflation_of,
     information,
+    without_input_noise,
 )
 from otolith.estimation.minimisers import (
     MAX_STEPS,
@@ -275,6 +276,8 @@ class _BothFits:
     inflation: float
     information: Information
     """Of the window alone."""
+    values: Array
+    """(guess,) of the window alone, without the bias by the noise of inputs."""
     evaluations: int
 
     @property
@@ -296,8 +299,21 @@ def _fit_alone(fitted: Fit, evaluations: int) -> _BothFits:
     alone = continued(objective, fitted.without_prior(), ALONE_STEPS)
     residuals = alone.residuals.reshape(objective.measured.shape)
     inflation = inflation_of(residuals, objective.present, float(np.sqrt(alone.chi_square / objective.count)))
-    uncertainty = information(alone.jacobian, objective.high - objective.low, inflation)
-    return _BothFits(fitted, alone, inflation, uncertainty, evaluations + alone.evaluations)
+    rows, values = _without_input_noise(objective, alone)
+    uncertainty = information(rows, objective.high - objective.low, inflation)
+    return _BothFits(fitted, alone, inflation, uncertainty, values, evaluations + alone.evaluations)
+
+
+def _without_input_noise(objective: Objective, alone: FitResult) -> tuple[Array, Array]:
+    """Return Jacobian (rows, guess) and values (guess,) of the window alone, without the bias by noisy inputs."""
+    changes = objective.changes_by_input_noise(alone.guess, alone.residuals, alone.jacobian)
+    _, root = np.linalg.qr(alone.jacobian)
+    unbiased, moved = without_input_noise(root, np.zeros(len(root)), changes)
+    if unbiased is root:
+        return alone.jacobian, alone.guess
+    width = objective.high - objective.low
+    step = -width * np.linalg.lstsq(unbiased * width, moved, rcond=MIN_SINGULAR)[0]
+    return unbiased, np.clip(alone.guess + step, objective.low, objective.high)
 
 
 def _leave_local_minimum(both: _BothFits) -> _BothFits:
@@ -395,7 +411,7 @@ def _parameter_estimates(both: _BothFits, outcome: Outcome) -> tuple[ParameterEs
     pressure = _pressure(both, at_bound)
     estimates = []
     for index, parameter in enumerate(problem.free):
-        value, bounded = float(guess[index]), bool(at_bound[index])
+        value, bounded = float(both.values[index]), bool(at_bound[index])
         target = AccuracyTarget(float(required[index]), parameter.unit, bounded, value, float(pressure[index]))
         identifiability, reason = classify(both.information, index, objective.names, target)
         if outcome is Outcome.AMBIGUOUS and identifiability is Identifiability.DETERMINED:

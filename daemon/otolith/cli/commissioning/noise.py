@@ -126,11 +126,11 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
     twin, problem = machine.twin, machine.problem
     yield "[noise]"
     rows = [_row(level, twin.unit_of(level.name)) for level in identified.outputs]
-    inputs = list(zip(twin.inputs, problem.input_noise, strict=True))
-    rows += [(f'{row.name} = "{level:.3g} {row.unit}"', _why_unchanged(machine, row)) for row, level in inputs if level]
+    inputs = list(zip(twin.inputs, identified.applied(problem).levels, strict=False))
+    rows += [_input_row(machine, identified, source, level) for source, level in inputs if level]
     yield from _aligned(rows)
-    measured = (signal for signal, level in inputs if not level and signal.hold == "foh")
-    yield from (f"# {signal.name}: {_why_unchanged(machine, signal)}" for signal in measured)
+    measured = (source for source, level in inputs if not level and source.hold == "foh")
+    yield from (f"# {source.name}: {_input_row(machine, identified, source, 0.0)[1]}" for source in measured)
     yield ""
     yield "[process_noise]"
     yield from _aligned([_row(level, f"{twin.unit_of(level.name)}/s^0.5") for level in identified.states])
@@ -146,13 +146,22 @@ def noise_lines(machine: "LoadedMachine", identified: "IdentifiedNoise") -> Iter
     yield from (f"# {remark}" for remark in identified.remarks)
 
 
-def _why_unchanged(machine: "LoadedMachine", signal: "Input") -> str:
-    """Why the noise of an input is not identified, and which levels contain it."""
+def _input_row(
+    machine: "LoadedMachine", identified: "IdentifiedNoise", source: "Input", level: float
+) -> tuple[str, str]:
+    """A line of the machine file for the noise of an input, and its comment: why it is not identified, if it is not."""
     from otolith.commissioning.identification import driven_states
 
-    states = driven_states(machine.twin, signal.name)
+    line = f'{source.name} = "{level:.3g} {source.unit}"'
+    shown = next((row for row in identified.inputs if row.name == source.name), None)
+    if shown is not None and shown.is_significant:
+        return line, f"± {shown.level_sd / shown.level:.1%}"
+    states = driven_states(machine.twin, source.name)
     contain = f"process noise of {' and '.join(states)}" if states else "noise of the outputs"
-    return f"not identifiable: its noise acts like {contain}, which contains what is not stated here"
+    acts = f"its noise acts like {contain}, which contains what is not stated here"
+    if shown is None:
+        return line, f"not identifiable: {acts}"
+    return line, f"not significant: up to about {shown.limit:.1g} {source.unit} cannot be detected; {acts}"
 
 
 def _whiteness_lines(identified: "IdentifiedNoise") -> Iterator[str]:
@@ -240,7 +249,7 @@ def _document(machine: "LoadedMachine", record: HealthyRecord) -> dict[str, Any]
 
     units = machine.twin.units()
     document = asdict(record.noise)
-    for level in document["outputs"]:
+    for level in (*document["outputs"], *document["inputs"]):
         level["unit"] = units[level["name"]]
     for level in document["states"]:
         level["unit"] = f"({units[level['name']]})/s^0.5"
