@@ -102,8 +102,11 @@ class MapObjective:
         prior_residuals = self._whitening @ (guess[:count] - self._mean)
         return np.concatenate([residuals, prior_residuals]), np.concatenate([jacobian, self._prior_jacobian])
 
-    def evidence(self, fit: FitResult, inflation: float) -> Evidence:
-        """Return the evidence of the window around ``fit``; ``inflation`` multiplies its standard deviations."""
+    def evidence(self, fit: FitResult, inflation: float, *, has_noisy_inputs: bool = True) -> Evidence:
+        """Return the evidence of the window around ``fit``; ``inflation`` multiplies its standard deviations.
+
+        If ``has_noisy_inputs``, it is without the bias that their noise causes.
+        """
         count = len(self._mean)
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
         constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])
@@ -113,9 +116,10 @@ class MapObjective:
         basis, root = np.linalg.qr(columns[:, :count])
         rotated = basis.T @ columns[:, count:]
         residual, noise = rotated[:, 0], rotated[:, 1:]
-        moved = self._objective.changes_by_input_noise(fit.guess, residuals, jacobian)
-        parts = (eliminate_states(np.delete(rows, np.s_[count:-1], axis=1), of_states) for rows in moved)
-        root, residual = without_input_noise(root, residual, parts)
+        if has_noisy_inputs:
+            moved = self._objective.changes_by_input_noise(fit.guess, residuals, jacobian)
+            parts = (eliminate_states(np.delete(rows, np.s_[count:-1], axis=1), of_states) for rows in moved)
+            root, residual = without_input_noise(root, residual, parts)
         root, residual = _with_noise(root / inflation, residual / inflation, noise)
         return Evidence(fit.guess[:count], root, residual)
 

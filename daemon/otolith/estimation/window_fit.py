@@ -281,6 +281,11 @@ class _BothFits:
     evaluations: int
 
     @property
+    def has_noisy_inputs(self) -> bool:
+        """Whether the noise of inputs biases the window by more than a negligible amount."""
+        return self.values is not self.alone.guess
+
+    @property
     def cost(self) -> float:
         """The lower cost of the two."""
         best = min(self.alone.chi_square, self.fit.window_chi_square)
@@ -379,7 +384,7 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
     return WindowEstimate(
         fit=both.fit,
         parameters=_parameter_estimates(both, outcome),
-        evidence=both.fit.map_objective.evidence(result, both.inflation),
+        evidence=both.fit.map_objective.evidence(result, both.inflation, has_noisy_inputs=both.has_noisy_inputs),
         outcome=outcome,
         cost=both.cost,
         rmse_configured=tuple(map(float, objective.rmse(configured))),
