@@ -304,9 +304,15 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
     if not QUANTILE / np.sqrt(information) < abs(moved) <= largest_delay(fitted.window.grid.length):
         return None
     problem = replace(tracked.problem, delays=((signal, moved),))
-    posterior = replace(tracked.posterior, problem=problem)
+    posterior = replace(tracked.posterior.moved((moved - delay) * np.array(own.shift)), problem=problem)
     sds = (*tracked.delay_sds, (before or own.information) ** -0.5)[-MAX_DELAY_SDS:]
-    return replace(tracked, posterior=posterior, delay_information=information, delay_sds=sds, shift_by_delay=own.shift)
+    return replace(
+        tracked,
+        posterior=posterior,
+        delay_information=information,
+        delay_sds=sds,
+        shift_by_delay=own.shift[: len(own.shift) // 2],
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,7 +321,7 @@ class DelayScore:
 
     step: float  # To the best delay, s
     information: float  # 1/s²; less if the window is not explained
-    shift: tuple[float, ...]  # (free,) how far the best parameters move with the delay, per second
+    shift: tuple[float, ...]  # (2 free,) how far the best parameters and trends move with the delay, per second
 
 
 def delay_score(fitted: Fit, signal: str) -> DelayScore:
@@ -328,11 +334,11 @@ def delay_score(fitted: Fit, signal: str) -> DelayScore:
     projected = response - basis @ (basis.T @ response)
     size = float(projected @ projected)
     if size <= MIN_DELAY_SHARE * float(response @ response):
-        return DelayScore(0.0, 0.0, (0.0,) * free)
+        return DelayScore(0.0, 0.0, (0.0,) * (2 * free))
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     shift = -np.linalg.lstsq(jacobian / scale, response, rcond=None)[0] / scale
     step, information = -float(projected @ residuals) / size, size / max(fitted.cost, 1.0) ** 2
-    return DelayScore(step, information, tuple(shift[:free].tolist()))
+    return DelayScore(step, information, tuple(shift[: 2 * free].tolist()))
 
 
 def complexity_penalty(predicted: Posterior, evidence: Evidence) -> float:

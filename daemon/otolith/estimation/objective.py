@@ -9,6 +9,7 @@ states, against sensor noise. Without process noise the gain is zero, and the tw
 """
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -53,7 +54,13 @@ class Objective:
         self.present = ~np.column_stack([window.missing_in(output.name) for output in twin.outputs])
         self.count = max(float(self.present.sum()), 1.0)  # Measured values of all outputs
         self.is_complete = bool(self.present.all())  # Whether every output was measured in every record
-        self._seed, self._sample_noise = problem.seed + window.index, np.zeros((0, 0))
+        self._seed = problem.seed + window.index
+        levels = zip((twin.base or twin).inputs, problem.input_noise, strict=False)
+        self._noisy_inputs = [
+            (column, level, np.flatnonzero(~window.missing_in(source.name)))
+            for column, (source, level) in enumerate(levels)
+            if level
+        ]
         self.noise = self._noise_model(problem, window)
         lowest, self._first, highest = _initial_state(twin, self.measured, self.present, self.noise.outputs)
         if problem.components:  # a faulty sensor shows the first state far from where it is
@@ -147,44 +154,47 @@ class Objective:
 
         A prediction that diverges gives very large residuals and zero derivatives.
         """
-        return self._linearise(guess, self._columns, self.excitation)
+        return self._linearise(guess, self._columns)
 
     def linearise_with_trends(self, guess: Array) -> tuple[Array, Array]:
         """Return the same for a guess with trends, which enter to first order: they move a parameter by little."""
-        return self._linearise_with_trends(guess, self.excitation)
+        trends = slice(self.free, 2 * self.free)
+        residuals, jacobian = self._linearise(self.without_trends(guess), self._columns_with_trends)
+        return residuals + jacobian[:, trends] @ guess[trends], jacobian
+
+    def with_noisier_inputs(self) -> Iterator["Objective"]:
+        """Yield the same with further noise of the inputs, as large as that of the samples; nothing if none is noisy.
+
+        The predictor stays. Each has other noise, and there is no end.
+        """
+        random = np.random.default_rng(self._seed)
+        while self._noisy_inputs:
+            inputs = self.excitation.inputs.copy()
+            for column, level, sampled in self._noisy_inputs:
+                errors = level * random.standard_normal(len(sampled))
+                inputs[:, column] += _held(
+                    errors, sampled, self.excitation.grid.offsets, self._base.inputs[column].hold
+                )
+            noisier = copy(self)
+            noisier.excitation = replace(self.excitation, inputs=inputs)
+            yield noisier
 
     def changes_by_input_noise(self, guess: Array, residuals: Array, jacobian: Array) -> Iterator[Array]:
         """Yield changes (residuals, guess + 1) of ``jacobian`` and ``residuals`` by further noise of the inputs.
 
-        Each is of other noise, as large as that of the samples; there is none if no input is noisy. Residuals and
-        Jacobian are those at ``guess``, with or without trends. It ends where the prediction diverges.
+        Both are those at ``guess``, with or without trends. It ends where the prediction diverges.
         """
-        random = np.random.default_rng(self._seed)
         has_trends = len(guess) > self.free + self._states
-        while self._sample_noise.any():
-            inputs = self.excitation.inputs.copy()
-            inputs[:, : self._sample_noise.shape[1]] += self._sample_noise * random.standard_normal(
-                self._sample_noise.shape
-            )
-            noisier = replace(self.excitation, inputs=inputs)
-            moved = (
-                self._linearise_with_trends(guess, noisier)
-                if has_trends
-                else self._linearise(guess, self._columns, noisier)
-            )
-            if not moved[1].any():
+        for noisier in self.with_noisier_inputs():
+            moved, slopes = noisier.linearise_with_trends(guess) if has_trends else noisier.linearise(guess)
+            if not slopes.any():
                 return
-            yield np.column_stack([moved[1] - jacobian, moved[0] - residuals])
+            yield np.column_stack([slopes - jacobian, moved - residuals])
 
-    def _linearise_with_trends(self, guess: Array, excitation: Excitation) -> tuple[Array, Array]:
-        trends = slice(self.free, 2 * self.free)
-        residuals, jacobian = self._linearise(self.without_trends(guess), self._columns_with_trends, excitation)
-        return residuals + jacobian[:, trends] @ guess[trends], jacobian
-
-    def _linearise(self, guess: Array, columns: Indices, excitation: Excitation) -> tuple[Array, Array]:
+    def _linearise(self, guess: Array, columns: Indices) -> tuple[Array, Array]:
         parameters, initial = self.parameters(guess[None])[0], guess[self.free :]
         with np.errstate(over="ignore", invalid="ignore"):
-            prediction = self.kernel.sensitivities(parameters, initial, excitation, columns)
+            prediction = self.kernel.sensitivities(parameters, initial, self.excitation, columns)
             residuals = self.residuals(prediction.outputs[None])[0].ravel()
             slopes = prediction.slopes
             if not self.is_complete:
@@ -260,13 +270,20 @@ class Objective:
         states = np.array(problem.process_noise or [0.0] * len(twin.states))
         inputs = np.array(problem.input_noise or [0.0] * len(twin.inputs))
         error = window.bridge_error
-        at_records = held = self._sample_noise = np.tile(inputs, (window.records, 1))  # without that of bridges
+        at_records = held = np.tile(inputs, (window.records, 1))
         if error is not None:
             columns = [window.signals.index(driven.name) for driven in twin.inputs]
-            self._sample_noise = inputs * np.sqrt(error.noise_ratio[:, columns])
             at_records = np.sqrt(inputs**2 + error.variance[:, columns])
-            held = np.sqrt(self._sample_noise**2 + error.held_variance[:, columns])
+            held = np.sqrt(inputs**2 * error.noise_ratio[:, columns] + error.held_variance[:, columns])
         return NoiseModel(outputs, at_records, held, states, problem.window.sample_period)
+
+
+def _held(values: Array, sampled: Indices, offsets: Array, hold: str) -> Array:
+    """Return ``values`` of the ``sampled`` records at all ``offsets`` (records,), as an input is held between them."""
+    if hold == "foh":
+        return np.asarray(np.interp(offsets, offsets[sampled], values))
+    last = np.searchsorted(sampled, np.arange(len(offsets)), side="right") - 1
+    return np.asarray(values[np.maximum(last, 0)])
 
 
 def _time_offsets(problem: Problem, window: Window) -> dict[str, float]:

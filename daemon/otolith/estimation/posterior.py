@@ -140,6 +140,10 @@ class Posterior:
         """Return the posterior after a window with that ``innovation``, which holds its prediction."""
         return Posterior(self.problem, imm_filter.update(innovation), phase)
 
+    def moved(self, change: Array) -> "Posterior":
+        """Return the same with parameters and trends moved by ``change`` (2 free,), in their units."""
+        return replace(self, belief=replace(self.belief, mean=self.belief.mean + change / _size(self.problem)))
+
     def set_prior(self, prior: Prior) -> "Posterior":
         """Return the same modes, each with ``prior`` as its distribution."""
         size = _size(self.problem)
