@@ -108,7 +108,7 @@ def test_the_lag_behind_a_drift_is_no_shift() -> None:
     mean = np.concatenate([[INERTIA, DAMPING], trend])
     drifting = Posterior.initial(PROBLEM).set_prior(Prior(mean, covariance))
     resting = Posterior.initial(PROBLEM).set_prior(Prior(np.concatenate([mean[:2], [0.0, 0.0]]), covariance))
-    values, sd = np.array([INERTIA, DAMPING * 1.005]), 1e-4 * scale
-    assert drifting.shifts(values + trend * -1.0, sd, 2.0).tolist()[1] == 0.0
-    assert resting.shifts(values, sd, 2.0)[1] > 1.0
-    assert drifting.shifts(values * [1.0, 1.2], sd, 2.0)[1] > 1.0
+    values, sd, middle = np.array([INERTIA, DAMPING * 1.005]), 1e-4 * scale, -1.0 * np.eye(2)
+    assert drifting.shifts(values + trend * -1.0, sd, middle, 2.0).tolist()[1] == 0.0
+    assert resting.shifts(values, sd, middle, 2.0)[1] > 1.0
+    assert drifting.shifts(values * [1.0, 1.2], sd, middle, 2.0)[1] > 1.0

@@ -176,7 +176,8 @@ def _shifts(state: AdaptationState, tested: _TestedEstimate) -> ParameterCusum:
         return state.shifts
     values = np.array([own.value for own in estimated.parameters])
     sd = np.array([own.sd for own in estimated.parameters])
-    return state.shifts.after(tested.predicted.shifts(values, sd, estimated.fit.window.grid.length))
+    length = estimated.fit.window.grid.length
+    return state.shifts.after(tested.predicted.shifts(values, sd, estimated.trend_response, length))
 
 
 def _apply_decision(state: AdaptationState, tested: _TestedEstimate, test: SequentialTest) -> WindowResult:

@@ -119,19 +119,20 @@ class Posterior:
         relative = Evidence(evidence.point / size, evidence.sqrt_information * size, evidence.residual)
         return imm_filter.innovation_of(self.belief, relative)
 
-    def shifts(self, values: Array, sd: Array, length: float) -> Array:
+    def shifts(self, values: Array, sd: Array, trend_response: Array, length: float) -> Array:
         """Return by how many standard deviations a window of ``length`` (s) alone differs from the prediction (free,).
 
-        ``values`` and ``sd`` (free,) are its estimates without trends, which hold in its middle. For a healthy machine
-        a shift is a standard normal deviate, or smaller. It is zero for values of components, and where the difference
-        is no larger than the drift within the window: the filter lags behind a drift that accelerates.
+        ``values`` and ``sd`` (free,) are its estimates without trends. A trend of a parameter moves them all, by
+        ``trend_response`` (free, free) s. For a healthy machine a shift is a standard normal deviate, or smaller. It is
+        zero for values of components, and where the difference is no larger than the drift within the window: the
+        filter lags behind a drift that accelerates.
         """
-        prior = self.prior()
-        before, trend = np.split(prior.mean, 2)
-        variance_before, variance_of_trend = np.split(np.diag(prior.covariance), 2)
-        difference = values - (before - 0.5 * length * trend)
-        drift = length * np.maximum(np.abs(trend) - QUANTILE * np.sqrt(variance_of_trend), 0.0)
-        variance = self.belief.variance_ratio * sd**2 + variance_before
+        prior, free = self.prior(), len(self.problem.free)
+        trend, sd_of_trend = prior.mean[free:], np.sqrt(np.diag(prior.covariance)[free:])
+        expected = np.hstack([np.eye(free), trend_response])
+        difference = values - expected @ prior.mean
+        drift = length * np.maximum(np.abs(trend) - QUANTILE * sd_of_trend, 0.0)
+        variance = self.belief.variance_ratio * sd**2 + np.diag(expected @ prior.covariance @ expected.T)
         counted = np.isfinite(variance) & (np.abs(difference) > drift)
         counted &= [not parameter.name.startswith("_") for parameter in self.problem.free]
         return np.where(counted, difference / np.sqrt(np.where(counted, variance, 1.0)), 0.0)

@@ -221,6 +221,8 @@ class WindowEstimate:
     """Of the components, to the next window."""
     generations: int
     evaluations: int
+    trend_response: Array
+    """(free, free) by how many seconds of the trend of each parameter those of the window alone move."""
     drifts: bool = False
     """Whether parameters that stay constant leave more of the window than those with trends."""
 
@@ -395,8 +397,17 @@ def _summary(both: _BothFits, outcome: Outcome, generations: int) -> WindowEstim
         advance=phase_advance(problem, both.fit.window, last_state),
         generations=generations,
         evaluations=both.evaluations,
+        trend_response=_trend_response(both),
         drifts=both.alone.chi_square > both.fit.window_chi_square + EQUALLY_GOOD * max(both.cost, 1.0) ** 2,
     )
+
+
+def _trend_response(both: _BothFits) -> Array:
+    """Return the least squares fit (free, free), in s, of constant parameters to what trends change in the window."""
+    objective, free, rows = both.fit.objective, both.fit.objective.free, len(both.fit.prior.mean)
+    width, of_trends = objective.high - objective.low, both.fit.result.jacobian[:-rows, free : 2 * free]
+    response = np.linalg.lstsq(both.alone.jacobian * width, of_trends, rcond=MIN_SINGULAR)[0]
+    return np.asarray((width[:, None] * response)[:free])
 
 
 def _without_amplitudes(problem: Problem, guess: Array) -> Array:
