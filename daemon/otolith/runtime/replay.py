@@ -25,8 +25,7 @@ from otolith.storage.recording_files import MIN_FREE_BYTES, shortage_of
 from otolith_drivers.base import Setup, Signal
 from otolith_drivers.config_files import read
 from otolith_drivers.errors import ConfigurationError, ServiceError, counted
-from otolith_drivers.replay.readers import Reader, Rows, format_of, holds_frames
-from otolith_drivers.replay.several_files import JoinedReader, MergedReader
+from otolith_drivers.replay.readers import JoinedReader, MergedReader, Reader, Rows, format_of, holds_frames
 from otolith_drivers.user_dirs import writable
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.

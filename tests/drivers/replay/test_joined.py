@@ -8,8 +8,7 @@ import pytest
 from otolith.acquisition.playback import Playback
 from otolith.acquisition.samples import SignalPlan
 from otolith_drivers.errors import ConfigurationError
-from otolith_drivers.replay.readers import Reader
-from otolith_drivers.replay.several_files import JoinedReader
+from otolith_drivers.replay.readers import JoinedReader, Reader
 from otolith_drivers.replay.tables import TableReader
 
 PERIOD, RECORDS = 0.01, 50
