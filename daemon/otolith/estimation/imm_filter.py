@@ -310,6 +310,16 @@ def reset_marginal(posterior: ImmPosterior, index: int, sd: float, value: float 
     return replace(posterior, mean=mean, covariance=covariance)
 
 
+def project(posterior: ImmPosterior, index: int, low: float, high: float) -> ImmPosterior:
+    """Return the posterior whose entry at ``index`` lies between ``low`` and ``high``; correlated entries move with it.
+
+    Estimate projection (D. Simon, IET Control Theory & Applications 4, 2010): the covariances stay.
+    """
+    beyond = np.clip(posterior.mean[:, index], low, high) - posterior.mean[:, index]
+    gains = posterior.covariance[:, :, index] / posterior.covariance[:, index, index, None]
+    return replace(posterior, mean=posterior.mean + gains * beyond[:, None])
+
+
 def set_all_modes(posterior: ImmPosterior, mean: Array, covariance: Array) -> ImmPosterior:
     """Return the posterior with the same mean (2 free,) and covariance (2 free, 2 free) in every mode."""
     modes = len(posterior.weight)

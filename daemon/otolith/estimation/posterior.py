@@ -138,8 +138,16 @@ class Posterior:
         return np.where(counted, difference / np.sqrt(np.where(counted, variance, 1.0)), 0.0)
 
     def update(self, innovation: Innovation, phase: PhaseAdvance) -> "Posterior":
-        """Return the posterior after a window with that ``innovation``, which holds its prediction."""
-        return Posterior(self.problem, imm_filter.update(innovation), phase)
+        """Return the posterior after a window with that ``innovation``, which holds its prediction.
+
+        Inner parameters of components stay within their bounds: beyond them a shape means something else.
+        """
+        belief, (low, high) = imm_filter.update(innovation), np.array(self.problem.bounds) / self.problem.scale
+        for slot, component in enumerate(self.problem.components):
+            if component.model.inner is not None:
+                inner = indices(self.problem, slot)[1]
+                belief = imm_filter.project(belief, inner, float(low[inner]), float(high[inner]))
+        return Posterior(self.problem, belief, phase)
 
     def moved(self, change: Array) -> "Posterior":
         """Return the same with parameters and trends moved by ``change`` (2 free,), in their units."""
