@@ -32,7 +32,7 @@ def noisier(windows: list[Window], factors: dict[str, float], smooth: int = 1, s
     return changed
 
 
-@pytest.mark.parametrize("factor", [1.9, 3.8])
+@pytest.mark.parametrize("factor", [1.9, 3.8, 15.0])
 @pytest.mark.parametrize("names", [("i",), ("omega",), ("i", "omega")], ids="-".join)
 def test_a_noisier_sensor_is_named_and_windows_are_learned(names: tuple[str, ...], factor: float) -> None:
     windows = noisier(simulated("steps", 20, Faults()), dict.fromkeys(names, factor))

@@ -21,7 +21,7 @@ from otolith.estimation.window_fit import Fit, fit
 
 # Thresholds: docs/reference/thresholds-discovery.md has the origin of each.
 MIN_NOISE_FACTOR = 1.3  # on a standard deviation: a smaller factor is left to the variance between windows
-MAX_NOISE_FACTOR = 6.0  # a sensor that is worse than this is faulty
+MAX_NOISE_FACTOR = 100.0  # a sensor that is worse than this measures nothing
 INPUT_SHARES = 0.5 ** (0.5 * np.arange(7.0))  # of what an input shows from sample to sample: its noise
 VISIBLE = 1.0  # in -2 log likelihood: an input's noise that changes the normalisation by less does not show
 WHITE_DEVIATIONS = 4.0  # of the autocorrelation at the first lags, in standard deviations of that of white noise

@@ -384,13 +384,30 @@ def _always_lacking(null: FittedHypothesis) -> list[FittedHypothesis]:
 def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple[Posterior, list[FittedHypothesis]]:
     """Search the screened window from the record at which something begins that the prediction does not explain.
 
-    Return the prediction there, and the hypotheses. What begins in the last records is left to the next window: then
-    the null hypothesis is the only one.
+    Return the prediction there, and the hypotheses. What begins with the window and what begins among its first records
+    differ only in that no single cause explains the whole window.
     """
     window = screening.fitted.window
-    onset = 0 if screening.always_late else find_onset(predicted, window)
-    if not onset:
+    if screening.always_late:
         return predicted, search(screening)
+    if onset := find_onset(predicted, window):
+        return _search_since(predicted, screening, onset)
+    fitted = search(screening)
+    onset = 0 if _is_explained(fitted) else _early_onset(predicted, window)
+    if not onset:
+        return predicted, fitted
+    later, again = _search_since(predicted, screening, onset)
+    return (later, again) if _is_explained(again) else (predicted, fitted)
+
+
+def _search_since(
+    predicted: Posterior, screening: ScreeningResult, onset: int
+) -> tuple[Posterior, list[FittedHypothesis]]:
+    """Return the prediction at record ``onset``, and the hypotheses about the window from there on.
+
+    What begins in the last records is left to the next window: then the null hypothesis is the only one.
+    """
+    window = screening.fitted.window
     measured = np.flatnonzero(screening.fitted.objective.present.any(axis=1))
     latest = int(measured[-MIN_RECORDS_AFTER]) if len(measured) >= MIN_RECORDS_AFTER else 0
     first = min(onset, latest)
@@ -399,23 +416,45 @@ def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple
     return later, [null] if onset > latest else search(screening_test(null.fit))
 
 
+def _is_explained(fitted: list[FittedHypothesis]) -> bool:
+    """Whether a hypothesis with one component added, or none, leaves no more than the noise of the window."""
+    simple = len(fitted[0].problem.components) + 1
+    return any(_leaves_noise(item) for item in fitted if len(item.problem.components) <= simple)
+
+
+def _leaves_noise(fitted: FittedHypothesis) -> bool:
+    count = fitted.fit.count
+    return fitted.unexplained <= count + EXPECTED_SPREAD * np.sqrt(2.0 * count)
+
+
 def find_onset(predicted: Posterior, window: Window) -> int:
-    """Return the record of the onset, or 0 if there is none within the window."""
-    as_predicted: FittedHypothesis | None = None
-    record = 0
-    null = nothing_happened(predicted.problem, predicted.prior())
-    for part in range(1, PARTS + 1):
-        end = max(window.records * part // PARTS, 1)
-        (fitted,) = fit_hypotheses([null], window.until(end))
-        count = fitted.fit.count
-        if fitted.chi_square > count + EXPECTED_SPREAD * np.sqrt(2.0 * count):
-            break
-        as_predicted, record = fitted, end
-    else:
-        return 0
-    if as_predicted is None:
-        return 0
-    return _first_far_off(as_predicted, window.until(min(record + window.records // PARTS, window.records)), record)
+    """Return the record of the onset, or 0 if there is none within the window, or none after its first part."""
+    before: FittedHypothesis | None = None
+    record, part = 0, window.records // PARTS
+    for number in range(1, PARTS + 1):
+        end = max(window.records * number // PARTS, 1)
+        fitted = _as_predicted(predicted, window.until(end))
+        if fitted is None:
+            return 0 if before is None else _first_far_off(before, window.until(min(record + part, end)), record)
+        before, record = fitted, end
+    return 0
+
+
+def _early_onset(predicted: Posterior, window: Window) -> int:
+    """Return the record of an onset in the first part of the window, before which all is as predicted; 0 for none."""
+    first = window.until(max(window.records // PARTS, 1))
+    record = first.records // 2
+    while record:
+        if (before := _as_predicted(predicted, first.until(record))) is not None:
+            return _first_far_off(before, first, record)
+        record //= 2
+    return 0
+
+
+def _as_predicted(predicted: Posterior, window: Window) -> FittedHypothesis | None:
+    """Return the null hypothesis fitted to the window, or None if it leaves more than the prediction allows."""
+    (fitted,) = fit_hypotheses([nothing_happened(predicted.problem, predicted.prior())], window)
+    return fitted if _leaves_noise(fitted) else None
 
 
 def _first_far_off(fitted: FittedHypothesis, window: Window, record: int) -> int:

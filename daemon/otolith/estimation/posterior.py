@@ -16,7 +16,7 @@ from otolith.estimation.arrival_cost import Evidence, Prior, initial_prior
 from otolith.estimation.imm_filter import ADDED_LEVEL, ImmPosterior, Innovation
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.objective import converter_steps
-from otolith.estimation.problem import Problem, indices, source_of, without
+from otolith.estimation.problem import INNER_BOUND, Problem, indices, source_of, without
 
 START_TOLERANCE = 0.5  # mean steps by which a window may start early or late and still follow its predecessor
 MAX_KNOWN_PHASE_SD = 1.0  # rad: a phase less certain than this counts as unknown
@@ -140,13 +140,16 @@ class Posterior:
     def update(self, innovation: Innovation, phase: PhaseAdvance) -> "Posterior":
         """Return the posterior after a window with that ``innovation``, which holds its prediction.
 
-        Inner parameters of components stay within their bounds: beyond them a shape means something else.
+        Inner parameters of components stay within the bounds of their search, widened as they are for a fit: beyond
+        them a shape means something else.
         """
-        belief, (low, high) = imm_filter.update(innovation), np.array(self.problem.bounds) / self.problem.scale
+        belief = imm_filter.update(innovation)
         for slot, component in enumerate(self.problem.components):
             if component.model.inner is not None:
                 inner = indices(self.problem, slot)[1]
-                belief = imm_filter.project(belief, inner, float(low[inner]), float(high[inner]))
+                low, high = component.low / INNER_BOUND, component.high * INNER_BOUND
+                scale = float(self.problem.scale[inner])
+                belief = imm_filter.project(belief, inner, low / scale, high / scale)
         return Posterior(self.problem, belief, phase)
 
     def moved(self, change: Array) -> "Posterior":
