@@ -424,7 +424,7 @@ def _is_explained(fitted: list[FittedHypothesis]) -> bool:
 
 def _leaves_noise(fitted: FittedHypothesis) -> bool:
     count = fitted.fit.count
-    return fitted.unexplained <= count + EXPECTED_SPREAD * np.sqrt(2.0 * count)
+    return bool(fitted.unexplained <= count + EXPECTED_SPREAD * np.sqrt(2.0 * count))
 
 
 def find_onset(predicted: Posterior, window: Window) -> int:
