@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from otolith.cli.commissioning.check import check_machine
+from otolith.cli.commissioning.check import check_machine, describe
+from otolith.machine import load_machine
 from tests.conftest import OwnMachine
 
 
@@ -20,6 +21,17 @@ def test_every_signal_is_shown_with_its_latest_value(tmp_path: Path) -> None:
     assert lines["omega"].endswith(" rad/s")
     assert ", now " in lines["i"]
     assert "otolith probe" not in lines["all"]
+
+
+def test_a_parameter_without_limits_is_named(tmp_path: Path) -> None:
+    machine = OwnMachine(tmp_path, "in-process")
+    text = machine.machine.read_text(encoding="utf-8")
+    row = 'D = { value = "0.00143 N*m*s/rad", estimate = true, watch = [] }'
+    machine.machine.write_text(text.replace('D = "0.00143 N*m*s/rad"', row), encoding="utf-8")
+    lines = describe(load_machine(machine.machine))
+    (without,) = (line for line in lines if "no change of it is an event" in line)
+    assert without.startswith("limits of D: none")
+    assert any(line.startswith("limits of R_a: ") for line in lines)
 
 
 def test_silent_machine_and_missing_signal_get_their_own_remark(tmp_path: Path) -> None:

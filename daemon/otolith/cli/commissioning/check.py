@@ -22,6 +22,7 @@ PATIENCE = 4.0  # s to wait for missing signals until the driver gives the cause
 MIN_SHARE = 0.5  # of the samples expected at the sample period; below it "too few" is printed
 PAUSE = 0.1  # s between two looks at the driver
 PROBED = ("can", "modbus")  # drivers that have an 'otolith probe'
+NO_LIMITS = 'none, so no change of it is an event: write {} = {{ watch = ["-10 %", "+10 %"] }} under [parameters]'
 FOR_REPLAY_ONLY = "no [driver] and no [signals]: for 'otolith replay' only"
 
 
@@ -91,7 +92,7 @@ def describe(machine: LoadedMachine, sources: Sequence[str] = (FOR_REPLAY_ONLY,)
         bounds = f"from {free.low:g} to {free.high:g} {free.unit}, starting at {free.nominal:g} {free.unit}"
         lines.append(f"estimated: {free.name} {bounds} ({free.meaning}){_origin(free.name, file.parameters)}")
         limits = machine.plan.parameters[free.name].limits_text
-        lines += [f"limits of {free.name}: {limits}"] if limits else []
+        lines.append(f"limits of {free.name}: {limits or NO_LIMITS.format(free.name)}")
     for name, site in machine.plan.sites.items():
         lines += [f"limits of components at {name}: {site.limits_text}"] if site.limits else []
     for output, noise in zip(twin.outputs, problem.noise, strict=True):
