@@ -119,3 +119,42 @@ def test_number_that_is_not_finite_is_named(tmp_path: Path) -> None:
     frame_decoder.decode(frame(385, bytes.fromhex("0000c07f") + bytes(4)), 0.0)
     (line,) = frame_decoder.warnings(0.1)
     assert "U of nan V is no number" in line
+
+
+@pytest.mark.parametrize(
+    ("bits", "table", "readings", "none"),
+    [
+        ("0|16@1+", '65535 "SNA" 65534 "Error" 0 "Standstill"', [0, 1, 65533], [65534, 65535]),
+        ("0|16@1-", '-32768 "Signal not available"', [-32767, 32767], [-32768]),
+        ("0|16@1-", '32768 "SNA"', [-32767, 32767], [-32768]),  # the bits of the lowest number
+        ("0|8@1+", '0 "Sensor error" 255 "Not available"', [1, 254], [0, 255]),
+        ("0|16@1+", '65535 "Maximum" 0 "Nabla" 32000 "Invalid"', [0, 32000, 65535], []),  # it may be passed
+        ("0|4@1+", '15 "SNA" 14 "Error"', [14, 15], []),  # a state
+    ],
+)
+def test_a_number_that_the_database_names_as_none_is_no_reading(
+    tmp_path: Path, bits: str, table: str, readings: list[int], none: list[int]
+) -> None:
+    text = dbc(f'BO_ 385 Motor: 8 Drive\n SG_ U : {bits} (0.1,0) [0|0] "V" X', after=f"VAL_ 385 U {table} ;")
+    plain = decoder(tmp_path, {"U": ("V", {"signal": "U"})}, text)
+    stated = decoder(tmp_path, {"U": ("V", {"signal": "U", "range": [-1e9, 1e9]})}, text)
+    for number in readings + none:
+        data = (number % 65536).to_bytes(2, "little") + bytes(6)
+        (sample,) = plain.decode(frame(385, data), 0.0)
+        assert sample.value == pytest.approx(float("nan") if number in none else 0.1 * number, nan_ok=True)
+        assert values(stated.decode(frame(385, data), 0.0)) == {"U": pytest.approx(0.1 * number)}
+    assert plain.counters.bad == len(none)
+    if none:
+        (line,) = plain.warnings(0.0)
+        assert f"U of {0.1 * none[-1]:g} V is no reading: its raw number {none[-1]} is '" in line
+
+
+def test_a_signal_without_receivers_and_a_message_without_a_sender_are_read(tmp_path: Path) -> None:
+    """The library drops the one without a word, and refuses the other."""
+    text = dbc('BO_ 385 Motor: 8\n SG_ U : 0|16@1- (0.1,0) [0|0] "V"\n SG_ I : 16|16@1- (0.1,0) [0|0] "A"  ')
+    for written in (text, text.replace("\n", "\r\n")):
+        signals = {"U": ("V", {"signal": "U"}), "I": ("A", {"signal": "I"})}
+        frame_decoder = decoder(tmp_path, signals, written)
+        assert frame_decoder.configuration_warnings == ()
+        samples = frame_decoder.decode(frame(385, bytes([10, 0, 20, 0, 0, 0, 0, 0])), 0.0)
+        assert values(samples) == pytest.approx({"U": 1.0, "I": 2.0})
