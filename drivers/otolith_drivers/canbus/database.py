@@ -226,6 +226,8 @@ def _why_unusable(message: Message) -> str:
         return f"it has {message.length} bytes"
     if any(not isinstance(signal.name, str) or signal.start < 0 for signal in message.signals):
         return "one of its signals has no name or no place"
+    if orders := {str(signal.byte_order) for signal in message.signals} - {"little_endian", "big_endian"}:
+        return f"one of its signals has the byte order {min(orders)!r}"
     return ""
 
 

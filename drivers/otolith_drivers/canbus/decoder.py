@@ -98,7 +98,9 @@ class MessageReader:
         self._lost = 0
         self._counter, self._checksum, self._declared_period = rules.counter, rules.checksum, rules.period
         self._length = max(rules.length, *(message.length for message in messages))
-        self._database_period = max(min(message.cycle_time or 0, MAX_CYCLE_TIME) * 1e-3 for message in messages)
+        cycles = [message.cycle_time for message in messages]  # a database may define it as a text
+        longest = max((ms for ms in cycles if isinstance(ms, int | float)), default=0)
+        self._database_period = 1e-3 * min(longest, MAX_CYCLE_TIME)
         self._rows: list[Row] = []
         self._groups: dict[tuple[object, ...], _MultiplexedGroup] = {}
         self._rejections: defaultdict[str, PassingFault] = defaultdict(PassingFault)  # Frames or values, by their kind

@@ -47,6 +47,13 @@ def test_a_cycle_time_that_is_none_does_no_harm(tmp_path: Path) -> None:
     assert values(frame_decoder.decode(frame(258, bytes([0, 1, 2, 3, 0, 0, 0, 0])), 0.0)) == {"U": 3.0}
 
 
+def test_a_cycle_time_that_is_a_text_does_no_harm(tmp_path: Path) -> None:
+    cycle = 'BA_DEF_ BO_ "GenMsgCycleTime" STRING ;\nBA_DEF_DEF_ "GenMsgCycleTime" "";\n'
+    text = dbc(NESTED, after=f'{cycle}BA_ "GenMsgCycleTime" BO_ 258 "100";')
+    frame_decoder = decoder(tmp_path, PLAIN, text)
+    assert values(frame_decoder.decode(frame(258, bytes([0, 1, 2, 3, 0, 0, 0, 0])), 0.0)) == {"U": 3.0}
+
+
 def test_a_message_of_a_negative_length_does_not_affect_others(tmp_path: Path) -> None:
     frame_decoder = decoder(tmp_path, PLAIN, dbc(NESTED, 'BO_ 400 Other: -1 Drive\n SG_ A : 0|8@1+ (1,0) [0|0] "V" X'))
     assert any("message Other cannot be used: it has -1 bytes" in line for line in frame_decoder.describe())
@@ -158,3 +165,18 @@ def test_a_signal_without_receivers_and_a_message_without_a_sender_are_read(tmp_
         assert frame_decoder.configuration_warnings == ()
         samples = frame_decoder.decode(frame(385, bytes([10, 0, 20, 0, 0, 0, 0, 0])), 0.0)
         assert values(samples) == pytest.approx({"U": 1.0, "I": 2.0})
+
+
+def test_an_unknown_byte_order_is_refused(tmp_path: Path) -> None:
+    """The library takes it over, and decodes it as the other one."""
+    path = tmp_path / "drive.kcd"
+    value = '<Value type="unsigned" unit="V"/>'
+    signal = f'<Signal name="U" offset="0" length="8" endianess="{{}}">{value}</Signal>'
+    text = (
+        '<NetworkDefinition xmlns="http://kayak.2codeornot2code.org/1.0"><Document/><Bus name="b">'
+        f'<Message id="0x181" name="M" length="8">{signal}</Message></Bus></NetworkDefinition>'
+    )
+    path.write_text(text.format("little"), encoding="utf-8")
+    assert load_database(path).unread == {}
+    path.write_text(text.format("lite"), encoding="utf-8")
+    assert load_database(path).unread == {"M": "one of its signals has the byte order 'lite_endian'"}
