@@ -37,7 +37,11 @@ MAX_PAYLOAD = 1 << 16  # bytes of a message that is read
 SAME_CLOCK = 0.2  # s between the offsets of two topics, below which their senders have one clock
 FIRST_WAIT = 10.0  # s without a message of a topic, after which the link has a warning of it
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-PATH = re.compile(r"[^.\[\]\s]+(?:\[\d+\])*(?:\.[^.\[\]\s]+(?:\[\d+\])*)*|(?:\[\d+\])+")
+MIN_RATE, RATE_SPAN = 0.1, 1.5  # s per s by which the times of messages must advance; s after which that is judged
+NAME = r"[^.\[\]\s](?:[^.\[\]]*[^.\[\]\s])?"
+PATH = re.compile(rf"{NAME}(?:\[\d+\])*(?:\.{NAME}(?:\[\d+\])*)*|(?:\[\d+\])+")
+STEP = re.compile(r"\.?([^.\[\]]+)|\[(\d+)\]")  # from a JSON value into it
+NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
 FieldPath = Annotated[str, Field(pattern=f"^(?:{PATH.pattern})$", max_length=200)]
 
@@ -94,7 +98,9 @@ class TopicSignals:
     name: str
     signals: list[tuple[str, str | None, Conversion]] = field(default_factory=list)
     """Name, path in the message, and conversion."""
-    periods: PeriodEstimator = field(default_factory=PeriodEstimator)
+    periods: PeriodEstimator = field(default_factory=PeriodEstimator)  # Of their times
+    arrivals: PeriodEstimator = field(default_factory=PeriodEstimator)
+    begun: tuple[float, float] = (math.inf, 0.0)  # s; arrival and time of the first message
     time: float = -math.inf  # s; of the latest samples
     clock: ArrivalClock = field(default_factory=ArrivalClock)
     retained: bool = False  # Whether a retained message has come
@@ -103,11 +109,15 @@ class TopicSignals:
     def warnings(self, now: float, begun: float) -> list[str]:
         """Return what is wrong at ``now`` (s) since the subscription at ``begun`` (s), a line each."""
         lines = self.unusable.warnings(now, self.name)
-        if self.periods.last is None and now - begun > FIRST_WAIT:
+        if self.arrivals.last is None and now - begun > FIRST_WAIT:
             kind = "only a retained message, which is old" if self.retained else "no message"
             lines.append(f"{self.name}: {kind} since {now - begun:.0f} s: does its publisher run?")
-        elif (silence := self.periods.silence(now)) is not None:
-            lines.append(f"{self.name} silent for {silence:.1f} s; {self.periods.describe()}")
+        elif (silence := self.arrivals.silence(now)) is not None:
+            lines.append(f"{self.name} silent for {silence:.1f} s; {self.arrivals.describe()}")
+        elif not lines and (span := (self.arrivals.last or 0.0) - self.begun[0]) > RATE_SPAN:
+            rate = (self.time - self.begun[1]) / span
+            if rate < MIN_RATE:
+                lines.append(f"{self.name}: its times advance by {rate:.2g} s per second: is time_format right?")
         return lines
 
 
@@ -142,6 +152,7 @@ class Messages:
             topic.retained = True
             self.retained += 1
             return []
+        topic.arrivals.lost_before(now)
         try:
             content = _content(payload, plain=all(path is None for _, path, _ in topic.signals))
             time = now if self._path is None else self._time(topic, content, now)
@@ -152,6 +163,7 @@ class Messages:
             topic.unusable.note(f"its time is {topic.time - time:.3g} s before that of the message before it", now)
             return []
         topic.time = time = max(time, topic.time)  # a faster message than all before it moves the offset a little
+        topic.begun = min(topic.begun, (now, time))
         samples = [self._sample(topic, signal, content, time, now) for signal in topic.signals]
         self.lost += topic.periods.lost_before(time) * len(samples)
         self.received += sum(math.isfinite(sample.value) for sample in samples)
@@ -175,7 +187,8 @@ class Messages:
         if not math.isfinite(stamp):
             raise ValueError(f"{self._path} is not finite")
         if not topic.clock.arrival(stamp, now, SAME_CLOCK):
-            raise ValueError(f"{self._path} is {shown(written)}, ahead of the messages before it")
+            ahead = f"{self._path} is {shown(written)}, ahead of the messages before it"
+            raise ValueError(f"{ahead}: is time_format right?")
         own = topic.clock.offset
         others = (other.clock.offset for other in self.topics.values())
         return stamp + min(offset for offset in others if abs(offset - own) < SAME_CLOCK)
@@ -186,6 +199,7 @@ class Messages:
         name, path, conversion = signal
         try:
             written = content if path is None else at(content, path)
+            written = float(written) if isinstance(written, str) and NUMBER.fullmatch(written.strip()) else written
             value = conversion.value(written)
             fault = f"{name} is {shown(written)}, no number in its range" if math.isnan(value) else ""
         except ValueError as error:
@@ -201,22 +215,30 @@ def _content(payload: bytes, *, plain: bool) -> Any:
         raise ValueError(f"a message of {len(payload)} bytes, more than {MAX_PAYLOAD}")
     try:
         text = payload.decode("utf-8").strip()
-        if plain and len(text) < 100:
-            return float(text)
-        return json.loads(text)
+        content = text if plain and NUMBER.fullmatch(text) else json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{shown(payload[:60])} is no {'number' if plain else 'JSON document'}") from error
+    if plain and isinstance(content, dict | list):
+        raise ValueError(f"{shown(payload[:60])} is no number: set 'field' beside the topic")
+    return content
 
 
 def at(content: Any, path: str | None) -> Any:
-    """Return what is at ``path``, like ``axes[0].speed``, of a JSON document; raise ValueError if there is nothing."""
-    value = content
-    for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path or ""):
+    """Return what is at ``path``, like ``axes[0].speed``, of a JSON document; raise ValueError if there is nothing.
+
+    A name may contain points and brackets, if that is not ambiguous: the longest one is taken.
+    """
+    value, rest = content, path or ""
+    while rest:
+        if isinstance(value, dict) and rest.removeprefix(".") in value:
+            return value[rest.removeprefix(".")]
+        match = STEP.match(rest)
         try:
-            value = value[name] if name else value[int(index)]
+            value = value[match[1] or int(match[2])] if match else None
         except (KeyError, IndexError, TypeError):
             known = f": it has {', '.join(map(str, list(value)[:8]))}" if isinstance(value, dict) and value else ""
             raise ValueError(f"a message without {path}{known}") from None
+        rest = rest[match.end() :] if match else ""
     return value
 
 

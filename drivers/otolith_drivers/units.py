@@ -41,29 +41,33 @@ def _by_spelling(rows: str) -> dict[str, str]:
 
 
 EXACT = _by_spelling("""
-    (N*m) = Nm NM N.m N-m; (kN*m) = kNm KNm; (mN*m) = mNm; (N*cm) = Ncm; (N*m*s) = Nms; (N*m/A) = N.m/A N-m/A
+    (N*m) = Nm NM N.m N-m N-M N_m Nmrms; (N*mm) = Nmm; (V*s) = Vs
+    (kN*m) = kNm KNm; (mN*m) = mNm; (N*cm) = Ncm; (N*m*s) = Nms; (N*m/A) = N.m/A N-m/A
     (cN*m) = cNm; (daN*m) = daNm; metric_horsepower = PS
-    degree = ° º; degC = °C ºC ℃ Â°C \ufffdC; degF = °F ºF ℉; kelvin = °K; (degree/s) = D/S; rpm = /min
-    V = v; kV = KV; milliohm = mOhm; megaohm = MOhm; kN = KN; kJ = KJ; MPa = Mpa
+    degree = ° º; degC = °C ºC ℃ oC Â°C \ufffdC; degF = °F ºF ℉; kelvin = °K; (degree/s) = D/S; rpm = /min
+    V = v; mV = mv; kV = KV; mH = mHenry; milliohm = mOhm; megaohm = MOhm; kN = KN; kJ = KJ; MPa = Mpa
     (m/s) = M/s M/S; (m/s^2) = M/s2 M/S2; dimensionless = 1 - --
 """)
 """pint's names by spellings whose capitals matter."""
 
 FOLDED = _by_spelling("""
-    V = volt volts vrms v_rms vpk v_pk vpeak vdc v_dc voltsdc vac; mV = mvolt mvolts millivolts
-    A = amp amps ampere amperes arms a_rms apk a_pk apeak a_peak adc a_dc ampsdc aac; Ah = ah
-    mA = mamp mamps milliamp milliamps; ohm = ohm ohms; kiloohm = kohm; kWh = kwh; J = joule joules
-    W = watt watts; kW = kw kilowatt kilowatts; N = newton newtons; (N*m) = newtonmeter newtonmeters newton-meter
+    V = volt volts vrms v_rms vpk v_pk vpeak vdc v_dc v(dc) voltsdc vac; mV = mvolt mvolts millivolts
+    A = amp amps ampere amperes arms a_rms apk a_pk apeak a_peak adc a_dc ampsdc ampsrms a(rms) aac; Ah = ah
+    mA = mamp mamps milliamp milliamps; ohm = ohm ohms; kiloohm = kohm kohms; kWh = kwh; J = joule joules
+    hp = hp; W = watt watts; kW = kw kilowatt kilowatts
+    N = newton newtons; (N*m) = newtonmeter newtonmeters newton-meter
     (N*m) = newton-meters newtonmetre newtonmetres
     Hz = hz hertz; kHz = khz; s = sec secs second seconds sekunde sekunden sek; ms = msec msecs milliseconds
     min = min mins minute minutes minuten; h = hr hrs hour hours std stunden
     degree = deg degree degrees grad winkelgrad; rad = rad rads radian radians
     turn = rev revs revolution revolutions turn turns umdr umdrehung umdrehungen; (turn/s) = rps u/s r/s
-    rpm = rpm r.p.m u/min 1/min r/min tr/min rev/min revs/min revolutions/minute umdr/min umdr./min umdrehungen/min
-    rpm = min^-1 min**-1 min-1 min⁻¹ rot/min; (degree/s) = dps; torr = torr
-    (ft*lbf) = lb-ft lbf-ft ft-lb ft-lbf ft.lbf lbft ftlb; (inch*lbf) = in-lb in-lbf lb-in lbf-in inlb lbin
+    krpm = krpm; rpm = rpm rpms upm r.p.m rotations/min
+    rpm = u/min 1/min r/min tr/min rev/min revs/min revolutions/minute umdr/min umdr./min umdrehungen/min
+    rpm = min^-1 min**-1 min-1 rot/min; (degree/s) = dps; torr = torr
+    (ft*lbf) = lb-ft lbf-ft ft-lb ft-lbf ft.lbf lbft ftlb ft-lbs ftlbs ft.lb lb.ft lbf.ft
+    (inch*lbf) = in-lb in-lbf lb-in lbf-in inlb lbin in-lbs lbs-in in.lb
     (inch*ozf) = oz-in ozf-in oz.in ozin; (cm*kgf) = kgf-cm kgf.cm kgfcm
-    degC = °celsius celsius cel degc deg.c deg_c degreec degreesc degcelsius degreecelsius degreescelsius
+    degC = °c °celsius celsius celcius cel degc deg.c deg_c degreec degreesc degcelsius degreecelsius degreescelsius
     degC = grad_c gradc gradcelsius; kelvin = kelvin degk
     degF = °fahrenheit fahrenheit degf deg.f deg_f degreef degreesf degfahrenheit degreesfahrenheit
     (km/h) = km/h km/hr km/std kmh kmph kph; (m/s^2) = m/ss; m = metre metres meter meters; km = km
@@ -73,11 +77,17 @@ FOLDED = _by_spelling("""
 """)
 """pint's names by spellings in any capitals, written here in small letters."""
 
-UNCLEAR = {"grad": ("degree", "gon"), "gradian": ("degree", "gon")}
+UNCLEAR = {"grad": ("degree", "gon"), "gradian": ("degree", "gon"), "ton": ("tonne", "short_ton")}
 """Units with several meanings of one dimension, by their exact spelling."""
 
 OTHER_MEANINGS = _by_spelling("degC = C; degF = F; standard_gravity = g G; kN = kn; s = S; m = M")
 """What a symbol means for a signal that has not the dimension of its standard meaning."""
+
+SIGNS = str.maketrans({"\u2126": "Ω", "\u02da": "°", "\u22c5": "·", "\u2219": "·", "\u2022": "·", "⁻": "-", "¹": "1"})
+"""Signs that look like others."""
+
+JOINED = {r"(?<=[^\W\d])[.-](?=[^\W\d])": "*", r"(?<=[^\W\d])-(?=[1-3](?!\d))": "^-"}
+"""What stands for a product or an exponent in a unit that no table has, as in ``kg.m2`` and ``rad.s-1``."""
 
 POWER = re.compile(r"(s|sec|mm|cm|m|min|h)([23])", re.IGNORECASE)
 """A unit with an exponent behind it, without a sign between them."""
@@ -142,9 +152,11 @@ def _replaced(text: str, symbols: Mapping[str, str]) -> str:
 @cache
 def unit(text: str) -> "pint.Unit":
     """Return the unit that ``text`` names; raise UnitNameError if it is unknown, malformed or ambiguous."""
-    short = re.sub(r"\s+", " ", text.strip()).removesuffix(".").replace("\u2126", "Ω")
+    short = re.sub(r"\s+", " ", text.strip()).removesuffix(".").translate(SIGNS)
+    short = re.sub(r"\[(.*)\]|\(([^()]*)\)", r"\1\2", short) if short[:1] in "[(" and short[-1:] in "])" else short
     whole = short.replace(" ", "")
     written = _known_name(whole) if whole else "dimensionless"
+    short = short if written else _replaced(short, JOINED)
     if len(text) > MAX_LENGTH or not (written or UNIT.fullmatch(short)):
         raise UnitNameError(f"{text!r} is not a unit")
     name = written or FACTOR_NAME.sub(_renamed, short)
@@ -191,8 +203,10 @@ def factor(source: str, target: str) -> tuple[float, float]:
     source = _meant(source, target)
     _check_dimension(source, target)
     zero = _registry().Quantity(0.0, unit(source)).to(unit(target)).magnitude
-    one = _registry().Quantity(1.0, unit(source)).to(unit(target)).magnitude
-    return one - zero, zero
+    one, two = (_registry().Quantity(number, unit(source)).to(unit(target)).magnitude for number in (1.0, 2.0))
+    if not math.isclose(two - one, one - zero, rel_tol=1e-6):
+        raise ValueError(f"unit {source!r} is logarithmic: log the quantity itself, in {target!r}")
+    return float(one - zero), float(zero)
 
 
 def to_base(text: str) -> tuple[float, float]:

@@ -255,12 +255,53 @@ def test_a_huge_message_is_refused() -> None:
 )
 def test_no_value_in_a_message_raises(value: Any) -> None:
     (sample,) = messages().take("motor", document(value), 1.0, retained=False)
-    assert math.isnan(sample.value) or isinstance(value, bool | int | float)
+    assert math.isnan(sample.value) or isinstance(value, bool | int | float | str)
 
 
 def test_paths_reach_into_lists() -> None:
     assert at({"axes": [{"speed": 3}]}, "axes[0].speed") == 3
     assert at([[1, 2]], "[0][1]") == 2
+
+
+@pytest.mark.parametrize("key", ["Motor Speed", "Channel1.Device1.Speed", "DB1[0]", "a.b[0].c"])
+def test_a_key_may_have_spaces_points_and_brackets(key: str) -> None:
+    read = Messages(mqtt.Options(host="a"), setup_of(i={"topic": "t", "field": key, "unit": "A"}).signals)
+    (sample,) = read.take("t", json.dumps({"x": 2, key: 1.5}).encode(), 1.0, retained=False)
+    assert sample.value == 1.5
+    nested = Messages(mqtt.Options(host="a"), setup_of(i={"topic": "t", "field": f"v.{key}", "unit": "A"}).signals)
+    (sample,) = nested.take("t", json.dumps({"v": {key: 1.5}}).encode(), 1.0, retained=False)
+    assert sample.value == 1.5
+
+
+@pytest.mark.parametrize(
+    ("payload", "value"),
+    [("1.5", 1.5), (" +1.5e0\n", 1.5), ('"1.5"', 1.5), ("true", 1.0), ('"1.5 A"', None), ("1,5", None), ("1_5", None)],
+)
+def test_a_number_may_be_a_text(payload: str, value: float | None) -> None:
+    """Some gateways write all values as texts; a number with its unit or with a comma is none."""
+    plain = Messages(mqtt.Options(host="a"), setup_of(i={"topic": "t", "unit": "A"}).signals)
+    samples = plain.take("t", payload.encode(), 1.0, retained=False)
+    assert [sample.value for sample in samples if not math.isnan(sample.value)] == ([] if value is None else [value])
+    assert plain.bad == (value is None)
+    read = Messages(mqtt.Options(host="a"), setup_of(i={"topic": "t", "field": "v", "unit": "A"}).signals)
+    read.take("t", f'{{"v": {json.dumps(payload)}}}'.encode(), 1.0, retained=False)
+    assert read.bad == (payload not in {"1.5", " +1.5e0\n"})
+
+
+def test_a_document_without_field_is_named() -> None:
+    read = Messages(mqtt.Options(host="a"), setup_of(i={"topic": "t", "unit": "A"}).signals)
+    assert read.take("t", b'{"value": 1.5}', 1.0, retained=False) == []
+    assert read.topics["t"].unusable.text.endswith("is no number: set 'field' beside the topic")
+
+
+@pytest.mark.parametrize(("written", "declared"), [(1.0, "ms"), (1e3, "s"), (1e3, "us"), (1e9, "ms")])
+def test_times_in_another_unit_than_declared_are_named(written: float, declared: str) -> None:
+    read = messages(time="t", time_format=declared)
+    for index in range(200):
+        read.take("motor", document(1.0, (1.7e9 + 0.01 * index) * written), 5.0 + 0.01 * index, retained=False)
+    (line,) = read.topics["motor"].warnings(7.0, 5.0)
+    assert "is time_format right?" in line
+    assert "silent" not in line
 
 
 def test_sampling_follows_from_the_times() -> None:

@@ -12,37 +12,38 @@ from tests.drivers.can_frames import dbc, decoder, frame
 
 TURN, DEGREE = 2 * math.pi, math.pi / 180
 SPELLINGS: dict[tuple[str, float, float], str] = {
-    ("V", 1, 0): "V|V_DC|Volts DC|v|Volt|Volts|volt|volts|VOLT|VOLTS|Vdc|VDC|V DC|Vrms|V_rms|Vac",
-    ("V", 1e-3, 0): "mV|mVolt|mVolts|millivolts",
+    ("V", 1, 0): "V|[V]|(V)|V(dc)|V_DC|Volts DC|v|Volt|Volts|volt|volts|VOLT|VOLTS|Vdc|VDC|V DC|Vrms|V_rms|Vac",
+    ("V", 1e-3, 0): "mV|mv|mVolt|mVolts|millivolts",
     ("V", 1e3, 0): "kV|KV",
     ("A", 1, 0): "A|A_dc|A_peak|Amps DC|Amp|Amps|amps|AMPS|amp|Ampere|Amperes|ampere|Amp.|Arms|A rms|"
-    "A_rms|ARMS|Apk|A peak|Adc|A DC",
+    "A_rms|ARMS|Apk|A peak|Adc|A DC|Amps RMS|A(rms)|[A]",
     ("A", 1e-3, 0): "mA|mAmp|mAmps|milliamps",
     ("ohm", 1, 0): "ohm|Ohm|Ohms|OHM|Ω|\u2126",
     ("ohm", 1e-3, 0): "mOhm|mohm|mΩ|milliohm",
-    ("ohm", 1e3, 0): "kOhm|KOhm|kΩ",
+    ("ohm", 1e3, 0): "kOhm|KOhm|kΩ|kOhms",
     ("rad", DEGREE, 0): "°|º|deg|Deg|DEG|deg.|Degree|Degrees|degrees|DEGREES|Grad|Winkelgrad",
     ("rad", 1, 0): "rad|Rad|RAD|rads|Radian|Radians",
     ("rad", TURN, 0): "rev|Rev|turn|Turns|revolutions|Umdrehungen|Umdr",
     ("rad/s", DEGREE, 0): "°/s|deg/s|Deg/s|deg/sec|Deg/Sec|degrees/s|Degree/Second|Grad/s|Grad/Sek|º/s|D/S|dps",
-    ("rad/s", 1, 0): "rad/s|Rad/s|rad/sec|Radians/Second",
+    ("rad/s", 1, 0): "rad/s|rad.s-1|rad·s⁻¹|rad s-1|Rad/s|rad/sec|Radians/Second",
     ("rad/s", TURN / 60, 0): "rpm|RPM|Rpm|r.p.m.|1/min|min-1|min⁻¹|rot/min|min^-1|/min|U/min|U/Min|Umdr/min|"
     "Umdrehungen/min|"
-    "Umdr./min|rev/min|Rev/Min|revs/min|Revolutions/Minute|r/min|tr/min|1/Min",
+    "Umdr./min|[rpm]|RPMs|UPM|Upm|rotations/min|rev/min|Rev/Min|revs/min|Revolutions/Minute|r/min|tr/min|1/Min",
     ("rad/s", TURN, 0): "rps|rev/s|Rev/s|U/s|Umdr/s|r/s",
     ("rad/s^2", 1, 0): "rad/s2|rad/s²|rad/s^2|rad/s/s|rad/sec2|rad/s**2",
     ("rad/s^2", DEGREE, 0): "deg/s2|°/s2|°/s²|deg/s^2|Deg/s2|Grad/s2|deg/sec^2",
     ("degC", 1, 0): "°C|ºC|° C|℃|degC|DegC|deg C|Deg C|DEG C|deg.C|Degrees C|degrees C|Degree C|Celsius|celsius|"
     "Cel|Â°C|\ufffdC|"
-    "Degrees Celsius|deg Celsius|Grad C|Grad Celsius|GradC|C|deg_C|°Celsius",
+    "Degrees Celsius|deg Celsius|Grad C|Grad Celsius|GradC|C|deg_C|°Celsius|°c|˚C|oC|[°C]|Celcius",
     ("degC", 5 / 9, -160 / 9): "°F|degF|deg F|Deg F|Degrees F|Fahrenheit|F",
     ("K", 1, 0): "K|Kelvin|kelvin|degK|deg K|°K",
-    ("N*m", 1, 0): "Nm|NM|N.m|N-m|N*m|N m|N·m|Newton meter|Newton-meters|newtonmeter",
+    ("N*m", 1, 0): "Nm|[Nm]|N⋅m|N∙m|N•m|N-M|N_m|Nm rms|NM|N.m|N-m|N*m|N m|N·m|Newton meter|Newton-meters|newtonmeter",
     ("N*m", 1e3, 0): "kNm|KNm|kN*m",
+    ("N*m", 1e-3, 0): "mNm|mN.m|mN-m|Nmm|N.mm|mN·m",
     ("N*m", 1e-2, 0): "Ncm|cNm|cN*m",
     ("N*m", 10, 0): "daNm",
-    ("N*m", 1.3558179, 0): "lb-ft|ft-lb|lbf-ft|ft.lbf|lbf*ft|ft lbf|FT-LB",
-    ("N*m", 0.11298483, 0): "in-lb|lbf-in|lb-in|lbf*in",
+    ("N*m", 1.3558179, 0): "lb-ft|ft-lb|lbf-ft|ft.lbf|lbf*ft|ft lbf|FT-LB|ft-lbs|ftlbs|ft.lb|lb.ft|lbf.ft|lbft",
+    ("N*m", 0.11298483, 0): "in-lb|lbf-in|lb-in|lbf*in|in-lbs|lbs-in|in.lb",
     ("N*m", 7.0615518e-3, 0): "oz-in|ozf-in|oz.in|ozf*in",
     ("N*m", 0.0980665, 0): "kgf-cm|kgf.cm|kgf*cm",
     ("N*m/A", 1, 0): "Nm/A|N.m/A|Nm/Arms|Nm/Amp",
@@ -55,6 +56,10 @@ SPELLINGS: dict[tuple[str, float, float], str] = {
     ("N", 1e3, 0): "kN|KN|kn",
     ("W", 1, 0): "W|Watt|Watts|WATT|watts",
     ("W", 735.49875, 0): "PS",
+    ("W", 745.69987, 0): "hp|HP|Hp",
+    ("V*s/rad", 1, 0): "V.s/rad|Vs/rad|V/(rad/s)",
+    ("V*s/rad", 9.5492966e-3, 0): "V/krpm|V/kRPM|mV/rpm",
+    ("H", 1e-3, 0): "mH|mHenry",
     ("Pa", 133.322368, 0): "Torr|torr",
     ("W", 1e3, 0): "kW|KW|Kw|kw|kiloWatt",
     ("W*h", 1e3, 0): "kWh|KWh|KWH|kwh",
@@ -77,8 +82,8 @@ SPELLINGS: dict[tuple[str, float, float], str] = {
     ("m", 1e3, 0): "km|Km|KM",
     ("m^3/s", 1 / 60e3, 0): "l/min|L/min|l/Min|lpm|LPM|liters/minute",
     ("m^3/s", 1 / 3600, 0): "m3/h|m³/h|m^3/h|m3/hr",
-    ("kg*m^2", 1, 0): "kgm2|kg*m2|kg m2|kg m^2|kgm^2|kgm²",
-    ("kg*m^2", 1e-4, 0): "kgcm2|kg*cm2|kg cm^2",
+    ("kg*m^2", 1, 0): "kgm2|kg.m2|kg.m^2|kg-m^2|kg*m2|kg m2|kg m^2|kgm^2|kgm²",
+    ("kg*m^2", 1e-4, 0): "kgcm2|kg.cm2|kg*cm2|kg cm^2",
     ("1", 0.01, 0): "%|Percent|percent|PERCENT|pct|Pct|Prozent",
     ("1", 1, 0): "|-|--|1|none|None|n/a|N/A|unitless|Unitless|counts",
 }  # fmt: skip
@@ -117,6 +122,9 @@ def test_spelling_of_a_database_is_understood(written: str, target: str, scale: 
         ("U", "rad"),
         ("bits", "rad"),
         ("rad", "1"),
+        ("dB", "1"),  # logarithmic: no factor converts it
+        ("ton", "kg"),  # metric, short or long
+        ("psig", "Pa"),
     ],
 )  # fmt: skip
 def test_ambiguous_unit_is_refused(written: str, target: str) -> None:

@@ -42,6 +42,10 @@ IDENTIFIERS = re.compile(r"^\s*ID\s*=\s*([0-9A-Fa-f]+)h\s*-\s*([0-9A-Fa-f]+)h", 
 DBC_MESSAGE = re.compile(r"^[ \t]*BO_ .*(?:\r?\n[ \t]*(?:\r?\n[ \t]*)*SG_ .*)*", re.MULTILINE)
 DBC_REFERENCE = re.compile(r"(\b(?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|SIG_GROUP_|BO_TX_BU_)\s+)(\d+)\b")
 DBC_MULTIPLEXED = re.compile(r"^[ \t]*SG_\s+\S+\s+m\d+M?\s*:\s*(\d+)\s*\|\s*(\d+)", re.MULTILINE)
+# Without a receiver or a sender cantools drops the signal, or refuses the file.
+DBC_WITHOUT_NODE = re.compile(
+    r'^([ \t]*(?:SG_ [^"\n]*"[^"\n]*"|BO_[ \t]+\d+[ \t]+\w+[ \t]*:[ \t]*\d+))[ \t]*$', re.MULTILINE
+)
 EXTENDED_FLAG = 1 << 31  # of an identifier in a DBC
 DBC_EXTRA = re.compile(r"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s[^;]*;", re.MULTILINE)
 
@@ -96,7 +100,7 @@ def load_database(path: Path) -> CanDatabase:
     kind = FORMATS.get(path.suffix.lower())
     multiplexed: set[tuple[int, int, int]] = set()
     if is_dbc := kind in (None, "dbc"):
-        text, flagged = _with_extended_flags(text)
+        text, flagged = _with_extended_flags(DBC_WITHOUT_NODE.sub(r"\1 Vector__XXX", text.replace("\r\n", "\n")))
         faults += flagged
         multiplexed = _multiplexed_places(text)
     unread: dict[str, str] = {}
@@ -222,6 +226,8 @@ def _why_unusable(message: Message) -> str:
         return f"it has {message.length} bytes"
     if any(not isinstance(signal.name, str) or signal.start < 0 for signal in message.signals):
         return "one of its signals has no name or no place"
+    if orders := {str(signal.byte_order) for signal in message.signals} - {"little_endian", "big_endian"}:
+        return f"one of its signals has the byte order {min(orders)!r}"
     return ""
 
 

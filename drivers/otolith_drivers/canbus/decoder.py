@@ -39,6 +39,7 @@ from otolith_drivers.canbus.options import (
     RawReader,
     SignalRequest,
     bytes_needed,
+    names_of_no_reading,
     raw_reader,
     request_bits,
     request_from_databases,
@@ -97,11 +98,14 @@ class MessageReader:
         self._lost = 0
         self._counter, self._checksum, self._declared_period = rules.counter, rules.checksum, rules.period
         self._length = max(rules.length, *(message.length for message in messages))
-        self._database_period = max(min(message.cycle_time or 0, MAX_CYCLE_TIME) * 1e-3 for message in messages)
+        cycles = [message.cycle_time for message in messages]  # a database may define it as a text
+        longest = max((ms for ms in cycles if isinstance(ms, int | float)), default=0)
+        self._database_period = 1e-3 * min(longest, MAX_CYCLE_TIME)
         self._rows: list[Row] = []
         self._groups: dict[tuple[object, ...], _MultiplexedGroup] = {}
         self._rejections: defaultdict[str, PassingFault] = defaultdict(PassingFault)  # Frames or values, by their kind
         self._standard = {request.name: request.signal for request in requests if rules.is_j1939}
+        self._named = {request.name: names_of_no_reading(request.signal) for request in requests}
         for request in requests:
             self._length = max(self._length, bytes_needed(request.signal))
             high = min(request.raw_high, highest_reading(request.signal) if rules.is_j1939 else math.inf)
@@ -198,6 +202,8 @@ class MessageReader:
         if name in self._standard and (meaning := fault_of(raw, self._standard[name])):
             self._count_rejection(name, time, f"{name} {meaning} (raw number 0x{int(raw):X})")
             return Sample(name, time, NO_READING)
+        if raw in self._named[name]:
+            why = f"is no reading: its raw number {raw:g} is {self._named[name][int(raw)]!r} in the database"
         self._count_rejection(name, time, f"{name} of {scale * raw + offset:.6g} {unit} {why}")
         return Sample(name, time, NO_READING)
 

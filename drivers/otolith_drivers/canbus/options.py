@@ -10,6 +10,7 @@ import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -28,6 +29,12 @@ CLASSIC_LENGTH, FD_LENGTH = 8, 64  # bytes of a frame
 MAX_VALUE = 1e300  # of a float, raw or scaled; the largest double is 1.8e308
 PLACEHOLDER_SHARE = 0.25  # of the raw numbers, below which a range of [0|1] is a placeholder of the tool
 RANGE_TOLERANCE = 1e-6  # of a bound: 0.1 in a frame of 32-bit floats is above 0.1
+MIN_NUMBER_BITS = 8  # of a signal whose named numbers may stand for no reading; fewer bits are a state
+NO_READING = re.compile(
+    r"(?<![a-z])(?:sna|n/?a|init\w*|no[ _]?data|reserved)(?![a-z])|not[ _]?(?:avail|valid|def)|invalid|unavail|undef"
+    r"|unknown|error|fault|fail|ung[uü]ltig|fehler|nicht[ _]verf",
+    re.IGNORECASE,
+)  # how databases name such a number
 
 FLOAT_CODES = {16: "e", 32: "f", 64: "d"}
 INTEGER_CODES = {8: "b", 16: "h", 32: "i", 64: "q"}
@@ -230,7 +237,7 @@ def request_for(signal: Signal, message: Message, layout: CanSignal, origin: str
     if source.range is not None:
         low, high = _raw_range(*source.range, scale, offset)
     else:
-        low, high = _raw_range(*range_of(layout), *inner)
+        low, high = _without_named_ends(*_raw_range(*range_of(layout), *inner), layout)
     limit = MAX_VALUE / max(1.0, abs(to_target * scale))
     times = "" if source.scale == 1.0 else f" * {source.scale:g}"
     ignored = source.range is None and has_placeholder_range(layout)
@@ -269,6 +276,27 @@ def _raw_range(low: float, high: float, scale: float, offset: float) -> tuple[fl
     first, last = sorted((bound - offset) / scale for bound in (low, high))
     slack = [RANGE_TOLERANCE * abs(bound) if math.isfinite(bound) else 0.0 for bound in (first, last)]
     return first - slack[0], last + slack[1]
+
+
+def names_of_no_reading(layout: CanSignal) -> dict[int, str]:
+    """The raw numbers that the database names as no reading, such as 65535 "SNA"; none of a state of some bits."""
+    if layout.conversion.is_float or layout.length < MIN_NUMBER_BITS:
+        return {}
+    names = {int(raw): str(name) for raw, name in (layout.conversion.choices or {}).items()}
+    named = {raw: name for raw, name in names.items() if NO_READING.search(name)}
+    half, whole = 1 << (layout.length - 1), 1 << layout.length
+    # Of a signed number some databases name the bits: 32768 for the lowest of 16 bits.
+    return {raw - whole if layout.is_signed and raw >= half else raw: name for raw, name in named.items()}
+
+
+def _without_named_ends(low: float, high: float, layout: CanSignal) -> tuple[float, float]:
+    """Raw numbers ``low`` to ``high`` without those at the ends of the number that are named as no reading."""
+    named = names_of_no_reading(layout)
+    first = -(1 << (layout.length - 1)) if layout.is_signed else 0
+    last = first + (1 << layout.length) - 1
+    below = next(number for number in count(first) if number not in named)
+    above = next(number for number in count(last, -1) if number not in named)
+    return (low if below == first else max(low, below)), (high if above == last else min(high, above))
 
 
 def request_bits(signal: Signal) -> SignalRequest:

@@ -47,8 +47,8 @@ class CandumpLines:
             identifier, length, rest = int(match["id"], 16), int(match["length"]), match["rest"]
             is_remote = rest.strip().startswith("remote")
             data = b"" if is_remote else bytes.fromhex("".join(rest.split()[:length]))
-            if len(data) < length and not is_remote:
-                raise ValueError("too few bytes")
+            if len(data) != length and not is_remote:  # too few, or bits (candump -i)
+                raise ValueError("not as many bytes as it says")
             is_long, is_error = len(match["id"]) > STANDARD_DIGITS, bool(identifier & ERROR_FLAG)
             yield can.Message(
                 timestamp=_candump_time(match["time"]),

@@ -46,10 +46,17 @@ HEADER_CELL = re.compile(r"^(.*?)\s*(?:\[(.*)\]|\((.*)\))?$", re.DOTALL)  # name
 TIME_NAME = re.compile(r"(?:t|_?time|time[ _]?stamp|date[ _/]?time|zeit(?:stempel)?)(?:_(s|ms|us))?", re.IGNORECASE)
 DATE = "2026-03-29T01:59:58.25Z"  # an example
 MAX_PREAMBLE = 100  # lines above the header that are no comments; engineering choice: oscilloscopes write some twenty
+MAX_BELOW = 5  # lines below the header among which one may have the units; engineering choice: types, units, comments
 DAY_FIRST = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})")  # no country writes the month first with points
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
 NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$"
 BLANK = r"(?i)^(?:[+-]?nan|n/?a|null|none)?$"
+LAST_SIGNS = {".": r",.*\.\d*$", ",": r"\..*,\d*$"}  # of a cell with both signs
+# A number whose thousands are separated, by {} or a space: three digits alone behind the other sign may be decimals.
+THOUSANDS = (
+    r"^[+-]?\d{{1,3}}(?:(?:{0}\d{{3}})+\.\d+|(?:{0}\d{{3}}){{2,}}"
+    r"|(?:[ '\x{{2019}}\x{{a0}}\x{{202f}}]\d{{3}})+(?:\.\d*)?)$"
+)
 
 
 keep_pandas_out()  # only the reader of MF4 logs needs it, which imports it itself
@@ -105,7 +112,7 @@ class Header:
     columns: dict[str, Column]  # Of the time and of every signal
     ignored: tuple[str, ...]  # Names of the columns that no signal uses
     segment: int | None = None  # Position of the column of segments in a row, from 0
-    below: str = ""  # The line below it, which was read, if that is a row
+    below: str = ""  # The lines below it that were read and may be rows
 
 
 @dataclass(slots=True)
@@ -260,24 +267,33 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
     """
     wanted = {TIME: ColumnRequest(TIME, SECONDS), **wanted}
     number, separator, faults = 0, "", list[tuple[int, ConfigurationError]]()
+    above, commented, rows = list[str](), "", list[str]()
     while len(faults) < MAX_PREAMBLE and (line := file.readline(MAX_LINE + 1)):
         number += 1
         _check_length(f"{path}:{number}", len(line))
+        is_comment = line.lstrip().startswith("#")
         if excel := EXCEL_SEPARATOR.fullmatch(line.strip()):
             separator = excel[1]
-        elif line.strip() and not line.lstrip().startswith("#"):
-            sign = separator or next((sign for sign in SEPARATORS if sign in line), ",")
-            cells = _split_quoted(line, sign)
-            try:
-                places, others = _places(f"{path}:{number}", cells, wanted)
-                break
-            except ConfigurationError as error:
-                faults.append((sum(not _is_number(cell) for cell in cells if cell), error))
+        if excel or not line.strip(" #\r\n"):
+            continue
+        sign = separator or next((sign for sign in SEPARATORS if sign in line), ",")
+        cells = _split_quoted(line, sign)
+        if commented and all(_is_number(cell) for cell in cells if cell):  # numpy writes names as a comment
+            number, rows, cells = number - 1, [line], _split_quoted(commented, sign)
+        elif is_comment:
+            commented = line.lstrip("# ")
+            continue
+        try:
+            places, others = _places(f"{path}:{number}", cells, wanted)
+            break
+        except ConfigurationError as error:
+            faults.append((sum(not _is_number(cell) for cell in cells if cell), error))
+            above = cells
     else:
         empty = ConfigurationError(f"{path}: is empty, or has only comments: a header line is needed")
         raise max(faults, key=lambda fault: fault[0], default=(0, empty))[1]
-    below = file.readline(MAX_LINE + 1)
-    units = _units_below(_split_quoted(below, sign), wanted, places)
+    rows += [line for _ in range(MAX_BELOW - len(rows)) if (line := file.readline(MAX_LINE + 1))]
+    units, skipped = _units_beside(above, [_split_quoted(row, sign) for row in rows], wanted, places)
     columns: dict[str, Column] = {}
     for signal, request in wanted.items():
         index, written = places[request.column]
@@ -289,8 +305,8 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
     named = max(index for index, cell in enumerate(cells) if cell) + 1
     is_wanted = SEGMENT in {request.column for request in wanted.values()}
     segment = None if is_wanted or SEGMENT not in places else places[SEGMENT][0]
-    widths, below = (named, len(cells)), "" if units else below
-    return Header(number + bool(units), sign, widths, columns, others, segment, below)
+    widths, below = (named, len(cells)), "".join(rows[skipped:])
+    return Header(number + skipped, sign, widths, columns, others, segment, below)
 
 
 def _places(
@@ -339,21 +355,35 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
     return name, unit or in_parentheses or None
 
 
-def _units_below(cells: list[str], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]) -> dict[int, str]:
-    """The units in the line below the header, by the position of their columns; empty if that is a row."""
+def _units_beside(
+    above: list[str], below: list[list[str]], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]
+) -> tuple[dict[int, str], int]:
+    """The units in a line below the header or above it, by the position of their columns; how many are no rows."""
+    for number, cells in enumerate(below, 1):
+        if units := _units_in(cells, wanted, places):
+            return units, number
+        if any(_is_number(cells[index]) for index, _ in places.values() if index < len(cells)):
+            break
+    units = _units_in(above, wanted, places)
+    return (units if all(map(is_unit, units.values())) else {}), 0
+
+
+def _units_in(cells: list[str], wanted: Mapping[str, ColumnRequest], places: Mapping[str, Place]) -> dict[int, str]:
+    """The units in a line, by the position of their columns; empty if it seems to have none."""
     texts, fitting = dict[int, str](), 0
     for request in wanted.values():
         index = places[request.column][0]
         text = cells[index].strip("[]()") if index < len(cells) else ""
-        if re.match(BLANK, text):
-            continue
-        if _is_number(text) or not is_unit(text):
+        if _is_number(text):
             return {}
+        if re.match(BLANK, text) or (request.column == TIME and not is_unit(text)):
+            continue
         texts[index] = text
         with contextlib.suppress(ValueError):
             factor(text, request.unit)
             fitting += 1
-    return texts if 2 * fitting >= len(texts) else {}  # single letters are units of something
+    is_sure = 2 * fitting > len(texts)  # single letters are units of something
+    return texts if is_sure or (2 * fitting == len(texts) and all(map(is_unit, texts.values()))) else {}
 
 
 def _missing(request: ColumnRequest, others: list[str], cells: list[str]) -> str:
@@ -451,6 +481,8 @@ class _TableChunk:
             if not np.isnan(times[first]):
                 cell = texts[int(first)].as_py()
                 cause = f"t is {cell!r}: write seconds, relative or Unix, a date like {DATE}, or the unit: 't [ms]'"
+                if (other := _other_sign(cell, self._counts.decimal)) and np.isinf(times[first]):
+                    cause = f"t is {cell!r}{other}"
             self._count_rows(lines[wrong], cause)
         return timed
 
@@ -468,7 +500,9 @@ class _TableChunk:
             values[wrong] = np.nan
             self._bad[lines[wrong]] += 1
             self._counts.bad_cells += len(wrong)
-            self._note(int(lines[wrong[0]]), f"{name} is {texts[int(wrong[0])].as_py()!r}, no number")
+            cell = texts[int(wrong[0])].as_py()
+            other = _other_sign(cell, self._counts.decimal)
+            self._note(int(lines[wrong[0]]), f"{name} is {cell!r}{other or ', no number'}")
 
     def _note(self, index: int, cause: str) -> None:
         line = self._first + index
@@ -484,26 +518,41 @@ def _has_text(cells: pa.ListArray) -> Mask:
 
 
 def _decimal_sign(texts: list[pa.StringArray]) -> str:
-    """The decimal sign that most of the cells use; empty if none uses any."""
+    """The decimal sign that most of the cells use; empty if none uses any. Of two signs in a cell it is the last."""
     points, commas = (sum(pc.sum(pc.count_substring(text, sign)).as_py() or 0 for text in texts) for sign in ".,")
+    if points and commas:
+        last = {sign: sum(_count(text, pattern) for text in texts) for sign, pattern in LAST_SIGNS.items()}
+        points, commas = (last["."], last[","]) if any(last.values()) else (points, commas)
     return "" if points == commas == 0 else "," if commas > points else "."
+
+
+def _count(texts: pa.StringArray, pattern: str) -> int:
+    return pc.sum(pc.match_substring_regex(texts, pattern)).as_py() or 0
 
 
 def _numbers(texts: pa.StringArray, decimal: str) -> Array:
     """The numbers of a column: NaN for a blank cell, infinity for one that is no number.
 
-    A cell with the other decimal sign is no number: the sign may separate thousands.
+    A cell with the other decimal sign is no number, unless that clearly separates thousands.
     """
     texts = pc.utf8_trim_whitespace(texts)
     if decimal == ",":
-        texts = pc.replace_substring(pc.replace_substring(texts, ".", "?"), ",", ".")
+        texts = pc.replace_substring(pc.replace_substring(texts, ".", "\x1f"), ",", ".")
     try:
         numbers = texts.cast(pa.float64())
     except pa.ArrowInvalid:
+        texts = pc.replace_substring(texts, "\u2212", "-")  # the minus of typesetters
+        grouped = pc.match_substring_regex(texts, THOUSANDS.format(r"\x1f" if decimal == "," else ","))
+        texts = pc.if_else(grouped, pc.replace_substring_regex(texts, r"[^\d.+-]", ""), texts)
         known = pc.if_else(pc.match_substring_regex(texts, BLANK), "nan", "inf")
         numbers = pc.if_else(pc.match_substring_regex(texts, NUMBER), texts, known).cast(pa.float64())
     array: Array = numbers.to_numpy()
     return array
+
+
+def _other_sign(text: str, decimal: str) -> str:
+    """A clause for a cell that is a number but for its decimal sign."""
+    return f", but {decimal!r} is the decimal sign of other cells" if decimal and _is_number(text) else ""
 
 
 def _date(text: str) -> float:

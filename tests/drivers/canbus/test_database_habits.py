@@ -47,6 +47,13 @@ def test_a_cycle_time_that_is_none_does_no_harm(tmp_path: Path) -> None:
     assert values(frame_decoder.decode(frame(258, bytes([0, 1, 2, 3, 0, 0, 0, 0])), 0.0)) == {"U": 3.0}
 
 
+def test_a_cycle_time_that_is_a_text_does_no_harm(tmp_path: Path) -> None:
+    cycle = 'BA_DEF_ BO_ "GenMsgCycleTime" STRING ;\nBA_DEF_DEF_ "GenMsgCycleTime" "";\n'
+    text = dbc(NESTED, after=f'{cycle}BA_ "GenMsgCycleTime" BO_ 258 "100";')
+    frame_decoder = decoder(tmp_path, PLAIN, text)
+    assert values(frame_decoder.decode(frame(258, bytes([0, 1, 2, 3, 0, 0, 0, 0])), 0.0)) == {"U": 3.0}
+
+
 def test_a_message_of_a_negative_length_does_not_affect_others(tmp_path: Path) -> None:
     frame_decoder = decoder(tmp_path, PLAIN, dbc(NESTED, 'BO_ 400 Other: -1 Drive\n SG_ A : 0|8@1+ (1,0) [0|0] "V" X'))
     assert any("message Other cannot be used: it has -1 bytes" in line for line in frame_decoder.describe())
@@ -119,3 +126,57 @@ def test_number_that_is_not_finite_is_named(tmp_path: Path) -> None:
     frame_decoder.decode(frame(385, bytes.fromhex("0000c07f") + bytes(4)), 0.0)
     (line,) = frame_decoder.warnings(0.1)
     assert "U of nan V is no number" in line
+
+
+@pytest.mark.parametrize(
+    ("bits", "table", "readings", "none"),
+    [
+        ("0|16@1+", '65535 "SNA" 65534 "Error" 0 "Standstill"', [0, 1, 65533], [65534, 65535]),
+        ("0|16@1-", '-32768 "Signal not available"', [-32767, 32767], [-32768]),
+        ("0|16@1-", '32768 "SNA"', [-32767, 32767], [-32768]),  # the bits of the lowest number
+        ("0|8@1+", '0 "Sensor error" 255 "Not available"', [1, 254], [0, 255]),
+        ("0|16@1+", '65535 "Maximum" 0 "Nabla" 32000 "Invalid"', [0, 32000, 65535], []),  # it may be passed
+        ("0|4@1+", '15 "SNA" 14 "Error"', [14, 15], []),  # a state
+    ],
+)
+def test_a_number_that_the_database_names_as_none_is_no_reading(
+    tmp_path: Path, bits: str, table: str, readings: list[int], none: list[int]
+) -> None:
+    text = dbc(f'BO_ 385 Motor: 8 Drive\n SG_ U : {bits} (0.1,0) [0|0] "V" X', after=f"VAL_ 385 U {table} ;")
+    plain = decoder(tmp_path, {"U": ("V", {"signal": "U"})}, text)
+    stated = decoder(tmp_path, {"U": ("V", {"signal": "U", "range": [-1e9, 1e9]})}, text)
+    for number in readings + none:
+        data = (number % 65536).to_bytes(2, "little") + bytes(6)
+        (sample,) = plain.decode(frame(385, data), 0.0)
+        assert sample.value == pytest.approx(float("nan") if number in none else 0.1 * number, nan_ok=True)
+        assert values(stated.decode(frame(385, data), 0.0)) == {"U": pytest.approx(0.1 * number)}
+    assert plain.counters.bad == len(none)
+    if none:
+        (line,) = plain.warnings(0.0)
+        assert f"U of {0.1 * none[-1]:g} V is no reading: its raw number {none[-1]} is '" in line
+
+
+def test_a_signal_without_receivers_and_a_message_without_a_sender_are_read(tmp_path: Path) -> None:
+    """The library drops the one without a word, and refuses the other."""
+    text = dbc('BO_ 385 Motor: 8\n SG_ U : 0|16@1- (0.1,0) [0|0] "V"\n SG_ I : 16|16@1- (0.1,0) [0|0] "A"  ')
+    for written in (text, text.replace("\n", "\r\n")):
+        signals = {"U": ("V", {"signal": "U"}), "I": ("A", {"signal": "I"})}
+        frame_decoder = decoder(tmp_path, signals, written)
+        assert frame_decoder.configuration_warnings == ()
+        samples = frame_decoder.decode(frame(385, bytes([10, 0, 20, 0, 0, 0, 0, 0])), 0.0)
+        assert values(samples) == pytest.approx({"U": 1.0, "I": 2.0})
+
+
+def test_an_unknown_byte_order_is_refused(tmp_path: Path) -> None:
+    """The library takes it over, and decodes it as the other one."""
+    path = tmp_path / "drive.kcd"
+    value = '<Value type="unsigned" unit="V"/>'
+    signal = f'<Signal name="U" offset="0" length="8" endianess="{{}}">{value}</Signal>'
+    text = (
+        '<NetworkDefinition xmlns="http://kayak.2codeornot2code.org/1.0"><Document/><Bus name="b">'
+        f'<Message id="0x181" name="M" length="8">{signal}</Message></Bus></NetworkDefinition>'
+    )
+    path.write_text(text.format("little"), encoding="utf-8")
+    assert load_database(path).unread == {}
+    path.write_text(text.format("lite"), encoding="utf-8")
+    assert load_database(path).unread == {"M": "one of its signals has the byte order 'lite_endian'"}

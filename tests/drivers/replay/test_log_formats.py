@@ -152,6 +152,7 @@ def test_samples_equal_live_samples(tmp_path: Path, frames: Frames, kind: str) -
     [
         ("candump -ta", " (1700000001.5)  can0  181   [8]  01 02"),
         ("candump -ta", " (never)  can0  181   [8]  01 02 03 04 05 06 07 08"),
+        ("candump -ta", f" (1700000001.5)  can0  181   [8]  {'00000001 ' * 8}"),  # candump -i: bits instead of bytes
         ("SavvyCAN", "1700000001500000,00000181,false,Rx,0,8,01,02"),
         ("SavvyCAN", "soon,00000181,false,Rx,0,1,01"),
         ("python-can", "1700000001.5,0x181,0,0,0,8"),

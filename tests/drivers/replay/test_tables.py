@@ -157,6 +157,86 @@ def test_the_line_below_the_header_is_a_row_or_an_error_if_it_has_no_units(tmp_p
         assert numbers(rows, "i")[-1] == 5.0
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        "time,i,omega\nfloat,float,float\nms,mA,rpm",
+        "time,i,omega\n\n# units\nms,mA,rpm",
+        "time,i,omega\n,,\nms,mA,rpm\n",
+        "ms,mA,rpm\ntime,i,omega",
+        "names\nms,mA,rpm\ntime,i,omega",
+    ],
+)
+def test_units_may_be_in_another_line_beside_the_header(tmp_path: Path, header: str) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(f"{header}\n0,1500,60\n10,2500,120\n", encoding="utf-8")
+    with TableReader(path, {"i": "A", "omega": "rad/s"}) as reader:
+        rows = list(reader.chunks())
+    assert reader.warnings() == []
+    assert times(rows) == [0.0, 0.01]
+    assert lines(rows)[-1] == header.count("\n") + 3
+    assert numbers(rows, "i") == pytest.approx([1.5, 2.5])
+    assert numbers(rows, "omega") == pytest.approx([2.0 * np.pi, 4.0 * np.pi])
+
+
+def test_a_word_for_the_unit_of_the_time_leaves_the_other_units(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("t,x\nTime,%\n1,50\n", encoding="utf-8")
+    assert numbers(read(path)[0]) == [0.5]
+
+
+def test_a_unit_that_is_not_known_is_refused_where_the_others_are_units(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("t,i,omega,x\ns,mA,rpm,Frobs\n0,1500,60,1\n", encoding="utf-8")
+    units = {"i": "A", "omega": "rad/s", "x": "V"}
+    with pytest.raises(ConfigurationError, match=r"table.csv:1: column 4 \('x'\): 'Frobs' is not a unit"):
+        TableReader(path, units)
+    with TableReader(path, units, {"x": TableSource(unit="V")}) as reader:
+        assert numbers(list(reader.chunks())) == [1.0]
+
+
+def test_names_in_a_comment_are_the_header_if_numbers_follow(tmp_path: Path) -> None:
+    """As numpy.savetxt writes them."""
+    path = tmp_path / "table.csv"
+    path.write_text("# made by hand\n# t [ms],x\n10,1\n20,2\n", encoding="utf-8")
+    rows, reader = read(path)
+    assert (times(rows), numbers(rows), lines(rows)) == ([0.01, 0.02], [1.0, 2.0], [3, 4])
+    assert reader.warnings() == []
+    path.write_text("# t [ms],x\nt,x\n10,1\n", encoding="utf-8")
+    assert times(read(path)[0]) == [10.0]
+
+
+@pytest.mark.parametrize(
+    ("separator", "cells", "expected"),
+    [
+        (";", ["1.001,5", "-12.345.678,25", "999,5"], [1001.5, -12345678.25, 999.5]),
+        (";", ["1,001.5", "1,234,567.25", "999.5"], [1001.5, 1234567.25, 999.5]),
+        (",", ['"1,001.5"', '"1,234,567"', '"999.5"'], [1001.5, 1234567.0, 999.5]),
+        (";", ["1 001,5", "12\u00a0345\u202f678,25", "\u2212999,5"], [1001.5, 12345678.25, -999.5]),
+        (";", ["1'001.5", "12\u2019345\u2019678.25", "0.5"], [1001.5, 12345678.25, 0.5]),
+        (";", ["1.001", "0,5", "1?001,5"], [np.nan, 0.5, np.nan]),
+        (";", ["1,001", "0.5", "12,34.5"], [np.nan, 0.5, np.nan]),
+    ],
+)
+def test_thousands_may_be_separated(tmp_path: Path, separator: str, cells: list[str], expected: list[float]) -> None:
+    """Three digits alone behind the other decimal sign are no number: they may be decimals."""
+    path = tmp_path / "table.csv"
+    rows = [f"{index}{separator}{cell}" for index, cell in enumerate(cells)]
+    path.write_text("\n".join([f"t{separator}x", *rows]) + "\n", encoding="utf-8")
+    read_rows, reader = read(path)
+    assert numbers(read_rows) == pytest.approx(expected, nan_ok=True)
+    assert reader.bad == np.count_nonzero(np.isnan(expected))
+
+
+def test_the_decimal_sign_is_named_where_a_cell_has_the_other(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("t;x\n0.0;1,5\n0.1;1,6\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"csv:2: t is '0.0', but ',' is the decimal sign of other cells"):
+        read(path)
+    path.write_text("t;x\n0;1,5\n1;1,6\n2;1.6\n", encoding="utf-8")
+    assert "line 4: x is '1.6', but ',' is the decimal sign of other cells" in read(path)[1].warnings()[0]
+
+
 def test_a_header_may_have_units_in_parentheses_and_names_with_them(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text(
