@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from otolith.cli.common import shipped_directory
 from otolith.cli.main import cli
 from otolith.cli.operation.install import UNIT, drop_in, named_files
+from otolith_drivers.canbus import bus as can_bus
 from otolith_drivers.errors import ConfigurationError
 from tests.conftest import EXAMPLES
 
@@ -74,22 +75,39 @@ def test_a_file_that_another_machine_names_is_not_replaced_silently(file: Path, 
         ('type = "modbus"\nhost = "192.168.0.10"', 1.0),
         ('type = "modbus"\nserial = "/dev/ttyUSB0"', 0.7),
         ('type = "plant"\nscenario = "plant.toml"', 0.6),
-        ('type = "modbus"\nhost = "drive.plant.local"', 1.2),  # its address is not known: none is denied
+        ('type = "modbus"\nhost = "drive.plant.local"', 1.1),  # its address is not known: none is denied
+        ('type = "can"\ninterface = "pcan"', 1.3),  # its library may open any socket
     ],
 )
 def test_the_shipped_unit_is_hardened(file: Path, tmp_path: Path, driver: str, limit: float) -> None:
     """Exposure by systemd's own measure, with the drop-in of the machine."""
-    if shutil.which("systemd-analyze") is None:
-        pytest.skip("no systemd-analyze here")
     installed(file, tmp_path)
     folder = tmp_path / "etc/systemd/system/otolith@press-3.service.d"
     text = drop_in("press-3", [tomllib.loads(driver)], ("local",), ())
     (folder / "machine.conf").write_text(text, encoding="utf-8")
-    command = ["systemd-analyze", "security", "--offline=yes", f"--root={tmp_path}", "otolith@press-3.service"]
+    assert exposure(tmp_path, "press-3") <= limit
+
+
+@pytest.mark.parametrize("bus", [True, False], ids=["vcan0", "no vcan0"])
+@pytest.mark.parametrize("name", sorted(path.stem for path in EXAMPLES.glob("*.toml")))
+def test_each_shipped_machine_file_is_exposed_at_most_1_0(
+    tmp_path: Path, name: str, bus: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(can_bus, "kernel_has", lambda channel: bus)
+    installed(EXAMPLES / f"{name}.toml", tmp_path)
+    limit = 1.2 if name == "dc-motor-two-buses" and bus else 1.0  # CAN of the kernel and Modbus over IP
+    assert exposure(tmp_path, name) <= limit
+
+
+def exposure(root: Path, name: str) -> float:
+    """Exposure of the installed instance ``name``, from 0 to 10."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze here")
+    command = ["systemd-analyze", "security", "--offline=yes", f"--root={root}", f"otolith@{name}.service"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    exposure = re.search(r"exposure level for \S+: ([\d.]+)", done.stdout)
-    assert exposure is not None, done.stderr
-    assert float(exposure[1]) <= limit
+    found = re.search(r"exposure level for \S+: ([\d.]+)", done.stdout)
+    assert found is not None, done.stderr
+    return float(found[1])
 
 
 def test_a_wrong_machine_file_installs_nothing(file: Path, tmp_path: Path) -> None:
@@ -127,7 +145,8 @@ def test_the_drop_in_allows_what_the_file_names() -> None:
     assert "PrivateDevices" not in drive
     assert [line for line in drive.splitlines() if "IPAddressAllow" in line] == [
         "IPAddressAllow=localhost", "IPAddressAllow=fd00::1", "IPAddressAllow=192.168.0.10"]  # fmt: skip
-    assert "IPAddressAllow=multicast" in drop_in("press", [{"type": "can"}], LOOPBACK, ())
+    missing = {"type": "can", "channel": "vcan99"}
+    assert "IPAddressAllow=multicast" in drop_in("press", [missing], LOOPBACK, ())
     assert "multicast" not in drop_in("press", [{"type": "can", "channel": "can0"}], LOOPBACK, ())
     adapter = drop_in("press", [{"type": "can", "interface": "slcan", "channel": "/dev/ttyACM0@115200"}], LOOPBACK, ())
     assert "DeviceAllow=/dev/ttyACM0 rw" in adapter
@@ -140,7 +159,7 @@ def test_the_drop_in_allows_what_the_file_names() -> None:
         ({"type": "modbus", "serial": "/dev/ttyUSB0"}, ("local",), "AF_UNIX"),
         ({"type": "can", "interface": "slcan", "channel": "/dev/ttyACM0"}, ("local",), "AF_UNIX"),
         ({"type": "can", "channel": "can0"}, ("local",), "AF_UNIX AF_CAN"),
-        ({"type": "can"}, ("local",), "AF_UNIX AF_CAN AF_INET AF_INET6"),  # without vcan0 it is UDP multicast
+        ({"type": "can", "channel": "vcan99"}, ("local",), "AF_UNIX AF_INET AF_INET6"),  # UDP multicast instead
         ({"type": "can", "channel": "can0"}, LOOPBACK, "AF_UNIX AF_CAN AF_INET AF_INET6"),
         ({"type": "modbus", "host": "192.168.0.10"}, ("local",), "AF_UNIX AF_INET AF_INET6"),
         ({"type": "opcua", "endpoint": "opc.tcp://10.0.0.7:4840"}, ("local",), "AF_UNIX AF_INET AF_INET6"),

@@ -18,7 +18,7 @@ begun=$SECONDS
 PYTHON=$python tests/vm/image.sh >/dev/null
 echo "guest ready after $((SECONDS - begun)) s"
 begun=$SECONDS code=0
-"$python" -m pytest -v -s tests/vm/test_modbus.py || code=1
+"$python" -m pytest -v -s tests/vm/test_modbus.py tests/vm/test_month.py || code=1
 mkdir -p "$share"
 rm -f "$share"/*.whl
 "$python" -m pip --disable-pip-version-check wheel --quiet --no-deps --wheel-dir "$share" .
@@ -28,8 +28,8 @@ work=$(mktemp -d)
 trap 'rm -rf --one-file-system "$work"' EXIT
 export SHARE=$share DISK=$work/disk
 boot() { tests/vm/run.sh "$@" || code=1; }
-SECONDS_AT_MOST=1800 boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py tests/vm/test_life.py \
-  tests/vm/test_troubles.py tests/vm/test_boots.py::test_before_a_reboot
+SECONDS_AT_MOST=1800 boot tests/vm/in_guest.sh tests/vm/test_can.py tests/vm/test_unit.py \
+  tests/vm/test_network.py tests/vm/test_life.py tests/vm/test_troubles.py tests/vm/test_boots.py::test_before_a_reboot
 boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_reboot '&&' python -m tests.vm.cut_power
 boot tests/vm/in_guest.sh tests/vm/test_boots.py::test_after_a_power_cut
 echo "system tests took $((SECONDS - begun)) s"

@@ -19,7 +19,7 @@ import pytest
 from otolith.acquisition.window import Verdict
 from otolith.health.schema import CountersDocument, ParameterDocument, ReportDocument, Status
 from otolith.publishing.subscriber import Subscriber
-from otolith.publishing.zenoh_config import Connection
+from otolith.publishing.zenoh_config import Connection, Credentials
 from tests.conftest import EXAMPLES, free_port
 
 if TYPE_CHECKING:
@@ -125,12 +125,12 @@ class Program:
 class ReportListener:
     """Receives the reports of a daemon over Zenoh."""
 
-    def __init__(self, endpoint: str, alive: Callable[[], str]) -> None:
+    def __init__(self, endpoint: str, alive: Callable[[], str], credentials: Credentials | None = None) -> None:
         """``alive`` returns why the daemon ended; empty while it runs."""
         self.reports: Reports = []
         self._alive = alive
         self._received: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._subscriber = Subscriber(Connection((endpoint,)), self._received.put)
+        self._subscriber = Subscriber(Connection((endpoint,), credentials or Credentials()), self._received.put)
 
     def wait_for(self, enough: Callable[[Reports], bool], seconds: float = PATIENCE) -> Reports:
         """The reports, once there are enough of them."""

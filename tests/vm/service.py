@@ -158,12 +158,12 @@ def holds_truth(report: ReportDocument) -> None:
         assert abs(found.value - TRUTH[name]) <= found.high - found.low
 
 
-def simulated_machine(folder: Path, extra: str = "") -> Path:
+def simulated_machine(folder: Path, extra: str = "", name: str = "press") -> Path:
     """A machine file for a motor that the daemon simulates."""
     text = (EXAMPLES / "dc-motor-in-process.toml").read_text(encoding="utf-8")
     text = text.replace('scenario = "scenarios/demo.toml"', 'scenario = "press-plant.toml"')
     (folder / "press-plant.toml").write_text(PLANT, encoding="utf-8")
-    file = folder / "press.toml"
+    file = folder / f"{name}.toml"
     file.write_text(f"{text}\n{WINDOW}{extra}", encoding="utf-8")
     return file
 

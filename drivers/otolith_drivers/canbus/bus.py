@@ -50,7 +50,8 @@ FILTERING = {"socketcan"}  # Interfaces that get filters: elsewhere they save no
 STAMPED_BY_KERNEL = {"socketcan", "udp_multicast"}  # Interfaces whose frames have the kernel's times
 WAYS_OUT = {
     "socketcan": "'ip -brief link show type can' lists what there is; set driver.channel or bring the interface up",
-    "udp_multicast": "it needs a multicast route: 'ip route add 239.0.0.0/8 dev lo' as root makes one",
+    "udp_multicast": "it needs a multicast route: 'ip route add 239.0.0.0/8 dev lo' as root makes one. A service"
+    " that was installed beside a bus of the kernel waits for that one, until 'otolith install' is repeated",
 }
 
 

@@ -140,7 +140,7 @@ def drop_in(
     hosts = [host for endpoint in connect if (host := host_of(endpoint))]
     hosts += [host for driver in drivers for host in _hosts_of(driver)]
     published = [host for endpoint in listen if (host := host_of(endpoint))]
-    buses = [bus for driver in drivers if driver.get("type") == "can" for bus in _can_buses(driver)]
+    buses = [_can_bus(driver) for driver in drivers if driver.get("type") == "can"]
     foreign = [f"driver {driver.get('type')!r}" for driver in drivers if driver.get("type") not in KNOWN_DRIVERS]
     foreign += [f"CAN interface {bus!r}" for bus in buses if bus not in KNOWN_BUSES]
     if not foreign:
@@ -153,17 +153,20 @@ def drop_in(
     unknown = [host for host in hosts if local[host] is None] + [host for host in published if not local[host]]
     if unknown or foreign:
         names = ", ".join(dict.fromkeys([*unknown, *foreign]))
-        return "\n".join([*lines, f"# No IPAddressDeny: the addresses that {names} stands for are not known.", ""])
+        lines += [f"# No IPAddressDeny: the addresses that {names} stands for are not known."]
+        lines += ["# Its devices are hidden: 'Run Otolith as a service' shows how to allow them."] if foreign else []
+        return "\n".join([*lines, ""])
     multicast = ["multicast"] if "udp_multicast" in buses else []
     allowed = dict.fromkeys(["localhost", *multicast, *hosts])
     return "\n".join([*lines, "IPAddressDeny=any", *(f"IPAddressAllow={host}" for host in allowed), ""])
 
 
-def _can_buses(driver: Table) -> Sequence[str]:
-    """Return the interfaces of python-can that a table ``[driver]`` may use."""
-    is_virtual = str(driver.get("channel", "vcan")).startswith("vcan")
-    automatic = ("socketcan", "udp_multicast") if is_virtual else ("socketcan",)
-    return automatic if driver.get("interface", "auto") == "auto" else (str(driver["interface"]),)
+def _can_bus(driver: Table) -> str:
+    """Return the interface of python-can that a table ``[driver]`` uses on this computer."""
+    from otolith_drivers.canbus.bus import BusOptions
+
+    given = {key: driver[key] for key in ("interface", "channel") if key in driver}
+    return BusOptions.model_validate(given).resolved()[0]
 
 
 def _hosts_of(driver: Table) -> Iterator[str]:
