@@ -1,5 +1,7 @@
 """The rules of the diagnosis: one contract over each row, and classes where the data do not distinguish."""
 
+from typing import Any
+
 import pytest
 
 from otolith.health.diagnosis import KEYS, FindingFeatures, FindingKind, Rule, diagnose, matching, severity
@@ -14,7 +16,7 @@ SITES = {site.name for twin in TWINS.values() for site in twin.sites}
 
 def example(rule: Rule) -> FindingFeatures:
     """Return a finding that the row must match, and no row that rests on more evidence."""
-    first = {key: next(iter(getattr(rule, key)), "") for key in KEYS}
+    first: dict[str, Any] = {key: next(iter(getattr(rule, key)), "") for key in KEYS}
     return FindingFeatures(rule.finding, **first, order=None if rule.order is None else sum(rule.order) / 2.0)
 
 
@@ -92,6 +94,17 @@ def test_every_parameter_with_limits_and_every_site_belongs_to_a_part(name: str)
 )
 def test_the_faults_of_the_paper_have_their_condition(features: FindingFeatures, condition: str) -> None:
     assert diagnose(RULES, features)["condition"] == condition
+
+
+@pytest.mark.parametrize(("order", "is_unbalance"), [(0.93, False), (0.93, True), (1.0, True)])
+def test_an_uncertain_order_leaves_the_condition_that_its_interval_holds(order: float, is_unbalance: bool) -> None:
+    """As after hours at rest, when the order has become uncertain."""
+    reach = 0.05 if is_unbalance else 0.001
+    features = FindingFeatures(
+        FindingKind.COMPONENT, "dc_motor", "shaft", family="periodic", input="angle", order=order, order_reach=reach
+    )
+    condition = diagnose(RULES, features)["condition"]
+    assert (condition == "unbalanced shaft") == is_unbalance
 
 
 def test_conditions_that_the_data_do_not_distinguish_are_one_class() -> None:

@@ -327,7 +327,12 @@ def _explanations(test: SequentialTest | None) -> tuple[AlternativeDocument, ...
 
 def _hypotheses_text(test: SequentialTest) -> str:
     """Return the most probable hypotheses in words; without probabilities if none explains the window."""
-    stated = [f"{item.text} ({_share(item.probability)})" for item in _explanations(test)[:3]]
+    items = _explanations(test)[:3]
+    stated = [
+        f"{'' if before is not None and before.reason == item.reason else f'{item.reason}: '}{item.text} "
+        f"({_share(item.probability)})"
+        for before, item in zip((None, *items), items, strict=False)
+    ]
     return "; or ".join(stated) or NEAREST.format(hypothesis=describe_hypothesis(test.best), factor=test.best.cost)
 
 
@@ -390,7 +395,7 @@ def _noise_finding(problem: Problem, since: float) -> FindingDocument:
 def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: str) -> FindingDocument:
     """Return the finding of a test that is still open after ``decision``."""
     kind, subject = _kind_and_subject(decision, test)
-    stated = f"{test.best.type}: " if test.explains else ""
+    text = _hypotheses_text(test)
     condition = AMBIGUOUS_CONDITION if decision is WindowDecision.AMBIGUOUS else OPEN_CONDITION
     return FindingDocument(
         id=f"{kind}/{subject}" if subject else "undecided",
@@ -398,7 +403,7 @@ def _open_finding(test: SequentialTest, decision: WindowDecision, experiment: st
         subject=subject,
         severity=Severity.FAULT if decision in DATA_FAULTS else Severity.WARNING,
         condition=condition if test.explains else NOT_EXPLAINED,
-        text=stated + _hypotheses_text(test),
+        text=text.removeprefix(f"{test.best.type}: ") if decision in DATA_FAULTS else text,
         since=test.onset,
         advice="; ".join(filter(None, (experiment, _machine_file_advice(test)))),
         value=_moved_value(test, subject) if kind is FindingKind.MOVED else None,

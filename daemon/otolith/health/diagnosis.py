@@ -30,6 +30,7 @@ class FindingKind(StrEnum):
     CLASS = "class"  # Several hypotheses explain the windows equally well
     OPEN = "open"  # Hypotheses are being compared
     MOVED = "moved"  # A parameter that the machine file gives as known is another
+    RETURNS = "returns"  # Something changes again and again, and is never there for long
     UNEXPLAINED = "unexplained"
     NO_DATA = "no data"
     NO_TEMPERATURE = "no temperature"  # The temperature on which a parameter depends is not measured at present
@@ -48,6 +49,7 @@ class FindingFeatures:
     family: str = ""
     input: str = ""  # t, angle, or another signal or state
     order: float | None = None  # Of a component that is periodic in an angle
+    order_reach: float = 0.0  # Half of its 95 % interval
 
 
 class Rule(StrictModel):
@@ -77,7 +79,8 @@ class Rule(StrictModel):
         """Whether the row applies."""
         agree = all(not (own := getattr(self, key)) or getattr(features, key) in own for key in KEYS)
         low, high = self.order or (0.0, 0.0)
-        in_order = self.order is None or (features.order is not None and low <= features.order <= high)
+        reach, order = features.order_reach, features.order
+        in_order = self.order is None or (order is not None and low - reach <= order <= high + reach)
         is_moved = features.finding is FindingKind.MOVED and self.finding is FindingKind.LIMIT and bool(self.subject)
         return (self.finding is features.finding or is_moved) and agree and in_order
 

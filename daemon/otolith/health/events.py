@@ -13,7 +13,18 @@ from otolith.discovery.decision import ACCEPTED, WindowDecision
 from otolith.estimation.information import QUANTILE
 from otolith.health.diagnosis import FindingKind, diagnose
 from otolith.health.limits import MACHINE, Level, MonitoredQuantity, MonitoringPlan
-from otolith.health.observations import BUS, SENSORS, UNDECIDED, Observation, Past, Persistence, is_determined, observe
+from otolith.health.observations import (
+    BUS,
+    PERSISTENT_WINDOWS,
+    RELEASE_WINDOWS,
+    SENSORS,
+    UNDECIDED,
+    Observation,
+    Past,
+    Persistence,
+    is_determined,
+    observe,
+)
 from otolith.health.prognosis import History, forecast, is_due, span, with_point
 from otolith.health.schema import (
     EventChange,
@@ -27,6 +38,7 @@ from otolith.health.schema import (
     WindowDocument,
 )
 
+RETURN_WINDOWS = 60  # after the end of an event within which it may return as one that comes and goes
 DECIDED = frozenset({WindowDecision.STEPPED, WindowDecision.DISCOVERED, WindowDecision.NOISIER})  # They end a test
 
 
@@ -38,11 +50,16 @@ class ConditionRecord:
     recent: tuple[tuple[Level, WindowDocument], ...] = ()  # The last observed levels with their windows
     event: EventDocument | None = None  # None at Level.OK
     persistence: Persistence = field(default_factory=Persistence)
+    cleared: int = -RETURN_WINDOWS  # Index of the window that ended its last event
+    others: tuple[str, ...] = ()  # Ids of the conditions by which the last windows describe the event otherwise
 
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing of it has to be carried on."""
-        return self.event is None and all(level is Level.OK for level, _ in self.recent)
+    def is_over(self, window: int) -> bool:
+        """Whether nothing of it has to be carried on after the window with this index."""
+        return self.event is None and not self.returns(window) and all(level is Level.OK for level, _ in self.recent)
+
+    def returns(self, window: int) -> bool:
+        """Whether an event of it that begins in the window with this index is one that comes and goes."""
+        return 0 <= window - self.cleared < RETURN_WINDOWS
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +76,7 @@ class HealthState:
     undetermined: Mapping[str, float] = field(default_factory=dict)
     """Time for which the machine has moved since each parameter was determined, s; none of those that never were."""
     inside: frozenset[str] = frozenset()  # Keys of conditions that were at OK in some window
+    doubtful: tuple[int, ...] = ()  # Indices of those of the last windows that contradicted what was known
     document: HealthDocument | None = None  # The states in the report before
 
     @property
@@ -83,7 +101,8 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     }
     report = report.model_copy(update={"parameters": parameters})
     is_moving = any(item.status is Status.ESTIMATED for item in report.parameters.values())
-    state = replace(state, undetermined=_undetermined_times(state.undetermined, report, is_moving=is_moving))
+    undetermined = _undetermined_times(state.undetermined, report, is_moving=is_moving)
+    state = replace(state, undetermined=undetermined, doubtful=_doubtful(state.doubtful, report))
     observations = _observations(plan, state, report, is_moving=is_moving)
     records, events = {}, []
     for key, observed in observations.items():
@@ -91,8 +110,9 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
         record = _advance(plan, state.records.get(key, ConditionRecord()), own, report)
         if record.event is not None:
             events.append(record.event)
-            record = replace(record, event=record.event if record.event.end is None else None)
-        if not record.is_over:
+            if record.event.end is not None:
+                record = replace(record, event=None, cleared=report.window.index)
+        if not record.is_over(report.window.index):
             records[key] = record
     events.sort(key=lambda event: -event.state.rank)
     current = [event for event in events if event.end is None]
@@ -108,9 +128,10 @@ def _observations(
     """Return what the window shows about each condition, by its key.
 
     A condition that earlier windows showed and this one does not is at OK if the window updated the estimates of a
-    moving machine; otherwise nothing is known of it.
+    moving machine and no test is open; otherwise nothing is known of it.
     """
-    absent = Level.OK if report.decision in ACCEPTED and is_moving else None
+    is_open = any(finding.kind is FindingKind.OPEN for finding in report.findings)
+    absent = Level.OK if report.decision in ACCEPTED and is_moving and not is_open else None
     earlier = {}
     for key, record in state.records.items():
         is_decided = report.decision in DECIDED and record.persistence == UNDECIDED
@@ -118,7 +139,7 @@ def _observations(
         earlier[key] = Observation(key, MACHINE, Level.OK if is_decided else absent, persistence=persistence)
     levels = {key: record.level for key, record in state.records.items()}
     spans = {name: span(history) for name, history in state.histories.items()}
-    shown = observe(plan, report, levels, Past(state.steps, spans, state.undetermined))
+    shown = observe(plan, report, levels, Past(state.steps, spans, state.undetermined, state.doubtful))
     return earlier | {item.key: item for item in shown}
 
 
@@ -127,6 +148,14 @@ def _undetermined_times(before: Mapping[str, float], report: ReportDocument, *, 
     length = report.window.end - report.window.start if is_moving else 0.0
     now = {name for name, item in report.parameters.items() if is_determined(item)}
     return {name: 0.0 if name in now else before.get(name, 0.0) + length for name in (*before, *now)}
+
+
+def _doubtful(before: tuple[int, ...], report: ReportDocument) -> tuple[int, ...]:
+    """Return the indices of the last windows that contradicted what was known; the window of the report may be one."""
+    now = report.window.index
+    recent = tuple(index for index in before if now - RELEASE_WINDOWS < index < now)
+    is_accepted = report.decision in ACCEPTED or report.decision is WindowDecision.BAD
+    return recent if is_accepted else (*recent, now)
 
 
 def _from_start(observed: Observation) -> Observation:
@@ -210,11 +239,13 @@ def _advance(
     plan: MonitoringPlan, before: ConditionRecord, observed: Observation, report: ReportDocument
 ) -> ConditionRecord:
     """Return the record after an observation, with its event; one that the window clears has an end."""
-    event = before.event and before.event.model_copy(update={"change": None})
+    event = before.event and _until(before.event, report.window.start)
     if observed.level is None:
         is_interrupted = event is None and report.decision is WindowDecision.SUSPECTED  # something else may be true
         return replace(before, event=event, recent=() if is_interrupted else before.recent)
     persistence = observed.persistence
+    if before.returns(report.window.index if event is None else event.evidence.windows[0]):
+        persistence = replace(persistence, fall=max(persistence.fall, RELEASE_WINDOWS))
     length = max(persistence.rise, persistence.fall, persistence.within)
     recent = (*before.recent, (observed.level, report.window))[-length:]
     level, count = _persistent(before.level, [item[0] for item in recent], persistence)
@@ -226,12 +257,22 @@ def _advance(
         changed = {"end": first.start} if is_over else {"state": level, "since": first.start}
         change = EventChange.CLEARED if is_over else EventChange.CHANGED
         event = event.model_copy(update={"change": change, **changed})
+    others: tuple[str, ...] = ()
     if event is not None and observed.level is not Level.OK:
         described = event.model_copy(update=_description(plan, event, observed, report.window.index))
-        is_other = event.condition_id not in ("", described.condition_id) and event.change is None
-        event = described.model_copy(update={"change": EventChange.CHANGED}) if is_other else described
+        if event.condition_id not in ("", described.condition_id) and event.change is None:
+            others = (*before.others, described.condition_id)[-PERSISTENT_WINDOWS:]
+        is_other = others == PERSISTENT_WINDOWS * (described.condition_id,)
+        if is_other:
+            described = described.model_copy(update={"change": EventChange.CHANGED})
+        event = described if is_other or not others else event
     kept = recent[-count:] if level.rank < before.level.rank else recent  # what is over does not count again
-    return ConditionRecord(level, kept, event, persistence)
+    return ConditionRecord(level, kept, event, observed.persistence, before.cleared, others)
+
+
+def _until(event: EventDocument, now: float) -> EventDocument:
+    """Return an event without a change, which began before ``now``: the clock may have been set back since."""
+    return event.model_copy(update={"change": None, "start": min(event.start, now), "since": min(event.since, now)})
 
 
 def _raised(
@@ -312,7 +353,7 @@ def _kept(
     before: PartDocument | None, state: Level, since: float, reason: str, undetermined: tuple[str, ...]
 ) -> PartDocument:
     """Return a state, since the report before or earlier if that has the same one."""
-    since = before.since if before is not None and before.state is state else since
+    since = min(before.since, since) if before is not None and before.state is state else since
     return PartDocument(state=state, since=since, reason=reason, undetermined=undetermined)
 
 

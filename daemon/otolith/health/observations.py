@@ -17,12 +17,13 @@ from otolith.health.schema import (
     ReportDocument,
     Status,
 )
-from otolith.health.text import forecast_text, interval_text, number_text, value_text
+from otolith.health.text import duration_text, forecast_text, interval_text, number_text, value_text
 from otolith_drivers.units import equation_text, unit_text
 
 PERSISTENT_WINDOWS = 3  # windows in a row that must agree on another level
 INTERMITTENT_WINDOWS = 12  # among which as many windows with a fault of a sensor are one that comes and goes
 RELEASE_WINDOWS = 30  # the same, to clear what shows only while the machine moves
+MIN_RETURNS = 4  # changes among as many windows, of which each was gone before the next: one that comes and goes
 MIN_TREND_SPAN = 3600.0  # s: of a history whose trend is announced before a limit is passed
 LOST_AFTER = 3600.0  # s for which a parameter was not determined
 MAIN_SHARE = 0.5  # of a deviation: what one sudden change must make up, so that the parameter counts as stepped
@@ -68,6 +69,7 @@ class Past:
     steps: Mapping[str, float]  # Last sudden change of each
     spans: Mapping[str, float]  # Length of the history of each, s
     undetermined: Mapping[str, float]  # Time for which the machine has moved since each was determined, s
+    doubtful: tuple[int, ...] = ()  # See HealthState.doubtful
 
 
 def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], past: Past) -> list[Observation]:
@@ -82,6 +84,7 @@ def observe(plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, L
         text = plan.texts.translated(report.decision)
         unexplained = Observation("unexplained", MACHINE, Level.WATCH, features, text)
         observations.append(replace(unexplained, persistence=Persistence(fall=RELEASE_WINDOWS)))
+    observations.append(_of_returns(plan, report, before, past.doubtful))
     for name, parameter in report.parameters.items():
         own = _of_parameter(plan, report, name, before, past.steps.get(name, 0.0))
         observations += [own, _of_trend(plan, report, name, own.level, past.spans.get(name, 0.0))]
@@ -102,6 +105,23 @@ def _of_sources(report: ReportDocument, before: Mapping[str, Level]) -> Iterator
     for key in sorted(absent.keys() | {key for key in before if key.startswith("source/")}):
         features = FindingFeatures(FindingKind.NO_SOURCE, subject=key.partition("/")[2])
         yield Observation(key, BUS, level if key in absent else Level.OK, features, absent.get(key, ""))
+
+
+def _of_returns(
+    plan: MonitoringPlan, report: ReportDocument, before: Mapping[str, Level], doubtful: tuple[int, ...]
+) -> Observation:
+    """Return whether something changes again and again, but never for long enough to be an event of its own."""
+    key, once, features = "returns", Persistence(rise=1, fall=1), FindingFeatures(FindingKind.RETURNS, report.twin)
+    begins = [index for index in doubtful if index - 1 not in doubtful]
+    is_shown = len(begins) >= MIN_RETURNS and doubtful[-1] == report.window.index
+    if not is_shown or any(level is not Level.OK for name, level in before.items() if name != key):
+        return Observation(key, MACHINE, None if doubtful else Level.OK, features, persistence=once)
+    length = report.window.end - report.window.start
+    seconds = length * (doubtful[-1] - begins[0] + 1)
+    causes = next((item.text for item in report.findings if item.kind is not FindingKind.COMPONENT), "")
+    text = plan.texts("returns", count=len(begins), duration=duration_text(seconds), causes=causes)
+    since = report.window.end - seconds
+    return Observation(key, MACHINE, Level.WATCH, features, text, since=since, persistence=once)
 
 
 def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Level) -> Observation:
@@ -141,6 +161,8 @@ def _of_parameter(
     level, limit = quantity.level(*referred, before.get(key, Level.OK))
     if limit is None:
         return Observation(key, quantity.part, level)
+    if max(abs(deviation), abs(limit.excess(referred[0]))) <= QUANTILE * referred[1]:  # it may as well be healthy
+        return Observation(key, quantity.part, None)
     manner = _manner(parameter, deviation, step)
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
     texts = plan.texts
@@ -243,7 +265,8 @@ def _of_component(
     key, amplitude = f"component/{component.site}/{component.family}", component.values["amplitude"]
     order, source = component.values.get("order"), component.input.partition("(")[0]
     is_of = {"subject": component.site, "family": component.family, "input": source}
-    features = FindingFeatures(FindingKind.COMPONENT, twin, **is_of, order=order.value if order else None)
+    number, reach = (order.value, QUANTILE * order.sd) if order else (None, 0.0)
+    features = FindingFeatures(FindingKind.COMPONENT, twin, **is_of, order=number, order_reach=reach)
     quantity = plan.sites.get(component.site, MonitoredQuantity())
     size, limit, level = abs(amplitude.value), None, Level.OK
     is_expected = component.approval is Approval.APPROVED or component.status is ComponentStatus.FADING
