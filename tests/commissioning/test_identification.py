@@ -320,3 +320,30 @@ def test_observable_states_are_measured_or_driven() -> None:
 
 def test_noise_identification_is_deterministic() -> None:
     assert identified(14, 4) == identified(14, 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "changes"), [("D", 1.3, (20,)), ("R_a", 1.1, (20,)), ("R_a", 1.1, (12, 26))]
+)
+def test_a_machine_that_changes_in_the_record_is_no_process_noise(
+    name: str, factor: float, changes: tuple[int, ...]
+) -> None:
+    random, windows = np.random.default_rng(7), []
+    for index in range(20):
+        own = TRUTH[name] * (factor if sum(2 * index >= change for change in changes) % 2 else 1.0)
+        windows.append(window(random, index, D=own) if name == "D" else window(random, index, R_a=own))
+    noise = identify_noise(PROBLEM, windows)
+    assert noise.consistency.remark == text.CONSISTENT
+    assert noise.remarks == (text.CHANGED.format(", ".join(f"{change} s" for change in changes)),)
+    assert levels(noise)[:2] == pytest.approx(SENSORS, rel=0.05)
+    assert levels(noise)[2:] * np.sqrt(PERIOD) == pytest.approx(0.0, abs=0.05 * SENSORS.min())
+
+
+def test_a_change_within_a_window_excludes_that_window() -> None:
+    random = np.random.default_rng(8)
+    windows = [window(random, index, R_a=(1.1 if index > 6 else 1.0) * TRUTH["R_a"]) for index in range(16)]
+    windows[7] = window(random, 7, R_a=1.05 * TRUTH["R_a"], hidden=0.01)
+    noise = identify_noise(PROBLEM, windows)
+    assert text.EXCLUDED_OUTLYING.format(1, 16, "14 s") in noise.remarks
+    assert noise.consistency.remark == text.CONSISTENT
+    assert levels(noise)[2:] * np.sqrt(PERIOD) == pytest.approx(0.0, abs=0.1 * SENSORS.min())

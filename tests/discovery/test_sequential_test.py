@@ -6,11 +6,18 @@ import numpy as np
 import pytest
 
 from otolith.discovery.decision import WindowDecision, decide
-from otolith.discovery.hypotheses import FaultHypothesis, FaultType, TrackedHypothesis, is_usable, prune
+from otolith.discovery.hypotheses import (
+    FaultHypothesis,
+    FaultType,
+    TrackedHypothesis,
+    is_usable,
+    prune,
+    without_insignificant,
+)
 from otolith.discovery.sequential_test import FitSummary, SequentialTest, join
 from otolith.estimation.arrival_cost import Evidence, Prior
 from otolith.estimation.posterior import PhaseAdvance, Posterior
-from otolith.estimation.problem import Component, Problem, augment
+from otolith.estimation.problem import Component, Problem, amplitude_indices, augment
 from otolith.machine import find_twin
 
 TWIN = find_twin("dc_motor")
@@ -51,6 +58,19 @@ def test_hypothesis_of_a_removed_component_is_not_pruned() -> None:
     both, one = augment(BARE, [PERIODIC, COULOMB]), augment(BARE, [COULOMB])
     null, removed = hypothesis(FaultType.NOTHING, both), hypothesis(FaultType.PARAMETER, one)
     assert prune([null, removed], [0.0, 0.0]) == [null, removed]
+
+
+def test_a_delay_that_loses_an_insignificant_component_is_still_known() -> None:
+    """Its parameters move with the delay; those of the component are no longer among them."""
+    both = replace(augment(BARE, [PERIODIC, COULOMB]), delays=(("omega", 0.02),))
+    amplitudes = (both.free[index].name for index in amplitude_indices(both))
+    certain = dict(zip(amplitudes, [(1e-6, 1e-5), (-3e-3, 1e-5)], strict=True))
+    shifts = tuple((free.label, 10.0) for free in both.free)
+    late = replace(hypothesis(FaultType.TIMING, both, **certain), delay_sds=(1e-3,), shift_by_delay=shifts)
+    fewer = without_insignificant(late)
+    assert [item.family for item in fewer.problem.components] == ["Coulomb"]
+    before = hypothesis(FaultType.TIMING, fewer.problem, **certain).posterior.prior()
+    assert np.diag(fewer.known(BARE).covariance)[0] == pytest.approx(before.covariance[0, 0] + 1e-4, rel=1e-6)
 
 
 @pytest.mark.parametrize("sharpness", [1e20, float("inf"), float("nan")])

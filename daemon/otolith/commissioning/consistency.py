@@ -5,15 +5,19 @@ identified from fast innovations, so it misses an error of the twin that is slow
 window then underestimates its uncertainty, which only other windows can show. Process noise is inflated until the
 windows are consistent.
 
+A machine that changes between two windows, as a load that is put down, is no noise: the windows before and after it are
+compared among themselves.
+
 Whiteness: noise levels that are right leave white innovations. Two tests of all windows together: their
 autocorrelations (G. M. Ljung, G. E. P. Box, Biometrika 65, 1978), and their cumulative periodogram against a straight
 line (M. S. Bartlett, An Introduction to Stochastic Processes, section 9.3). The first finds a short memory, the second
 a slow disturbance, whose correlation is small at every single lag.
 """
 
+from bisect import bisect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -28,6 +32,8 @@ MAX_FACTOR = 1e4  # on process noise
 HARDLY_MORE = 1.1  # times the least reduced chi-square of all factors
 BRACKET_RATIO = 2.0  # between successive factors until they enclose the solution
 FACTOR_TOLERANCE = 0.01  # of the factor's logarithm
+MIN_REGIME = 4  # windows between two changes of the machine
+CHANGE_SIGNIFICANCE = 1e-6  # probability of a difference by chance, below which the machine has changed
 MAX_OUTLYING_SHARE = 0.2  # of the windows: more of them are no exceptions
 OUTLYING = 4.75  # standard deviations from which on a window is not one of the machine that the others show
 LAGS = 20  # of the autocorrelation, records
@@ -145,19 +151,72 @@ class ChiSquareTest:
         return bool(self.reduced <= chdtri(self.degrees, SIGNIFICANCE) / self.degrees)
 
 
-def consistency_test(fits: Fits, width: Array) -> ChiSquareTest:
-    """The test of ``fits``; ``width`` (guess,) is :attr:`Likelihood.width`."""
-    free = fits[0].objective.free
-    roots = [sqrt_information(fit, width) for fit in fits]
-    stacked = np.vstack(roots)
+def consistency_test(fits: Fits, width: Array, changes: Sequence[float] = ()) -> ChiSquareTest:
+    """The test of ``fits``, which have a mean of their own after each of the ``changes`` (start of a window).
+
+    ``width`` (guess,) is :attr:`Likelihood.width`.
+    """
+    parts = [_about_mean([_whitened(fit, width) for fit in part]) for part in regimes(fits, changes)]
+    chi_square, degrees = sum(part[0] for part in parts), sum(part[1] for part in parts)
+    return ChiSquareTest(chi_square / degrees if degrees else float("nan"), degrees)
+
+
+def regimes(fits: Fits, changes: Sequence[float]) -> list[list[FittedWindow]]:
+    """Return the windows before, between and after the ``changes``."""
+    return [list(part) for _, part in groupby(fits, key=lambda fit: bisect(changes, fit.window.start))]
+
+
+def changes_of_the_machine(fits: Fits, width: Array) -> tuple[float, ...]:
+    """Return the starts of the windows from which on the machine is another than before, in their order.
+
+    The windows before and after a change agree much better among themselves than all of them do.
+    """
+    if consistency_test(fits, width).passed:
+        return ()
+    return tuple(fits[at].window.start for at in _changes([_whitened(fit, width) for fit in fits]))
+
+
+def _changes(rows: Sequence[tuple[Array, Array]]) -> list[int]:
+    """Return which windows are the first after a change.
+
+    The window in which it falls belongs to neither side. The probability of a change by chance is that of an F test,
+    times the number of tests.
+    """
+    from scipy.special import fdtrc  # noqa: PLC0415 - only noise identification needs SciPy
+
+    trials = []
+    for at in range(MIN_REGIME, len(rows) - MIN_REGIME):
+        for reach in (MIN_REGIME, len(rows)):  # the nearest windows alone show a change that is taken back
+            sides = rows[max(0, at - reach) : at], rows[at + 1 : at + 1 + reach]
+            within, degrees = np.sum([_about_mean(side) for side in sides], axis=0)
+            together, all_degrees = _about_mean([*sides[0], *sides[1]])
+            more = all_degrees - degrees
+            if degrees and more:
+                ratio = (together - within) / more / max(within / degrees, 1.0)
+                trials.append((float(fdtrc(more, degrees, ratio)), -ratio, at))
+    probability, _, at = min(trials, default=(1.0, 0.0, 0))
+    if not trials or probability * len(trials) > CHANGE_SIGNIFICANCE:
+        return []
+    before, after = rows[:at], rows[at + 1 :]
+    misfits = [_about_mean([*side, rows[at]])[0] - _about_mean(side)[0] for side in (before, after)]
+    first = at + 1 if misfits[0] < misfits[1] else at
+    return [*_changes(before), first, *(at + 1 + later for later in _changes(after))]
+
+
+def _whitened(fit: FittedWindow, width: Array) -> tuple[Array, Array]:
+    """Return :func:`sqrt_information` and the estimate multiplied by it, of unit variance."""
+    root, free = sqrt_information(fit, width), fit.objective.free
+    return root, root @ (fit.guess[:free] / width[:free])
+
+
+def _about_mean(rows: Sequence[tuple[Array, Array]]) -> tuple[float, int]:
+    """Return chi-square of whitened estimates about their weighted mean, and its degrees of freedom."""
+    stacked, estimates = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     if not len(stacked):
-        return ChiSquareTest(float("nan"), 0)
-    estimates = [root @ (fit.guess[:free] / width[:free]) for root, fit in zip(roots, fits, strict=True)]
-    whitened = np.concatenate(estimates)
-    mean, _, rank, _ = np.linalg.lstsq(stacked, whitened, rcond=None)
-    degrees = len(stacked) - int(rank)
-    deviations = stacked @ mean - whitened
-    return ChiSquareTest(float(deviations @ deviations) / degrees if degrees else float("nan"), degrees)
+        return 0.0, 0
+    mean, _, rank, _ = np.linalg.lstsq(stacked, estimates, rcond=None)
+    deviations = stacked @ mean - estimates
+    return float(deviations @ deviations), len(stacked) - int(rank)
 
 
 def outlyingness(fits: Fits, index: int, width: Array) -> float:
@@ -204,22 +263,22 @@ def sqrt_information(fit: FittedWindow, width: Array) -> Array:
 
 
 def inflate_process_noise(
-    likelihood: Likelihood, levels: Callable[[float], Array], fits: Fits
+    likelihood: Likelihood, levels: Callable[[float], Array], fits: Fits, changes: Sequence[float] = ()
 ) -> tuple[float, ChiSquareTest, Fits]:
     """The factor on process noise that makes the reduced chi-square of ``fits`` one, and test and fits with it.
 
-    ``levels`` returns the levels (outputs + states,) for a factor. If none suffices, it is the smallest one that leaves
-    hardly more than the best.
+    ``levels`` returns the levels (outputs + states,) for a factor; for ``changes`` see :func:`consistency_test`. If
+    none suffices, it is the smallest one that leaves hardly more than the best.
     """
     from scipy.optimize import brentq  # noqa: PLC0415 - only noise identification needs SciPy
 
-    tried = {0.0: (fits, consistency_test(fits, likelihood.width))}
+    tried = {0.0: (fits, consistency_test(fits, likelihood.width, changes))}
 
     def log_excess(log_factor: float) -> float:
         if log_factor not in tried:
             last, _ = list(tried.values())[-1]
             refitted = likelihood.refit(levels(float(np.exp(log_factor))), last)
-            tried[log_factor] = refitted, consistency_test(refitted, likelihood.width)
+            tried[log_factor] = refitted, consistency_test(refitted, likelihood.width, changes)
         _, test = tried[log_factor]
         return float(np.log(test.reduced)) if test.degrees else -1.0
 

@@ -17,9 +17,11 @@ from otolith.commissioning.consistency import (
     MAX_OUTLYING_SHARE,
     OUTLYING,
     Whiteness,
+    changes_of_the_machine,
     consistency_test,
     inflate_process_noise,
     outlyingness,
+    regimes,
     sqrt_information,
     whiteness,
 )
@@ -67,6 +69,7 @@ EXCLUDED_OUTLYING = (
     "windows excluded because they contradict all others: {} of {}, from {}: a standstill, a disturbance or a change "
     "of the machine; the levels do not hold there"
 )
+CHANGED = "the machine changes at about {}: windows before and after it were compared among themselves only"
 ONE_WINDOW = "consistency of windows: not tested, as there is only one window"
 NOT_COMPARABLE = "consistency of windows: not tested, as no two windows determine the same parameters"
 CONSISTENT = "consistency of windows: they scatter as their uncertainties predict"
@@ -254,46 +257,58 @@ def _without_outlying(
     noise would be too large for the other windows.
     """
     width, starts = guess.variances.likelihood.width, list[float]()
-    made = _make_consistent(guess, best, progress)
+    changes = changes_of_the_machine(best.fits, width)
+    made = _make_consistent(guess, best, changes, progress)
     limit = int(MAX_OUTLYING_SHARE * len(guess.fits))
     while len(starts) < limit:
-        scores = [outlyingness(best.fits, index, width) for index in range(len(best.fits))]
+        parts = regimes(best.fits, changes)
+        scores = [outlyingness(part, index, width) for part in parts for index in range(len(part))]
         index = int(np.argmax(scores))
         if made.consistency.factor == 1.0 and scores[index] < OUTLYING:
             break
         start = best.fits[index].window.start
         progress(f"without the window at {start:g} s")
-        trial = _without_window(guess, best, index, progress)
+        trial = _without_window(guess, best, index, changes, progress)
         if trial is None:
             break
         guess, best, made = trial
         starts.append(start)
+    remarks = list(guess.remarks)
     if starts:
-        times = ", ".join(f"{round(start, 6) + 0.0:g} s" for start in sorted(starts))
-        remark = EXCLUDED_OUTLYING.format(len(starts), len(starts) + len(guess.fits), times)
-        guess = replace(guess, remarks=(*guess.remarks, remark))
-    return guess, best, made
+        remarks.append(EXCLUDED_OUTLYING.format(len(starts), len(starts) + len(guess.fits), _times(starts)))
+    if changes:
+        remarks.append(CHANGED.format(_times(changes)))
+    return replace(guess, remarks=tuple(remarks)), best, made
+
+
+def _times(starts: Sequence[float]) -> str:
+    return ", ".join(f"{round(start, 6) + 0.0:g} s" for start in sorted(starts))
 
 
 def _without_window(
-    guess: _InitialGuess, best: LikelihoodPoint, index: int, progress: Progress
+    guess: _InitialGuess, best: LikelihoodPoint, index: int, changes: Sequence[float], progress: Progress
 ) -> tuple[_InitialGuess, LikelihoodPoint, _ConsistentLevels] | None:
     """Return what the other windows give without window ``index``; None if their noise explains it as well."""
     likelihood = guess.variances.likelihood
     # From the first fits, as those at levels that this window made too large may be at another minimum.
     first = [*guess.fits[:index], *guess.fits[index + 1 :]]
     others = backward_elimination(guess.variances, first, progress)
-    made = _make_consistent(guess, others, progress)
-    fits = likelihood.refit(made.levels, [best.fits[index], *others.fits])
+    made = _make_consistent(guess, others, changes, progress)
+    regime = next(part for part in regimes(best.fits, changes) if best.fits[index] in part)
+    starts = {fit.window.start for fit in regime}
+    near = (fit for fit in others.fits if fit.window.start in starts)
+    fits = likelihood.refit(made.levels, [best.fits[index], *near])
     if outlyingness(fits, 0, likelihood.width) < OUTLYING:
         return None
     return replace(guess, fits=first), others, made
 
 
-def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Progress) -> _ConsistentLevels:
-    """Test whether the windows agree with each other, and inflate the process noise if they do not."""
+def _make_consistent(
+    guess: _InitialGuess, best: LikelihoodPoint, changes: Sequence[float], progress: Progress
+) -> _ConsistentLevels:
+    """Test whether the windows between ``changes`` agree, and inflate the process noise if they do not."""
     likelihood, outputs = guess.variances.likelihood, len(guess.signal_noise)
-    before = consistency_test(best.fits, likelihood.width)
+    before = consistency_test(best.fits, likelihood.width, changes)
     if not before.degrees:
         remark = ONE_WINDOW if len(best.fits) == 1 else NOT_COMPARABLE
         return _ConsistentLevels(Consistency(remark=remark), best.levels)
@@ -307,7 +322,9 @@ def _make_consistent(guess: _InitialGuess, best: LikelihoodPoint, progress: Prog
         small = SMALL_PROCESS_SHARE * np.nan_to_num(guess.process)
         process[outputs:] = np.where(observable_states(likelihood.problem.base_model), small, 0.0)
     progress(f"reduced chi-square of the windows: {before.reduced:.3g}")
-    factor, after, inflated = inflate_process_noise(likelihood, lambda factor: sensors + factor * process, best.fits)
+    factor, after, inflated = inflate_process_noise(
+        likelihood, lambda factor: sensors + factor * process, best.fits, changes
+    )
     if not after.degrees or (not after.passed and after.reduced > MAX_LEFT * before.reduced):
         consistency = Consistency(before.degrees, before.reduced, before.reduced, None, NOT_INFLATED)
         return _ConsistentLevels(consistency, best.levels)

@@ -197,8 +197,8 @@ class TrackedHypothesis:
     inflation: float = 1.0  # Of standard deviations, by what it leaves of the last window: see inflation_of
     delay_information: float = 0.0  # About the delay that the hypothesis states, 1/s²; 0 if it states none
     delay_sds: tuple[float, ...] = ()  # Standard deviation, in s, of the delay with which each window was fitted
-    shift_by_delay: tuple[float, ...] = ()
-    """(free,) how far the parameters move with that delay, per second; empty if it states none."""
+    shift_by_delay: tuple[tuple[str, float], ...] = ()
+    """How far the parameters of each label move with that delay, per second; empty if it states none."""
     explains_all: bool = True  # Whether the screening test found nothing in what it left of the last window
 
     @property
@@ -225,7 +225,7 @@ class TrackedHypothesis:
         prior = self.posterior.remap_parameters(problem).prior()
         if not self.delay_sds:
             return prior
-        shifts = dict(zip((free.label for free in self.problem.free), self.shift_by_delay, strict=True))
+        shifts = dict(self.shift_by_delay)
         moved = np.array([shifts.get(free.label, 0.0) for free in problem.free] + [0.0] * len(problem.free))
         variance = float(np.mean(self.delay_sds)) ** 2
         return replace(prior, covariance=prior.covariance + variance * np.outer(moved, moved))
@@ -311,7 +311,7 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
         posterior=posterior,
         delay_information=information,
         delay_sds=sds,
-        shift_by_delay=own.shift[: len(own.shift) // 2],
+        shift_by_delay=tuple(zip((free.label for free in problem.free), own.shift, strict=False)),
     )
 
 
