@@ -60,10 +60,18 @@ def writable(folder: Path) -> Path:
         for missing in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
             missing.mkdir(exist_ok=True, mode=0o700)
     except OSError as error:
-        raise ServiceError(f"{folder}: cannot be created: {error.strerror}") from error
+        raise ServiceError(f"{folder}: cannot be created: {error.strerror}{way_out(folder)}") from error
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ServiceError(f"{folder}: not writable for this user")
+        raise ServiceError(f"{folder}: not writable for this user{way_out(folder)}")
     return folder
+
+
+def way_out(path: Path) -> str:
+    """Return what makes ``path`` usable for this user if it is a link or another user's, as after a copy by root."""
+    if path.is_symlink() or not path.exists() or (owner := path.stat().st_uid) == os.geteuid():
+        return ", as it is a link: move it away" if path.is_symlink() else ""
+    command = f"chown --recursive {os.geteuid()}:{os.getegid()} {path.parent}"
+    return f", as it belongs to user {owner}: run '{command}' as root"
 
 
 def check_writable(folder: Path) -> None:

@@ -1,10 +1,12 @@
 """State store and writer thread, with real files and with a disk that does not answer."""
 
+import errno
 import os
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -22,6 +24,7 @@ from otolith.machine import load_machine
 from otolith.storage import state_store
 from otolith.storage.state_store import StateStore, StateWriter
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
+from otolith_drivers.user_dirs import writable
 from tests.cli.replays import MACHINE
 from tests.waiting import PATIENCE, wait_for, within
 
@@ -179,9 +182,22 @@ def test_a_second_process_cannot_take_the_lock(store: StateStore) -> None:
 def test_a_lock_file_that_is_a_link_is_refused(store: StateStore, tmp_path: Path) -> None:
     store.lock_path.parent.mkdir()
     store.lock_path.symlink_to(tmp_path / "other")
-    with pytest.raises(ServiceError, match="cannot be locked"):
+    with pytest.raises(ServiceError, match=r"cannot be locked: .*, as it is a link: move it away"):
         store.lock()
     assert not (tmp_path / "other").exists()
+
+
+def test_a_state_of_another_user_is_named_with_the_way_out(store: StateStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after a copy by root; monitoring without what was learned would be silent about it."""
+    with store.locked():
+        pass
+    monkeypatch.setattr(os, "geteuid", lambda: store.lock_path.stat().st_uid + 1)
+    monkeypatch.setattr(os, "open", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))
+    with pytest.raises(ServiceError, match=r"Permission denied, as it belongs to user .*: run 'chown --recursive"):
+        store.lock()
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(ServiceError, match=r"not writable for this user, as it belongs to user .*: run 'chown"):
+        writable(store.lock_path.parent)
 
 
 def test_root_gives_the_open_file_to_the_owner_of_the_folder_and_never_a_path(

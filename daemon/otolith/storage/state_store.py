@@ -33,7 +33,7 @@ from otolith.storage.learned_state import (
 from otolith.twin.definition import Definition
 from otolith_drivers.config_files import StrictModel, content
 from otolith_drivers.errors import ConfigurationError, OtolithError, ServiceError
-from otolith_drivers.user_dirs import state_directory
+from otolith_drivers.user_dirs import state_directory, way_out
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +92,8 @@ class StateStore:
             used = f"machine {self._machine} at {self._site}: process {holder} of Otolith already uses its state"
             raise ServiceError(f"{used}: stop it, or give this machine another name") from error
         except OSError as error:
-            raise ServiceError(f"{self.lock_path}: cannot be locked: {error.strerror}") from error
+            remedy = way_out(self.lock_path)
+            raise ServiceError(f"{self.lock_path}: cannot be locked: {error.strerror}{remedy}") from error
         with contextlib.suppress(OSError):  # a full disk: only the message to others lacks the process
             os.pwrite(handle, str(os.getpid()).ljust(PROCESS_ID_BYTES).encode(), 0)
         self._lock = handle
