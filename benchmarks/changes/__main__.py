@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -28,6 +28,13 @@ def _cases(command: Command) -> Command:
     for option in (
         click.option("--changed", default=CHANGED_WINDOWS, show_default=True, help="Windows after the change."),
         click.option("--healthy", default=HEALTHY_WINDOWS, show_default=True, help="Windows before the change."),
+        click.option(
+            "--onset",
+            default=0.0,
+            show_default=True,
+            type=click.FloatRange(0.0, 1.0, max_open=True),
+            help="Share of a window before the change.",
+        ),
         click.argument("names", nargs=-1),
     ):
         command = option(command)
@@ -41,13 +48,15 @@ def main() -> None:
 
 @main.command("classes")
 @_cases
-def classes_command(options: Options, names: tuple[str, ...], healthy: int, changed: int, runs: int) -> None:
+def classes_command(
+    options: Options, names: tuple[str, ...], healthy: int, onset: float, changed: int, runs: int
+) -> None:
     """Changes that the data cannot distinguish, or can.
 
     Only pairs and changes whose names contain one of NAMES; all by default. The exit code is 1 if a target is missed.
     """
     trials = _selected(classes.trials(healthy, changed), names, lambda trial: f"{trial.pair}: {trial.truth}")
-    results = observe_all([trial.case for trial in trials], runs, options.seed, options.processes)
+    results = observe_all([replace(trial.case, onset=onset) for trial in trials], runs, options.seed, options.processes)
     summaries = [classes.summarise(trial, own) for trial, own in zip(trials, results, strict=True)]
     documents = list(map(classes.document, summaries))
     table = Table("pair", "truth", "expected", "right", "verdicts", "first", "equal", "coverage", "met")
@@ -63,13 +72,15 @@ def classes_command(options: Options, names: tuple[str, ...], healthy: int, chan
 
 @main.command("steps")
 @_cases
-def steps_command(options: Options, names: tuple[str, ...], healthy: int, changed: int, runs: int) -> None:
+def steps_command(
+    options: Options, names: tuple[str, ...], healthy: int, onset: float, changed: int, runs: int
+) -> None:
     """Steps of 20 % of each parameter of the library's twins.
 
     Only steps whose names contain one of NAMES; all by default. The exit code is 1 if a target is missed.
     """
     selected = _selected(steps.steps(healthy, changed), names, lambda step: step.case.name)
-    results = observe_all([step.case for step in selected], runs, options.seed, options.processes)
+    results = observe_all([replace(step.case, onset=onset) for step in selected], runs, options.seed, options.processes)
     documents = [steps.summarise(step, own) for step, own in zip(selected, results, strict=True)]
     table = Table("case", "held", "published", "half-width", "sensor", "others", "statuses", "met")
     for own in documents:

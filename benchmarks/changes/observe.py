@@ -80,6 +80,8 @@ class Case:
     """Changes the signals (records,) of a run in place, before noise is added."""
     quantum: float = 0.0
     """Step of the converters over the noise of the machine file; zero for none."""
+    onset: float = 0.0
+    """Share of a window between its beginning and that of the change."""
     later: tuple[tuple[int, Change], ...] = ()
     """Further changes of the healthy machine, each with its first window."""
 
@@ -109,7 +111,8 @@ def recordings(case: Case, problem: Problem, runs: Sequence[int], seed: int) -> 
     randoms = [generator(seed, case.plant.name, run) for run in runs]
     records = (case.healthy + case.changed) * plant.records
     later = [(first * plant.records, change) for first, change in case.later]
-    rows = simulate(plant, randoms, records, case.before, case.after, case.healthy * plant.records, later)
+    at = round((case.healthy + case.onset) * plant.records)
+    rows = simulate(plant, randoms, records, case.before, case.after, at, later)
     for number, random in enumerate(randoms):
         own = {name: rows[name][number].copy() for name in twin.signals}
         if case.disturb is not None:
