@@ -49,7 +49,7 @@ def test_each_sample_of_the_grid_is_received_or_lost() -> None:
     counters = listener.driver.counters()
     assert counters.received == len(listener.samples)
     assert counters.bad == 0
-    assert counters.reconnects == 1
+    assert counters.reconnects >= 1  # more if an answer timed out on a busy computer
     requested = (counters.received + counters.lost) / len(TWO)
     # The last backoff may not be counted yet.
     assert (last - opened - 0.3) / PERIOD <= requested <= elapsed / PERIOD + 1.0
