@@ -46,6 +46,7 @@ HEADER_CELL = re.compile(r"^(.*?)\s*(?:\[(.*)\]|\((.*)\))?$", re.DOTALL)  # name
 TIME_NAME = re.compile(r"(?:t|_?time|time[ _]?stamp|date[ _/]?time|zeit(?:stempel)?)(?:_(s|ms|us))?", re.IGNORECASE)
 DATE = "2026-03-29T01:59:58.25Z"  # an example
 MAX_PREAMBLE = 100  # lines above the header that are no comments; engineering choice: oscilloscopes write some twenty
+MIN_GROUPED = 10  # cells like 1.001, and whole numbers, from which on it is asked whether thousands are separated
 MAX_BELOW = 5  # lines below the header among which one may have the units; engineering choice: types, units, comments
 DAY_FIRST = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})")  # no country writes the month first with points
 EXCEL_SEPARATOR = re.compile(r"sep=(.)")  # a line that Excel writes for itself
@@ -105,6 +106,7 @@ class ColumnRequest(NamedTuple):
 class Header:
     """The line with the names of the columns."""
 
+    path: Path
     line: int  # Line number, from 1
     separator: str
     widths: tuple[int, int]
@@ -306,7 +308,7 @@ def read_header(path: Path, file: TextIO, wanted: Mapping[str, ColumnRequest]) -
     is_wanted = SEGMENT in {request.column for request in wanted.values()}
     segment = None if is_wanted or SEGMENT not in places else places[SEGMENT][0]
     widths, below = (named, len(cells)), "".join(rows[skipped:])
-    return Header(number + skipped, sign, widths, columns, others, segment, below)
+    return Header(path, number + skipped, sign, widths, columns, others, segment, below)
 
 
 def _places(
@@ -418,6 +420,10 @@ class _TableChunk:
         cells = cells if len(kept) == len(cells) else cells.take(pa.array(kept))
         texts = {name: pc.list_element(cells, column.place) for name, column in columns.items()}
         signs = (_decimal_sign([text for name, text in texts.items() if name != TIME]), _decimal_sign([texts[TIME]]))
+        if not counts.decimal and (cell := _ambiguous_cell([text for name, text in texts.items() if name != TIME])):
+            whole = cell.replace(".", "").replace(",", "")
+            cause = f"{cell!r} may be {whole} or a number with decimals, as no other cell shows it"
+            raise ConfigurationError(f"{self._header.path}: {cause}: export without separated thousands")
         counts.decimal = counts.decimal or signs[0] or signs[1]  # a date may have points and a comma
         times = columns[TIME].scaled(_numbers(texts[TIME], counts.decimal))
         dates = np.flatnonzero(np.isinf(times))
@@ -524,6 +530,18 @@ def _decimal_sign(texts: list[pa.StringArray]) -> str:
         last = {sign: sum(_count(text, pattern) for text in texts) for sign, pattern in LAST_SIGNS.items()}
         points, commas = (last["."], last[","]) if any(last.values()) else (points, commas)
     return "" if points == commas == 0 else "," if commas > points else "."
+
+
+def _ambiguous_cell(texts: list[pa.StringArray]) -> str:
+    """A cell that may have separated thousands or decimals, where whole numbers and such cells are all that there is.
+
+    Decimals of three digits each beside whole numbers are improbable, unless there are few.
+    """
+    cells = pc.utf8_trim_whitespace(pa.concat_arrays(texts)) if texts else pa.array([], pa.string())
+    signed = cells.filter(pc.match_substring_regex(cells, "[.,]"))
+    grouped = _count(signed, r"^[+-]?[1-9]\d{0,2}[.,]\d{3}$")
+    whole = _count(cells, r"^[+-]?\d{1,3}$")
+    return str(signed[0]) if MIN_GROUPED <= grouped == len(signed) and whole >= MIN_GROUPED else ""
 
 
 def _count(texts: pa.StringArray, pattern: str) -> int:

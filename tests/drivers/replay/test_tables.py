@@ -228,6 +228,19 @@ def test_thousands_may_be_separated(tmp_path: Path, separator: str, cells: list[
     assert reader.bad == np.count_nonzero(np.isnan(expected))
 
 
+@pytest.mark.parametrize(("separator", "sign"), [(";", "."), (";", ","), (",", ",")])
+def test_whole_numbers_with_separated_thousands_are_refused(tmp_path: Path, separator: str, sign: str) -> None:
+    """1,001 beside 999 would be taken for 1.001, a thousandth, without a warning."""
+    path = tmp_path / "table.csv"
+    cells = [f'"{number:,}"'.replace(",", sign) for number in range(980, 1020)]
+    rows = [f"{index}{separator}{cell}" for index, cell in enumerate(cells)]
+    path.write_text("\n".join([f"t{separator}x", *rows]) + "\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=rf"'1\{sign}000' may be 1000 or .*: export without separated thou"):
+        read(path)
+    path.write_text("\n".join([f"t{separator}x", *rows, f'40{separator}"0{sign}5"']) + "\n", encoding="utf-8")
+    assert numbers(read(path)[0])[-1] == 0.5
+
+
 def test_the_decimal_sign_is_named_where_a_cell_has_the_other(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("t;x\n0.0;1,5\n0.1;1,6\n", encoding="utf-8")
