@@ -20,22 +20,9 @@ from otolith_drivers.canbus import can
 from otolith_drivers.canbus import driver as can_driver
 from otolith_drivers.canbus.decoder import FrameDecoder, decoder_of
 from otolith_drivers.errors import ConfigurationError, counted
+from otolith_drivers.replay import readers
 from otolith_drivers.replay.frame_readers import CandumpLines, Mf4Frames, SavvyCanLines, SqliteFrames
-from otolith_drivers.replay.readers import (
-    CANDUMP,
-    CANDUMP_LOG,
-    DIFFERENCES,
-    MAX_TIME,
-    PYTHON_CAN,
-    SAVVYCAN,
-    DataFile,
-    Reader,
-    Rows,
-    head_of,
-    seen,
-    suffix_of,
-    text_log,
-)
+from otolith_drivers.replay.readers import MAX_TIME, DataFile, Reader, Rows, head_of, seen, suffix_of, text_log
 
 # Engineering choices, guarded by the tests with garbage and damaged logs in test_can_log.py.
 MAX_LINE = 4096  # characters; a CAN FD frame with 64 bytes needs some 300
@@ -214,10 +201,10 @@ class _TrcReader(can.TRCReader):
 TEXT_FORMATS = {
     ".asc": TextFormat(can.ASCReader, "Vector ASC", prelude="\n"),
     ".trc": TextFormat(_TrcReader, "PEAK TRC"),
-    CANDUMP_LOG: TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
-    CANDUMP: TextFormat(CandumpLines, "candump, as 'candump -ta' writes it"),
-    SAVVYCAN: TextFormat(SavvyCanLines, SAVVYCAN),
-    PYTHON_CAN: TextFormat(can.CSVReader, PYTHON_CAN, prelude="\n"),
+    readers.CANDUMP_LOG: TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
+    readers.CANDUMP: TextFormat(CandumpLines, "candump, as 'candump -ta' writes it"),
+    readers.SAVVYCAN: TextFormat(SavvyCanLines, readers.SAVVYCAN),
+    readers.PYTHON_CAN: TextFormat(can.CSVReader, readers.PYTHON_CAN, prelude="\n"),
 }
 """By suffix or, for others, by the format that the first line has."""
 
@@ -231,8 +218,8 @@ def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFr
         return SqliteFrames(path, head)
     if suffix == ".blf":
         return BlfFrames(path, data.stream)
-    name = suffix if suffix in TEXT_FORMATS else text_log(head) or CANDUMP_LOG
-    if name == DIFFERENCES:
+    name = suffix if suffix in TEXT_FORMATS else text_log(head) or readers.CANDUMP_LOG
+    if name == readers.DIFFERENCES:
         cause = f"{path}: is of {name}, of which a lost line would shift the rest: log with candump -L"
         raise ConfigurationError(cause)
     text = io.TextIOWrapper(data.stream, encoding="utf-8-sig", errors="replace")
