@@ -68,10 +68,14 @@ def writable(folder: Path) -> Path:
 
 def way_out(path: Path) -> str:
     """Return what makes ``path`` usable for this user if it is a link or another user's, as after a copy by root."""
-    if path.is_symlink() or not path.exists() or (owner := path.stat().st_uid) == os.geteuid():
-        return ", as it is a link: move it away" if path.is_symlink() else ""
+    try:
+        owner = path.lstat().st_uid
+        if path.is_symlink():
+            return ", as it is a link: move it away"
+    except OSError:  # it is missing, or in a folder that this user must not search
+        return ""
     command = f"chown --recursive {os.geteuid()}:{os.getegid()} {path.parent}"
-    return f", as it belongs to user {owner}: run '{command}' as root"
+    return "" if owner == os.geteuid() else f", as it belongs to user {owner}: run '{command}' as root"
 
 
 def check_writable(folder: Path) -> None:

@@ -2,7 +2,9 @@
 
 import csv
 import json
+import os
 import re
+import shutil
 import sqlite3
 import time
 from collections.abc import Iterator
@@ -13,12 +15,14 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner, Result
 
+from otolith.cli import common
 from otolith.cli.main import cli
 from otolith.health.schema import EventChange
 from otolith.storage.history import HOUR, history_path
 from otolith.storage.history_writer import Bounds, HistoryWriter, Numbers
-from otolith_drivers.errors import ConfigurationError
+from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import state_directory
+from tests.conftest import EXAMPLES
 from tests.storage.histories import MACHINE, SITE, document, documents
 
 COUNT, LENGTH = 400, 30.0
@@ -194,3 +198,43 @@ def test_an_instance_of_the_service_has_its_own_name(
     request.getfixturevalue("written")
     assert run("line-7", "--since", "1d").output == run(MACHINE, "--since", "1d").output != ""
     assert "no history of a machine 'line-8'" in str(run("line-8").exception)
+
+
+@pytest.fixture
+def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Machine file of an installed service, whose state this command is not told of."""
+    for name in ("SERVICES", "INSTALLED"):
+        (tmp_path / name).mkdir()
+        monkeypatch.setattr(common, name, tmp_path / name)
+    (tmp_path / "SERVICES" / "line-7").mkdir()
+    monkeypatch.setenv("STATE_DIRECTORY", "")  # restored after the test, whatever the command sets
+    monkeypatch.delenv("STATE_DIRECTORY")
+    return Path(shutil.copy(EXAMPLES / "dc-motor-in-process.toml", tmp_path / "INSTALLED" / "line-7.toml"))
+
+
+def test_commands_of_root_use_the_state_of_the_service(
+    service: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """They said that nothing was there, or that it was forgotten, and meant the state of root."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(common.SERVICES / "line-7"))
+    request.getfixturevalue("written")
+    expected = run(MACHINE, "--since", "1d").output
+    monkeypatch.delenv("STATE_DIRECTORY")
+    assert run("line-7", "--since", "1d").output == expected != ""
+    monkeypatch.delenv("STATE_DIRECTORY")
+    shutil.copytree(EXAMPLES / "scenarios", service.parent / "scenarios")
+    result = CliRunner().invoke(cli, ["reset", str(service), "R_a"], catch_exceptions=False)
+    assert (result.output, result.exit_code) == ("R_a is forgotten\n", 0)
+    assert len(list((common.SERVICES / "line-7" / "components").glob("*.decisions.json"))) == 1
+
+
+def test_a_command_that_may_not_use_the_state_of_the_service_says_so(
+    service: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = common.SERVICES / "line-7"
+    may = os.access
+    monkeypatch.setattr(os, "access", lambda path, *rest, **more: path != state and may(path, *rest, **more))
+    for command in (["history", "line-7"], ["components", "list", str(service)]):
+        error = CliRunner().invoke(cli, command, standalone_mode=False).exception
+        assert isinstance(error, ServiceError)
+        assert "line-7: state of a service, which root and its own user may read: try it with sudo" in str(error)

@@ -200,6 +200,14 @@ def test_a_state_of_another_user_is_named_with_the_way_out(store: StateStore, mo
         writable(store.lock_path.parent)
 
 
+def test_a_folder_that_must_not_be_searched_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the folder of another user: units and kernels are then not cached."""
+    monkeypatch.setattr(Path, "exists", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))
+    monkeypatch.setattr(Path, "lstat", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))
+    with pytest.raises(ServiceError, match=r"cannot be created: Permission denied$"):
+        writable(tmp_path / "closed" / "units")
+
+
 def test_root_gives_the_open_file_to_the_owner_of_the_folder_and_never_a_path(
     store: StateStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

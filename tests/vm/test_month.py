@@ -41,7 +41,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     run("mkfs.ext4", "-q", "-F", str(image))
     run("mount", "-o", "loop", str(image), str(folder))
     yield folder
-    run("umount", str(folder))
+    run("umount", "--lazy", str(folder))  # a test that failed may have files open
 
 
 def reports(begin: float) -> Iterator[Report]:

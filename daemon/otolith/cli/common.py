@@ -16,12 +16,32 @@ from typing import Any
 
 import click
 
+from otolith_drivers.errors import ServiceError
+
+SERVICES = Path("/var/lib/otolith")  # state directories of the instances of systemd/otolith@.service
+INSTALLED = Path("/etc/otolith")  # their machine files
 INTERRUPTED = 128 + signal.SIGINT  # exit code of a command that Ctrl-C ended, as a shell reports it
 FILE = click.Path(path_type=Path, dir_okay=False)
 MACHINE_FILE = click.argument("file", type=FILE)
 DATA_FILE = click.argument("data", type=FILE)
 DATA_FILES = click.argument("data", type=FILE, nargs=-1, required=True)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
+
+
+def use_state_of_service(machine: Path | str) -> bool:
+    """Use the state of the service with this machine file or of this name, if it is one; return whether it is used.
+
+    A ``STATE_DIRECTORY`` that is set is kept. Raises ServiceError if this user may not.
+    """
+    is_file = isinstance(machine, Path)
+    folder = SERVICES / (machine.stem if isinstance(machine, Path) else machine)
+    is_installed = not is_file or Path(machine).absolute().parent == INSTALLED
+    if not is_installed or "STATE_DIRECTORY" in os.environ or not folder.is_dir():
+        return False
+    if not os.access(folder, os.W_OK):
+        raise ServiceError(f"{folder}: state of a service, which root and its own user may read: try it with sudo")
+    os.environ["STATE_DIRECTORY"] = str(folder)
+    return True
 
 
 def new_file(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from otolith.cli.common import AS_JSON, DATA_FILE, MACHINE_FILE, echo_warnings, local_time, progress_line
+from otolith.cli.common import (
+    AS_JSON,
+    DATA_FILE,
+    MACHINE_FILE,
+    echo_warnings,
+    local_time,
+    progress_line,
+    use_state_of_service,
+)
 
 if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
@@ -186,6 +194,7 @@ def _store(file: Path) -> "tuple[LoadedMachine, StateStore]":
     from otolith.machine import load_machine
     from otolith.storage.state_store import store_of
 
+    use_state_of_service(file)
     machine = load_machine(file, with_driver=False)
     return machine, store_of(machine)
 
@@ -334,11 +343,7 @@ def baseline(file: Path, clear: bool) -> None:
       otolith baseline my-machine.toml
       otolith baseline my-machine.toml --clear
     """
-    from otolith.machine import load_machine
-    from otolith.storage.state_store import store_of
-
-    machine = load_machine(file, with_driver=False)
-    store = store_of(machine)
+    machine, store = _store(file)
     if clear:
         store.save_decisions(replace(store.decisions(), baselines={}))
         click.echo("limits in percent refer to the nominal values of the machine file")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from otolith.cli.common import AS_JSON, FILE, local_time, new_file, progress_line
+from otolith.cli.common import AS_JSON, FILE, local_time, new_file, progress_line, use_state_of_service
 
 if TYPE_CHECKING:
     from otolith.health.schema import EventDocument
@@ -114,11 +114,14 @@ def reader_of(machine: str) -> "HistoryReader":
     if machine.endswith(".toml") or "/" in machine or Path(machine).is_file():
         from otolith.machine import load_machine
 
+        use_state_of_service(Path(machine))
         names = load_machine(Path(machine), with_driver=False).file.machine
         return HistoryReader(history_path(names.site, names.name))
     known = [HistoryReader(path) for path in sorted(history_directory().glob(f"*{SUFFIX}"))]
     is_instance = Path(os.environ.get("STATE_DIRECTORY", "")).name == machine  # which systemd names so
     chosen = [reader for reader in known if reader.machine == machine or is_instance]
+    if not chosen and use_state_of_service(machine):
+        return reader_of(machine)
     if not chosen:
         hint = nearest(machine, [reader.machine for reader in known])
         raise ConfigurationError(f"no history of a machine {machine!r} in {history_directory()}: {hint}")

@@ -15,13 +15,12 @@ from typing import BinaryIO
 
 import click
 
-from otolith.cli.common import local_time
+from otolith.cli.common import SERVICES, local_time
 from otolith.cli.operation.history import age_or_date
 from otolith.storage.recording_files import MEGABYTE, RecordingFile, recording_file
 from otolith_drivers.errors import ConfigurationError, ServiceError
 from otolith_drivers.user_dirs import cache_directory, state_directory
 
-SERVICES = Path("/var/lib/otolith")  # state directories of the instances of systemd/otolith@.service
 MAGIC = b"RRF2"  # first bytes of Rerun's files
 HEADER_BYTES = 12  # before their first message
 MESSAGE = struct.Struct("<QQ")  # before each message: its kind and its length in bytes
@@ -131,7 +130,11 @@ def unreadable_text(path: Path) -> str:
         group = path.group()
     except (OSError, KeyError):
         group = "otolith"
-    join = f"'sudo usermod -aG {group} {getpass.getuser()}', and log in again"
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError):  # without a name
+        user = "USER"
+    join = f"'sudo usermod -aG {group} {user}', and log in again"
     return f"{path}: not readable for this user: join group {group}: {join}"
 
 
