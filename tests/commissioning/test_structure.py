@@ -35,12 +35,18 @@ SUBSTEPS = 4
 
 @lru_cache
 def record(
-    count: int, amplitude: float, seed: int, frequency: float | None = None, smoothness: float = TRUTH["v_s"]
+    count: int,
+    amplitude: float,
+    seed: int,
+    frequency: float | None = None,
+    smoothness: float = TRUTH["v_s"],
+    *,
+    load: float = 0.0,
 ) -> tuple[Window, ...]:
     """Windows of an axis under a position controller that moves to and fro; its encoder has steps.
 
     A force is a sine of the position, or of time if it has a ``frequency`` (Hz). Dry friction changes its sign within
-    ``smoothness`` (m/s) of standstill.
+    ``smoothness`` (m/s) of standstill. A ``load`` (N) is put down in the middle of the window in the middle.
     """
     random, x, v, rows = np.random.default_rng(seed), 0.0, 0.0, []
     dt = PERIOD / SUBSTEPS
@@ -53,7 +59,8 @@ def record(
             turns = x / PITCH if frequency is None else frequency * (time + substep * dt)
             friction = TRUTH["F_v"] * v + TRUTH["F_c"] * np.tanh(v / smoothness)
             periodic = amplitude * np.sin(2.0 * np.pi * turns + 0.7)
-            v += dt * (force - friction - TRUTH["offset"] + periodic) / TRUTH["M"]
+            carried = TRUTH["offset"] + (load if at < (count // 2 + 0.5) * RECORDS else 0.0)
+            v += dt * (force - friction - carried + periodic) / TRUTH["M"]
             x += dt * v
         v += UNEVENNESS * np.sqrt(PERIOD) * random.standard_normal()
     pieces = np.array(rows).reshape(count, RECORDS, 2)
@@ -65,6 +72,16 @@ def record(
 def structure(count: int, amplitude: float, seed: int, frequency: float | None = None) -> list[Structure]:
     windows = record(count, amplitude, seed, frequency)
     return remaining_structure(PROBLEM, identify_noise(PROBLEM, windows), windows)
+
+
+@pytest.mark.parametrize("amplitude", [0.0, AMPLITUDE])
+def test_a_load_that_is_put_down_is_no_structure(amplitude: float) -> None:
+    windows = record(21, amplitude, 1, load=30.0)
+    noise = identify_noise(PROBLEM, windows)
+    assert noise.changes[0] in {windows[10].start, windows[11].start}
+    assert [item.component.key for item in remaining_structure(PROBLEM, noise, windows)] == (
+        ["carriage/periodic/x"] if amplitude else []
+    )
 
 
 @pytest.mark.parametrize("half", [slice(0, 10), slice(10, 20)])

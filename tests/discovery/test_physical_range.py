@@ -50,6 +50,19 @@ def ranges(of: LinearResponse) -> dict[tuple[str, str, str], tuple[float, float]
     }
 
 
+def test_a_hump_that_has_almost_vanished_limits_nothing() -> None:
+    """At 26.75 times its width it is 2e-311, by which no friction can be divided."""
+    of = response("constant", lambda *_: 0.0)
+    (form,) = (
+        form
+        for form in candidate_library(TWIN, of.x)
+        if (form.model.name, sources(TWIN)[form.source].name) == ("Stribeck", "omega")
+        and sites(TWIN)[form.site].name == "shaft"
+    )
+    low, high = physical_range(of).amplitudes(form, float(np.abs(of.x[form.source]).max()) / 26.75)
+    assert -1.0 < low < high < 1.0
+
+
 def test_no_amplitude_exceeds_what_the_terms_of_the_equation_balance() -> None:
     """The motor turns with 0.03 N·m against damping and 0.1 N·m of load; its voltage is a few volts."""
     bounds = ranges(response("constant", lambda *_: 0.0))

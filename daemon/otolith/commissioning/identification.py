@@ -120,6 +120,7 @@ class IdentifiedNoise:
     windows: int = 0  # How many were used
     evaluations: int = 0  # Linearisations of a window, for all its fits
     inputs: tuple[InputNoise, ...] = ()  # Of inputs whose samples show what may be noise
+    changes: tuple[float, ...] = ()  # Starts of the windows from which on the machine is another than before
 
     def applied(self, problem: Problem) -> Problem:
         """The problem with these levels."""
@@ -186,6 +187,7 @@ def _identify(problem: Problem, windows: Sequence[Window], progress: Progress) -
         windows=len(guess.fits),
         evaluations=likelihood.evaluations,
         inputs=tuple(_shown_input_noise(problem, best.fits)),
+        changes=made.changes,
     )
 
 
@@ -243,6 +245,7 @@ def _first_fits(
 class _ConsistentLevels:
     """What the consistency test leads to."""
 
+    changes: tuple[float, ...]
     consistency: Consistency
     levels: Array  # (outputs + states,), inflated if necessary
     inflated: Fits = ()  # The windows fitted with inflated levels; none if they are not
@@ -286,7 +289,7 @@ def _times(starts: Sequence[float]) -> str:
 
 
 def _without_window(
-    guess: _InitialGuess, best: LikelihoodPoint, index: int, changes: Sequence[float], progress: Progress
+    guess: _InitialGuess, best: LikelihoodPoint, index: int, changes: tuple[float, ...], progress: Progress
 ) -> tuple[_InitialGuess, LikelihoodPoint, _ConsistentLevels] | None:
     """Return what the other windows give without window ``index``; None if their noise explains it as well."""
     likelihood = guess.variances.likelihood
@@ -304,17 +307,17 @@ def _without_window(
 
 
 def _make_consistent(
-    guess: _InitialGuess, best: LikelihoodPoint, changes: Sequence[float], progress: Progress
+    guess: _InitialGuess, best: LikelihoodPoint, changes: tuple[float, ...], progress: Progress
 ) -> _ConsistentLevels:
     """Test whether the windows between ``changes`` agree, and inflate the process noise if they do not."""
     likelihood, outputs = guess.variances.likelihood, len(guess.signal_noise)
     before = consistency_test(best.fits, likelihood.width, changes)
     if not before.degrees:
         remark = ONE_WINDOW if len(best.fits) == 1 else NOT_COMPARABLE
-        return _ConsistentLevels(Consistency(remark=remark), best.levels)
+        return _ConsistentLevels(changes, Consistency(remark=remark), best.levels)
     if before.passed:
         consistency = Consistency(before.degrees, before.reduced, before.reduced, 1.0, CONSISTENT)
-        return _ConsistentLevels(consistency, best.levels)
+        return _ConsistentLevels(changes, consistency, best.levels)
     sensors, process = best.levels.copy(), best.levels.copy()
     sensors[outputs:], process[:outputs] = 0.0, 0.0
     added = not process.any()
@@ -327,12 +330,12 @@ def _make_consistent(
     )
     if not after.degrees or (not after.passed and after.reduced > MAX_LEFT * before.reduced):
         consistency = Consistency(before.degrees, before.reduced, before.reduced, None, NOT_INFLATED)
-        return _ConsistentLevels(consistency, best.levels)
+        return _ConsistentLevels(changes, consistency, best.levels)
     remark = (ADDED if added else INFLATED) if after.passed else PARTLY
     if not added and factor > MAX_PLAUSIBLE_FACTOR:
         remark += DOUBTFUL
     consistency = Consistency(before.degrees, before.reduced, after.reduced, None if added else factor, remark)
-    return _ConsistentLevels(consistency, sensors + factor * process, inflated)
+    return _ConsistentLevels(changes, consistency, sensors + factor * process, inflated)
 
 
 def _output_levels(twin: Definition, guess: _InitialGuess, best: LikelihoodPoint) -> Iterator[NoiseLevel]:

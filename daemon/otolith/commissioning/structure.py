@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.commissioning.consistency import sqrt_information
+from otolith.commissioning.consistency import regimes, sqrt_information
 from otolith.commissioning.identification import IdentifiedNoise, usable_windows
 from otolith.commissioning.likelihood import Fits, FittedWindow, Likelihood, Progress, with_levels
 from otolith.discovery.candidate_forms import CandidateForm
@@ -217,7 +217,8 @@ def remaining_structure(
 ) -> list[Structure]:
     """Return the components that ``windows`` show together, the strongest first; none if there are few windows.
 
-    ``noise`` has been identified from these windows.
+    ``noise`` has been identified from these windows. If the machine changes in them, the longest part between changes
+    is used, without the windows in which they may fall.
     """
     if noise.windows < MIN_WINDOWS or problem.components:
         return []
@@ -227,7 +228,9 @@ def remaining_structure(
         progress(f"structure of window {len(fits) + 1}")
         starts = [problem.nominal, *(one.guess[: len(problem.free)] for one in fits[-1:])]
         fits.append(likelihood.fit(levels, window, starts))
-    fits = [one for one in fits if one.cost <= EXPLAINED]
+    parts = regimes([one for one in fits if one.cost <= EXPLAINED], noise.changes)
+    inner = [part[at > 0 : len(part) - (at < len(parts) - 1)] for at, part in enumerate(parts)]
+    fits = max(inner, key=len, default=[])
     if len(fits) < MIN_WINDOWS:
         return []
     progress("structure of all windows")

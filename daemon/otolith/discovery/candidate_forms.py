@@ -211,7 +211,8 @@ class PhysicalRange:
         visible = shape > 0.0
         if not visible.any():
             return -UNLIMITED, UNLIMITED
-        driving = max(float((self._own_friction(state, speeds)[visible] / shape[visible]).min()), 0.0)
+        with np.errstate(over="ignore"):  # where a narrow hump has almost vanished, it limits nothing
+            driving = max(float((self._own_friction(state, speeds)[visible] / shape[visible]).min()), 0.0)
         return (-UNLIMITED, driving) if coefficient > 0.0 else (-driving, UNLIMITED)
 
     def _own_friction(self, state: int, speeds: Array) -> Array:
