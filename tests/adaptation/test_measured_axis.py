@@ -6,6 +6,7 @@ Benchmarks, 2019.) The data is not part of this project: the tests read it from 
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -16,8 +17,7 @@ import pytest
 
 from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
-from otolith.adaptation.state import initial_state, restore_components
-from otolith.cli.commissioning.components import record_of
+from otolith.adaptation.state import ComponentRecord, initial_state, restore_components
 from otolith.commissioning.consistency import consistency_test
 from otolith.commissioning.identification import DOUBTFUL, IdentifiedNoise, identify_noise
 from otolith.commissioning.likelihood import Likelihood
@@ -243,7 +243,7 @@ def test_a_commissioned_axis_follows_the_force_that_depends_on_position_on_eithe
     (shown,) = remaining_structure(twin, noise, half(number))
     beside = identify_noise(augment(twin, [shown.component]), half(number))
     for other, (pitch, amplitude) in HALVES.items():
-        state = restore_components(initial_state("axis", "lab", beside.applied(twin)), (record_of(shown),))
+        state = restore_components(initial_state("axis", "lab", beside.applied(twin)), (ComponentRecord.of(shown),))
         for window in half(other):
             state, report = adapt(state, window)
             (component,) = report.document.components
@@ -252,3 +252,35 @@ def test_a_commissioned_axis_follows_the_force_that_depends_on_position_on_eithe
             assert 2.0 * np.pi / values["order"] == pytest.approx(pitch, rel=1e-3)
             assert values["amplitude"] == pytest.approx(amplitude, rel=0.1)
             assert report.document.parameters["M"].value == pytest.approx(MASS, rel=0.015)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("number", HALVES)
+def test_a_half_adopts_the_force_that_depends_on_position_with_its_commissioned_noise(number: int) -> None:
+    """Nobody approved it, and no window shows it alone. Nothing else is adopted."""
+    twin = problem("servo_axis_directional")
+    assert_adopted_and_followed(identify_noise(twin, half(number)).applied(twin), half(number), *HALVES[number])
+
+
+@pytest.mark.full
+def test_the_whole_record_adopts_the_force_that_depends_on_position() -> None:
+    pitch, amplitude = np.mean(list(HALVES.values()), axis=0)
+    noisy = identified("servo_axis_directional").applied(problem("servo_axis_directional"))
+    assert_adopted_and_followed(noisy, windows(), pitch, amplitude)
+
+
+def assert_adopted_and_followed(noisy: Problem, record: Sequence[Window], pitch: float, amplitude: float) -> None:
+    state, documents = initial_state("axis", "lab", noisy), []
+    for window in record:
+        state, report = adapt(state, window)
+        documents.append(report.document)
+        assert report.document.parameters["M"].value == pytest.approx(MASS, rel=0.015)
+    with_components = [document for document in documents if document.components]
+    assert len(with_components) >= len(record) - 4
+    for document in with_components:
+        (component,) = document.components
+        values = {name: value.value for name, value in component.values.items()}
+        assert component.id == "carriage/periodic/x"
+        assert 2.0 * np.pi / values["order"] == pytest.approx(pitch, rel=1e-3)
+        assert values["amplitude"] == pytest.approx(amplitude, rel=0.1)
+    assert with_components[-1] is documents[-1]

@@ -1,13 +1,12 @@
 """What a twin lacks in all windows of a healthy record: an axis whose force depends on its position."""
 
-import sys
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
-from otolith.acquisition.window import Window
 from otolith.commissioning import structure as module
 from otolith.commissioning.identification import identify_noise
 from otolith.commissioning.likelihood import Likelihood, with_levels
@@ -15,57 +14,9 @@ from otolith.commissioning.structure import PooledResponse, Structure, remaining
 from otolith.discovery.candidates import best_guesses
 from otolith.discovery.screening import ScoredGuess, allowed_forms
 from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.problem import Problem
 from otolith.estimation.window_fit import fit
-from otolith.machine import find_twin
-
-TWIN = find_twin("servo_axis")
-TRUTH = {"M": 95.0, "F_v": 200.0, "F_c": 20.0, "offset": -3.0, "v_s": 0.002}
-FREE = tuple(parameter for parameter in TWIN.parameters if parameter.name in ("M", "F_v", "F_c", "offset"))
-PROBLEM = Problem(TWIN, (("v_s", TRUTH["v_s"]),), FREE, noise=(1e-6,))
-PITCH = 5e-3  # m
-AMPLITUDE = 5.0  # N: in each window the process noise hides it
-UNEVENNESS = 0.01  # m/s/s^0.5
-NOISE = 1e-6  # m
-QUANTUM = 5e-7  # m
-PERIOD = 2e-3  # s
-RECORDS = 400
-SUBSTEPS = 4
-
-
-@lru_cache
-def record(
-    count: int,
-    amplitude: float,
-    seed: int,
-    frequency: float | None = None,
-    smoothness: float = TRUTH["v_s"],
-    *,
-    load: float = 0.0,
-) -> tuple[Window, ...]:
-    """Windows of an axis under a position controller that moves to and fro; its encoder has steps.
-
-    A force is a sine of the position, or of time if it has a ``frequency`` (Hz). Dry friction changes its sign within
-    ``smoothness`` (m/s) of standstill. A ``load`` (N) is put down in the middle of the window in the middle.
-    """
-    random, x, v, rows = np.random.default_rng(seed), 0.0, 0.0, []
-    dt = PERIOD / SUBSTEPS
-    for at in range(count * RECORDS):
-        time = at * PERIOD
-        target, speed = 0.08 * np.sin(1.9 * time), 0.152 * np.cos(1.9 * time)
-        force = 4000.0 * (target - x) + 1200.0 * (speed - v) + 25.0 * np.tanh(speed / 0.002)
-        rows.append((force, QUANTUM * np.rint((x + NOISE * random.standard_normal()) / QUANTUM)))
-        for substep in range(SUBSTEPS):
-            turns = x / PITCH if frequency is None else frequency * (time + substep * dt)
-            friction = TRUTH["F_v"] * v + TRUTH["F_c"] * np.tanh(v / smoothness)
-            periodic = amplitude * np.sin(2.0 * np.pi * turns + 0.7)
-            carried = TRUTH["offset"] + (load if at < (count // 2 + 0.5) * RECORDS else 0.0)
-            v += dt * (force - friction - carried + periodic) / TRUTH["M"]
-            x += dt * v
-        v += UNEVENNESS * np.sqrt(PERIOD) * random.standard_normal()
-    pieces = np.array(rows).reshape(count, RECORDS, 2)
-    length = RECORDS * PERIOD
-    return tuple(Window.whole(k, length * k, PERIOD, ("F", "x"), piece) for k, piece in enumerate(pieces))
+from otolith.twin.augmentation import sources
+from tests.cogging_axis import AMPLITUDE, FREE, PITCH, PROBLEM, TRUTH, record
 
 
 @lru_cache
@@ -113,8 +64,8 @@ def test_less_than_three_cycles_in_a_window_are_no_structure() -> None:
 
 
 @lru_cache
-def pooled_healthy() -> PooledResponse:
-    windows, likelihood = record(10, 0.0, 0), Likelihood(PROBLEM)
+def pooled(amplitude: float) -> PooledResponse:
+    windows, likelihood = record(10, amplitude, 0), Likelihood(PROBLEM)
     levels = np.array(identify_noise(PROBLEM, windows).before_inflation)
     problem, truth = with_levels(PROBLEM, levels), np.array([TRUTH[parameter.name] for parameter in FREE])
     prior, start = initial_prior(problem), np.concatenate([truth, np.zeros(len(FREE))])
@@ -124,31 +75,61 @@ def pooled_healthy() -> PooledResponse:
 
 
 def test_noise_seldom_gains_from_a_phase_in_each_window() -> None:
-    pooled = pooled_healthy()
-    forms = [form for form in allowed_forms(pooled.problem, pooled.parts[0].x) if pooled.is_restarted(form)]
+    healthy = pooled(0.0)
+    forms = [form for form in allowed_forms(healthy.problem, healthy.parts[0].x) if healthy.is_restarted(form)]
     guesses = [(form, 2.0 * np.pi * hertz) for form in forms[:1] for hertz in range(5, 45)]
     assert len(guesses) == 40
-    assert np.count_nonzero(pooled.score(guesses).gain) <= 1
+    assert np.count_nonzero(healthy.score(guesses).gain) <= 1
 
 
-def test_a_candidate_with_less_than_half_of_the_best_score_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It imitates the best: windows that do not agree on the best may agree on it."""
+@pytest.mark.parametrize(("stands_out", "expected"), [(False, [100.0, 60.0]), (True, [100.0, 60.0, 40.0])])
+def test_a_candidate_with_less_than_half_of_the_best_score_is_not_tried(
+    monkeypatch: pytest.MonkeyPatch, stands_out: bool, expected: list[float]
+) -> None:
+    """It imitates the best: windows that do not agree on the best may agree on it. A sine that stands out does not."""
     scores = (100.0, 60.0, 40.0)
     tried: list[float] = []
     monkeypatch.setattr(
         module, "best_guesses", lambda *given: [replace(best_guesses(*given)[0], score=score) for score in scores]
     )
     monkeypatch.setattr(module, "_structure", lambda _, guess: tried.append(guess.score))
+    monkeypatch.setattr(PooledResponse, "stands_out", lambda *_: stands_out)
     windows = record(20, AMPLITUDE, 1)[:10]
     assert remaining_structure(PROBLEM, identify_noise(PROBLEM, windows), windows) == []
-    assert tried == [100.0, 60.0]
+    assert tried == expected
+
+
+@pytest.mark.parametrize("count", [4, 6, 10, 30])
+def test_agreement_is_that_of_students_t(count: int) -> None:
+    """The scatter is that of windows of equal information around a mean of one; the limit is good to 15 %."""
+    limit = float(stdtrit(count - 1, 1.0 - module.SIGNIFICANCE))
+    signs = np.where(np.arange(count) % 2, 1.0, -1.0)
+    for ratio, agree in ((1.15 * limit, True), (0.99 * limit, False)):
+        values = 1.0 + signs * np.sqrt(count) / ratio
+        assert (module._amplitude_sd(values, np.ones(count)) is not None) is agree
+
+
+def test_a_slow_sine_of_the_position_does_not_stand_out() -> None:
+    """Less than six cycles are any slow curve, whatever they gain beside their neighbours."""
+    uneven = pooled(AMPLITUDE)
+    x = [source.name for source in sources(PROBLEM.twin)].index("x")
+    form = next(
+        form
+        for form in allowed_forms(PROBLEM, uneven.x)
+        if form.source == x and form.site == 0 and form.model.name == "periodic"
+    )
+    span = max(float(np.ptp(part.x[x])) for part in uneven.parts)
+    assert uneven.stands_out((form, 2.0 * np.pi / PITCH))
+    assert not uneven.stands_out((form, 2.0 * np.pi / PITCH + 25.0 * 2.0 * np.pi / span))
+    chance = [uneven.stands_out((form, lines * 2.0 * np.pi / span)) for lines in np.arange(1.0, 5.9, 0.1)]
+    assert not any(chance)
 
 
 def test_an_exponent_is_uncertain_by_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
-    pooled = pooled_healthy()
-    form = next(form for form in allowed_forms(pooled.problem, pooled.x) if form.model.name == "power")
+    healthy = pooled(0.0)
+    form = next(form for form in allowed_forms(healthy.problem, healthy.x) if form.model.name == "power")
     monkeypatch.setattr(PooledResponse, "amplitudes_of_windows", lambda *_: (np.full(10, 5.0), np.ones(10)))
-    shown = module._structure(pooled, ScoredGuess(form, 2.0, np.array([5.0, 0.0]), 50.0))
+    shown = module._structure(healthy, ScoredGuess(form, 2.0, np.array([5.0, 0.0]), 50.0))
     assert shown is not None
     assert shown[0].inner_sd == pytest.approx(0.2)
 
@@ -157,11 +138,11 @@ def test_an_exponent_is_uncertain_by_a_tenth(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_shape_at_a_bound_of_the_search_is_not_offered(
     monkeypatch: pytest.MonkeyPatch, exponent: float, is_at_bound: bool
 ) -> None:
-    pooled = pooled_healthy()
-    form = next(form for form in allowed_forms(pooled.problem, pooled.x) if form.model.name == "power")
+    healthy = pooled(0.0)
+    form = next(form for form in allowed_forms(healthy.problem, healthy.x) if form.model.name == "power")
     assert form.bounds == (0.3, 4.0)
     monkeypatch.setattr(PooledResponse, "amplitudes_of_windows", lambda *_: (np.full(10, 5.0), np.ones(10)))
-    shown = module._structure(pooled, ScoredGuess(form, exponent, np.array([5.0, 0.0]), 50.0))
+    shown = module._structure(healthy, ScoredGuess(form, exponent, np.array([5.0, 0.0]), 50.0))
     assert shown is not None
     assert shown[0].is_at_bound is is_at_bound
     assert shown[0].is_offered is not is_at_bound
@@ -169,9 +150,7 @@ def test_a_shape_at_a_bound_of_the_search_is_not_offered(
 
 def test_a_component_that_a_parameter_must_make_up_for_is_no_structure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Friction is smoother around standstill than in the twin: 16 722·v^1.01 N less 16 500·v would mend that."""
-    module_of_record = sys.modules[__name__]
-    monkeypatch.setattr(module_of_record, "UNEVENNESS", 5e-4)
-    windows = record(8, 0.0, 3, None, 0.06)
+    windows = record(8, 0.0, 3, None, 0.06, unevenness=5e-4)
     noise = identify_noise(PROBLEM, list(windows))
     possible = remaining_structure(PROBLEM, noise, windows)
     assert possible

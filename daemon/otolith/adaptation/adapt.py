@@ -12,8 +12,15 @@ import numpy as np
 
 from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Window
+from otolith.adaptation.pooled_windows import PooledWindows
 from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
-from otolith.adaptation.state import AdaptationState, with_converter_steps, with_posterior
+from otolith.adaptation.state import (
+    AdaptationState,
+    ComponentRecord,
+    with_converter_steps,
+    with_posterior,
+    with_records,
+)
 from otolith.discovery.decision import (
     MAX_COST,
     UPDATES,
@@ -141,14 +148,14 @@ def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
     if test is None and is_calm:
         moved = shifts.moved
         result = _follow_shifts(state, tested, moved) if moved else _update_filter(state, tested)
-        return replace(result, shifts=shifts)
+        return _pool(state, tested, replace(result, shifts=shifts))
     if test is None:
         result = _open_test(state, tested, screening)
     elif is_calm and not shifts.moved and not test.rejects_filter:
         result = _update_filter_beside(state, tested, test)
     else:
         result = _apply_decision(state, tested, test)
-    return replace(result, searched=True, shifts=shifts)
+    return _pool(state, tested, replace(result, searched=True, shifts=shifts))
 
 
 def _continued_test(
@@ -222,6 +229,20 @@ def _update_filter(state: AdaptationState, tested: _TestedEstimate) -> WindowRes
     return _without_faded(state, result, estimated) if state.adopted else result
 
 
+def _pool(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
+    """Return the result of a window, with the component that it shows with those before, if it shows nothing alone."""
+    fitted = tested.estimated.fit
+    if result.decision is not WindowDecision.LEARNED or result.test is not None or fitted.cost > EXPLAINED:
+        return result
+    pooled = state.pooled.after(fitted, result.after.mean[: len(state.problem.free)])
+    if pooled.confirmed is None:
+        return replace(result, pooled=pooled)
+    record = ComponentRecord.of(pooled.confirmed)
+    again = _TestedEstimate.of(with_records(tested.predicted, (record,), forget_phases=False), fitted.window)
+    found = _update_filter(replace(state, adopted=(*state.adopted, record.adopted)), again)
+    return replace(found, decision=WindowDecision.DISCOVERED, before=found.after)
+
+
 def _follow_shifts(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:
     """Return the result of a window that, with those before, shows a change of the parameters at ``moved``.
 
@@ -293,6 +314,7 @@ def _next_state(
         contradictions=result.contradictions(state),
         adopted=result.adopted,
         shifts=_next_shifts(state, result),
+        pooled=_next_pooled(state, result),
         noisier_since=result.noisier_since(state),
         previous=previous,
         health=health,
@@ -308,6 +330,13 @@ def _next_shifts(state: AdaptationState, result: WindowResult) -> ParameterCusum
     if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
         return ParameterCusum()
     return state.shifts if result.shifts is None or result.decision in DATA_FAULTS else result.shifts
+
+
+def _next_pooled(state: AdaptationState, result: WindowResult) -> PooledWindows:
+    """Return the windows to be searched together; those before a change are not."""
+    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
+        return PooledWindows()
+    return result.pooled or state.pooled
 
 
 def _next_records(state: AdaptationState, result: WindowResult) -> int:

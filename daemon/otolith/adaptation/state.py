@@ -5,10 +5,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from otolith.adaptation.pooled_windows import PooledWindows
+from otolith.commissioning.structure import Structure
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.imm_filter import TREND_MEMORY, ParameterCusum
-from otolith.estimation.posterior import Posterior
+from otolith.estimation.posterior import UNKNOWN_PHASE_SD, Posterior
 from otolith.estimation.problem import Component, Problem, WindowOptions, augment, indices, slot_of, without
 from otolith.health.events import HealthState
 from otolith.health.limits import MonitoringPlan
@@ -40,6 +42,8 @@ class AdaptationState:
     adopted: tuple[AdoptedComponent, ...] = ()  # The components in the twin
     shifts: ParameterCusum = field(default_factory=ParameterCusum)
     """By how much the estimates of windows differ from their predictions, all the same way."""
+    pooled: PooledWindows = field(default_factory=PooledWindows)
+    """The last windows that nothing was searched for in alone."""
     noisier_since: float | None = None
     """Unix seconds from which on sensors are noisier than stated; None if they are not."""
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)
@@ -188,6 +192,18 @@ class ComponentRecord:
     values: tuple[float, ...]  # Amplitude, inner parameter and phase, as far as it has them
     deviations: tuple[float, ...]
 
+    @classmethod
+    def of(cls, structure: Structure) -> "ComponentRecord":
+        """Return what a state is given of a structure that several windows show together."""
+        component = structure.component
+        values, deviations = [component.amplitude], [structure.sd]
+        if component.model.inner is not None:
+            values, deviations = [*values, component.inner], [*deviations, structure.inner_sd]
+        if component.periodic:
+            values, deviations = [*values, component.phase], [*deviations, structure.phase_sd]
+        probability = float(1.0 / (1.0 + np.exp(-0.5 * structure.evidence)))
+        return cls(AdoptedComponent(component, component.origin, probability), tuple(values), tuple(deviations))
+
 
 def component_records(state: AdaptationState) -> tuple[ComponentRecord, ...]:
     """Return what is stored of the components in the twin, in the order of their slots."""
@@ -205,15 +221,22 @@ def restore_components(state: AdaptationState, records: tuple[ComponentRecord, .
     """Return the state with stored components; their phases are unknown."""
     if not records:
         return state
-    problem = augment(state.problem, [record.adopted.component for record in records])
-    posterior = state.posterior.remap_parameters(problem)
-    for slot, record in enumerate(records):
+    posterior = with_records(state.posterior, records, forget_phases=True)
+    return replace(state, posterior=posterior, adopted=tuple(record.adopted for record in records))
+
+
+def with_records(posterior: Posterior, records: tuple[ComponentRecord, ...], *, forget_phases: bool) -> Posterior:
+    """Return the posterior with recorded components."""
+    first, problem = len(posterior.problem.components), posterior.problem
+    problem = augment(problem, [record.adopted.component for record in records])
+    posterior = posterior.remap_parameters(problem)
+    for slot, record in enumerate(records, first):
         values = zip(indices(problem, slot), record.values, record.deviations, strict=True)
         for number, (index, value, sd) in enumerate(values):
-            if number == PHASE:
+            if number == PHASE and (forget_phases or RESTART_FACTOR * sd >= UNKNOWN_PHASE_SD):
                 posterior = posterior.forget_phase(index)
             else:
                 posterior = posterior.reset_value(index, value, RESTART_FACTOR * sd)
                 # A trend moves it by no more than that: otherwise a pitch drifts until windows determine its trend.
                 posterior = posterior.reset_value(len(problem.free) + index, 0.0, RESTART_FACTOR * sd / TREND_MEMORY)
-    return replace(state, posterior=posterior, adopted=tuple(record.adopted for record in records))
+    return posterior

@@ -8,6 +8,7 @@ does. The amplitudes of the windows must agree, which those of coloured noise do
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,7 @@ from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuess, a
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.information import orthonormal_basis
 from otolith.estimation.objective import EXPLAINED
+from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
@@ -37,12 +39,15 @@ from otolith.twin.component_families import SourceKind
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree
-SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance
+SIGNIFICANCE = 1e-4  # probability that amplitudes of windows agree that much by chance, or that a sine stands out
+AGREEMENT = 3.72  # standard deviations of the normal distribution that are exceeded with that probability
 CHANCE_DEVIATE = 3.0  # standard deviations that count as chance: of χ² of further phases, of a parameter's value
 UNCERTAIN_SHAPE = 0.1  # of an inner parameter that is no frequency: its standard deviation
 MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
 NEIGHBOURS = (2, 3, 4, 5)  # spectral lines beside a sine, with which its gain is compared
-MIN_SHARE = 0.5  # of the best score: a candidate with less only imitates the best
+MIN_LINE = 6.0  # spectral lines: least frequency of a sine with one phase that is compared with its neighbours
+MIN_SHARE = 0.5  # of the best score: a candidate with less only imitates the best, but for a sine that stands out
+ROUNDING = 1e-9  # of an amplitude: scatter between windows below which they agree to all digits
 AT_BOUND = 1e-3  # of an inner parameter: distance from a bound of the search at which it lies there
 
 
@@ -56,6 +61,8 @@ class Structure:
     evidence: float  # -2 log evidence of all windows against a twin without it
     is_restarted: bool
     """Whether its phase is another in each window: a sine of time, or of an angle that begins at zero there."""
+    phase_sd: float = UNKNOWN_PHASE_SD
+    """Standard deviation of its phase, where its source is zero."""
     is_at_bound: bool = False
     """Whether its inner parameter lies at a bound of the search: then no form that is searched has its shape."""
 
@@ -70,8 +77,6 @@ class PooledResponse(ProjectedResponse):
 
     def __init__(self, fits: Sequence[Fit]) -> None:
         """``fits`` are linearised at the same parameters."""
-        from scipy.linalg import block_diag  # noqa: PLC0415 - only noise identification needs SciPy
-
         self.parts = [LinearResponse(fitted) for fitted in fits]
         first = self.parts[0]
         self.problem, self.window, self.objective = first.problem, first.window, first.objective
@@ -81,7 +86,11 @@ class PooledResponse(ProjectedResponse):
         """(windows,) rows of the residual at which the windows end."""
         free, rows = len(first.problem.free), list(map(_rows_of_window, fits))
         self._start = fits[0].parameters
-        self._states: Array = block_diag(*(orthonormal_basis(jacobian[:, 2 * free :]) for _, jacobian in rows))
+        states = [orthonormal_basis(jacobian[:, 2 * free :]) for _, jacobian in rows]
+        widest = max(basis.shape[1] for basis in states)
+        self._states = self.by_window(
+            np.vstack([np.pad(basis, ((0, 0), (0, widest - basis.shape[1]))) for basis in states])
+        )
         self._innovations = self._without_states(np.concatenate([residuals for residuals, _ in rows]))
         by_parameters = np.vstack([jacobian[:, :free] for _, jacobian in rows])
         self._parameters = self._without_states(by_parameters)
@@ -175,21 +184,36 @@ class PooledResponse(ProjectedResponse):
         return form._replace(bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, np.finfo(float).tiny)), high))
 
     def stands_out(self, guess: Guess) -> bool:
-        """Whether a sine gains more than its neighbours in the spectrum, as one with a phase in each window must.
+        """Whether a sine gains more than its neighbours in the spectrum.
 
-        Its amplitudes are positive whatever the noise. The ratio of its gain to the mean of its neighbours' has an F
-        distribution if it is coloured noise that is smooth over them (D. J. Thomson, Proceedings of the IEEE 70, 1982,
-        section XIII).
+        The ratio of its gain to the mean of its neighbours' has an F distribution if it is coloured noise that is
+        smooth over them (D. J. Thomson, Proceedings of the IEEE 70, 1982, section XIII). Amplitudes of a sine with a
+        phase in each window are positive whatever the noise. One with the same phase in all windows is projected out,
+        as it leaks into its neighbours; it has some cycles, as less is any slow curve.
         """
-        from scipy.special import fdtrc  # noqa: PLC0415 - only noise identification needs SciPy
-
         form, frequency = guess
-        line = 2.0 * np.pi / min(float(np.ptp(part.x[form.source])) for part in self.parts)
+        if len(form.model.phases) == 1:
+            return False
+        spans, is_restarted = [float(np.ptp(part.x[form.source])) for part in self.parts], self.is_restarted(form)
+        line = 2.0 * np.pi / (min(spans) if is_restarted else max(spans))
+        if not is_restarted and frequency < MIN_LINE * line:
+            return False
         around = frequency + line * np.array([step for step in NEIGHBOURS for step in (-step, step)])
-        guesses = [guess, *((form, float(value)) for value in around if value >= line)]
-        gains = np.sum([part.score(guesses).gain for part in self.parts], axis=0)
-        values, ratio = 2.0 * len(self.parts), float(gains[0] / gains[1:].mean())
-        return bool(fdtrc(values, values * (len(guesses) - 1), ratio) < SIGNIFICANCE)
+        beside: list[Guess] = [(form, float(value)) for value in around if value >= line]
+        if is_restarted:
+            from scipy.special import fdtrc  # noqa: PLC0415 - only noise identification needs SciPy
+
+            gains = np.sum([part.score([guess, *beside]).gain for part in self.parts], axis=0)
+            values = 2.0 * len(self.parts)
+            return bool(fdtrc(values, values * len(beside), gains[0] / gains[1:].mean()) < SIGNIFICANCE)
+        rest = copy(self)
+        rest.explain(self.responses(basis_functions([guess])))
+        ratio = float(self.score([guess]).gain[0]) / max(float(rest.score(beside).gain.mean()), np.finfo(float).tiny)
+        return (1.0 + ratio / len(beside)) ** -len(beside) < SIGNIFICANCE  # F distribution, 2 degrees of freedom
+
+    def is_line(self, guess: ScoredGuess) -> bool:
+        """Whether a sine has one phase in all windows, and stands out: then it imitates no smooth curve."""
+        return not self.is_restarted(guess.form) and self.stands_out((guess.form, guess.inner))
 
     def amplitudes_of_windows(self, guess: Guess, amplitudes: Array) -> tuple[Array, Array]:
         """Return the amplitude (windows,) that each window gives, in the pooled phase, and the information on it."""
@@ -235,10 +259,10 @@ def remaining_structure(
         return []
     progress("structure of all windows")
     pooled = PooledResponse(_at_common_parameters(with_levels(problem, levels), fits, likelihood.width))
-    return _structures(pooled, _pooled_forms(pooled))
+    return structures(pooled, pooled_forms(pooled))
 
 
-def _pooled_forms(pooled: PooledResponse) -> list[CandidateForm]:
+def pooled_forms(pooled: PooledResponse) -> list[CandidateForm]:
     """Return the forms that windows at different times show alike."""
     # Not-a-number between two windows: no change of a source from record to record spans them.
     separated = np.hstack([np.pad(part.x, ((0, 0), (0, 1)), constant_values=np.nan) for part in pooled.parts])
@@ -246,14 +270,14 @@ def _pooled_forms(pooled: PooledResponse) -> list[CandidateForm]:
     return [form for form in map(pooled.with_cycles, alike) if form.bounds[0] <= form.bounds[1]]
 
 
-def _structures(pooled: PooledResponse, allowed: list[CandidateForm]) -> list[Structure]:
+def structures(pooled: PooledResponse, allowed: list[CandidateForm]) -> list[Structure]:
     """Return the structures, one at a time: each is projected out before the next one is searched for."""
-    structures: list[Structure] = []
-    while len(structures) < MAX_COMPONENTS:
+    shown: list[Structure] = []
+    while len(shown) < MAX_COMPONENTS:
         guesses = best_guesses(pooled, allowed, CompetingForms.among(pooled.problem, allowed))
         best = max((guess.score for guess in guesses), default=0.0)
-        threshold = max(DECISIVE, MIN_SHARE * best)
-        likely = [guess for guess in guesses if guess.score > threshold and guess.is_readable]
+        likely = [guess for guess in guesses if guess.score > DECISIVE and guess.is_readable]
+        likely = [guess for guess in likely if guess.score > MIN_SHARE * best or pooled.is_line(guess)]
         impossible = [guess.form for guess in likely if not pooled.is_within_bounds(guess)]
         if impossible:
             allowed = [form for form in allowed if form not in impossible]
@@ -261,9 +285,9 @@ def _structures(pooled: PooledResponse, allowed: list[CandidateForm]) -> list[St
         structure = next(filter(None, (_structure(pooled, guess) for guess in likely)), None)
         if structure is None:
             break
-        structures.append(structure[0])
+        shown.append(structure[0])
         allowed = [form for form in allowed if _may_follow(structure[1], form)]
-    return structures
+    return shown
 
 
 def _may_follow(form: CandidateForm, other: CandidateForm) -> bool:
@@ -319,8 +343,10 @@ def _structure(pooled: PooledResponse, guess: ScoredGuess) -> tuple[Structure, C
     )
     span = float(np.ptp(pooled.parts[0].x[form.source] if is_restarted else pooled.x[form.source]))
     inner_sd = np.sqrt(12.0 / max(guess.score, 1.0)) / span if periodic else UNCERTAIN_SHAPE * inner
+    centre = float(np.abs(pooled.x[form.source].mean()))
+    phase_sd = UNKNOWN_PHASE_SD if is_restarted else float(np.hypot(sd / component.amplitude, inner_sd * centre))
     at_bound = not periodic and form.model.inner is not None and _is_at_bound(inner, form.bounds)
-    return Structure(component, sd, float(inner_sd), guess.score, is_restarted, at_bound), form
+    return Structure(component, sd, float(inner_sd), guess.score, is_restarted, phase_sd, at_bound), form
 
 
 def _amplitude_sd(values: Array, information: Array) -> float | None:
@@ -328,15 +354,17 @@ def _amplitude_sd(values: Array, information: Array) -> float | None:
 
     None if the mean is not significant by Student's t test: the windows do not agree on an amplitude.
     """
-    from scipy.special import stdtrit  # noqa: PLC0415 - only noise identification needs SciPy
-
     shares = information / information.sum()
     mean = float(shares @ values)
     sd = float(np.sqrt((shares**2 * (values - mean) ** 2).sum()))
     effective = 1.0 / float((shares**2).sum())  # number of windows
-    if effective <= 2.0 or abs(mean) < sd * float(stdtrit(effective - 1.0, 1.0 - SIGNIFICANCE)):
+    degrees = effective - 1.0
+    if degrees <= 1.0 or not mean:
         return None
-    return sd
+    # Student's t as a standard normal deviate (D. L. Wallace, Annals of Mathematical Statistics 30, 1959).
+    squared = degrees * np.log1p((mean / max(sd, ROUNDING * abs(mean))) ** 2 / degrees)
+    deviate = (8.0 * degrees + 1.0) / (8.0 * degrees + 3.0) * np.sqrt(squared)
+    return sd if deviate > AGREEMENT else None
 
 
 def _is_at_bound(value: float, bounds: tuple[float, float]) -> bool:

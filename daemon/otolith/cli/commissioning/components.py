@@ -22,7 +22,6 @@ from otolith.cli.common import (
 
 if TYPE_CHECKING:
     from otolith.adaptation.state import AdaptationState, ComponentRecord, OperatorDecisions
-    from otolith.commissioning.structure import Structure
     from otolith.health.prognosis import History
     from otolith.machine import LoadedMachine
     from otolith.storage.state_store import StateStore
@@ -222,13 +221,14 @@ def commission(file: Path, data: Path, yes: bool, windows: int) -> None:
 
 
 def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windows: int, *, approve_all: bool) -> None:
+    from otolith.adaptation.state import ComponentRecord
     from otolith.cli.commissioning.noise import identified_record, noise_lines
     from otolith.commissioning.identification import explains_no_window
     from otolith_drivers.errors import OtolithError
 
     record = identified_record(machine, data, windows)
     identified = record.noise_beside(machine) if record.offered else record.noise
-    components = tuple(record_of(item) for item in record.offered)
+    components = tuple(ComponentRecord.of(item) for item in record.offered)
     is_useless = bool(components) or explains_no_window(machine.problem, record.noise, record.windows[0])
     state = None if is_useless else _replayed(machine, data)
     if state is None or not state.adopted:  # the file's noise levels may have hidden a component
@@ -245,21 +245,6 @@ def _commission(machine: "LoadedMachine", store: "StateStore", data: Path, windo
         keep_baseline(machine, store, state.health.histories)
     except OtolithError as error:  # nothing that has limits, or a record that is too short
         click.echo(str(error), err=True)
-
-
-def record_of(structure: "Structure") -> "ComponentRecord":
-    """Return what a state is given of a structure, so that it is in the twin from the first window on."""
-    from otolith.adaptation.state import ComponentRecord
-    from otolith.discovery.decision import AdoptedComponent
-    from otolith.estimation.posterior import UNKNOWN_PHASE_SD
-
-    component = structure.component
-    values, deviations = [component.amplitude], [structure.sd]
-    if component.model.inner is not None:
-        values, deviations = [*values, component.inner], [*deviations, structure.inner_sd]
-    if component.periodic:
-        values, deviations = [*values, component.phase], [*deviations, UNKNOWN_PHASE_SD]
-    return ComponentRecord(AdoptedComponent(component, component.origin), tuple(values), tuple(deviations))
 
 
 def _replayed(

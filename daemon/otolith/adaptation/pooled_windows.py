@@ -1,0 +1,126 @@
+"""Components that no window shows alone, but all of the last windows together.
+
+A weak component gains too little in one window to be worth a search, however often it returns. So the last windows are
+kept and from time to time searched together, as those of a healthy record are: same parameters, same component (see
+:mod:`otolith.commissioning.structure`). It is adopted when two such searches find it. The second one contains a window
+that the first one has not seen. ``docs/explanation/discovery.md`` has the rules.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from otolith.acquisition.window import Array, Window
+from otolith.commissioning.structure import MIN_WINDOWS, PooledResponse, Structure, pooled_forms, structures
+from otolith.discovery.candidate_forms import CandidateForm
+from otolith.discovery.candidates import components_of
+from otolith.discovery.linear_response import Guess
+from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuesses
+from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.problem import Problem, key_of
+from otolith.estimation.window_fit import Fit, fit
+from otolith.twin.augmentation import sites, sources
+
+# Values, units, origins and guarding tests: docs/reference/thresholds-discovery.md.
+MAX_WINDOWS = 8  # that are searched together
+MAX_TOTAL_RECORDS = 12_000  # of these windows
+MAX_PAUSE = 256  # windows between two searches, which take as long as that of a window
+LESS_NOISE = 0.5  # ratio of two levels of process noise that are compared
+SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not found the same
+
+Starts = tuple[tuple[Window, tuple[float, ...]], ...]
+"""Windows, each with its initial state."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PooledWindows:
+    """The last windows that updated the filter and showed nothing that the twin lacks."""
+
+    windows: Starts = ()
+    pause: int = MIN_WINDOWS  # Windows until the next search
+    next_pause: int = MIN_WINDOWS  # The same after it
+    found: Structure | None = None  # By the last search
+    confirmed: Structure | None = None  # By the last two: it is to be adopted
+
+    def after(self, fitted: Fit, parameters: Array) -> "PooledWindows":
+        """Return them with the window of a fit; ``parameters`` (free,) are known after it."""
+        pause = self.pause - 1
+        if not fitted.problem.discover or pause >= MAX_WINDOWS:
+            return replace(self, windows=(), pause=pause)
+        windows = (*self.windows, (fitted.window, tuple(fitted.initial.tolist())))[-MAX_WINDOWS:]
+        while sum(window.records for window, _ in windows) > MAX_TOTAL_RECORDS:
+            windows = windows[1:]
+        added = replace(self, windows=windows, pause=pause)
+        if pause > 0 or len(windows) < MIN_WINDOWS:
+            return added
+        found = lacking_component(fitted.problem, windows, parameters)
+        if found is not None and self.found is not None and _agree(found, self.found):
+            return PooledWindows(confirmed=found)
+        pause, longer = self.next_pause, min(2 * self.next_pause, MAX_PAUSE)
+        return replace(added, found=found, pause=pause if found is None else 1, next_pause=longer)
+
+
+def _agree(one: Structure, other: Structure) -> bool:
+    """Whether two searches have found the same."""
+    inner = one.component.inner, other.component.inner
+    return one.component.key == other.component.key and abs(inner[0] - inner[1]) <= SAME_INNER * abs(inner[0])
+
+
+def lacking_component(problem: Problem, windows: Starts, parameters: Array) -> Structure | None:
+    """Return the component that ``windows`` show together most clearly, within its physical range; None if none.
+
+    Process noise that was stated larger than it is hides structure, so the likeliest level is searched at. But what the
+    stated noise covers may be a part of it: only a sine that stands out in its spectrum needs no evidence beside that.
+    """
+    likeliest, pooled = _at_likeliest_noise(problem, windows, parameters)
+    forms = [form for form in pooled_forms(pooled) if not pooled.is_restarted(form)]
+    for found in filter(lambda found: found.is_offered, structures(pooled, forms)):
+        guess = next(form for form in forms if _key(pooled, form) == found.component.key), found.component.inner
+        alone, stated = (_pooled(levels, windows, parameters) for levels in (likeliest, problem))
+        scored = ScoredGuesses.of(stated, [guess], CompetingForms.among(problem, forms))[0]
+        is_shown = scored.score > DECISIVE or alone.is_line(scored)
+        if (
+            is_shown
+            and not _may_be_of_sensor(alone, guess)
+            and all(components_of(own, [scored]) for own in stated.parts)
+        ):
+            return found
+    return None
+
+
+def _at_likeliest_noise(problem: Problem, windows: Starts, parameters: Array) -> tuple[Problem, PooledResponse]:
+    """Return problem and response at the stated process noise, or at a lower level that is likelier."""
+    pooled = _pooled(problem, windows, parameters)
+    while any(problem.process_noise):
+        lower = replace(problem, process_noise=tuple(LESS_NOISE * level for level in problem.process_noise))
+        calmer = _pooled(lower, windows, parameters)
+        if _deviance(calmer) >= _deviance(pooled):
+            break
+        problem, pooled = lower, calmer
+    return problem, pooled
+
+
+def _pooled(problem: Problem, windows: Starts, parameters: Array) -> PooledResponse:
+    """Return the response of the windows, each linearised at the same ``parameters`` (free,)."""
+    prior, start = initial_prior(problem), np.concatenate([parameters, np.zeros(len(parameters))])
+    return PooledResponse([fit(problem, window, prior, start, 0, state=state) for window, state in windows])
+
+
+def _deviance(pooled: PooledResponse) -> float:
+    """Minus twice the log-likelihood of the process noise, up to a constant."""
+    return pooled.chi_square + sum(part.objective.innovation_model.log_determinant for part in pooled.parts)
+
+
+def _key(pooled: PooledResponse, form: CandidateForm) -> str:
+    twin = pooled.problem.base_model
+    return key_of(sites(twin)[form.site].name, form.model.name, sources(twin)[form.source].name)
+
+
+def _may_be_of_sensor(pooled: PooledResponse, guess: Guess) -> bool:
+    """Whether the error of an output's sensor would explain the windows as well, as that of an encoder."""
+    (form, inner), twin = guess, pooled.problem.base_model
+    outputs = {output.name for output in twin.outputs}
+    read = [at for at, site in enumerate(sites(twin)) if at >= len(twin.sites) and site.into in outputs]
+    of_sensors = [(form._replace(site=at), inner) for at in read]
+    gains = pooled.score([guess, *of_sensors]).gain
+    return bool((gains[1:] > gains[0] - DECISIVE).any())
