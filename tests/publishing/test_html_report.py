@@ -303,10 +303,10 @@ SMALLEST = (
     "Math.min(...[...document.querySelectorAll('body *')].map(row => parseFloat(getComputedStyle(row).fontSize)))"
 )
 """Size of the smallest text, px."""
-CUT = """[...document.querySelectorAll('.labels span')].filter(
+CUT = """[...document.querySelectorAll('.labels span, .ticks span')].filter(
   row => row.getBoundingClientRect().right > row.parentElement.getBoundingClientRect().right
 ).map(row => row.textContent)"""
-"""Labels of plots that are wider than their column."""
+"""Labels of plots and of their axes that are cut at the right edge."""
 SPLIT = r"""(() => {
   const split = [], range = document.createRange();
   const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);

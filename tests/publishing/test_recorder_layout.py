@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from otolith.health.limits import Level, Limit, MonitoredQuantity
-from otolith.health.schema import Report, ReportDocument
+from otolith.health.schema import CrossingDocument, ForecastDocument, Report, ReportDocument
 from otolith.machine import load_machine
 from otolith.publishing.recorder import Recording, limit_lines, near_values, operator_text
 from otolith_drivers.base import Sampling
@@ -22,15 +22,27 @@ def at(level: Level) -> ReportDocument:
 
 def test_the_text_has_state_what_since_when_how_sure_and_what_to_do() -> None:
     text = operator_text(at(Level.ACT))
-    assert text.startswith("# ACT\nsince ")
+    assert text.startswith("# ACT\n\n## winding: short circuit between turns of the winding\nsince ")
+    assert text.count("ACT") == text.count("since ") == 1
     for part in (
-        "## ACT: winding: short circuit between turns of the winding\nsince",
         "R\\_a is 5.8 Ω",
         "% probability)",
         "**What to do: plan a replacement of the winding",
     ):
         assert part in text
     assert operator_text(documents()[0]).startswith("# OK\nsince ")
+
+
+def test_the_text_has_the_forecast_of_a_parameter_that_is_still_healthy() -> None:
+    document = documents()[0]
+    end = document.window.end
+    forecast = ForecastDocument(
+        computed=end, watch=CrossingDocument(limit=6.3, at=end + 80.0, low=end + 70.0, high=end + 90.0)
+    )
+    parameters = {"R_a": document.parameters["R_a"].model_copy(update={"forecast": forecast})}
+    text = operator_text(document.model_copy(update={"parameters": parameters}))
+    assert text.startswith("# OK\nsince ")
+    assert "reaches WATCH in 70 s to 90 s (80 %)" in text
 
 
 def test_text_of_a_machine_is_no_markdown() -> None:

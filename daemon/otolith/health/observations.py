@@ -170,12 +170,16 @@ def _of_parameter(
     share = f"{deviation / quantity.nominal:+.1%}" if quantity.nominal else ""
     expected = forecast_text(parameter, report.window.end, texts.language)
     change = f" ({share}{against}{_at_temperature(quantity, texts)})" if share else ""
-    side = texts(limit.side if limit.excess(referred[0]) > 0.0 else "still_near")
     what = {"what": texts.translated(quantity.meaning), "name": name, "value": value_text(parameter), "change": change}
     ahead = {"expected": expected and f", {expected}", "warming": _warming(quantity, deviation, texts)}
-    beside = f"{number_text(limit.value, 4)} {unit_text(unit)}".rstrip()
-    text = texts("limit", **what, side=side, limit=beside, **ahead)
+    text = texts("limit", **what, beside=_beside(limit, referred[0], unit, texts), **ahead)
     return Observation(key, quantity.part, level, features, text, numbers=_numbers(*referred, unit, limit))
+
+
+def _beside(limit: Limit, value: float, unit: str, texts: Texts) -> str:
+    """Return on which side of a limit a value is."""
+    side = texts(limit.side if limit.excess(value) > 0.0 else "still_near")
+    return texts("beside", side=side, limit=f"{number_text(limit.value, 4)} {unit_text(unit)}".rstrip())
 
 
 def _of_trend(plan: MonitoringPlan, report: ReportDocument, name: str, level: Level | None, span: float) -> Observation:
@@ -275,6 +279,8 @@ def _of_component(
     elif size > QUANTILE * amplitude.sd and not is_expected:
         level = Level(severity(plan.rules, features))
     interval = interval_text(amplitude.value, amplitude.sd, amplitude.unit)
-    text = plan.texts("component", what=component.meaning, equation=equation_text(component.equation), value=interval)
+    what = {"what": component.meaning, "equation": equation_text(component.equation), "value": interval}
+    beside = f", {_beside(limit, size, amplitude.unit, plan.texts)}" if limit else ""
+    text = plan.texts("component", **what, beside=beside)
     numbers = _numbers(size, amplitude.sd, amplitude.unit, limit)
     return Observation(key, quantity.part, level, features, text, since=component.onset, numbers=numbers)

@@ -19,6 +19,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from rerun.blueprint.encodings import TimelineColumn
 
 from otolith.acquisition.window import Array, Verdict
 from otolith.health.language import Texts, texts_in
@@ -27,6 +28,7 @@ from otolith.health.schema import EventDocument, Report, ReportDocument, Status
 from otolith.health.text import (
     announcements,
     event_text,
+    forecast_text,
     headline,
     moment_text,
     number_text,
@@ -184,7 +186,7 @@ class Recording:
         self._style("residual", [f"{output.name} / noise" for output in twin.outputs], None)
         for parameter in source.parameters:
             names = [*INTERVAL, quantity_text(parameter.name, parameter.unit)]  # the last is drawn on top
-            self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, TWIN])
+            self._style(f"parameters/{parameter.name}", names, [LIMIT, LIMIT, MEASURED])
             quantity = source.plan.parameters.get(parameter.name, MonitoredQuantity(nominal=parameter.nominal))
             self._limits[parameter.name], lines = quantity, limit_lines(quantity, source.plan.texts)
             self._style(f"limits/{parameter.name}", [name for name, _, _ in lines], [colour for _, _, colour in lines])
@@ -389,18 +391,27 @@ def operator_text(document: ReportDocument) -> str:
     if (health := document.health) is None:
         return f"# {document.machine}"
     texts = texts_in(health.language)
-    lines = [f"# {texts.translated(state_word(health))}\n{texts('since', time=moment_text(health.since))}"]
-    lines += [_paragraph(event) for event in document.events if event.end is None]
-    if len(lines) == 1:
-        lines.append(_plain(health.reason or texts("all_well")))
+    current = [event for event in document.events if event.end is None]
+    lines = [f"# {texts.translated(state_word(health))}"]
+    if all(event.state is not health.state for event in current):  # otherwise the first event says since when
+        reason = health.reason or texts("all_well")
+        lines[0] += f"\n{texts('since', time=moment_text(health.since))}"
+        lines += [] if current else [_plain(reason)]
+    lines += [_paragraph(event, health.state) for event in current]
+    judged = {event.id.partition("@")[0].partition("/")[2] for event in current}
+    for name, item in document.parameters.items():
+        expected = forecast_text(item, document.window.end, health.language)
+        if expected and name not in judged:
+            lines.append(_plain(f"{name} {value_text(item)} {expected} (80 %)"))
     return "\n\n".join(lines)
 
 
-def _paragraph(event: EventDocument) -> str:
-    """Return what is the matter, since when, how sure, and what to do."""
+def _paragraph(event: EventDocument, worst: Level) -> str:
+    """Return what is the matter, since when, how sure, and what to do; the state unless it is the ``worst``."""
     say = texts_in(event.language)
     sure = f" ({probability})" if (probability := probability_text(event)) else ""
-    what = _plain(f"{say.translated(event.state)}: {say.translated(event.part)}: {event.condition}")
+    state = "" if event.state is worst else f"{say.translated(event.state)}: "
+    what = _plain(f"{state}{say.translated(event.part)}: {event.condition}")
     what = f"## {what}\n{say('since', time=moment_text(event.since))}"
     advice = f"**{say('what_to_do')}: {_plain(event.advice)}**" if event.advice else ""
     return "  \n".join(filter(None, [what, advice, _plain(f"{event.text}{sure}")]))
@@ -453,14 +464,17 @@ def _operator(source: RecordedMachine) -> rrb.Container:
             contents=[f"/parameters/{row.name}", f"/limits/{row.name}"],
             name=f"{quantity_text(row.name, row.unit)}: {say(row.meaning)}",
             axis_x=whole,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+            plot_legend=rrb.PlotLegend(_legend_corner(source.plan.parameters.get(row.name, MonitoredQuantity()))),
         )
         for row in source.parameters
     ]
     estimates.append(
         rrb.TimeSeriesView(origin="/components", name=texts("components"), axis_x=whole),
     )
-    columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    columns = rrb.TextLogColumns(
+        timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow for a date, which the text has
+        text_log_columns=["LogLevel", "Body"],
+    )
     return rrb.Vertical(
         rrb.Horizontal(
             rrb.TextDocumentView(origin="/operator", name=source.title),
@@ -472,6 +486,12 @@ def _operator(source: RecordedMachine) -> rrb.Container:
         row_shares=[6, 4, 2],
         name=texts("state"),
     )
+
+
+def _legend_corner(quantity: MonitoredQuantity) -> rrb.Corner2D:
+    """Return where the legend hides the healthy value least: on the side of the nearest limit."""
+    nearest = min(quantity.limits, key=lambda row: abs(row.value - quantity.nominal), default=None)
+    return rrb.Corner2D.LeftBottom if nearest is not None and nearest.is_lower else rrb.Corner2D.LeftTop
 
 
 def _engineer(source: RecordedMachine) -> rrb.Container:
