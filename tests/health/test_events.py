@@ -15,7 +15,6 @@ from otolith.health.limits import RELEASE, Level, Limit, MonitoredQuantity, Moni
 from otolith.health.observations import (
     INTERMITTENT_WINDOWS,
     LOST_AFTER,
-    MIN_RETURNS,
     PERSISTENT_WINDOWS,
     RELEASE_WINDOWS,
     UNDECIDED,
@@ -551,89 +550,6 @@ def test_a_sensor_that_was_wrong_without_a_break_is_cleared_after_three_windows(
         (9 + PERSISTENT_WINDOWS, EventChange.RAISED),
         (19 + PERSISTENT_WINDOWS, EventChange.CLEARED),
     ]
-
-
-def test_an_open_test_that_a_machine_at_rest_cannot_decide_does_not_clear_the_event_of_a_sensor() -> None:
-    undecided = SENSOR.model_copy(update={"id": "undecided", "kind": FindingKind.OPEN, "subject": ""})
-    at_rest = [report(index, findings=(undecided,)) for index in range(10, 100)]
-    documents = assessed([*sensor_reports([True] * 10), *at_rest, report(100), report(101), report(102)])
-    assert [(index, change) for index, change, _ in changes(documents)] == [
-        (PERSISTENT_WINDOWS - 1, EventChange.RAISED),
-        (102, EventChange.CLEARED),
-    ]
-
-
-def test_a_fault_that_comes_and_goes_is_raised_again_once_and_stays_until_it_is_mended() -> None:
-    """A limit is passed in five of ten windows for ten minutes."""
-    broken = 300
-    values = [5.8 if index < broken and index % 10 >= 5 else NOMINAL for index in range(broken + 2 * RELEASE_WINDOWS)]
-    documents = assessed(report(index, value) for index, value in enumerate(values))
-    assert [(index, change) for index, change, _ in changes(documents)] == [
-        (7, EventChange.RAISED),
-        (12, EventChange.CLEARED),
-        (17, EventChange.RAISED),
-        (broken + RELEASE_WINDOWS - 1, EventChange.CLEARED),
-    ]
-    assert documents[broken + RELEASE_WINDOWS - 1].events[0].end == LENGTH * broken
-
-
-@pytest.mark.parametrize("period", [4, 5, 7])
-def test_changes_that_are_gone_before_they_are_an_event_of_their_own_are_one_together(period: int) -> None:
-    doubt = SENSOR.model_copy(update={"id": "undecided", "kind": FindingKind.OPEN, "subject": "", "text": "R_a or V_a"})
-    documents = assessed(
-        report(index, decision=WindowDecision.SUSPECTED, findings=(doubt,))
-        if 20 <= index < 100 and index % period < 2
-        else report(index)
-        for index in range(200)
-    )
-    raised, cleared = changes(documents)
-    first = next(index for index in range(20, 30) if index % period < 2)
-    assert raised == (first - first % period + (MIN_RETURNS - 1) * period, EventChange.RAISED, Level.WATCH)
-    assert cleared[1] is EventChange.CLEARED
-    assert 99 - period + RELEASE_WINDOWS <= cleared[0] <= 100 + RELEASE_WINDOWS
-    event = events(documents[raised[0]])["machine"]
-    assert event.condition == "a fault that comes and goes"
-    assert event.start == LENGTH * first
-    assert event.text.startswith(f"{MIN_RETURNS} times in ")
-    assert event.text.endswith("R_a or V_a")
-
-
-def test_doubts_about_another_event_are_not_announced_as_well() -> None:
-    doubt = SENSOR.model_copy(update={"id": "undecided", "kind": FindingKind.OPEN, "subject": ""})
-    documents = assessed(
-        report(index, 5.8, decision=WindowDecision.SUSPECTED, findings=(doubt,))
-        if index > 9 and index % 2
-        else report(index, 5.8)
-        for index in range(60)
-    )
-    assert [part for document in documents for part in events(document)] == ["winding"] * len(documents[2:])
-
-
-def test_an_interval_that_holds_the_healthy_value_as_well_says_nothing_about_the_event() -> None:
-    """As of a machine at rest: the condition, its text and its advice stay those of the windows that showed it."""
-    reports = [report(index, 5.8) for index in range(10)]
-    documents = assessed([*reports, *(report(index, 6.4, 0.5) for index in range(10, 30))])
-    assert len(changes(documents)) == 1
-    before, after = (events(document)["winding"] for document in (documents[9], documents[-1]))
-    assert after == before
-    assert documents[9].events[0].change is None
-
-
-def test_a_clock_that_is_set_back_leaves_no_event_that_begins_in_the_future_or_ends_before_its_begin() -> None:
-    back = 3600.0
-    reports = [report(index, 5.8 if 10 <= index < 30 else 6.5) for index in range(40)]
-    for index in range(20, 40):
-        window = reports[index].window
-        moved = window.model_copy(update={"start": window.start - back, "end": window.end - back})
-        reports[index] = reports[index].model_copy(update={"window": moved})
-    documents = assessed(reports)
-    assert [item[1] for item in changes(documents)] == [EventChange.RAISED, EventChange.CLEARED]
-    for document in documents:
-        assert document.health is not None
-        begins = [part.since for part in (document.health, *document.health.parts.values())]
-        begins += [time for event in document.events for time in (event.start, event.since)]
-        assert max(begins) <= document.window.end
-        assert all(event.end is None or event.end >= event.since for event in document.events)
 
 
 @pytest.mark.parametrize("decision", [WindowDecision.STEPPED, WindowDecision.DISCOVERED])

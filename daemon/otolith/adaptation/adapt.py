@@ -232,15 +232,16 @@ def _update_filter(state: AdaptationState, tested: _TestedEstimate) -> WindowRes
 def _pool(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
     """Return the result of a window, with the component that it shows with those before, if it shows nothing alone."""
     fitted = tested.estimated.fit
-    if result.decision is not WindowDecision.LEARNED or result.test is not None or fitted.cost > EXPLAINED:
+    is_undecided = result.decision is not WindowDecision.LEARNED or result.test is not None
+    if is_undecided or fitted.cost > EXPLAINED or tested.estimated.drifts:
         return result
-    pooled = state.pooled.after(fitted, result.after.mean[: len(state.problem.free)])
+    pooled = state.pooled.after(fitted, result.after.mean[: len(fitted.problem.free)])
     if pooled.confirmed is None:
         return replace(result, pooled=pooled)
     record = ComponentRecord.of(pooled.confirmed)
     again = _TestedEstimate.of(with_records(tested.predicted, (record,), forget_phases=False), fitted.window)
-    found = _update_filter(replace(state, adopted=(*state.adopted, record.adopted)), again)
-    return replace(found, decision=WindowDecision.DISCOVERED, before=found.after)
+    discovered = _update_filter(replace(state, adopted=(*state.adopted, record.adopted)), again)
+    return replace(discovered, decision=WindowDecision.DISCOVERED, before=discovered.after)
 
 
 def _follow_shifts(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:

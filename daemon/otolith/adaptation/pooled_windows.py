@@ -1,9 +1,10 @@
 """Components that no window shows alone, but all of the last windows together.
 
 A weak component gains too little in one window to be worth a search, however often it returns. So the last windows are
-kept and from time to time searched together, as those of a healthy record are: same parameters, same component (see
-:mod:`otolith.commissioning.structure`). It is adopted when two such searches find it. The second one contains a window
-that the first one has not seen. ``docs/explanation/discovery.md`` has the rules.
+kept and from time to time searched together, as those of a healthy record are: same component, and parameters that
+differ from what was known by the same amount in all windows (see :mod:`otolith.commissioning.structure`). It is adopted
+when two such searches find it. The second one contains a window that the first one has not seen.
+``docs/explanation/discovery.md`` has the rules.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from otolith.discovery.candidates import components_of
 from otolith.discovery.linear_response import Guess
 from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuesses
 from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.problem import Problem, key_of
+from otolith.estimation.problem import Problem, key_of, source_of
 from otolith.estimation.window_fit import Fit, fit
 from otolith.twin.augmentation import sites, sources
 
@@ -28,8 +29,8 @@ MAX_PAUSE = 256  # windows between two searches, which take as long as that of a
 LESS_NOISE = 0.5  # ratio of two levels of process noise that are compared
 SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not found the same
 
-Starts = tuple[tuple[Window, tuple[float, ...]], ...]
-"""Windows, each with its initial state."""
+Starts = tuple[tuple[Window, tuple[float, ...], tuple[float, ...]], ...]
+"""Windows, each with its initial state and with what was known of the parameters after it: they may drift."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,25 +40,28 @@ class PooledWindows:
     windows: Starts = ()
     pause: int = MIN_WINDOWS  # Windows until the next search
     next_pause: int = MIN_WINDOWS  # The same after it
-    found: Structure | None = None  # By the last search
+    shown: Structure | None = None  # By the last search
     confirmed: Structure | None = None  # By the last two: it is to be adopted
 
     def after(self, fitted: Fit, parameters: Array) -> "PooledWindows":
         """Return them with the window of a fit; ``parameters`` (free,) are known after it."""
-        pause = self.pause - 1
-        if not fitted.problem.discover or pause >= MAX_WINDOWS:
-            return replace(self, windows=(), pause=pause)
-        windows = (*self.windows, (fitted.window, tuple(fitted.initial.tolist())))[-MAX_WINDOWS:]
-        while sum(window.records for window, _ in windows) > MAX_TOTAL_RECORDS:
+        pause, problem = self.pause - 1, fitted.problem
+        in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
+        if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
+            return replace(self, windows=(), pause=pause)  # what is in the twin may have another phase in each window
+        states = fitted.initial[: len(problem.base_model.states)]
+        start = fitted.window, tuple(states.tolist()), tuple(parameters[: len(problem.free)].tolist())
+        windows = (*self.windows, start)[-MAX_WINDOWS:]
+        while sum(window.records for window, *_ in windows) > MAX_TOTAL_RECORDS:
             windows = windows[1:]
         added = replace(self, windows=windows, pause=pause)
         if pause > 0 or len(windows) < MIN_WINDOWS:
             return added
-        found = lacking_component(fitted.problem, windows, parameters)
-        if found is not None and self.found is not None and _agree(found, self.found):
-            return PooledWindows(confirmed=found)
+        shown = lacking_component(problem, windows)
+        if shown is not None and self.shown is not None and _agree(shown, self.shown):
+            return PooledWindows(confirmed=shown)
         pause, longer = self.next_pause, min(2 * self.next_pause, MAX_PAUSE)
-        return replace(added, found=found, pause=pause if found is None else 1, next_pause=longer)
+        return replace(added, shown=shown, pause=pause if shown is None else 1, next_pause=longer)
 
 
 def _agree(one: Structure, other: Structure) -> bool:
@@ -66,17 +70,17 @@ def _agree(one: Structure, other: Structure) -> bool:
     return one.component.key == other.component.key and abs(inner[0] - inner[1]) <= SAME_INNER * abs(inner[0])
 
 
-def lacking_component(problem: Problem, windows: Starts, parameters: Array) -> Structure | None:
+def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
     """Return the component that ``windows`` show together most clearly, within its physical range; None if none.
 
     Process noise that was stated larger than it is hides structure, so the likeliest level is searched at. But what the
     stated noise covers may be a part of it: only a sine that stands out in its spectrum needs no evidence beside that.
     """
-    likeliest, pooled = _at_likeliest_noise(problem, windows, parameters)
+    quieter, pooled = _at_likeliest_noise(problem, windows)
     forms = [form for form in pooled_forms(pooled) if not pooled.is_restarted(form)]
-    for found in filter(lambda found: found.is_offered, structures(pooled, forms)):
-        guess = next(form for form in forms if _key(pooled, form) == found.component.key), found.component.inner
-        alone, stated = (_pooled(levels, windows, parameters) for levels in (likeliest, problem))
+    for shown in filter(lambda own: own.is_offered, structures(pooled, forms)):
+        guess = next(form for form in forms if _key(pooled, form) == shown.component.key), shown.component.inner
+        alone, stated = (_pooled(levels, windows) for levels in (quieter, problem))
         scored = ScoredGuesses.of(stated, [guess], CompetingForms.among(problem, forms))[0]
         is_shown = scored.score > DECISIVE or alone.is_line(scored)
         if (
@@ -84,26 +88,27 @@ def lacking_component(problem: Problem, windows: Starts, parameters: Array) -> S
             and not _may_be_of_sensor(alone, guess)
             and all(components_of(own, [scored]) for own in stated.parts)
         ):
-            return found
+            return shown
     return None
 
 
-def _at_likeliest_noise(problem: Problem, windows: Starts, parameters: Array) -> tuple[Problem, PooledResponse]:
+def _at_likeliest_noise(problem: Problem, windows: Starts) -> tuple[Problem, PooledResponse]:
     """Return problem and response at the stated process noise, or at a lower level that is likelier."""
-    pooled = _pooled(problem, windows, parameters)
+    pooled = _pooled(problem, windows)
     while any(problem.process_noise):
         lower = replace(problem, process_noise=tuple(LESS_NOISE * level for level in problem.process_noise))
-        calmer = _pooled(lower, windows, parameters)
+        calmer = _pooled(lower, windows)
         if _deviance(calmer) >= _deviance(pooled):
             break
         problem, pooled = lower, calmer
     return problem, pooled
 
 
-def _pooled(problem: Problem, windows: Starts, parameters: Array) -> PooledResponse:
-    """Return the response of the windows, each linearised at the same ``parameters`` (free,)."""
-    prior, start = initial_prior(problem), np.concatenate([parameters, np.zeros(len(parameters))])
-    return PooledResponse([fit(problem, window, prior, start, 0, state=state) for window, state in windows])
+def _pooled(problem: Problem, windows: Starts) -> PooledResponse:
+    """Return the response of the windows, each linearised at what was known of the parameters after it."""
+    prior, trends = initial_prior(problem), np.zeros(len(problem.free))
+    starts = ((window, state, np.concatenate([parameters, trends])) for window, state, parameters in windows)
+    return PooledResponse([fit(problem, window, prior, start, 0, state=state) for window, state, start in starts])
 
 
 def _deviance(pooled: PooledResponse) -> float:

@@ -154,8 +154,7 @@ def _doubtful(before: tuple[int, ...], report: ReportDocument) -> tuple[int, ...
     """Return the indices of the last windows that contradicted what was known; the window of the report may be one."""
     now = report.window.index
     recent = tuple(index for index in before if now - RELEASE_WINDOWS < index < now)
-    is_accepted = report.decision in ACCEPTED or report.decision is WindowDecision.BAD
-    return recent if is_accepted else (*recent, now)
+    return recent if report.decision in ACCEPTED | {WindowDecision.BAD} else (*recent, now)
 
 
 def _from_start(observed: Observation) -> Observation:

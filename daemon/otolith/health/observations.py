@@ -116,12 +116,10 @@ def _of_returns(
     is_shown = len(begins) >= MIN_RETURNS and doubtful[-1] == report.window.index
     if not is_shown or any(level is not Level.OK for name, level in before.items() if name != key):
         return Observation(key, MACHINE, None if doubtful else Level.OK, features, persistence=once)
-    length = report.window.end - report.window.start
-    seconds = length * (doubtful[-1] - begins[0] + 1)
+    seconds = (report.window.end - report.window.start) * (doubtful[-1] - begins[0] + 1)
     causes = next((item.text for item in report.findings if item.kind is not FindingKind.COMPONENT), "")
     text = plan.texts("returns", count=len(begins), duration=duration_text(seconds), causes=causes)
-    since = report.window.end - seconds
-    return Observation(key, MACHINE, Level.WATCH, features, text, since=since, persistence=once)
+    return Observation(key, MACHINE, Level.WATCH, features, text, since=report.window.end - seconds, persistence=once)
 
 
 def _of_finding(plan: MonitoringPlan, twin: str, finding: FindingDocument, before: Level) -> Observation:

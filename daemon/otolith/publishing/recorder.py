@@ -394,14 +394,12 @@ def operator_text(document: ReportDocument) -> str:
     current = [event for event in document.events if event.end is None]
     lines = [f"# {texts.translated(state_word(health))}"]
     if all(event.state is not health.state for event in current):  # otherwise the first event says since when
-        reason = health.reason or texts("all_well")
         lines[0] += f"\n{texts('since', time=moment_text(health.since))}"
-        lines += [] if current else [_plain(reason)]
+        lines += [] if current else [_plain(health.reason or texts("all_well"))]
     lines += [_paragraph(event, health.state) for event in current]
     judged = {event.id.partition("@")[0].partition("/")[2] for event in current}
     for name, item in document.parameters.items():
-        expected = forecast_text(item, document.window.end, health.language)
-        if expected and name not in judged:
+        if name not in judged and (expected := forecast_text(item, document.window.end, health.language)):
             lines.append(_plain(f"{name} {value_text(item)} {expected} (80 %)"))
     return "\n\n".join(lines)
 
