@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from otolith.acquisition.window import Window
-from otolith.adaptation import pooled_windows as module
-from otolith.adaptation.adapt import adapt
-from otolith.adaptation.pooled_windows import MAX_PAUSE, MAX_WINDOWS, PooledWindows
+from otolith.adaptation import adapt as module
+from otolith.adaptation.adapt import MAX_PAUSE, MAX_WINDOWS, adapt, pooled_with
+from otolith.adaptation.pooled_windows import PooledWindows
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.commissioning.structure import Structure
 from otolith.discovery.decision import WindowDecision
@@ -77,7 +77,7 @@ def test_few_windows_are_kept_and_only_before_a_search(monkeypatch: pytest.Monke
     fits, records = fitted(), []
     pooled = PooledWindows()
     for _ in range(40):
-        pooled = pooled.after(fits, fits.parameters)
+        pooled = pooled_with(pooled, fits, fits.parameters)
         records.append(len(pooled.windows))
     assert max(records) == MAX_WINDOWS
     assert records[:8] == [1, 2, 3, 4, 5, 6, 7, 8]
@@ -85,7 +85,7 @@ def test_few_windows_are_kept_and_only_before_a_search(monkeypatch: pytest.Monke
     pooled = PooledWindows()
     monkeypatch.setattr(module, "MAX_TOTAL_RECORDS", 5 * fits.window.records)
     for _ in range(8):
-        pooled = pooled.after(fits, fits.parameters)
+        pooled = pooled_with(pooled, fits, fits.parameters)
     assert len(pooled.windows) == 5
 
 
@@ -95,7 +95,7 @@ def test_searches_become_rare(monkeypatch: pytest.MonkeyPatch) -> None:
     pooled = PooledWindows()
     for number in range(1, 1100):
         monkeypatch.setattr(module, "lacking_component", lambda *_, at=number: searched.append(at))
-        pooled = pooled.after(fits, fits.parameters)
+        pooled = pooled_with(pooled, fits, fits.parameters)
     assert searched == [4, 8, 16, 32, 64, 128, 256, 512, 768, 1024]
     assert MAX_PAUSE == 256
 
@@ -110,9 +110,9 @@ def test_two_searches_must_find_the_same(monkeypatch: pytest.MonkeyPatch, second
     monkeypatch.setattr(module, "lacking_component", lambda *_: structures.pop(0))
     pooled = PooledWindows()
     for _ in range(4):
-        pooled = pooled.after(fits, fits.parameters)
+        pooled = pooled_with(pooled, fits, fits.parameters)
     assert pooled.confirmed is None
-    assert (pooled.after(fits, fits.parameters).confirmed is not None) is agrees
+    assert (pooled_with(pooled, fits, fits.parameters).confirmed is not None) is agrees
 
 
 def fitted() -> Fit:

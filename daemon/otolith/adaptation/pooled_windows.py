@@ -11,23 +11,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from otolith.acquisition.window import Array, Window
+from otolith.acquisition.window import Window
 from otolith.commissioning.structure import MIN_WINDOWS, PooledResponse, Structure, pooled_forms, structures
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.discovery.candidates import components_of
 from otolith.discovery.linear_response import Guess
 from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuesses
 from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.problem import Problem, key_of, source_of
-from otolith.estimation.window_fit import Fit, fit
+from otolith.estimation.problem import Problem, key_of
+from otolith.estimation.window_fit import fit
 from otolith.twin.augmentation import sites, sources
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-discovery.md.
-MAX_WINDOWS = 8  # that are searched together
-MAX_TOTAL_RECORDS = 12_000  # of these windows
-MAX_PAUSE = 256  # windows between two searches, which take as long as that of a window
 LESS_NOISE = 0.5  # ratio of two levels of process noise that are compared
-SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not found the same
 
 Starts = tuple[tuple[Window, tuple[float, ...], tuple[float, ...]], ...]
 """Windows, each with its initial state and with what was known of the parameters after it: they may drift."""
@@ -42,32 +38,6 @@ class PooledWindows:
     next_pause: int = MIN_WINDOWS  # The same after it
     shown: Structure | None = None  # By the last search
     confirmed: Structure | None = None  # By the last two: it is to be adopted
-
-    def after(self, fitted: Fit, parameters: Array) -> "PooledWindows":
-        """Return them with the window of a fit; ``parameters`` (free,) are known after it."""
-        pause, problem = self.pause - 1, fitted.problem
-        in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
-        if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
-            return replace(self, windows=(), pause=pause)  # what is in the twin may have another phase in each window
-        states = fitted.initial[: len(problem.base_model.states)]
-        start = fitted.window, tuple(states.tolist()), tuple(parameters[: len(problem.free)].tolist())
-        windows = (*self.windows, start)[-MAX_WINDOWS:]
-        while sum(window.records for window, *_ in windows) > MAX_TOTAL_RECORDS:
-            windows = windows[1:]
-        added = replace(self, windows=windows, pause=pause)
-        if pause > 0 or len(windows) < MIN_WINDOWS:
-            return added
-        shown = lacking_component(problem, windows)
-        if shown is not None and self.shown is not None and _agree(shown, self.shown):
-            return PooledWindows(confirmed=shown)
-        pause, longer = self.next_pause, min(2 * self.next_pause, MAX_PAUSE)
-        return replace(added, shown=shown, pause=pause if shown is None else 1, next_pause=longer)
-
-
-def _agree(one: Structure, other: Structure) -> bool:
-    """Whether two searches have found the same."""
-    inner = one.component.inner, other.component.inner
-    return one.component.key == other.component.key and abs(inner[0] - inner[1]) <= SAME_INNER * abs(inner[0])
 
 
 def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
