@@ -53,7 +53,7 @@ from otolith.health.status import PreviousStatus, some_parameter_is_determined
 
 UNUSED = "nothing is estimated from this window: "
 # Thresholds of the windows that are searched together: docs/reference/thresholds-health.md.
-MAX_WINDOWS, MAX_TOTAL_RECORDS = 8, 12_000  # how many, and records of all of them
+MAX_WINDOWS, MAX_TOTAL_RECORDS = 8, 10_000  # how many, and records of all of them
 MAX_PAUSE = 256  # windows between two searches, which take as long as that of a window
 SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not shown the same
 MIN_GAP_SHARE = 0.05  # of a window: a shorter gap is not named; engineering choice

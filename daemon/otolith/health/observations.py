@@ -159,7 +159,8 @@ def _of_parameter(
     level, limit = quantity.level(*referred, before.get(key, Level.OK))
     if limit is None:
         return Observation(key, quantity.part, level)
-    if max(abs(deviation), abs(limit.excess(referred[0]))) <= QUANTILE * referred[1]:  # it may as well be healthy
+    may_be_healthy = max(abs(deviation), abs(limit.excess(referred[0]))) <= QUANTILE * referred[1]
+    if may_be_healthy and level is before.get(key, Level.OK):
         return Observation(key, quantity.part, None)
     manner = _manner(parameter, deviation, step)
     features = FindingFeatures(FindingKind.LIMIT, report.twin, name, limit.side, manner)
