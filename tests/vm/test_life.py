@@ -19,27 +19,6 @@ READY = 3.0  # s from the start to readiness, if all kernels are compiled
 WINDOW_LENGTH, FIRST_REPORT = 1.0, 2.0  # s: of `WINDOW`; from the end of the first window to its report
 
 
-def test_what_was_learned_survives_removal_and_upgrade(press: Instance) -> None:
-    """As docs/service.md says; a second installation has nothing to do. First, as the others are of the new version."""
-    before, source = press.before(), Path.home() / "press"
-    source.mkdir()
-    file = simulated_machine(source)
-    drop_in = Path(f"/etc/systemd/system/{press.unit}.service.d")
-    run("systemctl", "disable", "--now", press.unit)
-    press.file.unlink()
-    shutil.rmtree(drop_in)
-    install_wheel(*map(str, SHARE.glob("*.whl")))
-    shown = run(PROGRAM, "install", "--dry-run", str(file))
-    assert f"to write: {press.file}\n" in shown
-    assert not press.file.exists()
-    press.install(file)
-    again = run(PROGRAM, "install", str(file), seconds=300.0)
-    assert "write: " not in again
-    assert "replace: " not in again
-    run("systemctl", "enable", "--now", press.unit)
-    press.check_continued(before)
-
-
 def test_nobody_else_reads_or_publishes(press: Instance) -> None:
     """A user of no group can open neither the socket nor the files, and nothing of the service listens elsewhere."""
     (endpoint,) = Path("/run/otolith/press").glob("*.sock")
@@ -101,3 +80,24 @@ def test_all_processes_take_at_most_300_mb(press: Instance) -> None:
     print(f"{sum(taken):.0f} MB: {taken}")
     assert len(taken) == 4
     assert sum(taken) <= 300.0
+
+
+def test_what_was_learned_survives_removal_and_upgrade(press: Instance) -> None:
+    """As docs/service.md says; a second installation has nothing to do."""
+    before, source = press.before(), Path.home() / "press"
+    source.mkdir()
+    file = simulated_machine(source)
+    drop_in = Path(f"/etc/systemd/system/{press.unit}.service.d")
+    run("systemctl", "disable", "--now", press.unit)
+    press.file.unlink()
+    shutil.rmtree(drop_in)
+    install_wheel(*map(str, SHARE.glob("*.whl")))
+    shown = run(PROGRAM, "install", "--dry-run", str(file))
+    assert f"to write: {press.file}\n" in shown
+    assert not press.file.exists()
+    press.install(file)
+    again = run(PROGRAM, "install", str(file), seconds=300.0)
+    assert "write: " not in again
+    assert "replace: " not in again
+    run("systemctl", "enable", "--now", press.unit)
+    press.check_continued(before)
