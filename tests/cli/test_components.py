@@ -260,7 +260,7 @@ def test_reset_works_where_the_saved_state_is_damaged() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("share", "replays"), [(1.0, 2), (0.05, 1)])
+@pytest.mark.parametrize(("share", "replays"), [(1.0, 2), (0.005, 1)])
 def test_commission_replays_with_the_levels_of_the_file_unless_they_explain_no_window(
     share: float, replays: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

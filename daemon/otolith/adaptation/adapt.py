@@ -50,6 +50,7 @@ from otolith.estimation.window_fit import Fit, Search, WindowEstimate, estimate,
 from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
+from otolith.twin.augmentation import positions
 
 UNUSED = "nothing is estimated from this window: "
 # Thresholds of the windows that are searched together: docs/reference/thresholds-health.md.
@@ -257,6 +258,8 @@ def pooled_with(pooled: PooledWindows, fitted: Fit, parameters: Array) -> Pooled
     """
     pause, problem = pooled.pause - 1, fitted.problem
     in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
+    if not positions(problem.base_model):
+        return pooled
     if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
         return replace(pooled, windows=(), pause=pause)  # what is in the twin may have another phase in each window
     states = fitted.initial[: len(problem.base_model.states)]

@@ -20,7 +20,7 @@ from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuesses
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.problem import Problem, key_of
 from otolith.estimation.window_fit import fit
-from otolith.twin.augmentation import sites, sources
+from otolith.twin.augmentation import positions, sites, sources
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-discovery.md.
 LESS_NOISE = 0.5  # ratio of two levels of process noise that are compared
@@ -47,7 +47,8 @@ def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
     stated noise covers may be a part of it: only a sine that stands out in its spectrum needs no evidence beside that.
     """
     quieter, pooled = _at_likeliest_noise(problem, windows)
-    forms = [form for form in pooled_forms(pooled) if not pooled.is_restarted(form)]
+    at_positions = positions(problem.base_model)
+    forms = [form for form in pooled_forms(pooled) if form.source in at_positions]
     for shown in filter(lambda own: own.is_offered, structures(pooled, forms)):
         guess = next(form for form in forms if _key(pooled, form) == shown.component.key), shown.component.inner
         alone, stated = (_pooled(levels, windows) for levels in (quieter, problem))

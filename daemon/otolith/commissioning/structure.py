@@ -47,6 +47,7 @@ MIN_CYCLES = 3.0  # of a sine in each window, if its phase is another in each
 NEIGHBOURS = (2, 3, 4, 5)  # spectral lines beside a sine, with which its gain is compared
 MIN_LINE = 6.0  # spectral lines: least frequency of a sine with one phase that is compared with its neighbours
 MIN_SHARE = 0.5  # of the best score: a candidate with less only imitates the best, but for a sine that stands out
+SHORTEST = 1e-300  # of a source within a window: the frequency of a sine in it stays finite
 ROUNDING = 1e-9  # of an amplitude: scatter between windows below which they agree to all digits
 AT_BOUND = 1e-3  # of an inner parameter: distance from a bound of the search at which it lies there
 
@@ -181,7 +182,7 @@ class PooledResponse(ProjectedResponse):
             return form
         low, high = form.bounds
         shortest = min(float(np.ptp(part.x[form.source])) for part in self.parts)
-        return form._replace(bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, np.finfo(float).tiny)), high))
+        return form._replace(bounds=(max(low, MIN_CYCLES * 2.0 * np.pi / max(shortest, SHORTEST)), high))
 
     def stands_out(self, guess: Guess) -> bool:
         """Whether a sine gains more than its neighbours in the spectrum.

@@ -154,3 +154,12 @@ def augmented_model(base: Definition) -> Definition:
         equations=(*base.equations, *((f"der({_angle(name)})", name) for name, _ in speeds)),
         base=base,
     )
+
+
+def positions(base: Definition) -> list[int]:
+    """Return the indices of the sources that are positions and do not begin at zero in each window.
+
+    What depends on time, or on a signal that drifts, resembles a parameter that drifts.
+    """
+    rows = enumerate(sources(base))
+    return [at for at, source in rows if source.kind is SourceKind.PLACE and not source.symbol.startswith("_")]
