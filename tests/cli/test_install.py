@@ -105,9 +105,9 @@ def exposure(root: Path, name: str) -> float:
         pytest.skip("no systemd-analyze here")
     command = ["systemd-analyze", "security", "--offline=yes", f"--root={root}", f"otolith@{name}.service"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    found = re.search(r"exposure level for \S+: ([\d.]+)", done.stdout)
-    assert found is not None, done.stderr
-    return float(found[1])
+    exposure = re.search(r"exposure level for \S+: ([\d.]+)", done.stdout)
+    assert exposure is not None, done.stderr
+    return float(exposure[1])
 
 
 def test_a_wrong_machine_file_installs_nothing(file: Path, tmp_path: Path) -> None:

@@ -253,13 +253,12 @@ def _pool(state: AdaptationState, tested: _TestedEstimate, result: WindowResult)
 def pooled_with(pooled: PooledWindows, fitted: Fit, parameters: Array) -> PooledWindows:
     """Return ``pooled`` with the window of a fit; ``parameters`` (free,) are known after it.
 
-    It is here, as every healthy window passes it. What two searches in a row show is confirmed: the second one contains
-    a window that the first one has not seen.
+    What two searches in a row show is confirmed: the second one contains a window that the first one has not seen.
     """
     pause, problem = pooled.pause - 1, fitted.problem
-    in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
     if not positions(problem.base_model):
         return pooled
+    in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
     if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
         return replace(pooled, windows=(), pause=pause)  # what is in the twin may have another phase in each window
     states = fitted.initial[: len(problem.base_model.states)]

@@ -22,7 +22,7 @@ from otolith.estimation.problem import Problem, key_of
 from otolith.estimation.window_fit import fit
 from otolith.twin.augmentation import positions, sites, sources
 
-# Values, units, origins and guarding tests: docs/reference/thresholds-discovery.md.
+# Values, units, origins and guarding tests: docs/reference/thresholds-health.md.
 LESS_NOISE = 0.5  # ratio of two levels of process noise that are compared
 
 Starts = tuple[tuple[Window, tuple[float, ...], tuple[float, ...]], ...]

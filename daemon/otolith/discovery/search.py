@@ -384,8 +384,8 @@ def _always_lacking(null: FittedHypothesis) -> list[FittedHypothesis]:
 def search_from_onset(predicted: Posterior, screening: ScreeningResult) -> tuple[Posterior, list[FittedHypothesis]]:
     """Search the screened window from the record at which something begins that the prediction does not explain.
 
-    Return the prediction there, and the hypotheses. What begins with the window and what begins among its first records
-    differ only in that no single cause explains the whole window.
+    Return the prediction there, and the hypotheses. Onsets among the first records are searched for only if no single
+    cause explains the whole window: otherwise the cause has begun with it.
     """
     window = screening.fitted.window
     if screening.always_late:

@@ -140,7 +140,7 @@ class Posterior:
     def update(self, innovation: Innovation, phase: PhaseAdvance) -> "Posterior":
         """Return the posterior after a window with that ``innovation``, which holds its prediction.
 
-        Inner parameters of components stay within the bounds of their search, widened as they are for a fit: beyond
+        Inner parameters of components stay within the bounds of their search, widened by ``INNER_BOUND``: far beyond
         them a shape means something else.
         """
         belief = imm_filter.update(innovation)
