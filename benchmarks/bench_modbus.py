@@ -66,7 +66,7 @@ def poll_with_driver(port: int, seconds: float) -> tuple[list[float], str]:
     moments: list[float] = []
 
     def deliver(samples: Sequence[Sample]) -> None:
-        moments.append(samples[0].time)
+        moments.extend(sample.time for sample in samples if sample.signal == signals[0].name)
         rings.deliver(samples)
 
     driver = build(Options(host="127.0.0.1", port=port), Setup(signals, Path(), PERIOD))
