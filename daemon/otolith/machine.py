@@ -29,6 +29,7 @@ from otolith.machine_file import (
     driver_configs,
     observed_signals,
     own_keys,
+    signal_units,
 )
 from otolith.twin.augmentation import sensor_site, sites, sources
 from otolith.twin.component_families import FAMILY_NAMES
@@ -320,7 +321,8 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
     known = {name: _known(replace(twin.parameter(name), nominal=value), context) for name, value in problem.known}
     signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
     language = file.machine.language
-    rules = load_rules(language)
+    _check_rules(file, twin, context)
+    rules = (*file.rule, *load_rules(language))
     return MonitoringPlan(parameters, components, rules, language=language, known=known, signals=signals)
 
 
@@ -349,6 +351,18 @@ def _with_temperature(
             context.fail((*where, "temperature"), fault)
     temperature, reference = table.temperature or "", table.reference_temperature
     return replace(quantity, temperature_coefficient=coefficient, temperature=temperature, reference=reference)
+
+
+def _check_rules(file: MachineFile, twin: Definition, context: Context) -> None:
+    """Raise ConfigurationError if a rule of the file names what this machine does not have."""
+    subjects = [row.name for row in twin.parameters] + [row.name for row in twin.sites] + [*signal_units(file, twin)]
+    subjects += [str(table.get("name", table.get("type"))) for table in file.drivers]
+    inputs = [source.name.partition("(")[0] for source in sources(twin) if source.name]
+    known = {"twin": [twin.name], "subject": subjects, "family": list(FAMILY_NAMES), "input": inputs}
+    for number, rule in enumerate(file.rule):
+        for key, names in known.items():
+            for name in set(getattr(rule, key)) - set(names):
+                context.fail(("rule", number, key), f"unknown name {name!r}: {nearest(name, names)}")
 
 
 def load_rules(language: Language = "en") -> tuple[Rule, ...]:

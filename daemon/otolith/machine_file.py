@@ -14,6 +14,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.acquisition.samples import Check
+from otolith.health.diagnosis import OwnRule
 from otolith.health.language import Language
 from otolith.twin.definition import Definition
 from otolith_drivers.base import Driver, DriverType, Sampling, Setup, Signal, find_driver
@@ -238,6 +239,7 @@ class MachineFile(StrictModel):
         dict[str, Annotated[ParameterTable, BeforeValidator(_expand_value)]], Field(default_factory=dict)
     ]
     components: Annotated[dict[str, LimitsTable], Field(default_factory=dict)]  # Limits of amplitudes, by site
+    rule: tuple[OwnRule, ...] = ()  # Of the diagnosis, before the packaged ones
     noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # Standard deviation of each sensor
     process_noise: Annotated[dict[str, RawQuantity], Field(default_factory=dict)]  # In the state's unit per s^0.5
     window: WindowTable = WindowTable()

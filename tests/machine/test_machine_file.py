@@ -6,14 +6,16 @@ what differs between computers. ``OTOLITH_UPDATE_GOLDEN=1 make test`` writes the
 
 import os
 import re
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
 
 from otolith.cli.commissioning.check import describe
+from otolith.health.diagnosis import FindingFeatures, FindingKind, diagnose
 from otolith.health.limits import Level, MonitoringPlan
-from otolith.machine import LIBRARY, load_machine
+from otolith.machine import LIBRARY, load_machine, load_rules
 from otolith.publishing.zenoh_config import listening
 from otolith_drivers.errors import ConfigurationError, OtolithError
 from tests.conftest import EXAMPLES, OwnMachine
@@ -154,6 +156,36 @@ def test_components_have_limits_by_site(own_machine: OwnMachine) -> None:
     plan = limits_of(own_machine, 'value = "6.5 ohm"', '[components]\nshaft = { watch = "1 mN*m", act = "4 mN*m" }\n')
     assert [limit.value for limit in plan.sites["shaft"].limits] == pytest.approx([0.001, 0.004])
     assert plan.sites["winding"].limits == ()
+
+
+RULE = """
+[[rule]]
+id = "aged-cable"
+finding = "limit"
+subject = ["R_a"]
+side = ["above"]
+condition = "aged motor cable"
+cause = "heat"
+advice = "replace the cable"
+"""
+
+
+def test_a_rule_of_the_machine_file_replaces_what_the_packaged_ones_state(own_machine: OwnMachine) -> None:
+    rules = limits_of(own_machine, 'value = "6.5 ohm"', RULE).rules
+    above = FindingFeatures(FindingKind.LIMIT, "dc_motor", "R_a", "above", "step")
+    diagnosis = diagnose(rules, above)
+    assert (diagnosis["condition"], diagnosis["advice"]) == ("aged motor cable", "replace the cable")
+    assert diagnosis["condition_id"] == "aged-cable"
+    below = replace(above, side="below")
+    assert diagnose(rules, below) == diagnose(load_rules(), below)
+
+
+def test_of_the_own_rules_those_with_most_keys_count(own_machine: OwnMachine) -> None:
+    stepped = RULE.replace('["above"]', '["above"]\nmanner = ["step"]').replace("aged motor cable", "broken strands")
+    rules = limits_of(own_machine, 'value = "6.5 ohm"', RULE + stepped.replace("aged-cable", "broken-cable")).rules
+    above = FindingFeatures(FindingKind.LIMIT, "dc_motor", "R_a", "above", "step")
+    assert diagnose(rules, above)["condition"] == "broken strands"
+    assert diagnose(rules, replace(above, manner="trend"))["condition"] == "aged motor cable"
 
 
 def test_sources_without_a_delay_are_named(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 from pydantic import BaseModel, TypeAdapter
 
 from otolith import machine_file
+from otolith.health.diagnosis import OwnRule
 from otolith_drivers.canbus import driver as can
 from otolith_drivers.canbus.options import MessageTable, PdoTable
 from otolith_drivers.modbus import driver as modbus
@@ -24,6 +25,7 @@ TABLES: list[tuple[str, str, type[BaseModel]]] = [
     ("[twin]", "key", machine_file.TwinTable),
     ("[parameters]", "key", machine_file.ParameterTable),
     ("[components]", "key", machine_file.LimitsTable),
+    ("[[rule]]", "key", OwnRule),
     ("[window]", "key", machine_file.WindowTable),
     ("[estimation]", "key", machine_file.EstimationTable),
     ("[discovery]", "key", machine_file.DiscoveryTable),
@@ -70,5 +72,5 @@ def test_every_key_is_listed_with_its_default(section: str, first_cell: str, mod
 
 
 def test_every_table_is_listed() -> None:
-    sections = set(re.findall(r"`\[([a-z_]+)\]`", "\n".join(re.findall(r"^## .*", PAGE, re.MULTILINE))))
+    sections = set(re.findall(r"`\[{1,2}([a-z_]+)\]{1,2}`", "\n".join(re.findall(r"^## .*", PAGE, re.MULTILINE))))
     assert sections == set(machine_file.MachineFile.model_fields)

@@ -1,14 +1,17 @@
 """Diagnosis: from findings to conditions, causes and advice, by the rows of ``rules.toml``.
 
 A row matches a finding if every key that it has agrees; one of a limit that names a parameter also matches a parameter
-that has moved without being estimated. Of the rows that match, those with most keys rest on most
-evidence. If several remain, the data do not distinguish them: they are given together, and none is preferred.
+that has moved without being estimated. Of the rows that match, those of the machine file come first, then those with
+most keys, which rest on most evidence. If several remain, the data do not distinguish them: they are given together,
+and none is preferred.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
+
+from pydantic import Field
 
 from otolith.health.language import Texts, texts_in
 from otolith_drivers.config_files import StrictModel
@@ -83,6 +86,20 @@ class Rule(StrictModel):
         in_order = self.order is None or (order is not None and low - reach <= order <= high + reach)
         is_moved = features.finding is FindingKind.MOVED and self.finding is FindingKind.LIMIT and bool(self.subject)
         return (self.finding is features.finding or is_moved) and agree and in_order
+
+
+class OwnRule(Rule):
+    """A row of a machine file, with its texts; where one matches, no row of the packaged file counts."""
+
+    condition: str = Field(min_length=1)
+    cause: str = Field(min_length=1)
+    advice: str = Field(min_length=1)
+    source: str = "the machine file"
+
+    @property
+    def specificity(self) -> int:
+        """Above that of every packaged row."""
+        return len(KEYS) + 2 + super().specificity
 
 
 class RulesFile(StrictModel):
