@@ -292,12 +292,21 @@ def _message(fault: dict[str, Any], location: Location, model: type[BaseModel]) 
     return f"{shown(fault['input'])}: {re.sub('^Input', 'the value', fault['msg'])}"
 
 
+def _tags(model: Any) -> set[Any]:
+    """Return the values of the keys of a table that have few, by one of which pydantic tells the tables of a union."""
+    fields = getattr(model, "model_fields", {}).values()
+    literals = (row.annotation for row in fields if typing.get_origin(row.annotation) is typing.Literal)
+    return {value for literal in literals for value in typing.get_args(literal)}
+
+
 def _keys_at(model: Any, location: Location) -> list[str]:
     """Return the keys that the table at ``location`` of ``model`` may have."""
     origin, arguments = typing.get_origin(model), typing.get_args(model)
     if origin is typing.Annotated:
         return _keys_at(arguments[0], location)
     if origin in (typing.Union, types.UnionType):
+        if tagged := [part for part in arguments if location and location[0] in _tags(part)]:
+            return _keys_at(tagged[0], location[1:])
         return sorted({key for part in arguments for key in _keys_at(part, location)})
     if origin in (dict, tuple, list) and location:
         return _keys_at([part for part in arguments if part is not Ellipsis][-1], location[1:])

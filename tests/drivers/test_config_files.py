@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, Field
 
 from otolith_drivers.config_files import SourceFile, StrictModel, parse, read, validate
 from otolith_drivers.errors import ConfigurationError, nearest
@@ -14,6 +14,16 @@ from otolith_drivers.errors import ConfigurationError, nearest
 
 class Inner(StrictModel):
     speed: float = 1.0
+    torque: float = 0.0
+
+
+class Push(StrictModel):
+    kind: Literal["push"]
+    force: float = 0.0
+
+
+class Turn(StrictModel):
+    kind: Literal["turn"]
     torque: float = 0.0
 
 
@@ -26,6 +36,7 @@ class Outer(StrictModel):
     switch: bool = True
     either: int | bool | None = None
     folder: Path | None = None
+    moves: tuple[Annotated[Push | Turn, Field(discriminator="kind")], ...] = ()
     named: dict[str, Annotated[Inner, BeforeValidator(lambda value: value)]] | None = None
 
 
@@ -48,6 +59,10 @@ FAULTS = [
     ("name = 'x'\nquantity = [1]\n", "2: quantity: [1]: the value should be a valid number"),
     (f"name = 'x'\nquantity = {[1] * 999}\n", "1,...: the value should be a valid number"),
     ("name = 'x'\nname = 'y'\n", "not valid TOML: "),
+    (
+        "name = 'x'\n[[moves]]\nkind = 'push'\ntorque = 1.0\n",
+        "4: moves[0].torque: unknown key 'torque': known: force, kind",
+    ),
     ("[inner]\nspeed = 1.0\n", ": name: missing: this key must be set"),
 ]
 

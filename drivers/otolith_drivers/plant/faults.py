@@ -48,66 +48,6 @@ def fault_random(seed: int, number: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
 
 
-# Faults of the machine
-
-
-class Drift(StrictModel):
-    """Adds ``amount * (exp(rate * (t - start)) - 1)`` to a parameter: wear that accelerates."""
-
-    kind: Literal["drift"]
-    parameter: str
-    start: Seconds
-    amount: str  # In a unit of the parameter
-    rate: Annotated[float, BeforeValidator(Quantity("1/s", -10.0, 10.0))]
-    until: Seconds = 1e9  # From then on the parameter stays constant
-
-    def change(self, times: Array, amount: float) -> Array:
-        """What is added to the parameter at ``times`` (s), in its unit."""
-        return amount * np.expm1(self.rate * np.maximum(np.minimum(times, self.until) - self.start, 0.0))
-
-
-class Step(StrictModel):
-    """Adds ``amount`` to a parameter from ``start`` on."""
-
-    kind: Literal["step"]
-    parameter: str
-    start: Seconds
-    amount: str  # In a unit of the parameter
-
-    def change(self, times: Array, amount: float) -> Array:
-        """What is added to the parameter at ``times`` (s), in its unit."""
-        return np.where(times > self.start, amount, 0.0)
-
-
-class Unbalance(StrictModel):
-    """A sinusoidal angular acceleration of the shaft (Eq. 13), at a fixed frequency or an order of the shaft angle."""
-
-    kind: Literal["unbalance"]
-    start: Seconds
-    acceleration: Annotated[float, BeforeValidator(Quantity("rad/s^2", 0.0, 1e6))]
-    frequency: Annotated[float, BeforeValidator(Quantity("rad/s", 0.0, 1e4))] | None = None
-    order: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
-
-
-def shaking(unbalances: Iterable[Unbalance]) -> Callable[[float, float], float]:
-    """The acceleration (rad/s²) by all unbalances as a function of time (s) and shaft angle (rad)."""
-    sines = [(fault.start, fault.acceleration, fault.frequency or 0.0, fault.order or 0.0) for fault in unbalances]
-
-    def acceleration(time: float, angle: float) -> float:
-        total = 0.0
-        for start, amplitude, frequency, order in sines:
-            if time >= start:
-                total += amplitude * math.sin(frequency * time + order * angle)
-        return total
-
-    return acceleration
-
-
-# Faults of a sensor
-
-Distortion = Callable[[float], float]  # From what the sensor measures to what the bus carries; once per sample
-
-
 class Span(StrictModel):
     """A fault that acts from ``start`` on and before ``until``."""
 
@@ -123,6 +63,62 @@ class Span(StrictModel):
     def covers(self, time: float) -> bool:
         """Whether the fault acts at ``time`` (s)."""
         return self.start - ROUNDING <= time < self.until - ROUNDING
+
+
+# Faults of the machine
+
+
+class Drift(Span):
+    """Adds ``amount * (exp(rate * (t - start)) - 1)`` to a parameter: wear that accelerates, and stops at ``until``."""
+
+    kind: Literal["drift"]
+    parameter: str
+    amount: str  # In a unit of the parameter
+    rate: Annotated[float, BeforeValidator(Quantity("1/s", -10.0, 10.0))]
+
+    def change(self, times: Array, amount: float) -> Array:
+        """What is added to the parameter at ``times`` (s), in its unit."""
+        return amount * np.expm1(self.rate * np.maximum(np.minimum(times, self.until) - self.start, 0.0))
+
+
+class Step(Span):
+    """Adds ``amount`` to a parameter from ``start`` on, and takes it back at ``until``."""
+
+    kind: Literal["step"]
+    parameter: str
+    amount: str  # In a unit of the parameter
+
+    def change(self, times: Array, amount: float) -> Array:
+        """What is added to the parameter at ``times`` (s), in its unit."""
+        return np.where((times > self.start) & (times <= self.until), amount, 0.0)
+
+
+class Unbalance(Span):
+    """A sinusoidal angular acceleration of the shaft (Eq. 13), at a fixed frequency or an order of the shaft angle."""
+
+    kind: Literal["unbalance"]
+    acceleration: Annotated[float, BeforeValidator(Quantity("rad/s^2", 0.0, 1e6))]
+    frequency: Annotated[float, BeforeValidator(Quantity("rad/s", 0.0, 1e4))] | None = None
+    order: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
+
+
+def shaking(unbalances: Iterable[Unbalance]) -> Callable[[float, float], float]:
+    """The acceleration (rad/s²) by all unbalances as a function of time (s) and shaft angle (rad)."""
+    sines = [(u.start, u.until, u.acceleration, u.frequency or 0.0, u.order or 0.0) for u in unbalances]
+
+    def acceleration(time: float, angle: float) -> float:
+        total = 0.0
+        for start, until, amplitude, frequency, order in sines:
+            if start <= time < until:
+                total += amplitude * math.sin(frequency * time + order * angle)
+        return total
+
+    return acceleration
+
+
+# Faults of a sensor
+
+Distortion = Callable[[float], float]  # From what the sensor measures to what the bus carries; once per sample
 
 
 class _SignalSpan(Span):

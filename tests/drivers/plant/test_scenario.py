@@ -50,6 +50,15 @@ def lift() -> LiftScenario:
     return loaded.model_copy(update={"faults": faults, "parameters": type(loaded.parameters)(A_max="63.2 mm^2")})
 
 
+@pytest.mark.parametrize("fault", [SHORT, SHAKE], ids=lambda fault: fault.kind)
+def test_a_fault_of_the_machine_that_ends_leaves_it_as_it_was(quiet: MotorScenario, fault: Fault) -> None:
+    ended = run(quiet.model_copy(update={"faults": (fault.model_copy(update={"until": 3.0}),)}), 40.0)
+    healthy, lasting = (run(quiet.model_copy(update={"faults": faults}), 40.0) for faults in ((), (fault,)))
+    assert ended[-1].truth == pytest.approx(healthy[-1].truth, rel=2e-3)
+    assert lasting[-1].truth != pytest.approx(healthy[-1].truth, rel=2e-3)
+    assert [sample.truth for sample in ended[:300]] == [sample.truth for sample in lasting[:300]]
+
+
 def test_motor_settles_at_the_solution_of_its_equations(quiet: MotorScenario) -> None:
     last = run(quiet, 200.0)[-1]
     speed, p = last.truth["omega"], quiet.parameters
