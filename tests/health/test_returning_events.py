@@ -55,6 +55,19 @@ def test_changes_that_are_gone_before_they_are_an_event_of_their_own_are_one_tog
     assert event.text.endswith("R_a or V_a")
 
 
+@pytest.mark.parametrize("between", ["missed", "bad"])
+def test_a_doubt_goes_on_through_windows_that_cannot_be_judged(between: str) -> None:
+    """As of a busy computer: one change, of which every second window is missing, does not come and go."""
+    doubt = SENSOR.model_copy(update={"id": "undecided", "kind": FindingKind.OPEN, "subject": "", "text": "R_a or V_a"})
+    windows = [report(index) for index in range(20)]
+    for index in range(20, 40):
+        if index % 2 == 0:
+            windows.append(report(index, decision=WindowDecision.SUSPECTED, findings=(doubt,)))
+        elif between == "bad":
+            windows.append(report(index, decision=WindowDecision.BAD))
+    assert changes(assessed([*windows, *(report(index) for index in range(40, 100))])) == []
+
+
 def test_doubts_about_another_event_are_not_announced_as_well() -> None:
     doubt = SENSOR.model_copy(update={"id": "undecided", "kind": FindingKind.OPEN, "subject": ""})
     documents = assessed(

@@ -77,6 +77,7 @@ class HealthState:
     """Time for which the machine has moved since each parameter was determined, s; none of those that never were."""
     inside: frozenset[str] = frozenset()  # Keys of conditions that were at OK in some window
     doubtful: tuple[int, ...] = ()  # Indices of those of the last windows that contradicted what was known
+    agreed: int = -1  # Index of the last window that agreed with it
     document: HealthDocument | None = None  # The states in the report before
 
     @property
@@ -102,7 +103,7 @@ def assess(plan: MonitoringPlan, state: HealthState, report: ReportDocument) -> 
     report = report.model_copy(update={"parameters": parameters})
     is_moving = any(item.status is Status.ESTIMATED for item in report.parameters.values())
     undetermined = _undetermined_times(state.undetermined, report, is_moving=is_moving)
-    state = replace(state, undetermined=undetermined, doubtful=_doubtful(state.doubtful, report))
+    state = _with_doubts(replace(state, undetermined=undetermined), report)
     observations = _observations(plan, state, report, is_moving=is_moving)
     records, events = {}, []
     for key, observed in observations.items():
@@ -150,11 +151,20 @@ def _undetermined_times(before: Mapping[str, float], report: ReportDocument, *, 
     return {name: 0.0 if name in now else before.get(name, 0.0) + length for name in (*before, *now)}
 
 
-def _doubtful(before: tuple[int, ...], report: ReportDocument) -> tuple[int, ...]:
-    """Return the indices of the last windows that contradicted what was known; the window of the report may be one."""
+def _with_doubts(state: HealthState, report: ReportDocument) -> HealthState:
+    """Return the state with whether the window contradicted what was known.
+
+    Windows that were missed or have bad data end no doubt: between two doubtful windows they count as doubtful.
+    """
     now = report.window.index
-    recent = tuple(index for index in before if now - RELEASE_WINDOWS < index < now)
-    return recent if report.decision in ACCEPTED | {WindowDecision.BAD} else (*recent, now)
+    doubtful = tuple(index for index in state.doubtful if now - RELEASE_WINDOWS < index < now)
+    if report.decision in ACCEPTED:
+        return replace(state, doubtful=doubtful, agreed=now)
+    if report.decision is not WindowDecision.BAD:
+        agreed = state.agreed if state.agreed < now else -1  # of an earlier run
+        first = doubtful[-1] + 1 if doubtful and agreed < doubtful[-1] else now
+        doubtful += tuple(range(first, now + 1))
+    return replace(state, doubtful=doubtful)
 
 
 def _from_start(observed: Observation) -> Observation:
