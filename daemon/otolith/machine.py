@@ -322,7 +322,7 @@ def _plan(file: MachineFile, twin: Definition, problem: Problem, context: Contex
     signals = {row.name: row.meaning for row in twin.inputs} | {row.name: row.meaning for row in twin.outputs}
     language = file.machine.language
     _check_rules(file, twin, context)
-    rules = (*file.rule, *load_rules(language))
+    rules = (*(Rule(**rule.model_dump(), is_own=True) for rule in file.rule), *load_rules(language))
     return MonitoringPlan(parameters, components, rules, language=language, known=known, signals=signals)
 
 

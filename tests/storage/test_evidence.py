@@ -26,6 +26,8 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, OperatorDecisions, apply_decisions, initial_state
 from otolith.cli.main import cli
+from otolith.health.diagnosis import FindingFeatures, FindingKind, diagnose
+from otolith.health.limits import MonitoringPlan
 from otolith.health.schema import EventChange, Report
 from otolith.machine import load_machine
 from otolith.runtime.worker import Supervisor
@@ -125,6 +127,17 @@ def test_a_state_is_the_same_after_writing_and_reading_it(bundles: list[Path]) -
     for path in bundles:
         with zipfile.ZipFile(path) as archive:
             assert encoded(read_bundle(path)) == archive.read(EVIDENCE).decode()
+
+
+def test_the_rules_of_a_machine_file_are_kept(tmp_path: Path) -> None:
+    rule = {"id": "cable", "finding": "limit", "subject": ["R_a"], "condition": "c", "cause": "c", "advice": "a"}
+    lines = [f"{key} = {json.dumps(value)}" for key, value in rule.items()]
+    path = tmp_path / "machine.toml"
+    path.write_text("\n".join([FILE.path.read_text(encoding="utf-8"), "[[rule]]", *lines]), encoding="utf-8")
+    plan = load_machine(path, with_driver=False).plan
+    again = Decoder(FILE.twin).decode(MonitoringPlan, json.loads(encoded(plan)))
+    low = FindingFeatures(FindingKind.LIMIT, "dc_motor", "R_a", "below")
+    assert (again, diagnose(again.rules, low)["condition_id"]) == (plan, "cable")
 
 
 def test_the_bits_and_the_order_of_numbers_are_kept() -> None:

@@ -55,8 +55,8 @@ class FindingFeatures:
     order_reach: float = 0.0  # Half of its 95 % interval
 
 
-class Rule(StrictModel):
-    """A row: the values that it matches, and what they mean. A key without values matches everything."""
+class _Row(StrictModel):
+    """The values that a rule matches. A key without values matches everything."""
 
     id: str  # Key of its texts in `texts/`
     finding: FindingKind
@@ -67,16 +67,31 @@ class Rule(StrictModel):
     family: tuple[str, ...] = ()
     input: tuple[str, ...] = ()
     order: tuple[float, float] | None = None  # Lowest and highest order
+    severity: Literal["WATCH", "ACT"] = "WATCH"  # Level of what has no limits
+
+
+class OwnRule(_Row):
+    """A row of a machine file, and what it means."""
+
+    condition: str = Field(min_length=1)
+    cause: str = Field(min_length=1)
+    advice: str = Field(min_length=1)
+    source: str = "the machine file"
+
+
+class Rule(_Row):
+    """A row, and what it means."""
+
     condition: str = ""  # Empty until worded, as are cause and advice
     cause: str = ""
     advice: str = ""
-    severity: Literal["WATCH", "ACT"] = "WATCH"  # Level of what has no limits
     source: str
+    is_own: bool = False  # Whether it is of the machine file; where such a row matches, no packaged one counts
 
     @property
-    def specificity(self) -> int:
-        """Number of keys that a finding must agree with."""
-        return sum(bool(getattr(self, key)) for key in (*KEYS, "order"))
+    def rank(self) -> tuple[bool, int]:
+        """Whether it is of the machine file, and the number of keys that a finding must agree with."""
+        return self.is_own, sum(bool(getattr(self, key)) for key in (*KEYS, "order"))
 
     def matches(self, features: FindingFeatures) -> bool:
         """Whether the row applies."""
@@ -88,20 +103,6 @@ class Rule(StrictModel):
         return (self.finding is features.finding or is_moved) and agree and in_order
 
 
-class OwnRule(Rule):
-    """A row of a machine file, with its texts; where one matches, no row of the packaged file counts."""
-
-    condition: str = Field(min_length=1)
-    cause: str = Field(min_length=1)
-    advice: str = Field(min_length=1)
-    source: str = "the machine file"
-
-    @property
-    def specificity(self) -> int:
-        """Above that of every packaged row."""
-        return len(KEYS) + 2 + super().specificity
-
-
 class RulesFile(StrictModel):
     """The file of rules."""
 
@@ -111,8 +112,8 @@ class RulesFile(StrictModel):
 def matching(rules: Sequence[Rule], features: FindingFeatures) -> list[Rule]:
     """Return the rows that rest on most evidence; several if the data do not distinguish them."""
     rows = [rule for rule in rules if rule.matches(features)]
-    most = max((rule.specificity for rule in rows), default=0)
-    return [rule for rule in rows if rule.specificity == most]
+    first = max((rule.rank for rule in rows), default=None)
+    return [rule for rule in rows if rule.rank == first]
 
 
 def worded(rules: Sequence[Rule], texts: Texts) -> tuple[Rule, ...]:
