@@ -185,4 +185,5 @@ def test_noise_of_a_measured_torque_is_named_and_is_no_component(
     assert documents[-1].findings[0].text.startswith("T_m is noisier than stated")
     for name, truth in (("J", 0.4), ("D", 0.8), ("T_c", 1.2)):
         known = documents[-1].parameters[name]
+        assert known.sd is not None
         assert known.value == pytest.approx(truth, abs=4.0 * known.sd)
