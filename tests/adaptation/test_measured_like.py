@@ -68,11 +68,10 @@ def test_no_hypothesis_is_sure_that_does_not_explain_the_data(
 def test_a_ripple_that_sampling_turns_into_a_slow_one_is_no_offset_of_a_sensor(seeds: int, have: Imperfections) -> None:
     """In one window it is as constant as an offset: of a young machine, or less than the noise of a sample.
 
-    Where the beat takes minutes, the current sensor does read off for all eight windows. In one run of twenty the beat
-    is adopted as two slow components: a known fault, which the share of the current's ripple tolerates.
+    Where the beat takes minutes, the current sensor does read off for all eight windows.
     """
     faults = [blamed(reports(motor_problem("R_a", "D"), motor_windows(seed, WINDOWS, have))) for seed in range(seeds)]
-    assert sum(map(bool, faults)) <= (0.15 if have.current_ripple else 0.1) * seeds
+    assert sum(map(bool, faults)) <= 0.1 * seeds
 
 
 @SEEDS

@@ -11,6 +11,7 @@ import pytest
 
 from otolith.acquisition.window import Array
 from otolith.commissioning.identification import identify_noise
+from otolith.discovery.decision import WindowDecision
 from otolith.estimation.problem import Problem
 from otolith.machine import load_machine
 from tests.adaptation.measured_like import blamed, cut, reports
@@ -163,3 +164,26 @@ def test_torque_ripple_of_a_joint_is_no_sensor_fault(tmp_path: Path, seed: int, 
     values = np.column_stack([command + 0.05 * random.normal(size=len(angle)), step * np.rint(angle / step)])
     documents = reports(rig, cut(("T_m", "q"), values, RECORDS, PERIOD)[:FEW])
     assert not blamed(documents) & {"T_m", "q"}
+
+
+@SEEDS
+@pytest.mark.parametrize(("excitation", "level"), [("sine", 0.3), ("stops", 0.3), ("sine", 0.05)])
+def test_noise_of_a_measured_torque_is_named_and_is_no_component(
+    tmp_path: Path, seed: int, excitation: str, level: float
+) -> None:
+    """The noise of the angle is stated as about one step of its encoder, which is four times too large."""
+    random, rig = np.random.default_rng(seed), problem(tmp_path, "joint", JOINT)
+    command = excited(excitation, 4.5, random)
+    angle = moved(command, 0.4, 1.2, lambda u, _, w: u - 0.8 * w)[0]
+    step = 2.0 * np.pi / 16384
+    values = np.column_stack([command + level * random.normal(size=len(angle)), step * np.rint(angle / step)])
+    documents = reports(rig, cut(("T_m", "q"), values, RECORDS, PERIOD))
+    assert not any(document.components for document in documents)
+    decisions = [document.decision for document in documents]
+    after = decisions[decisions.index(WindowDecision.NOISIER) + 1 :]
+    assert after.count(WindowDecision.LEARNED) >= len(after) - 1  # a window may be suspected by chance
+    assert documents[-1].findings[0].text.startswith("T_m is noisier than stated")
+    for name, truth in (("J", 0.4), ("D", 0.8), ("T_c", 1.2)):
+        known = documents[-1].parameters[name]
+        assert known.sd is not None
+        assert known.value == pytest.approx(truth, abs=4.0 * known.sd)

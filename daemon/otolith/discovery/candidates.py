@@ -4,6 +4,7 @@ Amplitudes enter linearly and need no search, so each form has one dimension to 
 so that a round costs one call of a compiled kernel.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,8 @@ from otolith.discovery.screening import (
     highest_lines,
     inner_grid,
 )
-from otolith.estimation.problem import Component, Problem
-from otolith.twin.augmentation import sites, sources
+from otolith.estimation.problem import Component, Problem, key_of
+from otolith.twin.augmentation import sensor_site, sites, sources
 
 FINE = 0.5  # spectral lines between two frequencies
 PEAKS = 3  # best grid points whose neighbourhood is searched
@@ -60,6 +61,22 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     kept += threshold_like(problem, [own for own in guesses if own.form not in chosen]) if kept else []
     rows = ((guess.form, component) for guess, component in components_of(response, kept))
     return [Candidate(component, competing.of(form), competing.is_sensor(form)) for form, component in rows]
+
+
+def errors_of_encoders(response: LinearResponse, beside: Iterable[Component]) -> list[Candidate]:
+    """Return for each measured position of which a component ``beside`` is a sine: that sine, as its sensor's error."""
+    problem, twin, starts = response.problem, response.problem.base_model, dict[CandidateForm, list[float]]()
+    names, signals = [site.name for site in sites(twin)], {output.name for output in twin.outputs}
+    for sine in beside:
+        key = key_of(sensor_site(sine.source), sine.family, sine.source)
+        if sine.model.phases[1:] and sine.source in signals and key not in problem.excluded:
+            source = [own.name for own in sources(twin)].index(sine.source)
+            form = CandidateForm(names.index(sensor_site(sine.source)), sine.model, source, (sine.low, sine.high))
+            starts.setdefault(form, []).append(sine.inner)
+    competing = CompetingForms.among(problem, list(starts))
+    scored = ScoredGuesses.of(response, refine_inner_parameters(response, list(starts.items())), competing)
+    guesses = [scored[at] for at in range(len(starts))]
+    return [Candidate(error, competing.of(guess.form), True) for guess, error in components_of(response, guesses)]
 
 
 def best_guesses(

@@ -128,12 +128,12 @@ def _data_fault_or_component(test: SequentialTest, *, is_young: bool) -> WindowO
 
 
 def _is_below_noise(hypothesis: TrackedHypothesis) -> bool:
-    """Whether a hypothesis states an offset of an output below the noise of one sample: that is no fault of its sensor.
+    """Whether a hypothesis states an error of an output below the noise of one sample: that is no fault of its sensor.
 
     In a short window, a small structure of another cause is as constant as an offset.
     """
     problem, slot = hypothesis.problem, len(hypothesis.problem.components) - 1
-    if hypothesis.type is not FaultType.SENSOR or slot < 0 or problem.components[slot].family != "constant":
+    if hypothesis.type is not FaultType.SENSOR or slot < 0 or problem.components[slot].family == "linear":
         return False
     into = site_of(problem.base_model, problem.components[slot].site).into
     offset = abs(float(hypothesis.posterior.prior().mean[indices(problem, slot)[0]]))

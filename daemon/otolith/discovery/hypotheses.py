@@ -427,9 +427,11 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
     values = tracked.posterior.prior().mean
     if tracked.type is FaultType.SENSOR and problem.components:
         component = problem.components[-1]
-        site = site_of(twin, component.site)
-        error = float(values[indices(problem, len(problem.components) - 1)[0]])
+        site, at = site_of(twin, component.site), indices(problem, len(problem.components) - 1)
+        error = float(values[at[0]])
         off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g} {unit_text(site.unit)}".rstrip()
+        if component.family == "periodic":
+            off = equation_text(equation(twin, component, values[at].tolist()))
         return f"{site.into} reads {off} off: look at the sensor and its scale"
     return "; ".join(
         f"{component.site}: {equation_text(equation(twin, component, values[indices(problem, slot)].tolist()))}"

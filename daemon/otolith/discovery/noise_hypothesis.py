@@ -122,14 +122,15 @@ def is_white(fitted: Fit) -> bool:
     """Whether the whitened innovations of each output are uncorrelated at the first lags.
 
     The standard deviation of an autocorrelation of n white values is 1/√n (G. E. P. Box, D. A. Pierce, Journal of the
-    American Statistical Association 65, 1970).
+    American Statistical Association 65, 1970). Noise that is stated too large correlates innovations that are smaller:
+    then it is the scale of the correlation.
     """
     present = fitted.objective.present
     for innovations, measured in zip(fitted.innovations.T, present.T, strict=True):
         values = innovations[measured]
         power, count = float(values @ values), len(values)
         for lag in range(1, min(WHITE_LAGS, count - 1) + 1):
-            if abs(float(values[lag:] @ values[:-lag])) > WHITE_DEVIATIONS * power / np.sqrt(count):
+            if abs(float(values[lag:] @ values[:-lag])) > WHITE_DEVIATIONS * max(power, count) / np.sqrt(count):
                 return False
     return True
 

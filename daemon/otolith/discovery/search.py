@@ -11,7 +11,14 @@ from functools import cache
 import numpy as np
 
 from otolith.acquisition.window import Array, Window
-from otolith.discovery.candidates import MAX_CANDIDATES, Candidate, components_of, find_candidates, threshold_like
+from otolith.discovery.candidates import (
+    MAX_CANDIDATES,
+    Candidate,
+    components_of,
+    errors_of_encoders,
+    find_candidates,
+    threshold_like,
+)
 from otolith.discovery.hypotheses import (
     FaultHypothesis,
     FaultType,
@@ -138,11 +145,13 @@ def search(screening: ScreeningResult) -> list[FittedHypothesis]:
     window convincingly.
     """
     fitted = _single_causes(screening)
+    fitted += _errors_of_encoders(screening, fitted)
     if _convincing(fitted) is None:
         fitted += _several_moved(fitted)
     fitted += _several_components(fitted)
     if screening.always_lacking or _convincing(fitted) is None:
         fitted += _always_lacking(fitted[0])
+    fitted += _errors_of_encoders(screening, fitted)
     return _without_local_minima(fitted)
 
 
@@ -158,6 +167,19 @@ def _single_causes(screening: ScreeningResult) -> list[FittedHypothesis]:
     gains = screening.response.score_delays().gain
     uncertain = [*noisier_sensors(fitted[0]), *changing_commands(fitted[0], gains)]
     return [*fitted, *uncertain, *late_signals(fitted[0], gains)]
+
+
+def _errors_of_encoders(screening: ScreeningResult, fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
+    """Fit beside components that are sines of a measured position the same error of its sensor, if none is ``fitted``.
+
+    A force must not be preferred to the error of an encoder because no other hypothesis is periodic.
+    """
+    known, names = fitted[0].problem.components, {item.name for item in fitted}
+    sines = {own.key: own for item in fitted for own in item.problem.components if own not in known}
+    errors = errors_of_encoders(screening.response, sines.values())
+    own = screening.fitted
+    proposals = [with_candidate(own.problem, own.prior, error) for error in errors]
+    return fit_hypotheses([item for item in proposals if item.hypothesis.name not in names], own.window, FAR_WORSE)
 
 
 def _several_components(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:

@@ -143,7 +143,7 @@ class SequentialTest:
     hypotheses: tuple[TrackedHypothesis, ...]  # The best first
     onset: float  # Unix seconds
     windows: int = 1  # Windows since the test was opened; hypotheses that a later search added are younger
-    leading: int = 1  # Consecutive windows in which the best hypothesis was the best
+    leading: int = 1  # Consecutive windows in which the best hypothesis was the best, and a component left no structure
     settled: int = 1  # Windows since a hypothesis of a new search took the lead
     last: FitSummary = FitSummary()  # Of the last window
     clear: int = CLEAR_WINDOWS  # Consecutive windows after which one cause explained all windows best
@@ -321,10 +321,12 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
     if test.windows > MAX_OPEN_WINDOWS:
         hypotheses = without_duplicates(hypotheses, interchangeable(hypotheses))
+    best, name = hypotheses[0], test.best.hypothesis.name
+    leaves_structure = best.type is FaultType.COMPONENT and best.inflation > EXPLAINED
     followed = replace(
         test,
         hypotheses=_screened(hypotheses, steps),
-        leading=test.leading + 1 if hypotheses[0].hypothesis.name == test.best.hypothesis.name else 1,
+        leading=(0 if leaves_structure else test.leading + 1) if best.hypothesis.name == name else 1,
         settled=test.settled + 1,
         last=last,
         filter_deviance=filter_deviance,
