@@ -23,6 +23,7 @@ from otolith.publishing.zenoh_config import (
     SOCKET_UMASK,
     Access,
     Settings,
+    patient,
     raise_descriptor_limit,
 )
 from otolith_drivers.config_files import StrictModel
@@ -151,7 +152,7 @@ def session(
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "listen/endpoints": listen,
+        "listen/endpoints": [patient(endpoint) for endpoint in listen],
         "connect/endpoints": connect,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
         "open/return_conditions/connect_scouted": False,
