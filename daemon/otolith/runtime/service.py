@@ -180,7 +180,8 @@ class Service:
 
         Raises:
             DeviceError: the machine's bus cannot be opened.
-            ServiceError: a port or folder of this computer is not available, or another daemon runs for the machine.
+            ServiceError: a port or folder of this computer is not available, or another daemon runs for the machine,
+                also one that was started after the lock of this one was removed.
         """
         for number in SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
@@ -189,6 +190,8 @@ class Service:
             self._start()
             while self._stop_signal is None:
                 self._step()
+                if self._writer.locked_out is not None:
+                    raise self._writer.locked_out
                 if self._is_reload_due:
                     self._reload()
         finally:
