@@ -88,6 +88,18 @@ def test_the_shipped_unit_is_hardened(file: Path, tmp_path: Path, driver: str, l
     assert exposure(tmp_path, "press-3") <= limit
 
 
+def test_readers_whose_network_is_in_a_drop_in_of_ones_own_leave_1_0(file: Path, tmp_path: Path) -> None:
+    """As docs/service.md says."""
+    installed(file, tmp_path)
+    folder = tmp_path / "etc/systemd/system/otolith@press-3.service.d"
+    text = drop_in("press-3", [{"type": "plant"}], ("local", "tls/0.0.0.0:7447"), ("tcp/router.plant.local:7447",))
+    (folder / "machine.conf").write_text(text, encoding="utf-8")
+    assert exposure(tmp_path, "press-3") == 1.1
+    own = "[Service]\nIPAddressDeny=any\nIPAddressAllow=localhost 192.168.7.0/24\n"
+    (folder / "override.conf").write_text(own, encoding="utf-8")
+    assert exposure(tmp_path, "press-3") <= 1.0
+
+
 @pytest.mark.parametrize("bus", [True, False], ids=["vcan0", "no vcan0"])
 @pytest.mark.parametrize("name", sorted(path.stem for path in EXAMPLES.glob("*.toml")))
 def test_each_shipped_machine_file_is_exposed_at_most_1_0(
