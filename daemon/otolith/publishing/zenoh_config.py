@@ -21,7 +21,7 @@ LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
 MAX_SESSIONS = 200  # connections at a time
 MAX_HALF_OPEN = 512  # connections at a time that have not finished their handshake
 HANDSHAKE_TIMEOUT = 2000  # ms
-TLS_TIMEOUT = 600_000  # ms in which a connection may finish its TLS handshake, before the one above
+TLS_TIMEOUT = 600_000  # ms for the TLS handshake before that one: Zenoh accepts nobody for 0.1 s after one that fails
 MAX_DESCRIPTORS = 16_384  # open files and connections of a daemon that listens with TLS
 MAX_MESSAGE_BYTES = 1 << 20  # of a message from a reader or a router: a query
 MAX_SOCKET_PATH = 107  # bytes, of a unix socket under Linux
@@ -141,13 +141,6 @@ def raise_descriptor_limit() -> None:
     allowed = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(MAX_DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < allowed:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
-
-
-def patient(endpoint: str) -> str:
-    """Return ``endpoint`` with ``TLS_TIMEOUT``: Zenoh accepts nobody for 0.1 s after each handshake that has failed."""
-    if not endpoint.startswith("tls/"):
-        return endpoint
-    return f"{endpoint}{';' if '#' in endpoint else '#'}tls_handshake_timeout_ms={TLS_TIMEOUT}"
 
 
 def _limits() -> Settings:

@@ -180,8 +180,7 @@ class Service:
 
         Raises:
             DeviceError: the machine's bus cannot be opened.
-            ServiceError: a port or folder of this computer is not available, or another daemon runs for the machine,
-                also one that was started after the lock of this one was removed.
+            ServiceError: a port or folder of this computer is not available, or another daemon runs for the machine.
         """
         for number in SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
