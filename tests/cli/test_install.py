@@ -1,5 +1,6 @@
 """``otolith install`` into a folder: the files of the service, again, and what the drop-in allows."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -57,6 +58,36 @@ def test_every_step_is_shown_and_idempotent(file: Path, tmp_path: Path) -> None:
     assert "# changed" not in (root / f"{names[0]}~").read_text(encoding="utf-8")
 
 
+def test_the_service_can_read_its_files_whatever_the_umask_of_root(file: Path, tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        installed(file, tmp_path / "root")
+    finally:
+        os.umask(before)
+    paths = [path for path in (tmp_path / "root").rglob("*") if path != tmp_path]
+    assert {path.stat().st_mode & 0o777 for path in paths if path.is_dir()} == {0o755}
+    assert {path.stat().st_mode & 0o777 for path in paths if path.is_file()} == {0o644}
+
+
+def test_what_others_may_not_read_stays_so(file: Path, tmp_path: Path) -> None:
+    """Commands of the machine file and files that it names may have secrets."""
+    root, dbc = tmp_path / "root", file.with_name("dc-motor.dbc")
+    copies = [root / "etc/otolith" / path.name for path in (file, dbc)]
+    installed(file, root)
+    for path in (file, dbc):
+        path.chmod(0o600)
+    assert installed(file, root, "--dry-run").count("to restrict: ") == len(copies)
+    assert [copy.stat().st_mode & 0o777 for copy in copies] == [0o644, 0o644]
+    output = installed(file, root)
+    assert [copy.stat().st_mode & 0o777 for copy in copies] == [0o640, 0o640]
+    assert "to run: chgrp otolith /etc/otolith/press-3.toml /etc/otolith/dc-motor.dbc" in output
+    assert "restrict: " not in installed(file, root)
+    file.write_text(file.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
+    installed(file, root)
+    kept = copies[0].with_name(f"{file.name}~")
+    assert [path.stat().st_mode & 0o777 for path in (copies[0], kept)] == [0o640, 0o640]
+
+
 def test_a_file_that_another_machine_names_is_not_replaced_silently(file: Path, tmp_path: Path) -> None:
     root, dbc = tmp_path / "root", tmp_path / "dc-motor.dbc"
     installed(file, root)
@@ -86,6 +117,18 @@ def test_the_shipped_unit_is_hardened(file: Path, tmp_path: Path, driver: str, l
     text = drop_in("press-3", [tomllib.loads(driver)], ("local",), ())
     (folder / "machine.conf").write_text(text, encoding="utf-8")
     assert exposure(tmp_path, "press-3") <= limit
+
+
+def test_readers_whose_network_is_in_a_drop_in_of_ones_own_leave_1_0(file: Path, tmp_path: Path) -> None:
+    """As docs/service.md says."""
+    installed(file, tmp_path)
+    folder = tmp_path / "etc/systemd/system/otolith@press-3.service.d"
+    text = drop_in("press-3", [{"type": "plant"}], ("local", "tls/0.0.0.0:7447"), ("tcp/router.plant.local:7447",))
+    (folder / "machine.conf").write_text(text, encoding="utf-8")
+    assert exposure(tmp_path, "press-3") == 1.1
+    own = "[Service]\nIPAddressDeny=any\nIPAddressAllow=localhost 192.168.7.0/24\n"
+    (folder / "override.conf").write_text(own, encoding="utf-8")
+    assert exposure(tmp_path, "press-3") <= 1.0
 
 
 @pytest.mark.parametrize("bus", [True, False], ids=["vcan0", "no vcan0"])

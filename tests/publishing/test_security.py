@@ -33,6 +33,7 @@ from tests.publishing import attacker
 from tests.waiting import PATIENCE, wait_for
 
 STRANGER = 65533  # a user of no group
+ZENOHS_TIMEOUT = 11.0  # s: longer than its default for a TLS handshake
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
 
 
@@ -269,6 +270,20 @@ def test_half_open_connections_do_not_keep_readers_out(stack: ExitStack, site: P
             half_open.connect(("127.0.0.1", port))
     late = reader(stack, endpoint, client(site, "operator"))
     assert late.receives(daemon) == EXPECTED
+
+
+@pytest.mark.full
+def test_half_open_handshakes_do_not_keep_readers_out_when_zenohs_timeout_is_over(stack: ExitStack, site: Path) -> None:
+    """Each one that it closed would cost a tenth of a second in which nobody is accepted."""
+    endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
+    tls = TlsTable(ca=Path("ca.crt"), certificate=Path("press.crt"), key=Path("press.key"))
+    daemon = publisher(stack, endpoint, Access(ZenohTable(tls=tls), site / "site" / "machine.toml"))
+    port = int(endpoint.rpartition(":")[2])
+    held = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(200)]
+    held[0].settimeout(ZENOHS_TIMEOUT)
+    with pytest.raises(TimeoutError):
+        held[0].recv(1)
+    assert reader(stack, endpoint, client(site, "operator")).receives(daemon) == EXPECTED
 
 
 def test_a_flood_does_not_reach_readers(stack: ExitStack) -> None:

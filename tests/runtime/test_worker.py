@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,6 +29,7 @@ from otolith.runtime.worker import (
     perform,
 )
 from otolith_drivers.plant.dc_motor import MotorScenario
+from tests.conftest import EXAMPLES
 from tests.estimation.test_window_fit import Cut, state_for
 from tests.waiting import PATIENCE, wait_for
 
@@ -115,6 +118,35 @@ def test_the_worker_is_stateless(batch: list[Window]) -> None:
     assert again.report is not None
     assert alone.report is not None
     assert again.report.document == alone.report.document
+
+
+# In a process of its own, as a kernel reports its first call in a process only.
+CALLED = """
+import sys
+from pathlib import Path
+from dataclasses import replace
+from otolith import kernel_cache
+from otolith.adaptation.state import initial_state, with_problem
+from otolith.machine import load_machine
+from otolith.runtime import worker
+machine, steps = load_machine(Path(sys.argv[1]), with_driver=False), []
+state = initial_state("motor", "here", machine.problem, machine.plan)
+with kernel_cache.observed(steps.append):
+    assert not worker.warm_up(state)
+    print(len(steps))
+    worker.WARM_UP_RECORDS = 200
+    for seed in range(3):
+        worker.warm_up(with_problem(state, replace(state.problem, seed=seed)))
+    print(len(steps))
+"""
+
+
+@pytest.mark.parametrize("name", ["dc-motor-in-process", "odrive-axis"])
+def test_the_warm_up_calls_every_kernel_that_windows_need(name: str) -> None:
+    command = [sys.executable, "-c", CALLED, str(EXAMPLES / f"{name}.toml")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    first, all_of_them = map(int, done.stdout.split())
+    assert first == all_of_them > 0
 
 
 def test_windows_missed_during_compilation_are_logged_once(

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -177,6 +178,40 @@ def test_a_second_process_cannot_take_the_lock(store: StateStore) -> None:
     other.lock()
     other.unlock()
     StateStore("here", "pump", PROBLEM.base_model, store.components_path.parent).lock()
+
+
+def other_store(store: StateStore) -> StateStore:
+    return StateStore("here", "motor", PROBLEM.base_model, store.components_path.parent)
+
+
+def test_a_lock_whose_folder_was_removed_is_taken_again(store: StateStore, writer: StateWriter) -> None:
+    """As by an operator who removes the state of a running daemon: a second one must not write the same files."""
+    store.lock()
+    shutil.rmtree(store.lock_path.parent)
+    wait_for(store.lock_path.exists)
+    with pytest.raises(ServiceError, match="already uses"):
+        other_store(store).lock()
+    assert writer.locked_out is None
+    shutil.rmtree(store.lock_path.parent)
+    store.save(STATE)
+    assert store.components() == SAVED
+    with pytest.raises(ServiceError, match="already uses"):
+        other_store(store).save(STATE)
+    store.unlock()
+    other_store(store).lock()
+
+
+def test_who_finds_another_process_in_the_place_of_its_lock_writes_nothing(store: StateStore) -> None:
+    store.lock()
+    store.lock_path.unlink()
+    with other_store(store).locked():
+        writer = StateWriter(store, store.decisions_time())
+        writer.start()
+        writer.save(STATE)
+        wait_for(lambda: writer.locked_out is not None)
+        writer.stop(PATIENCE)
+        assert f"process {os.getpid()} of Otolith already uses" in str(writer.locked_out)
+    assert not store.components_path.exists()
 
 
 def test_a_lock_file_that_is_a_link_is_refused(store: StateStore, tmp_path: Path) -> None:

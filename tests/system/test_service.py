@@ -25,6 +25,7 @@ from otolith.runtime.service import STALL_TIMEOUT, Service
 from otolith.runtime.worker import COMPILE_TIMEOUT
 from otolith.storage.state_store import StateStore
 from otolith_drivers.base import Sampling
+from otolith_drivers.errors import ServiceError
 from tests.conftest import OwnMachine
 from tests.system.conftest import Running
 from tests.waiting import PATIENCE, wait_for, within
@@ -190,6 +191,27 @@ def test_components_are_saved_and_decisions_apply_at_run_time(
     code, seconds = running.stop()
     assert (code, seconds < within(3.0)) == (0, True)
     assert [record.adopted.component.key for record in store.components()] == [FRICTION.key]  # saved again at the end
+
+
+def is_locked(store: StateStore) -> bool:
+    """Whether the lock was taken in the place of a daemon's, whose file is removed."""
+    store.lock_path.unlink(missing_ok=True)
+    try:
+        store.lock()
+    except ServiceError:  # the daemon has taken it again
+        return False
+    return True
+
+
+def test_a_daemon_whose_lock_another_has_taken_ends(running: Running) -> None:
+    """Its file was removed with the state: both would write the same files."""
+    running.wait_for(lambda reports: len(reports) >= 1)
+    machine = load_machine(running.machine.machine, with_driver=False)
+    store = StateStore(machine.file.machine.site, machine.file.machine.name, machine.twin)
+    wait_for(lambda: is_locked(store))
+    assert running.daemon.wait(timeout=PATIENCE) == 2
+    assert f"process {os.getpid()} of Otolith already uses its state: stop it" in running.log.read_text()
+    store.unlock()
 
 
 class Pipe:

@@ -21,6 +21,7 @@ LEASE = 2000  # ms without a message after which Zenoh regards a peer as gone
 MAX_SESSIONS = 200  # connections at a time
 MAX_HALF_OPEN = 512  # connections at a time that have not finished their handshake
 HANDSHAKE_TIMEOUT = 2000  # ms
+TLS_TIMEOUT = 600_000  # ms for the TLS handshake before that one: Zenoh accepts nobody for 0.1 s after one that fails
 MAX_DESCRIPTORS = 16_384  # open files and connections of a daemon that listens with TLS
 MAX_MESSAGE_BYTES = 1 << 20  # of a message from a reader or a router: a query
 MAX_SOCKET_PATH = 107  # bytes, of a unix socket under Linux

@@ -21,6 +21,7 @@ from otolith.publishing.zenoh_config import (
     LEASE,
     SOCKET,
     SOCKET_UMASK,
+    TLS_TIMEOUT,
     Access,
     Settings,
     raise_descriptor_limit,
@@ -147,11 +148,12 @@ def session(
         ServiceError: an endpoint to listen on is in use, one is malformed, or a client reaches none.
     """
     listen, connect = tuple(listen), tuple(connect)
+    timeout = f"#tls_handshake_timeout_ms={TLS_TIMEOUT}"
     whole: Settings = {
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "listen/endpoints": listen,
+        "listen/endpoints": [each + timeout if each.startswith("tls/") else each for each in listen],
         "connect/endpoints": connect,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
         "open/return_conditions/connect_scouted": False,

@@ -189,6 +189,8 @@ class Service:
             self._start()
             while self._stop_signal is None:
                 self._step()
+                if self._writer.locked_out is not None:
+                    raise self._writer.locked_out
                 if self._is_reload_due:
                     self._reload()
         finally:

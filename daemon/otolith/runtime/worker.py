@@ -27,7 +27,7 @@ from otolith.runtime.process import ChildProcess
 log = logging.getLogger(__name__)
 
 # Thresholds: docs/reference/thresholds-runtime.md has the origin of each.
-WARM_UP_RECORDS = 80  # of the random window that makes a new worker compile every kernel
+WARM_UP_RECORDS = 40  # of the random window that makes a new worker compile every kernel
 MAX_WAITING_WINDOWS = 2  # for a busy worker; older ones are missed
 WINDOW_TIMEOUT = 20.0  # s for a window, in addition to twice its length
 COMPILE_TIMEOUT = 600.0  # s in addition, from one kernel to the next: while the worker starts or compiles a kernel

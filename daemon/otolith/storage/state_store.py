@@ -60,6 +60,10 @@ class _DecisionsFile(StrictModel):
     baselines: dict[str, Baseline] = Field(default_factory=dict)
 
 
+class LockedError(ServiceError):
+    """Another process has the lock of the state."""
+
+
 class StateStore:
     """The two state files of one machine, and the lock of its daemon."""
 
@@ -77,9 +81,13 @@ class StateStore:
         self._is_blocked = False
 
     def lock(self) -> None:
-        """Take the lock until :meth:`unlock` or the end; raise ServiceError if another process has it."""
-        if self._lock is not None:
-            return
+        """Take the lock until :meth:`unlock` or the end, again if its file was removed.
+
+        Raises LockedError if another process has it, ServiceError if its file cannot be opened.
+        """
+        with contextlib.suppress(OSError):
+            if self._lock is not None and os.path.samestat(self.lock_path.lstat(), os.fstat(self._lock)):
+                return
         handle = -1
         try:
             with opened_folder(self.lock_path.parent) as folder:
@@ -90,13 +98,21 @@ class StateStore:
             holder = os.read(handle, PROCESS_ID_BYTES).decode("ascii", "replace").strip()
             os.close(handle)
             used = f"machine {self._machine} at {self._site}: process {holder} of Otolith already uses its state"
-            raise ServiceError(f"{used}: stop it, or give this machine another name") from error
+            raise LockedError(f"{used}: stop it, or give this machine another name") from error
         except OSError as error:
+            if handle >= 0:
+                os.close(handle)
             remedy = way_out(self.lock_path)
             raise ServiceError(f"{self.lock_path}: cannot be locked: {error.strerror}{remedy}") from error
         with contextlib.suppress(OSError):  # a full disk: only the message to others lacks the process
             os.pwrite(handle, str(os.getpid()).ljust(PROCESS_ID_BYTES).encode(), 0)
+        self.unlock()
         self._lock = handle
+
+    def keep_lock(self) -> None:
+        """Take the lock again if this process had it; raises as :meth:`lock`."""
+        if self._lock is not None:
+            self.lock()
 
     def unlock(self) -> None:
         """Release the lock."""
@@ -250,6 +266,8 @@ class StateWriter(WriterThread):
         self._to_save: deque[AdaptationState] = deque(maxlen=1)
         self._unsaved: AdaptationState | None = None
         self._new_decisions: deque[OperatorDecisions] = deque(maxlen=1)
+        self.locked_out: LockedError | None = None
+        """Another process has taken the lock that this one had: its file was removed."""
 
     def save(self, state: AdaptationState) -> None:
         """Request that ``state`` replaces what is on disk."""
@@ -269,7 +287,13 @@ class StateWriter(WriterThread):
             self._unsaved = None
 
     def read(self) -> None:
-        """Read the decisions if their file has changed."""
+        """Read the decisions if their file has changed; take the lock again if its file was removed."""
+        try:
+            self._store.keep_lock()
+        except LockedError as error:
+            self.locked_out = error
+        except OtolithError as error:  # the next save fails as well, and is logged
+            log.debug("%s", error)
         decisions_time = self._store.decisions_time()
         if decisions_time == self._decisions_time:
             return

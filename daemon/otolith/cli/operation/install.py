@@ -93,8 +93,7 @@ def _files(file: Path) -> Iterator[InstalledFile]:
     command = bool(machine.file.machine.on_event)
     text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, command=command)
     yield InstalledFile(etc / f"systemd/system/otolith@{file.stem}.service.d/machine.conf", text.encode())
-    yield InstalledFile(ETC / file.name, file.read_bytes())
-    for name in named_files(file):
+    for name in [Path(file.name), *named_files(file)]:
         source = file.parent / name
         is_private = not source.stat().st_mode & 0o004
         yield InstalledFile(ETC / name, source.read_bytes(), is_private)
@@ -190,12 +189,17 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
     path = root / item.path
     before = path.read_bytes() if path.is_file() else None
     if before == item.content:
-        click.echo(f"unchanged: {path}")
+        is_open = item.is_private and bool(path.stat().st_mode & 0o007)
+        click.echo(f"{('to ' if dry_run else '') + 'restrict' if is_open else 'unchanged'}: {path}")
+        if is_open and not dry_run:
+            path.chmod(0o640)
         return False
     click.echo(f"{'to ' if dry_run else ''}{'write' if before is None else 'replace'}: {path}")
     if dry_run:
         return before is not None
+    umask = os.umask(0o022)  # that of root may close the folders to the service
     path.parent.mkdir(parents=True, exist_ok=True)
+    os.umask(umask)
     if before is not None:
         shutil.copy2(path, path.with_name(f"{path.name}~"))
     handle, temporary = tempfile.mkstemp(dir=path.parent)
