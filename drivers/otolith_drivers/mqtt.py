@@ -214,7 +214,7 @@ def _content(payload: bytes, *, plain: bool) -> Any:
     if len(payload) > MAX_PAYLOAD:
         raise ValueError(f"a message of {len(payload)} bytes, more than {MAX_PAYLOAD}")
     try:
-        text = payload.decode("utf-8").strip()
+        text = payload.decode("utf-8-sig").rstrip("\0").strip()
         content = text if plain and NUMBER.fullmatch(text) else json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{shown(payload[:60])} is no {'number' if plain else 'JSON document'}") from error

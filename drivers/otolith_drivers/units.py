@@ -231,7 +231,7 @@ def _check_dimension(source: str, target: str) -> None:
 
 
 def _is_angular(text: str) -> bool:
-    return any(angle in str(unit(text)) for angle in ("radian", "degree", "revolution", "turn"))
+    return any(angle in str(unit(text)) for angle in ("radian", "degree", "revolution", "turn", "grade", "arc"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,10 @@
 """The example driver keeps the contract, and its entry point makes it a driver of machine files."""
 
 import os
+import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 from otolith_drivers.conformance import CONTRACT
@@ -17,6 +19,14 @@ def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
         [sys.executable, *command], capture_output=True, text=True, timeout=600, check=False,
         cwd=FOLDER, env={**os.environ, **environment},
     )  # fmt: skip
+
+
+def test_the_page_names_where_its_classes_are() -> None:
+    page = (FOLDER.parent / "your-own-driver.md").read_text(encoding="utf-8")
+    places = re.findall(r"`(\w+)` of\s+`(otolith_drivers[.\w]*)`", page)
+    assert [name for name, _ in places] == ["ThreadedDriver", "Conversion"]
+    for name, module in places:
+        assert hasattr(import_module(module), name)
 
 
 def test_example_driver_keeps_the_contract() -> None:

@@ -28,7 +28,7 @@ PERIOD = 0.002  # s
 @contextmanager
 def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
     """The CAN driver, and a function that makes the socket of its bus invalid."""
-    reconnection.BACKOFF_FIRST = SHORT
+    reconnection.BACKOFF_FIRST, reconnection.LASTING = SHORT, 0.0  # the time between two failures is shortened too
     options = BusOptions(interface="udp_multicast", channel="239.74.163.8", port=free_port(socket.SOCK_DGRAM))
     opened: list[can.BusABC] = []  # at most one: the latest that has not been broken yet
 
@@ -72,7 +72,7 @@ def can_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
 @contextmanager
 def modbus_rig() -> Iterator[tuple[Driver, Callable[[], None]]]:
     """The Modbus driver, and a function that cuts its connection."""
-    reconnection.BACKOFF_FIRST = SHORT
+    reconnection.BACKOFF_FIRST, reconnection.LASTING = SHORT, 0.0  # the time between two failures is shortened too
     port = free_port(socket.SOCK_STREAM)
     registers = dict(enumerate(struct.unpack(">2H", struct.pack(">f", 24.0))))
     source = modbus_poller.Source.model_validate({"register": 0, "type": "float32", "unit": "V"})

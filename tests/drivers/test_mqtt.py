@@ -288,6 +288,13 @@ def test_a_number_may_be_a_text(payload: str, value: float | None) -> None:
     assert read.bad == (payload not in {"1.5", " +1.5e0\n"})
 
 
+@pytest.mark.parametrize("around", [("\ufeff", ""), ("", "\0"), ("\ufeff ", "\n\0")])
+def test_a_mark_of_the_encoding_and_the_zero_at_the_end_of_a_c_string_are_no_fault(around: tuple[str, str]) -> None:
+    text = '{"values": {"speed": 30}}'.join(around)
+    (sample,) = messages().take("motor", text.encode(), 1.0, retained=False)
+    assert sample.value == pytest.approx(math.pi)
+
+
 def test_a_document_without_field_is_named() -> None:
     read = Messages(mqtt.Options(host="a"), setup_of(i={"topic": "t", "unit": "A"}).signals)
     assert read.take("t", b'{"value": 1.5}', 1.0, retained=False) == []

@@ -4,19 +4,29 @@ import errno
 import logging
 import socket
 import ssl
+import time
 
 import pytest
 
-from otolith_drivers.common.reconnection import BACKOFF_FIRST, BACKOFF_MAX, Reconnection, cause_of
+from otolith_drivers.common.reconnection import BACKOFF_FIRST, BACKOFF_MAX, LASTING, Reconnection, cause_of
 
 
-def test_a_pause_grows_until_the_connection_is_up() -> None:
+def test_a_pause_grows_until_the_connection_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A broker may accept a client and close its connection at once, for ever."""
+    now = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
     connection = Reconnection("line", logging.getLogger("test"))
-    pauses = [connection.backoff.next() for _ in range(10)]
+    pauses = []
+    for _ in range(10):
+        pauses.append(connection.backoff.next())
+        connection.come_up("answers")
+        connection.go_down("the connection was closed")
     for number, pause in enumerate(pauses):
         longest = min(BACKOFF_FIRST * 2.0**number, BACKOFF_MAX)
         assert 0.5 * longest <= pause <= longest
     connection.come_up("answers")
+    now += LASTING
+    connection.go_down("the connection was closed")
     assert connection.backoff.next() <= BACKOFF_FIRST
 
 

@@ -132,6 +132,14 @@ def test_ambiguous_unit_is_refused(written: str, target: str) -> None:
         factor(written, target)
 
 
+@pytest.mark.parametrize(
+    ("written", "per_turn"), [("gon", 400), ("gon/s", 400), ("arcmin", 21600), ("arcsec", 1296000)]
+)
+def test_every_unit_of_an_angle_is_one(written: str, per_turn: int) -> None:
+    target = "rad/s" if written.endswith("/s") else "rad"
+    assert factor(written, target)[0] == pytest.approx(2 * math.pi / per_turn)
+
+
 def test_ambiguous_unit_names_its_meanings() -> None:
     with pytest.raises(ValueError, match=r"'grad' may be 'degree' or 'gon': write one of them"):
         unit("grad")

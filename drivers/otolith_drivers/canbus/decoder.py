@@ -19,9 +19,9 @@ from otolith_drivers.canbus.database import STANDARD_LIMIT, CanDatabase, load_da
 from otolith_drivers.canbus.j1939 import (
     ParameterGroups,
     fault_of,
-    has_several_frames,
     highest_reading,
-    names_any_source,
+    is_a_group,
+    is_j1939,
 )
 from otolith_drivers.canbus.monitoring import (
     MIN_STUCK_FRAMES,
@@ -383,8 +383,9 @@ def decoder_of(options: FrameOptions, setup: Setup) -> FrameDecoder:
             content.messages.append(request.message)
     warnings += [line for drive in drives.values() for line in drive.warnings]
     tables = _tables_by_frame(frames, options.messages, databases, warnings)
-    open_sources = [(key, content.messages[0]) for key, content in frames.items() if _is_j1939(content, options)]
-    standard = {key for key, _ in open_sources}
+    described = {key: content.messages[0] for key, content in frames.items() if options.j1939}
+    open_sources = [(key, message) for key, message in described.items() if is_a_group(message)]
+    standard = {key for key, message in described.items() if is_j1939(message)}
     readers = {
         key: MessageReader(
             content.messages, content.requests, _rules(content, tables.get(key, MessageTable()), key in standard)
@@ -410,12 +411,6 @@ class _FrameContent:
             return int(name, 0) == self.messages[0].frame_id
         except ValueError:
             return any(message.name == name for message in self.messages)
-
-
-def _is_j1939(content: _FrameContent, options: FrameOptions) -> bool:
-    """Whether the frames are those of a parameter group of J1939."""
-    message = content.messages[0]
-    return options.j1939 and (names_any_source(message) or has_several_frames(message))
 
 
 def _key(message: Message) -> int:

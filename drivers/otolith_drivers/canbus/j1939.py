@@ -117,6 +117,16 @@ def has_several_frames(message: Message) -> bool:
     return message.is_extended_frame and message.length > CLASSIC_LENGTH and not message.is_fd
 
 
+def is_a_group(message: Message) -> bool:
+    """Whether ``message`` is read by its parameter group, not by its identifier."""
+    return names_any_source(message) or has_several_frames(message)
+
+
+def is_j1939(message: Message) -> bool:
+    """Whether the highest numbers of ``message`` are those that the standard reserves."""
+    return is_a_group(message) or (message.is_extended_frame and message.protocol == "j1939")
+
+
 def group_of(identifier: int) -> int:
     """Return the PGN of an identifier of 29 bits."""
     group = identifier >> GROUP_BITS & GROUP_MASK

@@ -8,7 +8,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import can
 import numpy as np
@@ -19,7 +19,18 @@ from numpy.typing import NDArray
 
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import STATES
-from otolith_drivers.canbus.j1939 import group_of
+from otolith_drivers.canbus.j1939 import (
+    ADDRESS_MASK,
+    DATA,
+    GROUP_BITS,
+    MANAGEMENT,
+    Assembler,
+    group_of,
+    has_several_frames,
+    highest_reading,
+    is_a_group,
+    is_j1939,
+)
 from otolith_drivers.canbus.monitoring import error_classes
 from otolith_drivers.canbus.options import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
 from otolith_drivers.errors import some_names
@@ -50,7 +61,7 @@ class ObservedValue:
     latest: float
     low: float
     high: float
-    beyond: int = 0  # How often it was outside the range of the database
+    beyond: int = 0  # How often it was outside the range of the database, or no reading by the standard (J1939)
 
 
 @dataclass(slots=True)
@@ -76,6 +87,14 @@ class ObservedFrames:
     def name(self) -> str:
         """Its arbitration ID; an extended one has eight digits."""
         return f"0x{self.identifier:08X}" if self.extended else f"0x{self.identifier:03X}"
+
+    @property
+    def title(self) -> str:
+        """The message of the database; with the address of its sender if that is open there."""
+        if self.message is None:
+            return self.name
+        address = f" from 0x{self.identifier & ADDRESS_MASK:02X}" if is_a_group(self.message) else ""
+        return f"{self.message.name}{address}"
 
     @property
     def period(self) -> float | None:
@@ -126,7 +145,10 @@ class ObservedFrames:
             self.undecodable += 1
             return
         for signal in message.signals:
-            if (number := numbers.get(signal.name)) is not None and math.isfinite(number):
+            number, highest = numbers.get(signal.name, math.nan), signal.raw_to_scaled(highest_reading(signal), False)
+            if is_j1939(message) and number > cast("float", highest):
+                self.values.get(signal.name, ObservedValue(number, number, number)).beyond += 1
+            elif math.isfinite(number):
                 value = self.values.setdefault(signal.name, ObservedValue(number, number, number))
                 value.latest, value.low, value.high = number, min(value.low, number), max(value.high, number)
                 value.beyond += not within(signal, number)
@@ -150,6 +172,10 @@ class Picture:
             for message in (database.messages if database else [])
             if not message.is_container
         }
+        described = [message for message in self._messages.values() if is_a_group(message)]
+        self._groups = {group_of(message.frame_id): message for message in described}
+        self._assembler = Assembler([group_of(one.frame_id) for one in described if has_several_frames(one)])
+        self._assembled: dict[int, ObservedFrames] = {}  # Messages of several frames, by an identifier of their source
         self.has_database = bool(self._messages)
         self.observed: dict[tuple[int, bool], ObservedFrames] = {}
         self.errors: Counter[str] = Counter()  # Error frames of each class
@@ -174,16 +200,31 @@ class Picture:
             if len(self.observed) >= MAX_IDENTIFIERS:
                 self.left_out += 1
                 return
-            observed = self.observed[key] = ObservedFrames(*key, self._messages.get(key))
+            observed = self.observed[key] = ObservedFrames(*key, self._message_of(*key))
         observed.take(frame, time)
+        group, source = group_of(frame.arbitration_id), frame.arbitration_id & ADDRESS_MASK
+        if frame.is_extended_id and group in (MANAGEMENT, DATA):
+            pair = source, frame.arbitration_id >> GROUP_BITS & ADDRESS_MASK
+            if (whole := self._assembler.take(group, pair, bytes(frame.data), time)) is not None:
+                message = self._groups[whole.group]
+                identifier = message.frame_id & ~ADDRESS_MASK | whole.source
+                assembled = self._assembled.setdefault(identifier, ObservedFrames(identifier, True, message))
+                assembled.take(can.Message(arbitration_id=identifier, data=whole.data), whole.time)
+
+    def _message_of(self, identifier: int, extended: bool) -> Message | None:
+        """The description of a frame in the database: by its identifier, else by its parameter group."""
+        exact = self._messages.get((identifier, extended))
+        return exact or (self._groups.get(group_of(identifier)) if extended else None)
 
     def ordered(self) -> list[ObservedFrames]:
-        """The observed frames by arbitration ID, standard ones first."""
-        return [self.observed[key] for key in sorted(self.observed, key=lambda key: (key[1], key[0]))]
+        """The observed frames by arbitration ID, standard ones first; last the messages of several frames."""
+        single = [self.observed[key] for key in sorted(self.observed, key=lambda key: (key[1], key[0]))]
+        return single + [self._assembled[key] for key in sorted(self._assembled)]
 
     def missing(self) -> list[Message]:
         """Messages of the database that have not come."""
-        return [message for key, message in self._messages.items() if key not in self.observed]
+        seen = {id(observed.message) for observed in self.ordered()}
+        return [message for message in self._messages.values() if id(message) not in seen]
 
     def signals(self) -> Iterator[tuple[ObservedFrames, CanSignal, ObservedValue]]:
         """Every signal of the database that has come, with its frames and its value."""
@@ -300,6 +341,10 @@ def can_signal_lines(picture: Picture) -> Iterator[str]:
         for observed, signal, value in picture.signals()
         if signal.unit or not COUNTER_OR_CHECKSUM.search(signal.name)
     ]
+    titles: dict[str, list[str]] = {}
+    for observed in picture.ordered():
+        titles.setdefault(observed.message.name if observed.message else "", []).append(observed.title)
+    signals = [row for row in signals if row[0].message and row[0].title == titles[row[0].message.name][0]]
     names = Counter(signal.name for _, signal, _ in signals)
     for observed, signal, value in signals:
         message = observed.message.name if observed.message and names[signal.name] > 1 else None
@@ -307,6 +352,9 @@ def can_signal_lines(picture: Picture) -> Iterator[str]:
         keys += "" if signal.unit else ', unit = "?"'
         unit = f"{signal.unit}, " if signal.unit else ""
         yield f"NAME = {{ {keys} }}  # {unit}{value_text(signal, value.latest)} now"
+    for name, several in titles.items():
+        if name and len(several) > 1:
+            yield f"# {', '.join(several)}: set source_address in [driver] to one of them"
     yield from _candidate_lines([observed for observed in picture.ordered() if observed.message is None])
 
 

@@ -6,11 +6,13 @@ import os
 import random
 import ssl
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 BACKOFF_FIRST, BACKOFF_MAX = 0.2, 10.0  # s between attempts to connect
+LASTING = 1.0  # s; a connection that lasted so long works, and the next pause is the shortest one again
 FAULT_SHOWN = 10.0  # s after which a passing fault is no longer a warning
 CLOSE_TIMEOUT = 0.9  # s for the thread to end
 
@@ -39,7 +41,7 @@ class Reconnection:
         self.up, self.reason, self.count = False, "not opened yet", 0
         self.backoff = ReconnectBackoff()
         self._title, self._log = title, log
-        self._was_up = False
+        self._was_up, self._begun = False, 0.0
         self._logged = ""  # the latest reason
 
     def come_up(self, what: str) -> None:
@@ -48,7 +50,7 @@ class Reconnection:
             self.up, self.reason, self._logged = True, "", ""
             self.count += self._was_up
             self._was_up = True
-            self.backoff.reset()
+            self._begun = time.monotonic()
             self._log.info("%s: %s", self._title, what)
 
     def go_down(self, reason: str) -> None:
@@ -56,6 +58,8 @@ class Reconnection:
         if reason != self._logged:
             self._logged = reason
             self._log.warning("%s: %s; retried until it answers", self._title, reason)
+        if self.up and time.monotonic() - self._begun >= LASTING:
+            self.backoff.reset()
         self.up, self.reason = False, reason
 
 

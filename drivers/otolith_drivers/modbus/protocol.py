@@ -23,7 +23,8 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 ILLEGAL_FUNCTION = 1  # Exception of a device that does not serve the function, such as reading a table that it lacks
-PERMANENT_CODES = (ILLEGAL_FUNCTION, 2, 3)  # Exceptions that a repeated request will meet again
+ILLEGAL_ADDRESS = 2  # Exception for registers that the device does not have
+PERMANENT_CODES = (ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, 3)  # Exceptions that a repeated request will meet again
 BUSY_CODES = (5, 6)  # Exceptions that ask to repeat the request later
 GATEWAY_CODES = (10, 11)  # Exceptions by which a gateway reports that the device does not answer
 

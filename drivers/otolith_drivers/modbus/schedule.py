@@ -14,6 +14,7 @@ from otolith_drivers.modbus.options import BIT_TABLES, RegisterSignal, Table
 from otolith_drivers.modbus.protocol import (
     BUSY_CODES,
     GATEWAY_CODES,
+    ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     PERMANENT_CODES,
     ExceptionReplyError,
@@ -22,6 +23,7 @@ from otolith_drivers.modbus.protocol import (
 # Requests. Engineering choices, guarded by tests/drivers/modbus/test_schedule.py.
 MAX_FAILURES = 3  # in a row before a request or device is paused; one timeout on a noisy line is no dead device
 MIN_PAUSE, MAX_PAUSE = 1.0, 10.0  # s, doubled from one to the other: a device that returns is read again within 10 s
+TABLE_DIGITS = {"holding": 4, "input": 3, "discrete": 1}  # before a register in manuals that count from 40001
 
 # Rounds: decisions about the grid.
 DECISION_ROUNDS = 50  # engineering choice: half a second at 100 Hz, and enough for a median
@@ -204,7 +206,11 @@ class RequestSet:
 def _hint(request: Request, error: ExceptionReplyError) -> str:
     """Return what may help, as the end of a sentence; empty if nothing is known."""
     other = {"holding": "input", "coil": "discrete"}.get(request.table)
-    return f'; try table = "{other}"' if error.code == ILLEGAL_FUNCTION and other is not None else ""
+    if error.code == ILLEGAL_FUNCTION and other is not None:
+        return f'; try table = "{other}"'
+    if error.code == ILLEGAL_ADDRESS and request.address // 10_000 == (digit := TABLE_DIGITS.get(request.table)):
+        return f"; where a manual says {digit}0103, write first_address = 1 and register = 103"
+    return ""
 
 
 class PollSchedule:

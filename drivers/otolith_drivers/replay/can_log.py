@@ -124,13 +124,13 @@ class CanLogReader(Reader):
             self._first_bad = (place, cause)
 
     def _why_no_rows(self) -> str:
+        kind = seen(head_of(self.path))
+        hint = f" (it looks like {kind})" if kind not in ("", SUFFIXES.get(suffix_of(self.path))) else ""
         if self._first_bad is not None:
             place, cause = self._first_bad
-            kind = seen(head_of(self.path))
-            hint = f" (it looks like {kind})" if kind and not self._frames else ""
-            return f": {self.place} {place}: {cause}; no frame can be used{hint}"
+            return f": {self.place} {place}: {cause}; no frame can be used{'' if self._frames else hint}"
         if not self._frames:
-            return "".join([": no frames", *(f": {line}" for line in self._cut_off())])
+            return "".join([f": no frames{hint}", *(f": {line}" for line in self._cut_off())])
         wanted = ", ".join(f"0x{identifier:X}" for identifier, _ in self._decoder.identifiers())
         return f": none of its {self._frames} frames is one of {wanted}"
 
@@ -199,18 +199,18 @@ class _TrcReader(can.TRCReader):
 
 
 TEXT_FORMATS = {
-    ".asc": TextFormat(can.ASCReader, "Vector ASC", prelude="\n"),
-    ".trc": TextFormat(_TrcReader, "PEAK TRC"),
+    readers.ASC: TextFormat(can.ASCReader, readers.ASC, prelude="\n"),
+    readers.TRC: TextFormat(_TrcReader, readers.TRC),
     readers.CANDUMP_LOG: TextFormat(can.CanutilsLogReader, "candump, as 'candump -L' writes it"),
     readers.CANDUMP: TextFormat(CandumpLines, "candump, as 'candump -ta' writes it"),
     readers.SAVVYCAN: TextFormat(SavvyCanLines, readers.SAVVYCAN),
     readers.PYTHON_CAN: TextFormat(can.CSVReader, readers.PYTHON_CAN, prelude="\n"),
 }
-"""By suffix or, for others, by the format that the first line has."""
+SUFFIXES = {".asc": readers.ASC, ".trc": readers.TRC}  # of texts whose first lines may not show the format
 
 
 def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFrames | Mf4Frames":
-    """The frames of a log, by suffix or first line; raise ConfigurationError, with the format, for another one."""
+    """The frames of a log, by first line or suffix; raise ConfigurationError, with the format, for another one."""
     suffix, head = suffix_of(path), head_of(path)
     if suffix == ".mf4":
         return Mf4Frames(path, head)
@@ -218,7 +218,7 @@ def _frames_of(path: Path, data: DataFile) -> "TextFrames | BlfFrames | SqliteFr
         return SqliteFrames(path, head)
     if suffix == ".blf":
         return BlfFrames(path, data.stream)
-    name = suffix if suffix in TEXT_FORMATS else text_log(head) or readers.CANDUMP_LOG
+    name = text_log(head) or SUFFIXES.get(suffix, readers.CANDUMP_LOG)
     if name == readers.DIFFERENCES:
         cause = f"{path}: is of {name}, of which a lost line would shift the rest: log with candump -L"
         raise ConfigurationError(cause)

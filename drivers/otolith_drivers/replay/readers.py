@@ -55,12 +55,15 @@ CANDUMP = "candump -ta"
 CANDUMP_LOG = "candump -L"
 PYTHON_CAN = "CSV of python-can"
 SAVVYCAN = "CSV of SavvyCAN"
+ASC, TRC = "Vector ASC", "PEAK TRC"
 DIFFERENCES = "candump -td, whose times are differences"
 TEXT_LOGS = {
     CANDUMP_LOG: re.compile(r"\(\d+\.\d+\)\s+\S+\s+[0-9A-Fa-f]{3,8}##?"),
     CANDUMP: re.compile(r"(?:\x1b\[\d*m)*\s*\((?:\d+|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\.\d+\)\s.*\[\d+\]"),
     PYTHON_CAN: re.compile(r"timestamp,arbitration_id,extended,remote,error,dlc,data\s*$"),
     SAVVYCAN: re.compile(r"\"?Time Stamp\"?,\"?ID\"?,\"?Extended\"?,", re.IGNORECASE),
+    ASC: re.compile(r"base\s+(?:hex|dec)\s+timestamps\s"),
+    TRC: re.compile(r";\$FILEVERSION="),
 }
 """By name: how a line of a text log, or its header, begins."""
 OTHERS = {
@@ -76,12 +79,11 @@ OTHERS = {
     "gzip": rb"\x1f\x8b",
     "a capture of network packets (pcap)": rb"(?:\xd4\xc3\xb2\xa1|\xa1\xb2\xc3\xd4|\x0a\x0d\x0d\x0a)",
     "UTF-16 text": rb"(?:\xff\xfe|\xfe\xff)",
-    "PEAK TRC": rb";\$FILEVERSION|;\s*\$STARTTIME",
-    "Vector ASC": rb"date .*\n(?:base|internal)",
     "BUSMASTER log": rb"\*\*\*BUSMASTER",
     "candump without times: log with candump -L": rb"\w+\s+(?:[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[\d+\]\s",
     "a CAN log of another tool: export it as candump -L writes": (
         rb"(?i)(?>[^\n]*?\b(?:can[ _]?)?id(?:entifier)?\b)[^\n]*\b(?:dlc|length|data\w*|d0)\b"
+        rb"|\d+\.\d+ \d?[rt](?:11|29) |t[0-9a-f]{3}[0-8](?:[0-9a-f]{2})*\s|\d+\s+[0-9a-f]{8}\s+\d(?:\s+[0-9a-f]{2}\b)+"
     ),
     "JSON": rb"[\[{]\s*[\"{\[]",
     "XML": rb"<\?xml",
@@ -125,7 +127,8 @@ def _has_differences(lines: list[str]) -> bool:
 
 def seen(head: bytes) -> str:
     """Return the name of the format that begins with ``head``; empty if it is not known."""
-    other = next((name for name, start in OTHERS.items() if re.match(start, head.lstrip(b" \r\n"))), "")
+    begins = (head, head.lstrip(b" \r\n"))
+    other = next((name for name, start in OTHERS.items() if any(re.match(start, begin) for begin in begins)), "")
     return other or text_log(head)
 
 

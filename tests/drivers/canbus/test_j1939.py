@@ -189,5 +189,19 @@ def test_other_identifiers_and_databases_that_are_not_of_j1939_stay_exact(folder
     assert sent(plain, ENGINE, engine(8000, state=3))["state"] == 3.0
 
 
+def test_a_message_that_the_database_marks_as_j1939_has_no_reserved_readings(tmp_path: Path) -> None:
+    marked = """BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";
+BA_DEF_DEF_ "VFrameFormat" "J1939PG";
+"""
+    (tmp_path / "j.dbc").write_text(DATABASE + marked, encoding="utf-8")
+    signal = Signal("other", "1", Source(signal="Other"))
+    decode = decoder_of(Options(dbc=Path("j.dbc")), Setup((signal,), tmp_path, 0.01))
+    assert sent(decode, 0x0CF00402, bytes(8)) == {}
+    assert sent(decode, FIXED, bytes([250, *bytes(7)])) == {"other": 250.0}
+    assert math.isnan(sent(decode, FIXED, b"\xff" * 8)["other"])
+    plain = decoder_of(Options(dbc=Path("j.dbc"), j1939=False), Setup((signal,), tmp_path, 0.01))
+    assert sent(plain, FIXED, b"\xff" * 8) == {"other": 255.0}
+
+
 def test_group_numbers_are_those_of_the_standard() -> None:
     assert [group_of(identifier) for identifier in (0x0CF00400, 0x18FEEE00, 0x18EA2301)] == [61444, 65262, 59904]

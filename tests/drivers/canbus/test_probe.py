@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from pathlib import Path
 
 import can
 import numpy as np
@@ -15,6 +16,8 @@ from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.database import load_dbc
 from otolith_drivers.canbus.probe import MAX_IDENTIFIERS, Picture, can_driver_lines, can_signal_lines, canopen_name
 from tests.conftest import EXAMPLES
+from tests.drivers.canbus.test_j1939 import DATABASE as GROUPS
+from tests.drivers.canbus.test_j1939 import ENGINE, LONG, broadcast, engine
 
 
 def frame(identifier: int, data: bytes, **keys: bool) -> can.Message:
@@ -94,6 +97,43 @@ def test_the_database_gives_names_values_and_ranges() -> None:
     lines = list(can_signal_lines(picture))
     assert 'NAME = { signal = "RotorSpeed" }  # rad/s, 327.67 now' in lines
     assert not any("Alive" in line for line in lines)
+
+
+@pytest.fixture
+def j1939_picture(tmp_path: Path) -> Picture:
+    (tmp_path / "j.dbc").write_text(GROUPS, encoding="utf-8")
+    return Picture(load_dbc(tmp_path / "j.dbc"))
+
+
+def test_a_message_of_a_parameter_group_is_known_from_any_source(j1939_picture: Picture) -> None:
+    for index, source in enumerate((0x00, 0x03, 0x00)):
+        j1939_picture.take(frame(ENGINE & ~0xFF | source, engine(8000 + index), extended=True), 0.01 * index)
+    shown = {frames.name: frames.title for frames in j1939_picture.ordered()}
+    assert shown == {"0x0CF00400": "EEC1 from 0x00", "0x0CF00403": "EEC1 from 0x03"}
+    assert "EEC1" not in [message.name for message in j1939_picture.missing()]
+    lines = [line for line in can_signal_lines(j1939_picture) if "EngineSpeed" in line]
+    assert lines == ['NAME = { signal = "EngineSpeed" }  # rpm, 1000.2 now']
+    assert "# EEC1 from 0x00, EEC1 from 0x03: set source_address in [driver] to one of them" in list(
+        can_signal_lines(j1939_picture)
+    )
+
+
+def test_a_message_of_several_frames_is_shown_with_its_signals(j1939_picture: Picture) -> None:
+    frames = broadcast(0x21, bytes([7, *range(19)]))
+    for index, (identifier, data) in enumerate(frames):
+        j1939_picture.take(frame(identifier, data, extended=True), 0.05 * index)
+    values = {signal.name: (frames.title, value.latest) for frames, signal, value in j1939_picture.signals()}
+    assert values == {"Lamp": ("Faults from 0x21", 7.0)}
+    assert j1939_picture.ordered()[-1].identifier == LONG & ~0xFF | 0x21
+    assert j1939_picture.frames == len(frames)
+
+
+def test_numbers_that_the_standard_reserves_are_no_readings_of_a_probe(j1939_picture: Picture) -> None:
+    for index, speed in enumerate((8000, 0xFFFF, 0xFE00)):
+        j1939_picture.take(frame(ENGINE, engine(speed, state=3), extended=True), 0.01 * index)
+    values = {signal.name: value for _, signal, value in j1939_picture.signals()}
+    assert (values["EngineSpeed"].high, values["EngineSpeed"].beyond) == (1000.0, 2)
+    assert "State" not in values
 
 
 @pytest.mark.parametrize(

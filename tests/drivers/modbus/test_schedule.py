@@ -178,6 +178,19 @@ def test_busy_device_is_reported_and_never_paused(code: int) -> None:
     assert requests.warnings(3.0) == []
 
 
+@pytest.mark.parametrize(
+    ("table", "register", "hint"),
+    [("holding", 40103, True), ("holding", 40000, True), ("holding", 39999, False), ("input", 30021, True)],
+)
+def test_a_register_with_the_digit_of_its_table_is_explained(table: str, register: int, hint: bool) -> None:
+    requests = RequestSet(plan([item("a", table=table, register=register)], 0, 125))
+    requests.refused(requests.requests[0], ExceptionReplyError(2), 1.0)
+    (line,) = requests.warnings(1.0)
+    digit = "3" if table == "input" else "4"
+    remedy = f"where a manual says {digit}0103, write first_address = 1 and register = 103"
+    assert (remedy in line) == hint
+
+
 def test_least_time_counts_serial_characters() -> None:
     line = ModbusOptions(serial="/dev/ttyUSB0", baudrate=9600)
     assert line.least_time(10) == pytest.approx((8 + 5 + 20 + 7) * 11 / 9600)

@@ -22,6 +22,7 @@ from otolith_drivers.plant.dc_motor import MotorScenario
 from otolith_drivers.replay import frame_readers
 from otolith_drivers.replay.readers import HEAD, OTHERS, TEXT_LOGS, Rows, holds_frames, seen, text_log
 from otolith_drivers.replay.tables import TableReader
+from tests.drivers import logs
 from tests.drivers.logs import frames_of, live, opened, samples_of
 
 Frames = list[can.Message]
@@ -223,11 +224,35 @@ def test_a_refusal_of_a_text_names_the_log_that_it_seems_to_be(tmp_path: Path, n
         _ = read(path) if name == "bus.log" else TableReader(path, {"x": "1"})
 
 
-def test_a_text_log_with_the_suffix_of_another_is_named(tmp_path: Path, frames: Frames) -> None:
-    path = tmp_path / "bus.trc"
-    path.write_text(savvycan(frames), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="looks like CSV of SavvyCAN"):
-        read(path)
+@pytest.mark.parametrize("name", ["bus.trc", "bus.asc", "bus.csv", "bus.log", "bus"])
+@pytest.mark.parametrize("kind", ["savvycan", ".asc", ".trc"])
+def test_a_text_log_is_recognised_whatever_its_name(tmp_path: Path, frames: Frames, kind: str, name: str) -> None:
+    path = tmp_path / name
+    if kind == "savvycan":
+        path.write_text(savvycan(frames), encoding="utf-8")
+    else:
+        logs.written(tmp_path, frames, kind).rename(path)
+    assert holds_frames(path)
+    rows, summary, _ = read(path)
+    assert samples_of(rows) == [(sample.signal, sample.value) for sample in live(frames)]
+    assert " 0 bad" in summary
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "kind"),
+    [
+        ("bus.asc", "date Wed\nbase hex\n".encode("utf-16"), "no frames \\(it looks like UTF-16 text\\)"),
+        ("bus.asc", b"PAR1", "no frames \\(it looks like Parquet\\)"),
+        ("bus.log", b"\x0a\x0d\x0d\x0a\x1c", "looks like a capture of network packets"),
+        ("bus.log", b"1795564000.000000 R11 181 40 1F\n", "looks like a CAN log of another tool"),
+        ("bus.log", b"t1818401FF9FF00000000\n", "looks like a CAN log of another tool"),
+        ("bus.log", b" 0    00000181         8  40  1F  F9  FF  00  00  00  00    0.01 R\n", "CAN log of another tool"),
+    ],
+)
+def test_a_log_without_frames_names_the_format(tmp_path: Path, name: str, content: bytes, kind: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ConfigurationError, match=kind):
+        read(tmp_path / name)
 
 
 def test_a_database_without_frames_and_with_damaged_rows_is_no_traceback(tmp_path: Path, frames: Frames) -> None:

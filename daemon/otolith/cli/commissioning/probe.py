@@ -368,7 +368,12 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
         console = stdout_console()
         for variable in variables:
             console.print(_opcua_line(variable), markup=False, soft_wrap=True)
-        console.print(f"{len(variables)} variables" if variables else "no variables beside those of OPC UA itself")
+        count = (
+            f"the first {most} variables; --most shows more"
+            if len(variables) == most
+            else f"{len(variables)} variables"
+        )
+        console.print(count if variables else "no variables beside those of OPC UA itself")
     return 0 if variables else NOTHING_THERE
 
 
@@ -398,7 +403,7 @@ def _opcua_line(variable: "Variable") -> str:
     name = "".join(sign if sign.isalnum() else "_" for sign in variable.path.rpartition("/")[2]) or "signal"
     value = str(variable.value)
     short = value if len(value) <= SHOWN_VALUE else f"{value[:SHOWN_VALUE]}..."
-    unit = variable.unit or "unit?"
+    in_unit, unit = (f" {variable.unit}", "") if variable.unit else ("", ', unit = "?"')
     status = "" if variable.status == "Good" else f", status {variable.status}"
     node = json.dumps(variable.node, ensure_ascii=False)
-    return f"{name} = {{ node = {node} }}  # {variable.path}: {short} {unit}, {variable.type}{status}"
+    return f"{name} = {{ node = {node}{unit} }}  # {variable.path}: {short}{in_unit}, {variable.type}{status}"

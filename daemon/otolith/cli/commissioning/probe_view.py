@@ -291,7 +291,7 @@ def _content(picture: canbus.Picture, frames: canbus.ObservedFrames) -> str:
     if frames.remote == frames.count:
         return f"{'! ' if unknown else ''}remote frames"
     if frames.message is not None:
-        return frames.message.name + (f"; {frames.undecodable} not decodable" if frames.undecodable else "")
+        return frames.title + (f"; {frames.undecodable} not decodable" if frames.undecodable else "")
     return "; ".join(filter(None, [unknown, picture.guess(frames)]))
 
 
@@ -306,9 +306,9 @@ def marked(frames: canbus.ObservedFrames) -> str:
 
 def _signal_row(frames: canbus.ObservedFrames, signal: Signal, value: canbus.ObservedValue) -> Row:
     low, high = signal.minimum, signal.maximum
-    name = f"{frames.message.name if frames.message else frames.name}.{signal.name}"
+    message, _, sender = frames.title.partition(" ")
     return {
-        "signal": name,
+        "signal": f"{message}.{signal.name} {sender}".rstrip(),
         "unit": signal.unit or "",
         "now": ("" if canbus.within(signal, value.latest) else "!") + canbus.value_text(signal, value.latest),
         "least": canbus.value_text(signal, value.low),
