@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 LINTER = Path(sys.executable).with_name("lint-imports")
 SOURCES = sorted(path for root in ("daemon", "drivers") for path in (ROOT / root).rglob("*.py"))
 MAX_FILE_LINES = 600
-# History, security, recordings, several sources, PLC tables, pooled windows, own rules: beyond it code must be replaced.
+# History, security, recordings, several sources, pooled windows, own rules: beyond it something must be replaced.
 MAX_SOURCE_LINES = 33_600
 MAX_MODULES = 160  # in daemon and drivers
 MAX_MODULES_IN_A_FOLDER = 12

@@ -1,1 +1,1 @@
-"""How the twin learns from a window: objective, swarm, information. Pure: no clock, thread, socket or file."""
+"""What a window changes: state and report. Pure: no clock, thread, socket or file."""

@@ -236,7 +236,7 @@ def _update_filter(state: AdaptationState, tested: _TestedEstimate) -> WindowRes
 
 
 def _pool(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
-    """Return the result of a window, with the component that it shows with those before, if it shows nothing alone."""
+    """Return the result of a window; if the twin explains it alone, it is searched together with those before."""
     fitted = tested.estimated.fit
     is_undecided = result.decision is not WindowDecision.LEARNED or result.test is not None
     if is_undecided or fitted.cost > EXPLAINED or tested.estimated.drifts:

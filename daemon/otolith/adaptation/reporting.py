@@ -93,7 +93,7 @@ class WindowResult:
     is_mixture: bool = False  # Whether after is the mixture of the hypotheses of an open test
     searched: bool = False  # Whether other hypotheses were compared
     shifts: ParameterCusum | None = None  # With those of this window; None for a window that was not estimated from
-    pooled: PooledWindows | None = None  # With this window, if it shows nothing alone
+    pooled: PooledWindows | None = None  # With this window, if the twin explained it
 
     @classmethod
     def unchanged(  # noqa: PLR0913 - the optional parts of a result

@@ -43,7 +43,7 @@ class AdaptationState:
     shifts: ParameterCusum = field(default_factory=ParameterCusum)
     """By how much the estimates of windows differ from their predictions, all the same way."""
     pooled: PooledWindows = field(default_factory=PooledWindows)
-    """The last windows that nothing was searched for in alone."""
+    """The last windows that the twin explained, which are searched together."""
     noisier_since: float | None = None
     """Unix seconds from which on sensors are noisier than stated; None if they are not."""
     plan: MonitoringPlan = field(default_factory=MonitoringPlan)

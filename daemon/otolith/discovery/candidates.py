@@ -54,7 +54,8 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
         return []
     best, guesses = guesses[0].score, _without_parameters(response, guesses, competing)
     error = SCORE_MARGIN + SCORE_SHARE * abs(best)
-    # Of a large change, an inner parameter also fits that error, which a simpler form cannot: both scores may be off.
+    # Scores are of a linear response, which is wrong for a large change. An inner parameter fits its error as well,
+    # which a simpler form cannot: forms with one are kept up to one error from the best, the others up to two.
     kept = [own for own in guesses if own.score > max(best - error * (2 - bool(own.form.model.inner)), -DECISIVE)]
     kept = kept[: _affordable(response)]
     chosen = {own.form for own in kept}

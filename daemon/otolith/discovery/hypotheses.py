@@ -76,8 +76,8 @@ class FittedHypothesis:
     hypothesis: FaultHypothesis
     fit: Fit
     normalisation: float = 0.0
-    """What -2 log likelihood has beside χ², against the null hypothesis: of a larger noise; and what is as expected, of
-    the measured values that a delay moves out of the window."""
+    """What is added to χ² to compare -2 log likelihood with that of the null hypothesis: the log determinant of a
+    larger noise, and the expected χ² of the measured values that a delay moves out of the window."""
 
     @property
     def type(self) -> FaultType:

@@ -315,7 +315,7 @@ def _clipped_sensor(channel: _Channel, runs: list[Indices]) -> FaultySensor:
 def _pile(values: Array, present: Indices, noise: float) -> tuple[list[Indices], float]:
     """Return the records of each long run within the range of the noise below the largest of ``values`` (records,).
 
-    Those ``present`` count. The noise there, which may be larger than ``noise``, is returned as well.
+    Only the records ``present`` count. The noise of the values in these runs, at least ``noise``, is returned as well.
     """
     samples, deviation = values[present], noise
     if len(samples) < MIN_FROZEN_RUN:
