@@ -22,6 +22,7 @@ from otolith_drivers.canbus.j1939 import (
     highest_reading,
     is_a_group,
     is_j1939,
+    names_any_source,
 )
 from otolith_drivers.canbus.monitoring import (
     MIN_STUCK_FRAMES,
@@ -386,6 +387,8 @@ def decoder_of(options: FrameOptions, setup: Setup) -> FrameDecoder:
     described = {key: content.messages[0] for key, content in frames.items() if options.j1939}
     open_sources = [(key, message) for key, message in described.items() if is_a_group(message)]
     standard = {key for key, message in described.items() if is_j1939(message)}
+    if options.source_address is not None and not any(names_any_source(message) for _, message in open_sources):
+        warnings.append("source_address: no signal is of a message from any source (0xFE)")
     readers = {
         key: MessageReader(
             content.messages, content.requests, _rules(content, tables.get(key, MessageTable()), key in standard)

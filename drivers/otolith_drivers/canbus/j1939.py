@@ -9,7 +9,7 @@ or to one that then controls the transfer (RTS, CTS), and sends packets of 7 byt
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from cantools.database import Message
 from cantools.database import Signal as CanSignal
@@ -60,6 +60,11 @@ class Assembler:
         self.latency = 0.0  # s from the announcement of the latest message to its last frame
         self._groups = frozenset(groups)
         self._transfers: dict[NodePair, _Transfer] = {}
+
+    def take_frame(self, identifier: int, data: bytes | bytearray, time: float) -> WholeMessage | None:
+        """Take a frame of any group; see :meth:`take`."""
+        pair = identifier & ADDRESS_MASK, identifier >> GROUP_BITS & ADDRESS_MASK
+        return self.take(group, pair, data, time) if (group := group_of(identifier)) in (MANAGEMENT, DATA) else None
 
     def take(self, group: int, pair: NodePair, data: bytes | bytearray, time: float) -> WholeMessage | None:
         """Take a frame of the protocol, and return the message that it completes."""
@@ -149,6 +154,12 @@ def highest_reading(signal: CanSignal) -> float:
     return float((FIRST_NO_READING << (signal.length - 8)) - 1)
 
 
+def highest_value(message: Message, signal: CanSignal) -> float:
+    """Return the highest value that is a reading, in the unit of the database; infinite if none is reserved."""
+    highest = signal.raw_to_scaled(highest_reading(signal), decode_choices=False)
+    return cast("float", highest) if is_j1939(message) else float("inf")
+
+
 def fault_of(raw: float, signal: CanSignal) -> str:
     """Return what a raw number above :func:`highest_reading` means; empty for one that is not above."""
     if raw <= highest_reading(signal):
@@ -194,7 +205,7 @@ class ParameterGroups:
         group, source = group_of(identifier), identifier & ADDRESS_MASK
         if self.assembler is None or group not in (MANAGEMENT, DATA):
             return WholeMessage(group, source, data, time) if group in self._groups else None
-        return self.assembler.take(group, (source, identifier >> GROUP_BITS & ADDRESS_MASK), data, time)
+        return self.assembler.take_frame(identifier, data, time)
 
     def key(self, message: WholeMessage) -> int:
         """Return the key of the reader of a message; ``NO_READER`` if another source is read."""

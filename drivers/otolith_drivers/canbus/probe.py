@@ -8,7 +8,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import can
 import numpy as np
@@ -17,20 +17,9 @@ from cantools.database import Signal as CanSignal
 from cantools.database.can.database import Database
 from numpy.typing import NDArray
 
+from otolith_drivers.canbus import j1939
 from otolith_drivers.canbus.bus import BusOptions
 from otolith_drivers.canbus.canopen import STATES
-from otolith_drivers.canbus.j1939 import (
-    ADDRESS_MASK,
-    DATA,
-    GROUP_BITS,
-    MANAGEMENT,
-    Assembler,
-    group_of,
-    has_several_frames,
-    highest_reading,
-    is_a_group,
-    is_j1939,
-)
 from otolith_drivers.canbus.monitoring import error_classes
 from otolith_drivers.canbus.options import CLASSIC_LENGTH, RANGE_TOLERANCE, range_of
 from otolith_drivers.errors import some_names
@@ -93,7 +82,7 @@ class ObservedFrames:
         """The message of the database; with the address of its sender if that is open there."""
         if self.message is None:
             return self.name
-        address = f" from 0x{self.identifier & ADDRESS_MASK:02X}" if is_a_group(self.message) else ""
+        address = f" from 0x{self.identifier & j1939.ADDRESS_MASK:02X}" if j1939.is_a_group(self.message) else ""
         return f"{self.message.name}{address}"
 
     @property
@@ -145,8 +134,8 @@ class ObservedFrames:
             self.undecodable += 1
             return
         for signal in message.signals:
-            number, highest = numbers.get(signal.name, math.nan), signal.raw_to_scaled(highest_reading(signal), False)
-            if is_j1939(message) and number > cast("float", highest):
+            number = numbers.get(signal.name, math.nan)
+            if number > j1939.highest_value(message, signal):
                 self.values.get(signal.name, ObservedValue(number, number, number)).beyond += 1
             elif math.isfinite(number):
                 value = self.values.setdefault(signal.name, ObservedValue(number, number, number))
@@ -172,9 +161,8 @@ class Picture:
             for message in (database.messages if database else [])
             if not message.is_container
         }
-        described = [message for message in self._messages.values() if is_a_group(message)]
-        self._groups = {group_of(message.frame_id): message for message in described}
-        self._assembler = Assembler([group_of(one.frame_id) for one in described if has_several_frames(one)])
+        self._groups = {j1939.group_of(one.frame_id): one for one in self._messages.values() if j1939.is_a_group(one)}
+        self._assembler = j1939.Assembler([key for key, one in self._groups.items() if j1939.has_several_frames(one)])
         self._assembled: dict[int, ObservedFrames] = {}  # Messages of several frames, by an identifier of their source
         self.has_database = bool(self._messages)
         self.observed: dict[tuple[int, bool], ObservedFrames] = {}
@@ -202,19 +190,18 @@ class Picture:
                 return
             observed = self.observed[key] = ObservedFrames(*key, self._message_of(*key))
         observed.take(frame, time)
-        group, source = group_of(frame.arbitration_id), frame.arbitration_id & ADDRESS_MASK
-        if frame.is_extended_id and group in (MANAGEMENT, DATA):
-            pair = source, frame.arbitration_id >> GROUP_BITS & ADDRESS_MASK
-            if (whole := self._assembler.take(group, pair, bytes(frame.data), time)) is not None:
-                message = self._groups[whole.group]
-                identifier = message.frame_id & ~ADDRESS_MASK | whole.source
-                assembled = self._assembled.setdefault(identifier, ObservedFrames(identifier, True, message))
-                assembled.take(can.Message(arbitration_id=identifier, data=whole.data), whole.time)
+        if frame.is_extended_id and (
+            whole := self._assembler.take_frame(frame.arbitration_id, bytes(frame.data), time)
+        ):
+            message = self._groups[whole.group]
+            identifier = message.frame_id & ~j1939.ADDRESS_MASK | whole.source
+            assembled = self._assembled.setdefault(identifier, ObservedFrames(identifier, True, message))
+            assembled.take(can.Message(arbitration_id=identifier, data=whole.data), whole.time)
 
     def _message_of(self, identifier: int, extended: bool) -> Message | None:
         """The description of a frame in the database: by its identifier, else by its parameter group."""
         exact = self._messages.get((identifier, extended))
-        return exact or (self._groups.get(group_of(identifier)) if extended else None)
+        return exact or (self._groups.get(j1939.group_of(identifier)) if extended else None)
 
     def ordered(self) -> list[ObservedFrames]:
         """The observed frames by arbitration ID, standard ones first; last the messages of several frames."""
@@ -247,7 +234,7 @@ class Picture:
     def guess(self, observed: ObservedFrames) -> str:
         """What frames that no database describes may be, by their arbitration ID; empty if that is not known."""
         if observed.extended:
-            return f"PGN {group_of(observed.identifier)} from {observed.identifier & 0xFF}, if SAE J1939"
+            return f"PGN {j1939.group_of(observed.identifier)} from {observed.identifier & 0xFF}, if SAE J1939"
         if not (name := canopen_name(observed.identifier)):
             return ""
         if not self.is_canopen:
@@ -353,7 +340,7 @@ def can_signal_lines(picture: Picture) -> Iterator[str]:
         unit = f"{signal.unit}, " if signal.unit else ""
         yield f"NAME = {{ {keys} }}  # {unit}{value_text(signal, value.latest)} now"
     for name, several in titles.items():
-        if name and len(several) > 1:
+        if name and len(set(several)) > 1:
             yield f"# {', '.join(several)}: set source_address in [driver] to one of them"
     yield from _candidate_lines([observed for observed in picture.ordered() if observed.message is None])
 

@@ -65,10 +65,10 @@ class Request:
         return cls(first.device, first.table, first.address, end - first.address, tuple(signals))
 
     def describe(self) -> str:
-        """Return device and registers in words."""
-        last = self.address + self.count - 1
+        """Return device and registers in words, as the machine file counts them."""
+        first = self.address + self.signals[0].source.register_ - self.signals[0].address
         noun = BIT_TABLES.get(self.table, f"{self.table} register")
-        return f"device {self.device}, {noun}s {self.address} to {last}"
+        return f"device {self.device}, {noun}s {first} to {first + self.count - 1}"
 
 
 def plan(signals: Iterable[RegisterSignal], max_gap: int, max_registers: int) -> tuple[Request, ...]:

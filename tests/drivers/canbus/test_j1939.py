@@ -203,5 +203,12 @@ BA_DEF_DEF_ "VFrameFormat" "J1939PG";
     assert sent(plain, FIXED, b"\xff" * 8) == {"other": 255.0}
 
 
+def test_a_source_address_without_a_message_from_any_source_is_a_warning(folder: Path) -> None:
+    signal = Signal("other", "1", Source(signal="Other"))
+    decode = decoder_of(Options(dbc=Path("j.dbc"), source_address=3), Setup((signal,), folder, 0.01))
+    assert decode.configuration_warnings == ("source_address: no signal is of a message from any source (0xFE)",)
+    assert decoder(folder, source_address=3).configuration_warnings == ()
+
+
 def test_group_numbers_are_those_of_the_standard() -> None:
     assert [group_of(identifier) for identifier in (0x0CF00400, 0x18FEEE00, 0x18EA2301)] == [61444, 65262, 59904]

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otolith_drivers.modbus.options import ModbusOptions, RegisterSignal
+from otolith_drivers.base import Signal
+from otolith_drivers.modbus.options import ModbusOptions, ModbusSource, RegisterSignal, register_signal
 from otolith_drivers.modbus.protocol import ExceptionReplyError, TypeName
 from otolith_drivers.modbus.schedule import (
     DECISION_ROUNDS,
@@ -189,6 +190,14 @@ def test_a_register_with_the_digit_of_its_table_is_explained(table: str, registe
     digit = "3" if table == "input" else "4"
     remedy = f"where a manual says {digit}0103, write first_address = 1 and register = 103"
     assert (remedy in line) == hint
+
+
+def test_registers_are_named_as_the_machine_file_counts_them() -> None:
+    source = ModbusSource.model_validate({"register": 103, "type": "float32", "unit": "V"})
+    signal = register_signal(Signal("a", "V", source), ModbusOptions(host="localhost", first_address=1))
+    (request,) = plan([signal], 0, 125)
+    assert request.address == 102
+    assert request.describe() == "device 1, holding registers 103 to 104"
 
 
 def test_least_time_counts_serial_characters() -> None:
