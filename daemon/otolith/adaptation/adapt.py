@@ -172,10 +172,11 @@ def _screen(state: AdaptationState, tested: _TestedEstimate) -> ScreeningResult:
         screening = screen_window(predicted, estimated, determined=determined)
         return with_threshold_test(screening) if screening.needs_threshold_test else screening
 
-    predicted, estimated = tested.predicted, tested.estimated
+    predicted, estimated, test = tested.predicted, tested.estimated, state.test
     problem, screening = predicted.problem, screened(predicted, estimated)
-    likelier = likelier_levels_of(estimated.fit) if screening.is_positive and not state.test else problem
-    levels = state.test.problem if state.test else likelier
+    if test is None and not screening.is_positive:
+        return screening
+    levels = likelier_levels_of(estimated.fit) if test is None else test.problem
     quieter = replace(problem.with_levels(levels.levels), process_noise=levels.process_noise)
     if quieter == problem:
         return screening
