@@ -1,15 +1,16 @@
 """Hypotheses are compared at their best fits: neither a local minimum nor the integrator's error is evidence."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from benchmarks.changes import classes
-from benchmarks.changes.machines import DC_MOTOR, ONE_MASS, PUMP, SERVO_AXIS, TWO_MASS
+from benchmarks.changes.machines import DC_MOTOR, LAB_MOTOR, ONE_MASS, PUMP, SERVO_AXIS, TWO_MASS
 from benchmarks.changes.observe import Case, observe, recordings
 from benchmarks.changes.plants import Change, Term
 
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import initial_state
 from otolith.discovery.candidate_forms import scales_a_sum
@@ -141,3 +142,44 @@ def test_samples_of_a_structure_that_nothing_explains_are_no_independent_evidenc
     slow, fast = evidence
     assert slow > 0.0
     assert fast < 1.5 * slow
+
+
+def test_a_gain_of_the_speed_is_a_cause_beside_all_parameters_on_a_sine() -> None:
+    """A tenth of the speed is lost, as if K, J and T_c had moved. Shapes that depend on the voltage score far better.
+
+    The linear response underrates the gain, because dry friction changes its sign at other times.
+    """
+
+    def sine(random: np.random.Generator, times: Array) -> dict[str, Array]:
+        return {"V": 9.0 * np.sin(2.0 * np.pi * 0.7 * times + random.uniform(0.0, 6.0))}
+
+    plant = replace(LAB_MOTOR, operate=sine)
+    (reports,) = observe(Case("gain", plant, Change(gains={"omega": 0.9}), healthy=6, changed=5), [0], 1)
+    for report in reports[6:]:
+        assert report.decision in (WindowDecision.SUSPECTED, WindowDecision.AMBIGUOUS)
+        assert {item.reason for item in report.stated} == {"PARAMETER", "SENSOR"}
+        assert all(parameter.holds_truth for parameter in report.parameters.values())
+
+
+def test_a_load_that_drops_is_a_cause_beside_the_offset_of_the_measured_torque() -> None:
+    """While the winch turns one way, dry friction explains both; when it turns back, a sensor is not the only cause."""
+    change = Change(terms={"shaft": Term("constant", amplitude=-0.4)})
+    (reports,) = observe(Case("load", ONE_MASS, change, healthy=6, changed=9), [0], 1)
+    assert WindowDecision.SENSOR not in {report.decision for report in reports}
+    shares = {
+        (item.reason, item.text.split(":")[0].split(" reads")[0]): item.probability for item in reports[-1].stated
+    }
+    assert shares["SENSOR", "T"] == pytest.approx(shares["COMPONENT", "shaft"], abs=0.01)
+    assert all(parameter.holds_truth for report in reports[8:] for parameter in report.parameters.values())
+
+
+@pytest.mark.parametrize("run", [1, 2])
+def test_a_constant_represents_what_hardly_varies(run: int) -> None:
+    """A constant torque, and ln(omega) where the speed varies by little of its logarithm."""
+    lacking = Change(terms={"shaft": Term("constant", amplitude=-0.0004)})
+    case = Case("constant", DC_MOTOR, lacking, before=lacking, healthy=3, changed=0)
+    (reports,) = observe(case, [run], 1)
+    for report in reports:
+        components = [item for item in report.stated if item.reason == "COMPONENT"]
+        best = max(components, key=lambda item: item.probability)
+        assert re.fullmatch(r"shaft: -0\.000\d+ N·m", best.text), best

@@ -1,14 +1,18 @@
 """Sensors that are noisier than stated are named, and everything goes on being estimated."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from benchmarks.changes.healthy import MACHINES, cases
-from benchmarks.changes.observe import recordings
+from benchmarks.changes.machines import SERVO_AXIS_DIRECTIONAL
+from benchmarks.changes.observe import Case, recordings
+from benchmarks.changes.plants import HEALTHY, Change, Plant, Values
 from benchmarks.discovery.motor import Faults
 
-from otolith.acquisition.window import Window
+from otolith.acquisition.window import Array, Window
 from otolith.adaptation.state import initial_state
 from otolith.discovery.decision import WindowDecision
 from otolith.health.schema import Status
@@ -87,3 +91,50 @@ def test_errors_of_a_sensor_are_no_noise_of_an_input_that_is_smooth() -> None:
     before = initial("R_a", "D")
     state, _ = run(before, windows)
     assert state.problem.input_noise == before.problem.input_noise
+
+
+def disturbed(plant: Plant, noise: Mapping[str, float]) -> Plant:
+    """Return the plant with process noise of states: of each state in its unit per root of a second."""
+
+    def operate(random: np.random.Generator, times: Array) -> dict[str, Array]:
+        size = plant.period**-0.5
+        drawn = {f"noise of {name}": level * size * random.standard_normal(len(times)) for name, level in noise.items()}
+        return {**plant.operate(random, times), **drawn}
+
+    def rates(x: Values, u: Values, q: Values) -> dict[str, Any]:
+        return {name: rate + u.get(f"noise of {name}", 0.0) for name, rate in plant.rates(x, u, q).items()}
+
+    held = (*plant.held, *(f"noise of {name}" for name in noise))
+    return replace(plant, operate=operate, rates=rates, held=held)
+
+
+@pytest.mark.parametrize("factor", [2.0, 4.0, 10.0])
+def test_process_noise_that_is_stated_too_large_is_no_faulty_sensor(factor: float) -> None:
+    """The predictor follows every sample; the gain of the sensor, which mass and friction make up for, calms it."""
+    noise = {"v": 1e-3}
+    case = Case("too large", disturbed(SERVO_AXIS_DIRECTIONAL, noise), HEALTHY, healthy=10, changed=0)
+    problem = replace(case.problem, process_noise=(0.0, factor * noise["v"]))
+    (windows,) = recordings(case, problem, [0], seed=1)
+    state, documents = run(initial_state("axis", "test", problem), windows)
+    assert {document.decision for document in documents} <= {WindowDecision.LEARNED, WindowDecision.SUSPECTED}
+    assert [document.decision for document in documents[4:]] == [WindowDecision.LEARNED] * 6
+    assert state.problem.process_noise == problem.process_noise
+    truth = case.plant.parameters
+    for name, parameter in documents[-1].parameters.items():
+        assert parameter.low is not None
+        assert parameter.high is not None
+        assert parameter.low <= truth[name] <= parameter.high
+
+
+def test_a_step_of_the_mass_is_seen_beside_process_noise_that_is_stated_too_large() -> None:
+    change = Change(parameters={"M": 76.0})
+    case = Case("step", disturbed(SERVO_AXIS_DIRECTIONAL, {"v": 1e-3}), change, healthy=6, changed=8)
+    problem = replace(case.problem, process_noise=(0.0, 4e-3))
+    (windows,) = recordings(case, problem, [0], seed=1)
+    _, documents = run(initial_state("axis", "test", problem), windows)
+    assert WindowDecision.SENSOR not in {document.decision for document in documents}
+    for document in documents[8:]:
+        mass = document.parameters["M"]
+        assert mass.low is not None
+        assert mass.high is not None
+        assert mass.low <= 76.0 <= mass.high

@@ -110,6 +110,18 @@ def test_a_known_value_at_its_bound_is_invalid_and_never_estimated(value: float)
     assert document.reason.startswith("at its bound ")
 
 
+@pytest.mark.parametrize(("explained", "status"), [(True, Status.ESTIMATED), (False, Status.INVALID)])
+def test_a_bound_that_the_twin_alone_reaches_does_not_count_where_hypotheses_explain_the_window(
+    explained: bool, status: Status
+) -> None:
+    """A flow reads too little, so that the twin alone has no leakage left; the sensor's hypothesis has its leakage."""
+    estimate = ParameterEstimate("R_a", RESISTANCE.low, 0.1, Identifiability.AT_BOUND, "at its bound")
+    evidence = WindowEvidence(estimate, WindowDecision.AMBIGUOUS, is_mixture=True, is_explained=explained)
+    before = PreviousStatus(True, Status.ESTIMATED)
+    _, document = publish(RESISTANCE, ALLOWED, MarginalPosterior(6.0, 0.1, 0.0, 1e-6), evidence, before)
+    assert document.status is status
+
+
 def test_status_is_held_then_invalid_after_contradictions() -> None:
     before = PreviousStatus(True, Status.ESTIMATED)
     assert publish_after(0.1, decision=WindowDecision.REFUSED, contradictions=1, before=before)[1].status is Status.HELD

@@ -36,6 +36,7 @@ from otolith.discovery.decision import (
     with_approvals,
 )
 from otolith.discovery.hypotheses import CHANGING, FaultType
+from otolith.discovery.noise_hypothesis import likelier_levels_of
 from otolith.discovery.screening import ScreeningResult, screen_window
 from otolith.discovery.search import with_threshold_test
 from otolith.discovery.sequential_test import SequentialTest, continue_test, mixture, open_test
@@ -46,7 +47,7 @@ from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of, source_of
 from otolith.estimation.timing import with_changes_between
-from otolith.estimation.window_fit import Fit, Search, WindowEstimate, estimate, estimate_window
+from otolith.estimation.window_fit import Fit, Search, WindowEstimate, estimate, estimate_window, fit_predicted
 from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
@@ -143,11 +144,7 @@ def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
     A window that is expected and shows nothing that the twin lacks updates the filter. Otherwise, or while a test is
     open, hypotheses are compared, and the update follows the decision.
     """
-    screening = screen_window(
-        tested.predicted, tested.estimated, determined=some_parameter_is_determined(state.previous)
-    )
-    if screening.needs_threshold_test:
-        screening = with_threshold_test(screening)
+    screening = _screen(state, tested)
     is_calm = tested.is_expected and not screening.is_positive
     shifts = _shifts(state, tested)
     test = _continued_test(state, tested, screening)
@@ -164,19 +161,45 @@ def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
     return _pool(state, tested, replace(result, searched=True, shifts=shifts))
 
 
+def _screen(state: AdaptationState, tested: _TestedEstimate) -> ScreeningResult:
+    """Return the screening test of the window; if it is positive, at levels of noise below the stated ones if likelier.
+
+    While a test is open, its levels count.
+    """
+
+    def screened(predicted: Posterior, estimated: WindowEstimate) -> ScreeningResult:
+        determined = some_parameter_is_determined(state.previous)
+        screening = screen_window(predicted, estimated, determined=determined)
+        return with_threshold_test(screening) if screening.needs_threshold_test else screening
+
+    predicted, estimated, test = tested.predicted, tested.estimated, state.test
+    problem, screening = predicted.problem, screened(predicted, estimated)
+    if test is None and not screening.is_positive:
+        return screening
+    levels = likelier_levels_of(estimated.fit) if test is None else test.problem
+    quieter = replace(problem.with_levels(levels.levels), process_noise=levels.process_noise)
+    if quieter == problem:
+        return screening
+    fitted = fit_predicted(predicted, quieter, estimated.fit.window, estimated.fit.parameters)
+    return screened(replace(predicted, problem=quieter), replace(estimated, fit=fitted))
+
+
 def _continued_test(
     state: AdaptationState, tested: _TestedEstimate, screening: ScreeningResult
 ) -> SequentialTest | None:
     """Return the open test after the window; None if there is none, or if the window shows something else."""
     if state.test is None:
         return None
-    test = continue_test(state.test, tested.predicted, screening).with_filter(tested.estimated.fit)
+    at_levels, fitted = replace(tested.predicted, problem=screening.fitted.problem), tested.estimated.fit
+    test = continue_test(state.test, at_levels, screening)
+    test = test.with_filter(fitted if at_levels.problem == fitted.problem else screening.fitted)
     return None if test.best.type is FaultType.NOTHING and not tested.is_expected else test
 
 
 def _open_test(state: AdaptationState, tested: _TestedEstimate, screening: ScreeningResult) -> WindowResult:
     """Search for hypotheses. If the window is expected and none is decisively better, only the filter is updated."""
-    state, test = replace(state, test=None), open_test(tested.predicted, screening)
+    at_levels = replace(tested.predicted, problem=screening.fitted.problem)
+    state, test = replace(state, test=None), open_test(at_levels, screening)
     if tested.is_expected and test.is_null_possible:
         return _update_filter(state, tested)
     return _apply_decision(state, tested, test)
@@ -309,7 +332,9 @@ def _adopt_hypothesis(
     accepted, adopted = outcome.hypothesis, state.adopted
     if outcome.decision is WindowDecision.DISCOVERED:
         adopted = adopt(adopted, test, accepted)
-    problem = replace(accepted.problem, excluded=state.problem.excluded)
+    problem, stated = accepted.problem, state.problem  # a test may have lower levels of noise than stated
+    problem = problem.with_levels(list(map(max, problem.levels, stated.levels)))
+    problem = replace(problem, excluded=stated.excluded, process_noise=stated.process_noise)
     posterior = replace(accepted.posterior, problem=problem)
     return replace(_replace_posterior(outcome.decision, posterior, estimated, adopted), test=test)
 

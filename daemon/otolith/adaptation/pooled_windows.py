@@ -7,7 +7,7 @@ when two such searches find it. The second one contains a window that the first 
 ``docs/explanation/discovery.md`` has the rules.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,14 +16,12 @@ from otolith.commissioning.structure import MIN_WINDOWS, PooledResponse, Structu
 from otolith.discovery.candidate_forms import CandidateForm
 from otolith.discovery.candidates import components_of
 from otolith.discovery.linear_response import Guess
+from otolith.discovery.noise_hypothesis import likelier_levels
 from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuesses
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.problem import Problem, key_of
 from otolith.estimation.window_fit import fit
 from otolith.twin.augmentation import positions, sites, sources
-
-# Values, units, origins and guarding tests: docs/reference/thresholds-health.md.
-LESS_NOISE = 0.5  # ratio of two levels of process noise that are compared
 
 Starts = tuple[tuple[Window, tuple[float, ...], tuple[float, ...]], ...]
 """Windows, each with its initial state and with what was known of the parameters after it: they may drift."""
@@ -43,10 +41,11 @@ class PooledWindows:
 def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
     """Return the component that ``windows`` show together most clearly, within its physical range; None if none.
 
-    Process noise that was stated larger than it is hides structure, so the likeliest level is searched at. But what the
+    Noise that was stated larger than it is hides structure, so likelier levels are searched at. But what the
     stated noise covers may be a part of it: only a sine that stands out in its spectrum needs no evidence beside that.
     """
-    quieter, pooled = _at_likeliest_noise(problem, windows)
+    quieter = likelier_levels(problem, lambda levels: _deviance(_pooled(levels, windows)))
+    pooled = _pooled(quieter, windows)
     at_positions = positions(problem.base_model)
     forms = [form for form in pooled_forms(pooled) if form.source in at_positions]
     for shown in filter(lambda own: own.is_offered, structures(pooled, forms)):
@@ -61,18 +60,6 @@ def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
         ):
             return shown
     return None
-
-
-def _at_likeliest_noise(problem: Problem, windows: Starts) -> tuple[Problem, PooledResponse]:
-    """Return problem and response at the stated process noise, or at a lower level that is likelier."""
-    pooled = _pooled(problem, windows)
-    while any(problem.process_noise):
-        lower = replace(problem, process_noise=tuple(LESS_NOISE * level for level in problem.process_noise))
-        calmer = _pooled(lower, windows)
-        if _deviance(calmer) >= _deviance(pooled):
-            break
-        problem, pooled = lower, calmer
-    return problem, pooled
 
 
 def _pooled(problem: Problem, windows: Starts) -> PooledResponse:

@@ -32,6 +32,7 @@ REFINEMENTS, NARROWER = 4, 1.0 / 3.0  # of refining, and the ratio of the steps 
 MAX_REFINED = 16  # forms whose inner parameters are refined
 MAX_CANDIDATES, MIN_CANDIDATES = 10, 4  # candidates that are fitted
 AFFORDABLE_STEPS = 500  # integrator steps of a window up to which the largest number of candidates is fitted
+SENSOR_MARGIN, MAX_SENSORS = 3.0, 2  # times that error below the best: errors of sensors that are fitted; how many
 SCORE_MARGIN, SCORE_SHARE = 23.0, 0.3  # absolute (-2 log evidence) and relative error of the linear approximation
 
 
@@ -59,7 +60,10 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
     kept = [own for own in guesses if own.score > max(best - error * (2 - bool(own.form.model.inner)), -DECISIVE)]
     kept = kept[: _affordable(response)]
     chosen = {own.form for own in kept}
-    kept += threshold_like(problem, [own for own in guesses if own.form not in chosen]) if kept else []
+    rest = [own for own in guesses if own.form not in chosen]
+    if kept:  # errors of sensors are few, and nothing else is as simple
+        sensors = [own for own in rest if competing.is_sensor(own.form) and own.score > best - SENSOR_MARGIN * error]
+        kept += sensors[:MAX_SENSORS] + threshold_like(problem, rest)
     rows = ((guess.form, component) for guess, component in components_of(response, kept))
     return [Candidate(component, competing.of(form), competing.is_sensor(form)) for form, component in rows]
 
@@ -141,19 +145,33 @@ def _around(form: CandidateForm, x: Array, inner: Array, scale: float) -> list[f
 def _without_parameters(
     response: LinearResponse, guesses: list[ScoredGuess], competing: CompetingForms
 ) -> list[ScoredGuess]:
-    """Return the guesses that no parameter would produce as well; errors of sensors stay, and causes of their own."""
+    """Return the guesses that no parameter would produce as well; errors of sensors stay, and causes of their own.
+
+    A constant stays beside an offset of a sensor that scores as much: if windows refute the parameter, both remain.
+    """
     twin = response.problem.base_model
     curves = [len(guess.form.model.phases) for guess in guesses]
     amplitudes = np.concatenate([guess.amplitudes[:count] for guess, count in zip(guesses, curves, strict=True)])
     same = response.is_parameter(basis_functions((guess.form, guess.inner) for guess in guesses), amplitudes)
     first = np.cumsum([0, *curves[:-1]]).tolist()
+    constants = [guess for guess in guesses if guess.form.model.name == "constant"]
+    offsets = [_gain(guess, competing) for guess in constants if competing.is_sensor(guess.form)]
+    causes = {
+        guess.form
+        for guess in constants
+        if scales_a_sum(twin, guess.form.site)
+        or any(abs(_gain(guess, competing) - offset) < DECISIVE for offset in offsets)
+    }
     return [
         guess
         for guess, at in zip(guesses, first, strict=True)
-        if competing.is_sensor(guess.form)
-        or (guess.form.model.name == "constant" and scales_a_sum(twin, guess.form.site))
-        or not same[at]
+        if competing.is_sensor(guess.form) or guess.form in causes or not same[at]
     ]
+
+
+def _gain(guess: ScoredGuess, competing: CompetingForms) -> float:
+    """Return the score of a guess without its prior weight."""
+    return guess.score + 2.0 * float(np.log(competing.of(guess.form)))
 
 
 def _affordable(response: ProjectedResponse) -> int:

@@ -7,6 +7,7 @@ grows with the noise. So parameters or a component that explain a window up to t
 innovations that are white with this noise count as noise: what follows a curve is no noise, however large.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from otolith.estimation.window_fit import Fit, fit
 MIN_NOISE_FACTOR = 1.3  # on a standard deviation: a smaller factor is left to the variance between windows
 MAX_NOISE_FACTOR = 100.0  # a sensor that is worse than this measures nothing
 INPUT_SHARES = 0.5 ** (0.5 * np.arange(7.0))  # of what an input shows from sample to sample: its noise
+LESS_NOISE = 0.5  # ratio of two levels of noise that are compared
 VISIBLE = 1.0  # in -2 log likelihood: an input's noise that changes the normalisation by less does not show
 WHITE_DEVIATIONS = 4.0  # of the autocorrelation at the first lags, in standard deviations of that of white noise
 WHITE_LAGS = 4
@@ -110,6 +112,31 @@ def _with_noisier_inputs(null: Fit) -> Problem:
 def _deviance(trial: Fit) -> float:
     """Return -2 log likelihood of a window around which the twin is linearised."""
     return chi_square_of_parameters(trial) + trial.objective.innovation_model.log_determinant
+
+
+def likelier_levels(problem: Problem, deviance: Callable[[Problem], float]) -> Problem:
+    """Return the problem with the noise of states, or of outputs, halved as often as its ``deviance`` falls decisively.
+
+    Process noise that is stated too large for that of the sensors makes the predictor follow every sample. The gain of
+    a sensor would change how far it follows, and would pass for a cause.
+    """
+    least = deviance(problem)
+    while any(problem.process_noise):
+        states, outputs = (tuple(LESS_NOISE * level for level in own) for own in (problem.process_noise, problem.noise))
+        inputs = problem.levels[: -len(outputs)]
+        lower = replace(problem, process_noise=states), problem.with_levels((*inputs, *outputs))
+        deviances = list(map(deviance, lower))
+        if min(deviances) >= least - DECISIVE:
+            break
+        least = min(deviances)
+        problem = lower[deviances.index(least)]
+    return problem
+
+
+def likelier_levels_of(fitted: Fit) -> Problem:
+    """Return the same for the window of ``fitted``, around its parameters."""
+    window, prior, start = fitted.window, fitted.prior, fitted.parameters
+    return likelier_levels(fitted.problem, lambda problem: _deviance(linearised(problem, window, prior, start)))
 
 
 def normalisation(fitted: Fit, reference: Fit) -> float:

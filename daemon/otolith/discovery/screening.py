@@ -39,6 +39,8 @@ class CompetingForms:
     first_sensor: int
     """Index of the first site that is a sensor."""
     of_machine: float
+    of_constants: float
+    """Of constants at sites of the machine: a family has one share at each site, of which each source gets a part."""
     of_sensors: float
     states: frozenset[int]
     """Indices of the sources that are states."""
@@ -51,7 +53,9 @@ class CompetingForms:
         sensors = sum(form.site >= first for form in forms)
         names = {state.name for state in twin.states}
         states = frozenset(index for index, source in enumerate(sources(twin)) if source.name in names)
-        return cls(first, float(max(len(forms) - sensors, 1)), float(max(sensors, 1)), states)
+        of_machine = float(max(len(forms) - sensors, 1))
+        of_constants = min(of_machine, float(first * len({form.model.name for form in forms})))
+        return cls(first, of_machine, max(of_constants, 1.0), float(max(sensors, 1)), states)
 
     def of(self, form: CandidateForm) -> float:
         """Return the number of forms of the same kind.
@@ -61,6 +65,8 @@ class CompetingForms:
         """
         if self.is_sensor(form):
             return self.of_sensors
+        if form.model.name == "constant":
+            return self.of_constants
         of_input = form.model.threshold_like and form.source not in self.states
         return self.of_machine * (FRICTION_OF_INPUT if of_input else 1.0)
 

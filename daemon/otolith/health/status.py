@@ -61,8 +61,9 @@ class WindowEvidence:
 
     @property
     def at_bound(self) -> bool:
-        """Whether the best value of the window lies at a bound."""
-        return self.estimate is not None and self.estimate.identifiability is Identifiability.AT_BOUND
+        """Whether the best value of the window lies at a bound; not if other hypotheses than the twin explain it."""
+        is_at_bound = self.estimate is not None and self.estimate.identifiability is Identifiability.AT_BOUND
+        return is_at_bound and (self.accepted or not (self.is_mixture and self.is_explained))
 
     @property
     def accepted(self) -> bool:
