@@ -42,13 +42,13 @@ def reports(folder: Path, recording: Recording, schedule: Schedule = ROWS, extra
     return replayed(machine, data)
 
 
-def assert_named(document: ReportDocument, name: str, delay: float) -> None:
-    """The first finding names signal, delay (ms) and interval."""
+def assert_named(document: ReportDocument, name: str, delay: float, within: float = 1.0) -> None:
+    """The first finding names signal, delay (ms), ``within`` as many ms, and interval."""
     finding = FINDING.search(document.findings[0].text)
     assert finding is not None, document.findings
     value, low, high = map(float, finding.group(2, 3, 4))
     assert finding.group(1) == name
-    assert value == pytest.approx(delay, abs=1.0)
+    assert value == pytest.approx(delay, abs=within)
     assert low - 0.5 * (high - low) <= delay <= high + 0.5 * (high - low)
     assert document.explanations[0].reason is FaultType.TIMING
 
@@ -124,6 +124,59 @@ def test_a_declared_delay_gives_the_estimates_of_no_delay(tmp_path: Path, name: 
         assert own.sd is not None
         assert abs(own.value - other.value) < 2.0 * own.sd
         assert own.value == pytest.approx(getattr(recording.motor, parameter), abs=3.3 * own.sd)
+
+
+BLOCK = """
+[twin]
+name = "block"
+title = "heated block"
+source = "energy balance"
+validity = "always"
+[states]
+T = { unit = "K", bounds = [250, 600], initial = 300, meaning = "temperature" }
+[inputs]
+P = { unit = "W", hold = "zoh", range = [0, 500], meaning = "power of the heater" }
+[outputs]
+T = { unit = "K", noise = "20 mK", meaning = "temperature" }
+[parameters]
+C = { unit = "J/K", nominal = 500, bounds = [50, 5000], role = "estimated", meaning = "heat capacity" }
+h = { unit = "W/K", nominal = 5, bounds = [0.5, 50], role = "estimated", meaning = "heat loss coefficient" }
+[constants]
+T_a = { unit = "K", value = 293, meaning = "ambient temperature" }
+[equations]
+"der(T)" = "(P - h*(T - T_a)) / C"
+[sites]
+block = { into = "der(T)", mode = "additive", through = "1/C", unit = "W", meaning = "heat into the block" }
+"""
+HEATER = """
+[machine]
+name = "heater"
+[twin]
+file = "block.toml"
+[window]
+length = "300 s"
+sample_period = "5 s"
+"""
+
+
+@pytest.mark.full
+def test_a_delay_of_some_samples_of_a_slow_machine_is_named(tmp_path: Path) -> None:
+    """Samples come every 5 s, so a delay of 20 s is one of four samples."""
+    random, capacity, loss, step, late = np.random.default_rng(4), 540.0, 4.6, 5.0, 4
+    power = np.repeat(random.choice([0.0, 100.0, 200.0, 300.0, 400.0], 40), 12)
+    rises, decay = [7.0], np.exp(-step * loss / capacity)  # K above the ambient temperature
+    for value in power[:-1].tolist():
+        rises.append(decay * rises[-1] + (1.0 - decay) * value / loss)
+    shown = np.array(rises[:-late]) + 293.0 + random.normal(0.0, 0.02, len(power) - late)
+    lines = [f"{step * at},{power[at + late]},{value:.4f}" for at, value in enumerate(shown)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,P,T", *lines]) + "\n", encoding="utf-8")
+    (tmp_path / "block.toml").write_text(BLOCK, encoding="utf-8")
+    (tmp_path / "heater.toml").write_text(HEATER, encoding="utf-8")
+    documents = replayed(load_machine(tmp_path / "heater.toml", with_driver=False), tmp_path / "log.csv")
+    assert len(documents) >= 7
+    assert all(document.decision not in ACCEPTED for document in documents)
+    assert documents[-1].decision is WindowDecision.TIMING
+    assert_named(documents[-1], "T", 20e3, within=500.0)
 
 
 @pytest.mark.parametrize(("seed", "since"), [(1, 5), (2, 5)])

@@ -184,8 +184,8 @@ class _Search:
         self._problem, self._progress = problem, progress
         self._levels = np.array([*problem.noise, *(problem.process_noise or (0.0,) * len(twin.states))])
         good = [window for window in windows if window.quality.verdict is Verdict.GOOD]
-        length = min((window.grid.length for window in good), default=0.0)
-        self._limit = largest_delay(length)
+        limits = (largest_delay(window.grid.length, window.sample_period) for window in good)
+        self._limit = min(limits, default=0.0)
         self._windows = [window for window in good if window.records >= MIN_RECORDS]
         starts = [problem.nominal] * len(self._windows)
         point = self._evaluate(np.zeros(len(self.names)), self._windows, starts)

@@ -301,7 +301,11 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
     if not information > 0.0 or own.step**2 * before * own.information > MAX_DELAY_CHANGE**2 * information:
         return None
     moved = delay + own.information * own.step / information
-    if not QUANTILE / np.sqrt(information) < abs(moved) <= largest_delay(fitted.window.grid.length):
+    if (
+        not QUANTILE / np.sqrt(information)
+        < abs(moved)
+        <= largest_delay(fitted.window.grid.length, fitted.window.sample_period)
+    ):
         return None
     problem = replace(tracked.problem, delays=((signal, moved),))
     posterior = replace(tracked.posterior.moved((moved - delay) * np.array(own.shift)), problem=problem)

@@ -230,7 +230,7 @@ def late_signals(null: FittedHypothesis, gains: Array) -> list[FittedHypothesis]
 def _late_signal(null: FittedHypothesis, index: int) -> FittedHypothesis:
     """Fit the delay of one signal: the best of a grid, then Gauss-Newton steps of the delay."""
     window, names = null.fit.window, delayable(null.problem.base_model)
-    limit = largest_delay(window.grid.length)
+    limit = largest_delay(window.grid.length, window.sample_period)
     stated = FaultHypothesis(FaultType.TIMING, f"{names[index]} is late", 1, float(len(names)))
 
     def proposal(delay: float) -> Proposal:

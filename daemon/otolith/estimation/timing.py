@@ -20,15 +20,15 @@ from otolith.twin.kernel import Excitation
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-estimation.md.
 SAME_RECORD_STEPS = 1e-6  # mean steps: times that differ by less are one record
-MAX_DELAY, MAX_DELAY_SHARE = 0.2, 0.125  # s, and of a window: largest delay that is searched
+MAX_DELAY, MAX_DELAY_RECORDS, MAX_DELAY_SHARE = 0.2, 20, 0.125  # s or records, and of a window: largest one searched
 DELAY_RATIO = 1.5  # between two delays that are tried; the first is half a record
 SLOPE_SHARE = 0.02  # of a step: length of the difference before a record that gives the slope of an output
 PROBE = 1e-3  # of the mean step: delay of the finite difference
 
 
-def largest_delay(length: float) -> float:
-    """Return the largest delay, s, that is searched in a window of ``length`` s."""
-    return min(MAX_DELAY, MAX_DELAY_SHARE * length)
+def largest_delay(length: float, period: float) -> float:
+    """Return the largest delay, s, that is searched in a window of ``length`` s with a record every ``period`` s."""
+    return min(max(MAX_DELAY, MAX_DELAY_RECORDS * period), MAX_DELAY_SHARE * length)
 
 
 def trial_delays(period: float, limit: float) -> Array:
