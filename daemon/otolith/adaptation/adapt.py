@@ -162,26 +162,20 @@ def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
 
 
 def _screen(state: AdaptationState, tested: _TestedEstimate) -> ScreeningResult:
-    """Return the screening test of the window; if it is positive, at levels of noise below the stated ones if likelier.
-
-    While a test is open, its levels count.
-    """
+    """Return the screening test of the window; it is positive only if it is so at likelier levels of noise as well."""
+    determined = some_parameter_is_determined(state.previous)
 
     def screened(predicted: Posterior, estimated: WindowEstimate) -> ScreeningResult:
-        determined = some_parameter_is_determined(state.previous)
         screening = screen_window(predicted, estimated, determined=determined)
         return with_threshold_test(screening) if screening.needs_threshold_test else screening
 
-    predicted, estimated, test = tested.predicted, tested.estimated, state.test
-    problem, screening = predicted.problem, screened(predicted, estimated)
-    if test is None and not screening.is_positive:
-        return screening
-    levels = likelier_levels_of(estimated.fit) if test is None else test.problem
-    quieter = replace(problem.with_levels(levels.levels), process_noise=levels.process_noise)
-    if quieter == problem:
+    predicted, estimated = tested.predicted, tested.estimated
+    screening = screened(predicted, estimated)
+    if not screening.is_positive or (quieter := likelier_levels_of(estimated.fit)) == predicted.problem:
         return screening
     fitted = fit_predicted(predicted, quieter, estimated.fit.window, estimated.fit.parameters)
-    return screened(replace(predicted, problem=quieter), replace(estimated, fit=fitted))
+    again = screened(replace(predicted, problem=quieter), replace(estimated, fit=fitted))
+    return screening if again.is_positive else replace(screening, gain=again.gain)
 
 
 def _continued_test(
@@ -190,16 +184,13 @@ def _continued_test(
     """Return the open test after the window; None if there is none, or if the window shows something else."""
     if state.test is None:
         return None
-    at_levels, fitted = replace(tested.predicted, problem=screening.fitted.problem), tested.estimated.fit
-    test = continue_test(state.test, at_levels, screening)
-    test = test.with_filter(fitted if at_levels.problem == fitted.problem else screening.fitted)
+    test = continue_test(state.test, tested.predicted, screening).with_filter(tested.estimated.fit)
     return None if test.best.type is FaultType.NOTHING and not tested.is_expected else test
 
 
 def _open_test(state: AdaptationState, tested: _TestedEstimate, screening: ScreeningResult) -> WindowResult:
     """Search for hypotheses. If the window is expected and none is decisively better, only the filter is updated."""
-    at_levels = replace(tested.predicted, problem=screening.fitted.problem)
-    state, test = replace(state, test=None), open_test(at_levels, screening)
+    state, test = replace(state, test=None), open_test(tested.predicted, screening)
     if tested.is_expected and test.is_null_possible:
         return _update_filter(state, tested)
     return _apply_decision(state, tested, test)
@@ -332,9 +323,7 @@ def _adopt_hypothesis(
     accepted, adopted = outcome.hypothesis, state.adopted
     if outcome.decision is WindowDecision.DISCOVERED:
         adopted = adopt(adopted, test, accepted)
-    problem, stated = accepted.problem, state.problem  # a test may have lower levels of noise than stated
-    problem = problem.with_levels(list(map(max, problem.levels, stated.levels)))
-    problem = replace(problem, excluded=stated.excluded, process_noise=stated.process_noise)
+    problem = replace(accepted.problem, excluded=state.problem.excluded)
     posterior = replace(accepted.posterior, problem=problem)
     return replace(_replace_posterior(outcome.decision, posterior, estimated, adopted), test=test)
 
