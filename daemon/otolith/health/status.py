@@ -61,9 +61,8 @@ class WindowEvidence:
 
     @property
     def at_bound(self) -> bool:
-        """Whether the best value of the window lies at a bound; not if other hypotheses than the twin explain it."""
-        is_at_bound = self.estimate is not None and self.estimate.identifiability is Identifiability.AT_BOUND
-        return is_at_bound and (self.accepted or not (self.is_mixture and self.is_explained))
+        """Whether the best value of the window lies at a bound."""
+        return self.estimate is not None and self.estimate.identifiability is Identifiability.AT_BOUND
 
     @property
     def accepted(self) -> bool:
@@ -84,7 +83,7 @@ def publish(
     estimate, reason = window.estimate, window.reason
     if at_bound and not window.at_bound:
         reason = "; ".join(filter(None, (at_its_bound(value, parameter.unit), reason)))
-    elif estimate is not None and (window.accepted or window.at_bound):
+    elif estimate is not None and (window.accepted or (window.at_bound and status is Status.INVALID)):
         reason = "; ".join(filter(None, (estimate.reason, reason)))
     identifiability = None if estimate is None else estimate.identifiability
     alone = estimate if estimate is not None and _is_informative(estimate, width) else None
@@ -111,12 +110,13 @@ def _status(
     known_now: MarginalPosterior, window: WindowEvidence, before: PreviousStatus, *, known: bool, required: float
 ) -> Status:
     refused = window.decision is WindowDecision.REFUSED
-    if (window.contradictions >= INVALID_AFTER and refused) or window.at_bound:
+    is_agreed = window.is_mixture and window.is_explained and QUANTILE * known_now.sd <= required
+    # A bound that only the twin alone reaches does not count where the hypotheses that explain the window agree.
+    if (window.contradictions >= INVALID_AFTER and refused) or (window.at_bound and not is_agreed):
         return Status.INVALID
     if not known:
         return Status.UNESTIMATED
     if window.is_mixture:
-        is_agreed = window.is_explained and QUANTILE * known_now.sd <= required
         return Status.ESTIMATED if is_agreed else Status.AMBIGUOUS
     if not window.accepted or window.estimate is None:
         return Status.HELD
