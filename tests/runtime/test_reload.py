@@ -36,6 +36,10 @@ def test_limits_and_recording_change(tmp_path: Path) -> None:
     result = change(tmp_path, '"+40 %"', '"+60 %"')
     assert (result.limits, result.recording, result.needs_restart) == (True, False, ())
     assert any(limit.value == pytest.approx(6.5 * 1.6) for limit in result.machine.plan.parameters["R_a"].limits)
+    rule = '[[rule]]\nid = "x"\nfinding = "limit"\ncondition = "c"\ncause = "c"\nadvice = "a"\n[recording]'
+    result = change(tmp_path, "[recording]", rule)
+    assert (result.limits, result.recording, result.needs_restart) == (True, False, ())
+    assert result.machine.plan.rules[0].id == "x"
     result = change(tmp_path, "enabled = false", "enabled = true")
     assert (result.limits, result.recording, result.needs_restart) == (False, True, ())
     assert result.machine.file.recording.enabled

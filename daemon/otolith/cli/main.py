@@ -113,7 +113,7 @@ def cli() -> None:
 def run(file: Path, listen: tuple[str, ...], recording: Path | None, verbose: bool) -> int:
     """Run the daemon for the machine in FILE.
 
-    It runs until SIGTERM or Ctrl-C. SIGHUP takes over changed limits and
+    It runs until SIGTERM or Ctrl-C. SIGHUP takes over changed limits, rules and
     [recording] from FILE.
 
     \b

@@ -61,17 +61,18 @@ Key = tuple[str, ...]
 
 @dataclass(frozen=True, slots=True)
 class Reload:
-    """What a changed machine file changes in a running daemon: limits and recording. The rest needs a restart."""
+    """What a changed machine file changes in a running daemon: limits, rules, recording. The rest needs a restart."""
 
     machine: LoadedMachine  # The machine to go on with
-    limits: bool
+    limits: bool  # Or rules of the diagnosis
     recording: bool
     needs_restart: tuple[str, ...]  # Keys of the file that were changed and that a running daemon does not take over
 
     @property
     def text(self) -> str:
         """What has changed, in words."""
-        changed = " and ".join(name for name in ("limits", "recording") if getattr(self, name)) or "nothing"
+        names = {"limits or rules": self.limits, "recording": self.recording}
+        changed = " and ".join(name for name, is_changed in names.items() if is_changed) or "nothing"
         line = f"{self.machine.path}: reloaded, {changed} changed"
         return f"{line}; only a restart takes over {', '.join(self.needs_restart)}" if self.needs_restart else line
 
@@ -92,13 +93,13 @@ def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
     if any(key[0] in {"twin", "parameters"} for key in rest):
         rest, limits = [*rest, *limits], []
     if limits:
-        update |= {"parameters": file.parameters, "components": file.components}
+        update |= {"parameters": file.parameters, "components": file.components, "rule": file.rule}
     machine = replace(running, file=old.model_copy(update=update), plan=new.plan if limits else running.plan)
     return Reload(machine, bool(limits), recording, tuple(".".join(key) for key in rest))
 
 
 def _is_limit(key: Key) -> bool:
-    return key[0] == "components" or (key[0] == "parameters" and key[-1] in {"watch", "act"})
+    return key[0] in {"components", "rule"} or (key[0] == "parameters" and key[-1] in {"watch", "act"})
 
 
 def _differences(old: Any, new: Any, key: Key = ()) -> Iterator[Key]:
@@ -270,7 +271,7 @@ class Service:
             self._history.start()
 
     def _reload(self) -> None:
-        """Take over limits and recording from the machine file; if it is invalid, go on as before."""
+        """Take over limits, rules and recording from the machine file; if it is invalid, go on as before."""
         self._is_reload_due = False
         try:
             change = reloaded(self._machine, load_machine(self._machine.path))
