@@ -361,7 +361,7 @@ def _check_rules(file: MachineFile, twin: Definition, context: Context) -> None:
     known = {"twin": [twin.name], "subject": subjects, "family": list(FAMILY_NAMES), "input": inputs}
     for number, rule in enumerate(file.rule):
         for key, names in known.items():
-            for name in set(getattr(rule, key)) - set(names):
+            for name in [name for name in getattr(rule, key) if name not in names][:1]:
                 context.fail(("rule", number, key), f"unknown name {name!r}: {nearest(name, names)}")
 
 

@@ -14,7 +14,7 @@ from typing import Literal
 from pydantic import Field
 
 from otolith.health.language import Texts, texts_in
-from otolith_drivers.config_files import StrictModel
+from otolith_drivers.config_files import Range, StrictModel
 
 KEYS = ("twin", "subject", "side", "manner", "family", "input")
 
@@ -58,7 +58,7 @@ class FindingFeatures:
 class _Row(StrictModel):
     """The values that a rule matches. A key without values matches everything."""
 
-    id: str  # Key of its texts in `texts/`
+    id: str = Field(min_length=1)  # Of a packaged row, the key of its texts in `texts/`
     finding: FindingKind
     twin: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ class _Row(StrictModel):
     manner: tuple[Literal["step", "trend"], ...] = ()
     family: tuple[str, ...] = ()
     input: tuple[str, ...] = ()
-    order: tuple[float, float] | None = None  # Lowest and highest order
+    order: Range | None = None  # Lowest and highest order
     severity: Literal["WATCH", "ACT"] = "WATCH"  # Level of what has no limits
 
 
