@@ -8,6 +8,7 @@ when two such searches find it. The second one contains a window that the first 
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -44,8 +45,9 @@ def lacking_component(problem: Problem, windows: Starts) -> Structure | None:
     Noise that was stated larger than it is hides structure, so likelier levels are searched at. But what the
     stated noise covers may be a part of it: only a sine that stands out in its spectrum needs no evidence beside that.
     """
-    quieter = likelier_levels(problem, lambda levels: _deviance(_pooled(levels, windows)))
-    pooled = _pooled(quieter, windows)
+    response_at = cache(lambda levels: _pooled(levels, windows))
+    quieter = likelier_levels(problem, lambda levels: _deviance(response_at(levels)))
+    pooled = response_at(quieter)
     at_positions = positions(problem.base_model)
     forms = [form for form in pooled_forms(pooled) if form.source in at_positions]
     for shown in filter(lambda own: own.is_offered, structures(pooled, forms)):

@@ -69,15 +69,21 @@ def find_candidates(response: LinearResponse) -> list[Candidate]:
 
 
 def errors_of_encoders(response: LinearResponse, beside: Iterable[Component]) -> list[Candidate]:
-    """Return for each measured position of which a component ``beside`` is a sine: that sine, as its sensor's error."""
+    """Return for each measured position of which a component ``beside`` is a sine: that sine, as its sensor's error.
+
+    An error that is itself among the components ``beside`` is not returned again.
+    """
     problem, twin, starts = response.problem, response.problem.base_model, dict[CandidateForm, list[float]]()
-    names, signals = [site.name for site in sites(twin)], {output.name for output in twin.outputs}
-    for sine in beside:
-        key = key_of(sensor_site(sine.source), sine.family, sine.source)
-        if sine.model.phases[1:] and sine.source in signals and key not in problem.excluded:
-            source = [own.name for own in sources(twin)].index(sine.source)
-            form = CandidateForm(names.index(sensor_site(sine.source)), sine.model, source, (sine.low, sine.high))
+    site_names, source_names = [site.name for site in sites(twin)], [source.name for source in sources(twin)]
+    components, signals = {own.key: own for own in beside}, {output.name for output in twin.outputs}
+    for sine in components.values():
+        error = key_of(sensor_site(sine.source), sine.family, sine.source)
+        if sine.periodic and sine.source in signals and error not in problem.excluded | components.keys():
+            site, source = site_names.index(sensor_site(sine.source)), source_names.index(sine.source)
+            form = CandidateForm(site, sine.model, source, (sine.low, sine.high))
             starts.setdefault(form, []).append(sine.inner)
+    if not starts:
+        return []
     competing = CompetingForms.among(problem, list(starts))
     scored = ScoredGuesses.of(response, refine_inner_parameters(response, list(starts.items())), competing)
     guesses = [scored[at] for at in range(len(starts))]
@@ -154,13 +160,12 @@ def _without_parameters(
     amplitudes = np.concatenate([guess.amplitudes[:count] for guess, count in zip(guesses, curves, strict=True)])
     same = response.is_parameter(basis_functions((guess.form, guess.inner) for guess in guesses), amplitudes)
     first = np.cumsum([0, *curves[:-1]]).tolist()
-    constants = [guess for guess in guesses if guess.form.model.name == "constant"]
-    offsets = [_gain(guess, competing) for guess in constants if competing.is_sensor(guess.form)]
+    gains = {guess.form: _gain(guess, competing) for guess in guesses if guess.form.model.name == "constant"}
+    offsets = [gain for form, gain in gains.items() if competing.is_sensor(form)]
     causes = {
-        guess.form
-        for guess in constants
-        if scales_a_sum(twin, guess.form.site)
-        or any(abs(_gain(guess, competing) - offset) < DECISIVE for offset in offsets)
+        form
+        for form, gain in gains.items()
+        if scales_a_sum(twin, form.site) or any(abs(gain - offset) < DECISIVE for offset in offsets)
     }
     return [
         guess

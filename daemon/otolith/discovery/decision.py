@@ -136,9 +136,9 @@ def _is_below_noise(hypothesis: TrackedHypothesis) -> bool:
     if hypothesis.type is not FaultType.SENSOR or slot < 0 or problem.components[slot].family == "linear":
         return False
     into = site_of(problem.base_model, problem.components[slot].site).into
-    offset = abs(float(hypothesis.posterior.prior().mean[indices(problem, slot)[0]]))
+    error = abs(float(hypothesis.posterior.prior().mean[indices(problem, slot)[0]]))
     return any(
-        output.name == into and offset < noise
+        output.name == into and error < noise
         for output, noise in zip(problem.base_model.outputs, problem.noise, strict=True)
     )
 

@@ -301,11 +301,8 @@ def _with_delay(tracked: TrackedHypothesis, fitted: Fit) -> TrackedHypothesis | 
     if not information > 0.0 or own.step**2 * before * own.information > MAX_DELAY_CHANGE**2 * information:
         return None
     moved = delay + own.information * own.step / information
-    if (
-        not QUANTILE / np.sqrt(information)
-        < abs(moved)
-        <= largest_delay(fitted.window.grid.length, fitted.window.sample_period)
-    ):
+    limit = largest_delay(fitted.window.grid.length, fitted.window.sample_period)
+    if not QUANTILE / np.sqrt(information) < abs(moved) <= limit:
         return None
     problem = replace(tracked.problem, delays=((signal, moved),))
     posterior = replace(tracked.posterior.moved((moved - delay) * np.array(own.shift)), problem=problem)
@@ -433,9 +430,10 @@ def describe_hypothesis(tracked: TrackedHypothesis) -> str:
         component = problem.components[-1]
         site, at = site_of(twin, component.site), indices(problem, len(problem.components) - 1)
         error = float(values[at[0]])
-        off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g} {unit_text(site.unit)}".rstrip()
-        if component.family == "periodic":
+        if component.periodic:
             off = equation_text(equation(twin, component, values[at].tolist()))
+        else:
+            off = f"{error:+.1%}" if component.family == "linear" else f"{error:+.2g} {unit_text(site.unit)}".rstrip()
         return f"{site.into} reads {off} off: look at the sensor and its scale"
     return "; ".join(
         f"{component.site}: {equation_text(equation(twin, component, values[indices(problem, slot)].tolist()))}"

@@ -134,7 +134,7 @@ def likelier_levels(problem: Problem, deviance: Callable[[Problem], float]) -> P
 
 
 def likelier_levels_of(fitted: Fit) -> Problem:
-    """Return the same for the window of ``fitted``, around its parameters."""
+    """Return the problem of ``fitted`` with the :func:`likelier_levels` of its window, linearised at its parameters."""
     window, prior, start = fitted.window, fitted.prior, fitted.parameters
     return likelier_levels(fitted.problem, lambda problem: _deviance(linearised(problem, window, prior, start)))
 

@@ -174,12 +174,10 @@ def _errors_of_encoders(screening: ScreeningResult, fitted: list[FittedHypothesi
 
     A force must not be preferred to the error of an encoder because no other hypothesis is periodic.
     """
-    known, names = fitted[0].problem.components, {item.name for item in fitted}
-    sines = {own.key: own for item in fitted for own in item.problem.components if own not in known}
-    errors = errors_of_encoders(screening.response, sines.values())
-    own = screening.fitted
-    proposals = [with_candidate(own.problem, own.prior, error) for error in errors]
-    return fit_hypotheses([item for item in proposals if item.hypothesis.name not in names], own.window, FAR_WORSE)
+    known, own = fitted[0].problem.components, screening.fitted
+    added = [component for item in fitted for component in item.problem.components if component not in known]
+    errors = errors_of_encoders(screening.response, added)
+    return fit_hypotheses([with_candidate(own.problem, own.prior, error) for error in errors], own.window, FAR_WORSE)
 
 
 def _several_components(fitted: list[FittedHypothesis]) -> list[FittedHypothesis]:
