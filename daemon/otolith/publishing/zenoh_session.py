@@ -134,6 +134,11 @@ def prefix(site: str, machine: str) -> str:
     return f"otolith/{site}/{machine}"
 
 
+def _with_timeout(endpoint: str) -> str:
+    """Return a TLS endpoint with the time that a handshake may take; Zenoh writes what follows ``#`` as ``a=1;b=2``."""
+    return f"{endpoint}{';' if '#' in endpoint else '#'}tls_handshake_timeout_ms={TLS_TIMEOUT}"
+
+
 def session(
     listen: Iterable[str] = (),
     connect: Iterable[str] = (),
@@ -148,12 +153,11 @@ def session(
         ServiceError: an endpoint to listen on is in use, one is malformed, or a client reaches none.
     """
     listen, connect = tuple(listen), tuple(connect)
-    timeout = f"#tls_handshake_timeout_ms={TLS_TIMEOUT}"
     whole: Settings = {
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "listen/endpoints": [each + timeout if each.startswith("tls/") else each for each in listen],
+        "listen/endpoints": [_with_timeout(each) if each.startswith("tls/") else each for each in listen],
         "connect/endpoints": connect,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5},
         "open/return_conditions/connect_scouted": False,

@@ -156,8 +156,9 @@ def highest_reading(signal: CanSignal) -> float:
 
 def highest_value(message: Message, signal: CanSignal) -> float:
     """Return the highest value that is a reading, in the unit of the database; infinite if none is reserved."""
-    highest = signal.raw_to_scaled(highest_reading(signal), decode_choices=False)
-    return cast("float", highest) if is_j1939(message) else float("inf")
+    if not is_j1939(message):
+        return float("inf")
+    return cast("float", signal.raw_to_scaled(highest_reading(signal), decode_choices=False))
 
 
 def fault_of(raw: float, signal: CanSignal) -> str:

@@ -79,11 +79,14 @@ class ObservedFrames:
 
     @property
     def title(self) -> str:
-        """The message of the database; with the address of its sender if that is open there."""
-        if self.message is None:
-            return self.name
-        address = f" from 0x{self.identifier & j1939.ADDRESS_MASK:02X}" if j1939.is_a_group(self.message) else ""
-        return f"{self.message.name}{address}"
+        """The message of the database; with its source address if that is open there."""
+        return self.name if self.message is None else f"{self.message.name}{self.source}"
+
+    @property
+    def source(self) -> str:
+        """The source address in words, if it is open in the database; else empty."""
+        is_open = self.message is not None and j1939.is_a_group(self.message)
+        return f" from 0x{self.identifier & j1939.ADDRESS_MASK:02X}" if is_open else ""
 
     @property
     def period(self) -> float | None:
@@ -136,7 +139,8 @@ class ObservedFrames:
         for signal in message.signals:
             number = numbers.get(signal.name, math.nan)
             if number > j1939.highest_value(message, signal):
-                self.values.get(signal.name, ObservedValue(number, number, number)).beyond += 1
+                if signal.name in self.values:  # one that never had a reading is not shown
+                    self.values[signal.name].beyond += 1
             elif math.isfinite(number):
                 value = self.values.setdefault(signal.name, ObservedValue(number, number, number))
                 value.latest, value.low, value.high = number, min(value.low, number), max(value.high, number)

@@ -368,11 +368,7 @@ def opcua(endpoint: str, timeout: float, most: int, as_json: bool, **keys: Any) 
         console = stdout_console()
         for variable in variables:
             console.print(_opcua_line(variable), markup=False, soft_wrap=True)
-        count = (
-            f"the first {most} variables; --most shows more"
-            if len(variables) == most
-            else f"{len(variables)} variables"
-        )
+        count = f"{len(variables)} variables" + (", as many as --most allows" if len(variables) == most else "")
         console.print(count if variables else "no variables beside those of OPC UA itself")
     return 0 if variables else NOTHING_THERE
 

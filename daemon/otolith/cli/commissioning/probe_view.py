@@ -306,9 +306,9 @@ def marked(frames: canbus.ObservedFrames) -> str:
 
 def _signal_row(frames: canbus.ObservedFrames, signal: Signal, value: canbus.ObservedValue) -> Row:
     low, high = signal.minimum, signal.maximum
-    message, _, sender = frames.title.partition(" ")
+    message = frames.message.name if frames.message else frames.name
     return {
-        "signal": f"{message}.{signal.name} {sender}".rstrip(),
+        "signal": f"{message}.{signal.name}{frames.source}",
         "unit": signal.unit or "",
         "now": ("" if canbus.within(signal, value.latest) else "!") + canbus.value_text(signal, value.latest),
         "least": canbus.value_text(signal, value.low),

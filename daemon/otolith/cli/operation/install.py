@@ -198,8 +198,10 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
     if dry_run:
         return before is not None
     umask = os.umask(0o022)  # that of root may close the folders to the service
-    path.parent.mkdir(parents=True, exist_ok=True)
-    os.umask(umask)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    finally:
+        os.umask(umask)
     if before is not None:
         shutil.copy2(path, path.with_name(f"{path.name}~"))
     handle, temporary = tempfile.mkstemp(dir=path.parent)
