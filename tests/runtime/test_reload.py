@@ -63,6 +63,16 @@ def test_all_else_needs_a_restart(tmp_path: Path, before: str, after: str, keys:
     assert f"only a restart takes over {', '.join(keys)}" in result.text
 
 
+def test_limits_wait_for_a_restart_with_the_language_of_their_texts(tmp_path: Path) -> None:
+    (tmp_path / "machine.toml").write_text(TEXT, encoding="utf-8")
+    running = load_machine(tmp_path / "machine.toml", with_driver=False)
+    text = TEXT.replace('"+40 %"', '"+60 %"').replace('name = "motor"', 'name = "motor"\nlanguage = "de"')
+    (tmp_path / "machine.toml").write_text(text, encoding="utf-8")
+    result = reloaded(running, load_machine(tmp_path / "machine.toml", with_driver=False))
+    assert result.needs_restart == ("machine.language", "parameters.R_a.act")
+    assert result.machine.plan == running.plan
+
+
 def test_a_file_that_vanishes_during_a_reload_does_not_end_the_daemon(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -80,7 +80,8 @@ class Reload:
 def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
     """Return ``running`` with what it can take over from ``new``.
 
-    Limits may be percentages of values, so they are taken over only with the parameters they belong to.
+    Limits may be percentages of values, so they are taken over only with the parameters they belong to. With them come
+    the texts of the rules, so they also wait for a restart if the language has changed.
     """
     old, file = running.file, new.file
     changed = list(_differences(old.model_dump(), file.model_dump()))
@@ -90,7 +91,7 @@ def reloaded(running: LoadedMachine, new: LoadedMachine) -> Reload:
     if new.twin != running.twin and not any(key[0] == "twin" for key in rest):
         rest.append(("twin", "file"))
     update: dict[str, Any] = {"recording": file.recording}
-    if any(key[0] in {"twin", "parameters"} for key in rest):
+    if any(key[0] in {"twin", "parameters"} or key == ("machine", "language") for key in rest):
         rest, limits = [*rest, *limits], []
     if limits:
         update |= {"parameters": file.parameters, "components": file.components, "rule": file.rule}
