@@ -31,8 +31,7 @@ from otolith.machine_file import (
     own_keys,
     signal_units,
 )
-from otolith.twin.augmentation import sensor_site, sites, sources
-from otolith.twin.component_families import FAMILY_NAMES
+from otolith.twin.components import FAMILY_NAMES, sensor_site, sites, sources
 from otolith.twin.definition import Definition, Parameter, Role
 from otolith.twin.language import MAX_COEFFICIENT, read_twin
 from otolith_drivers.base import Driver, Sampling, sampling_of

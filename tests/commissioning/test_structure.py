@@ -15,7 +15,7 @@ from otolith.discovery.candidates import best_guesses
 from otolith.discovery.screening import ScoredGuess, allowed_forms
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.window_fit import fit
-from otolith.twin.augmentation import sources
+from otolith.twin.components import sources
 from tests.cogging_axis import AMPLITUDE, FREE, PITCH, PROBLEM, TRUTH, record
 
 

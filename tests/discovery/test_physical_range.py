@@ -18,8 +18,7 @@ from otolith.discovery.screening import ScoredGuess, candidate_library, linearis
 from otolith.discovery.search import search
 from otolith.estimation.arrival_cost import Prior, initial_prior
 from otolith.machine import find_twin
-from otolith.twin.augmentation import sites, sources
-from otolith.twin.component_families import COMPONENT_FAMILIES, SourceKind
+from otolith.twin.components import COMPONENT_FAMILIES, SourceKind, sites, sources
 from otolith.twin.symbolic import system_of
 from tests.discovery.two_mass import DryFriction, simulate
 from tests.discovery.two_mass import problem as two_mass_problem

@@ -51,7 +51,7 @@ from otolith.estimation.window_fit import Fit, Search, WindowEstimate, estimate,
 from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
-from otolith.twin.augmentation import positions
+from otolith.twin.components import positions
 
 UNUSED = "nothing is estimated from this window: "
 # Thresholds of the windows that are searched together: docs/reference/thresholds-health.md.

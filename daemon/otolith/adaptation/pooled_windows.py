@@ -22,7 +22,7 @@ from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuesses
 from otolith.estimation.arrival_cost import initial_prior
 from otolith.estimation.problem import Problem, key_of
 from otolith.estimation.window_fit import fit
-from otolith.twin.augmentation import positions, sites, sources
+from otolith.twin.components import positions, sites, sources
 
 Starts = tuple[tuple[Window, tuple[float, ...], tuple[float, ...]], ...]
 """Windows, each with its initial state and with what was known of the parameters after it: they may drift."""

@@ -54,7 +54,7 @@ from otolith.health.status import (
     publish,
     some_parameter_is_determined,
 )
-from otolith.twin.component_families import SourceKind
+from otolith.twin.components import SourceKind
 from otolith_drivers.units import equation_text
 
 DISAGREEING_RATIO = 3.0  # ratio of variances above which windows disagree with each other

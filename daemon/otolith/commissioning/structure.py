@@ -34,8 +34,7 @@ from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, fit
-from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
-from otolith.twin.component_families import SourceKind
+from otolith.twin.components import MAX_COMPONENTS, SourceKind, sites, sources
 
 # Values, units, origins and guarding tests: docs/reference/thresholds-commissioning.md.
 MIN_WINDOWS = 4  # fewer do not show whether amplitudes agree

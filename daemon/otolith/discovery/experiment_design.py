@@ -17,7 +17,7 @@ from otolith.discovery.screening import DECISIVE
 from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.information import QUANTILE
 from otolith.estimation.problem import Problem
-from otolith.twin.augmentation import ELAPSED
+from otolith.twin.components import ELAPSED
 from otolith.twin.definition import Input
 from otolith.twin.kernel import Excitation, kernel_of
 from otolith_drivers.units import unit_text

@@ -49,7 +49,7 @@ from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem
 from otolith.estimation.timing import delayable, largest_delay, trial_delays
 from otolith.estimation.window_fit import Fit, fit
-from otolith.twin.augmentation import MAX_COMPONENTS
+from otolith.twin.components import MAX_COMPONENTS
 from otolith.twin.definition import Parameter
 
 ROUNDS, STEPS_OF_ROUND = 5, 5  # of Gauss-Newton for a hypothesis

@@ -28,8 +28,7 @@ from otolith.estimation.problem import UNLIMITED, Problem, augment, indices
 from otolith.health.events import HealthState
 from otolith.health.prognosis import is_plausible
 from otolith.health.status import PreviousStatus
-from otolith.twin.augmentation import MAX_COMPONENTS, sites, sources
-from otolith.twin.component_families import FAMILY_NAMES
+from otolith.twin.components import FAMILY_NAMES, MAX_COMPONENTS, sites, sources
 from otolith.twin.definition import Definition
 from otolith_drivers.config_files import StrictModel
 
