@@ -12,7 +12,6 @@ import numpy as np
 
 from otolith.acquisition.quality import Gap, longest_gap, time_text
 from otolith.acquisition.window import Array, Window
-from otolith.adaptation.pooled_windows import PooledWindows, lacking_component
 from otolith.adaptation.reporting import DATA_FAULTS, OPEN, WindowResult, make_report
 from otolith.adaptation.state import (
     AdaptationState,
@@ -21,7 +20,7 @@ from otolith.adaptation.state import (
     with_posterior,
     with_records,
 )
-from otolith.commissioning.structure import MIN_WINDOWS
+from otolith.commissioning.structure import PooledWindows, pooled_with
 from otolith.discovery.decision import (
     MAX_COST,
     UPDATES,
@@ -45,19 +44,14 @@ from otolith.estimation.imm_filter import Innovation, ParameterCusum
 from otolith.estimation.information import QUANTILE, Identifiability, information
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
-from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of, source_of
+from otolith.estimation.problem import Problem, WindowExcitation, next_records, slot_of
 from otolith.estimation.timing import with_changes_between
-from otolith.estimation.window_fit import Fit, Search, WindowEstimate, estimate, estimate_window, fit_predicted
+from otolith.estimation.window_fit import Search, WindowEstimate, estimate, estimate_window, fit_predicted
 from otolith.health.events import HealthState, assess
 from otolith.health.schema import Report
 from otolith.health.status import PreviousStatus, some_parameter_is_determined
-from otolith.twin.components import positions
 
 UNUSED = "nothing is estimated from this window: "
-# Thresholds of the windows that are searched together: docs/reference/thresholds-health.md.
-MAX_WINDOWS, MAX_TOTAL_RECORDS = 8, 10_000  # how many, and records of all of them
-MAX_PAUSE = 256  # windows between two searches, which take as long as that of a window
-SAME_INNER = 0.02  # of an inner parameter: two searches that differ by more have not shown the same
 MIN_GAP_SHARE = 0.05  # of a window: a shorter gap is not named; engineering choice
 
 
@@ -262,33 +256,6 @@ def _pool(state: AdaptationState, tested: _TestedEstimate, result: WindowResult)
     again = _TestedEstimate.of(with_records(tested.predicted, (record,), forget_phases=False), fitted.window)
     discovered = _update_filter(replace(state, adopted=(*state.adopted, record.adopted)), again)
     return replace(discovered, decision=WindowDecision.DISCOVERED, before=discovered.after)
-
-
-def pooled_with(pooled: PooledWindows, fitted: Fit, parameters: Array) -> PooledWindows:
-    """Return ``pooled`` with the window of a fit; ``parameters`` (free,) are known after it.
-
-    What two searches in a row show is confirmed: the second one contains a window that the first one has not seen.
-    """
-    pause, problem = pooled.pause - 1, fitted.problem
-    if not positions(problem.base_model):
-        return pooled
-    in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
-    if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
-        return replace(pooled, windows=(), pause=pause)  # what is in the twin may have another phase in each window
-    states = fitted.initial[: len(problem.base_model.states)]
-    start = fitted.window, tuple(states.tolist()), tuple(parameters[: len(problem.free)].tolist())
-    windows = (*pooled.windows, start)[-MAX_WINDOWS:]
-    while sum(window.records for window, *_ in windows) > MAX_TOTAL_RECORDS:
-        windows = windows[1:]
-    if pause > 0 or len(windows) < MIN_WINDOWS:
-        return replace(pooled, windows=windows, pause=pause)
-    shown, before = lacking_component(problem, windows), pooled.shown
-    if shown is not None and before is not None and shown.component.key == before.component.key:
-        one, other = shown.component.inner, before.component.inner
-        if abs(one - other) <= SAME_INNER * abs(one):
-            return PooledWindows(confirmed=shown)
-    longer = min(2 * pooled.next_pause, MAX_PAUSE)
-    return PooledWindows(windows, pooled.next_pause if shown is None else 1, longer, shown)
 
 
 def _follow_shifts(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:

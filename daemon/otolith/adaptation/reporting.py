@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from otolith.acquisition.window import Window
-from otolith.adaptation.pooled_windows import PooledWindows
 from otolith.adaptation.state import AdaptationState
+from otolith.commissioning.structure import PooledWindows
 from otolith.discovery.decision import (
     ACCEPTED,
     COMPONENT_PROBABILITY,

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from otolith.adaptation.pooled_windows import PooledWindows
-from otolith.commissioning.structure import Structure
+from otolith.commissioning.structure import PooledWindows, Structure
 from otolith.discovery.decision import AdoptedComponent, Approval, keep_present
 from otolith.discovery.sequential_test import SequentialTest
 from otolith.estimation.imm_filter import TREND_MEMORY, ParameterCusum

@@ -33,8 +33,7 @@ from otolith.health.text import announcements, event_text, summary
 from otolith.machine import LoadedMachine, load_machine
 from otolith.publishing.zenoh_config import Access, listening
 from otolith.publishing.zenoh_session import Publisher
-from otolith.runtime.process import SIGNALS, EventCommand
-from otolith.runtime.recorder_supervisor import RecorderSupervisor
+from otolith.runtime.process import SIGNALS, EventCommand, RecorderSupervisor
 from otolith.runtime.worker import COMPILE_TIMEOUT, Supervisor
 from otolith.storage.evidence import EvidenceWriter, files_of
 from otolith.storage.history import describe_machine
