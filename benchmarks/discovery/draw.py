@@ -19,7 +19,7 @@ from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidate_forms import CandidateForm, PhysicalRange
 from otolith.discovery.linear_response import LinearResponse, basis_functions
 from otolith.discovery.screening import DECISIVE, ScreeningResult, candidate_library
-from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.information import Prior
 from otolith.twin.components import COMPONENT_FAMILIES, ComponentFamily, SourceKind, sites, sources
 
 SECONDS = 2.0

@@ -12,7 +12,7 @@ from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.commissioning import structure as module
 from otolith.commissioning.structure import MAX_PAUSE, MAX_WINDOWS, PooledWindows, Structure, pooled_with
 from otolith.discovery.decision import WindowDecision
-from otolith.estimation.arrival_cost import initial_prior
+from otolith.estimation.information import initial_prior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, fit
 from otolith.health.schema import ReportDocument

@@ -22,10 +22,9 @@ from otolith.discovery.decision import (
 from otolith.discovery.experiment_design import Situation, advise, deciding_experiment
 from otolith.discovery.hypotheses import FaultType, describe_hypothesis, describe_sensors
 from otolith.discovery.sequential_test import SequentialTest
-from otolith.estimation.arrival_cost import Prior
 from otolith.estimation.data_checks import FaultySensor
 from otolith.estimation.imm_filter import ParameterCusum
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of

@@ -35,8 +35,7 @@ from otolith.discovery.linear_response import (
 )
 from otolith.discovery.noise_hypothesis import likelier_levels
 from otolith.discovery.screening import DECISIVE, CompetingForms, ScoredGuess, ScoredGuesses, allowed_forms
-from otolith.estimation.arrival_cost import initial_prior
-from otolith.estimation.information import orthonormal_basis
+from otolith.estimation.information import initial_prior, orthonormal_basis
 from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import UNKNOWN_PHASE_SD
 from otolith.estimation.problem import Component, Problem, key_of, source_of

@@ -14,8 +14,7 @@ import numpy as np
 from otolith.acquisition.window import Array, TimeGrid
 from otolith.discovery.hypotheses import TrackedHypothesis
 from otolith.discovery.screening import DECISIVE
-from otolith.estimation.arrival_cost import Prior
-from otolith.estimation.information import QUANTILE
+from otolith.estimation.information import QUANTILE, Prior
 from otolith.estimation.problem import Problem
 from otolith.twin.components import ELAPSED
 from otolith.twin.definition import Input

@@ -12,7 +12,7 @@ import numpy as np
 from otolith.acquisition.window import Array, Window
 from otolith.discovery.candidate_forms import CandidateForm, candidate_table
 from otolith.discovery.linear_response import Guess, LinearResponse, ProjectedResponse
-from otolith.estimation.arrival_cost import Prior
+from otolith.estimation.information import Prior
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem
 from otolith.estimation.window_fit import Fit, WindowEstimate, fit

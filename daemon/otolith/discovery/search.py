@@ -43,7 +43,7 @@ from otolith.discovery.screening import (
     linearised,
     screen_fit,
 )
-from otolith.estimation.arrival_cost import Prior, extend_prior, forget_parameter, initial_prior
+from otolith.estimation.information import Prior, extend_prior, forget_parameter, initial_prior
 from otolith.estimation.objective import EXPLAINED, Objective
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Problem

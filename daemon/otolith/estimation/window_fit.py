@@ -10,14 +10,16 @@ from enum import Enum
 import numpy as np
 
 from otolith.acquisition.window import Array, Mask, Window
-from otolith.estimation.arrival_cost import Evidence, MapObjective, Prior
 from otolith.estimation.information import (
     MIN_SINGULAR,
     AccuracyTarget,
+    Evidence,
     Identifiability,
     Information,
+    MapObjective,
     Outcome,
     ParameterEstimate,
+    Prior,
     classify,
     inflation_of,
     information,

@@ -15,7 +15,6 @@ from pydantic import BaseModel, Field
 
 from otolith.acquisition.window import Array
 from otolith.adaptation.state import AdaptationState, ComponentRecord, cleared, component_records, restore_components
-from otolith.estimation.arrival_cost import MAX_TREND
 from otolith.estimation.imm_filter import (
     HIGHEST_LEVEL,
     MAX_VARIANCE_RATIO,
@@ -23,6 +22,7 @@ from otolith.estimation.imm_filter import (
     ParameterCusum,
     moment_match,
 )
+from otolith.estimation.information import MAX_TREND
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import UNLIMITED, Problem, augment, indices
 from otolith.health.events import HealthState
