@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from otolith.acquisition.samples import Check
 from otolith.health.diagnosis import OwnRule
-from otolith.health.language import Language
+from otolith.health.schema import Language
 from otolith.twin.definition import Definition
 from otolith_drivers.base import Driver, DriverType, NamedSource, Sampling, Setup, SeveralSources, Signal, find_driver
 from otolith_drivers.config_files import Context, Limits, SourceFile, StrictModel, validate

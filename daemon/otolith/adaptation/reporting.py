@@ -29,13 +29,13 @@ from otolith.estimation.objective import EXPLAINED
 from otolith.estimation.posterior import Posterior
 from otolith.estimation.problem import Component, Problem, equation, indices, site_of, source_of
 from otolith.estimation.window_fit import WindowEstimate
-from otolith.health.diagnosis import FindingKind
 from otolith.health.schema import (
     AlternativeDocument,
     ComponentDocument,
     ComponentStatus,
     CostDocument,
     FindingDocument,
+    FindingKind,
     FitDocument,
     NumberDocument,
     ParameterDocument,

@@ -26,7 +26,7 @@ from otolith.acquisition.ring import Rings
 from otolith.acquisition.window import Verdict
 from otolith.acquisition.windower import Windower
 from otolith.adaptation.state import AdaptationState, apply_decisions, initial_state, with_problem, with_sample_grid
-from otolith.health.limits import MonitoringPlan
+from otolith.health.diagnosis import MonitoringPlan
 from otolith.health.schema import CountersDocument, Report, ReportDocument
 from otolith.health.status import absent_sources, driver_document, with_absent_sources
 from otolith.health.text import announcements, event_text, summary
