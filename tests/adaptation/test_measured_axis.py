@@ -82,6 +82,7 @@ def shares(window: Window) -> Array:
     return np.asarray(paths / paths.sum())
 
 
+@pytest.mark.full
 def test_noise_levels_of_encoder_and_slow_model_error() -> None:
     noise = identified("servo_axis_directional")
     assert noise.outputs[0].value < 5e-8  # m: the encoder's step

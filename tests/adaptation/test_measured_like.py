@@ -75,7 +75,7 @@ def test_a_ripple_that_sampling_turns_into_a_slow_one_is_no_offset_of_a_sensor(s
 
 
 @SEEDS
-@pytest.mark.parametrize("noise", [0.005, 0.05])
+@pytest.mark.parametrize("noise", [0.005, pytest.param(0.05, marks=pytest.mark.full)])
 @pytest.mark.parametrize("free", [("R_a", "D"), ("R_a", "L_a", "J", "D")], ids="-".join)
 def test_only_the_clipped_sensor_is_named(seeds: int, noise: float, free: tuple[str, ...]) -> None:
     """Not another signal that is early, nor parameters that moved. All that is published holds the truth."""

@@ -19,7 +19,7 @@ from tests.adaptation.measured_like import blamed, cut, reports
 PERIOD, RECORDS, SUBSTEPS = 0.02, 100, 20
 WINDOWS, FEW = 14, 6
 SEEDS = pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(2, 9))])
-EXCITATIONS = pytest.mark.parametrize("excitation", ["sine", "steps", "stops"])
+EXCITATIONS = pytest.mark.parametrize("excitation", ["sine", "steps", pytest.param("stops", marks=pytest.mark.full)])
 TRUTH = {"K": 0.046, "J": 6e-5, "T_c": 0.009}  # of the motor
 RESISTANCE = 2.0  # ohm
 CARRIED, LEFT = 0.98, 0.20  # N*m: load of the winch before and after the window in the middle
@@ -167,7 +167,9 @@ def test_torque_ripple_of_a_joint_is_no_sensor_fault(tmp_path: Path, seed: int, 
 
 
 @SEEDS
-@pytest.mark.parametrize(("excitation", "level"), [("sine", 0.3), ("stops", 0.3), ("sine", 0.05)])
+@pytest.mark.parametrize(
+    ("excitation", "level"), [("sine", 0.3), pytest.param("stops", 0.3, marks=pytest.mark.full), ("sine", 0.05)]
+)
 def test_noise_of_a_measured_torque_is_named_and_is_no_component(
     request: pytest.FixtureRequest, tmp_path: Path, seed: int, excitation: str, level: float
 ) -> None:

@@ -248,6 +248,7 @@ def test_a_command_that_changes_between_its_samples_is_not_late(tmp_path: Path) 
     assert noise.states[0].value < 0.01
 
 
+@pytest.mark.full
 def test_a_command_that_is_late_by_several_samples_does_not_change_between_them(tmp_path: Path) -> None:
     """A smooth command between its samples is as good as a held one, and late all the same."""
     schedule = replace(ROWS, voltage="sine")

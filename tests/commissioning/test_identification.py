@@ -78,7 +78,7 @@ def test_sensor_noise_without_process_noise(seed: int) -> None:
 
 
 @pytest.mark.parametrize("process", [(0.0, 0.3), (0.05, 0.0), (0.05, 0.3)])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.full)])
 def test_process_noise_beside_sensor_noise(process: tuple[float, float], seed: int) -> None:
     noise = identified(seed, 30, process=process)
     assert levels(noise)[:2] == pytest.approx(SENSORS, rel=0.15)

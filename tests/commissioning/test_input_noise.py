@@ -17,7 +17,7 @@ def identified(
     return identify_noise(replace(problem, input_noise=()), windows[:USED]), level
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(1, 4))])
 @pytest.mark.parametrize("share", [0.3, 0.6])
 def test_noise_of_a_force_is_identified(share: float, seed: int) -> None:
     noise, level = identified(share, seed)
@@ -33,7 +33,7 @@ def test_process_noise_no_longer_contains_it() -> None:
     assert {level.name: level.value for level in noise.states}["v"] < 0.009
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(2, 6))])
 def test_fast_changes_that_drive_the_machine_are_no_noise(seed: int) -> None:
     noise, level = identified(0.01, seed, roughness=0.5)
     (force,) = noise.inputs

@@ -58,7 +58,7 @@ def with_slow_load(random: np.random.Generator, plant: Plant, rows: dict[str, Ar
     rows["T_load"] = rows["T_load"] - load
 
 
-@pytest.mark.parametrize("seed", [0, 7])
+@pytest.mark.parametrize("seed", [0, pytest.param(7, marks=pytest.mark.full)])
 def test_a_slow_load_is_inconsistent_and_coloured_and_no_structure(seed: int) -> None:
     """White process noise that explains its changes lets sines of low frequency gain; seed 7 has one."""
     case = Case("slow load", DC_MOTOR, HEALTHY, healthy=24, changed=0, disturb=with_slow_load)

@@ -287,6 +287,7 @@ def test_one_of_three_components_disappears_and_two_remain() -> None:
     assert documents[-1].parameters["R_a"].value == pytest.approx(6.5, rel=0.002)
 
 
+@pytest.mark.full
 def test_search_refuses_a_fourth_component() -> None:
     """The twin has three components, its limit. Windows with a fourth are refused and do not update the posterior."""
     state = with_two_terms()

@@ -170,6 +170,7 @@ def test_noise_levels_of_the_guide_are_identified(folder: Path, machine: str, lo
             assert level.value == pytest.approx(written[level.name], rel=FIGURE)
 
 
+@pytest.mark.full
 @needs_data
 def test_the_swing_of_the_guide_is_named_and_is_no_delay(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ((key, period),) = re.findall(r"`structure: (\S+)`, again every ([\d.]+) s", GUIDE)
@@ -314,6 +315,7 @@ def _inside(columns: dict[str, Array], document: ReportDocument) -> NDArray[np.b
     return (columns["t"] >= document.window.start) & (columns["t"] < document.window.end)
 
 
+@pytest.mark.full
 @needs_data
 def test_windows_of_the_servo_with_motion_are_used(folder: Path) -> None:
     moving, problems = 0, []

@@ -141,7 +141,7 @@ with kernel_cache.observed(steps.append):
 """
 
 
-@pytest.mark.parametrize("name", ["dc-motor-in-process", "odrive-axis"])
+@pytest.mark.parametrize("name", ["dc-motor-in-process", pytest.param("odrive-axis", marks=pytest.mark.full)])
 def test_the_warm_up_calls_every_kernel_that_windows_need(name: str) -> None:
     command = [sys.executable, "-c", CALLED, str(EXAMPLES / f"{name}.toml")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
