@@ -319,11 +319,17 @@ def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:
 def _next_state(
     state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus], health: HealthState
 ) -> AdaptationState:
-    """Return the state for the next window."""
+    """Return the state for the next window.
+
+    A posterior that replaces the filter's contains what windows before have shown: their test, sums and pool end.
+    """
+    test, cusum, pooled = result.test, result.cusum or state.cusum, result.pooled or state.pooled
+    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
+        test, cusum, pooled = None, ParameterCusum(), PooledWindows()
+    elif result.decision in DATA_FAULTS:  # the error of a sensor shifts no parameter
+        cusum = state.cusum
     if result.estimate is None:  # data that are not used are evidence neither for a hypothesis nor against one
         test = state.test
-    else:  # the test that led to another posterior is closed
-        test = None if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS else result.test
     return replace(
         state,
         posterior=result.posterior,
@@ -331,30 +337,13 @@ def _next_state(
         learned=state.learned + result.is_accepted,
         contradictions=result.contradictions(state),
         adopted=result.adopted,
-        cusum=_next_cusum(state, result),
-        pooled=_next_pooled(state, result),
+        cusum=cusum,
+        pooled=pooled,
         noisier_since=result.noisier_since(state),
         previous=previous,
         health=health,
         records=_next_records(state, result),
     )
-
-
-def _next_cusum(state: AdaptationState, result: WindowResult) -> ParameterCusum:
-    """Return the sums for the next window; a posterior that replaces the filter's contains the change that they show.
-
-    The error of a sensor shifts no parameter.
-    """
-    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
-        return ParameterCusum()
-    return state.cusum if result.cusum is None or result.decision in DATA_FAULTS else result.cusum
-
-
-def _next_pooled(state: AdaptationState, result: WindowResult) -> PooledWindows:
-    """Return the windows to be searched together; those before a change are not."""
-    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
-        return PooledWindows()
-    return result.pooled or state.pooled
 
 
 def _next_records(state: AdaptationState, result: WindowResult) -> int:
