@@ -57,7 +57,7 @@ def main(*, quick: bool) -> int:
             if window.index > 2 and decision is WindowDecision.LEARNED and not state.problem.components:
                 times["explained"].append(seconds)
             elif decision is WindowDecision.SUSPECTED and state.test is not None:
-                times["search" if state.test.windows == 1 else "tested"].append(seconds)
+                times["search" if state.test.counts.tested == 1 else "tested"].append(seconds)
             if window.end <= 20.0:
                 start = time.process_time()
                 without_discovery, _ = adapt(without_discovery, window)

@@ -10,7 +10,7 @@ from otolith.acquisition.window import Window
 from otolith.adaptation.adapt import adapt
 from otolith.adaptation.state import AdaptationState, initial_state
 from otolith.commissioning import structure as module
-from otolith.commissioning.structure import MAX_PAUSE, MAX_WINDOWS, PooledWindows, Structure, pooled_with
+from otolith.commissioning.structure import MAX_PAUSE, MAX_WINDOWS, PooledWindows, Structure
 from otolith.discovery.decision import WindowDecision
 from otolith.estimation.information import initial_prior
 from otolith.estimation.problem import Component, Problem
@@ -76,7 +76,7 @@ def test_few_windows_are_kept_and_only_before_a_search(monkeypatch: pytest.Monke
     fits, records = fitted(), []
     pooled = PooledWindows()
     for _ in range(40):
-        pooled = pooled_with(pooled, fits, fits.parameters)
+        pooled = pooled.after(fits, fits.parameters)
         records.append(len(pooled.windows))
     assert max(records) == MAX_WINDOWS
     assert records[:8] == [1, 2, 3, 4, 5, 6, 7, 8]
@@ -84,7 +84,7 @@ def test_few_windows_are_kept_and_only_before_a_search(monkeypatch: pytest.Monke
     pooled = PooledWindows()
     monkeypatch.setattr(module, "MAX_TOTAL_RECORDS", 5 * fits.window.records)
     for _ in range(8):
-        pooled = pooled_with(pooled, fits, fits.parameters)
+        pooled = pooled.after(fits, fits.parameters)
     assert len(pooled.windows) == 5
 
 
@@ -94,7 +94,7 @@ def test_searches_become_rare(monkeypatch: pytest.MonkeyPatch) -> None:
     pooled = PooledWindows()
     for number in range(1, 1100):
         monkeypatch.setattr(module, "lacking_component", lambda *_, at=number: searched.append(at))
-        pooled = pooled_with(pooled, fits, fits.parameters)
+        pooled = pooled.after(fits, fits.parameters)
     assert searched == [4, 8, 16, 32, 64, 128, 256, 512, 768, 1024]
     assert MAX_PAUSE == 256
 
@@ -109,9 +109,9 @@ def test_two_searches_must_find_the_same(monkeypatch: pytest.MonkeyPatch, second
     monkeypatch.setattr(module, "lacking_component", lambda *_: structures.pop(0))
     pooled = PooledWindows()
     for _ in range(4):
-        pooled = pooled_with(pooled, fits, fits.parameters)
+        pooled = pooled.after(fits, fits.parameters)
     assert pooled.confirmed is None
-    assert (pooled_with(pooled, fits, fits.parameters).confirmed is not None) is agrees
+    assert (pooled.after(fits, fits.parameters).confirmed is not None) is agrees
 
 
 def fitted() -> Fit:

@@ -95,9 +95,9 @@ def test_a_parameter_that_is_shifted_along_moves_with_the_other() -> None:
 
 def test_a_reset_of_one_parameter_forgets_no_other() -> None:
     sums = ParameterCusum(np.array([[3.0, 12.0], [0.0, 0.0]]))
-    state = replace(initial_state("shaft", "bench", PROBLEM), shifts=sums)
-    assert state.shifts.moved == [0, 1]
-    assert apply_decisions(state, OperatorDecisions(resets={"D": 1.0})).shifts.moved == []
+    state = replace(initial_state("shaft", "bench", PROBLEM), cusum=sums)
+    assert state.cusum.moved == [0, 1]
+    assert apply_decisions(state, OperatorDecisions(resets={"D": 1.0})).cusum.moved == []
 
 
 def test_the_lag_behind_a_drift_is_no_shift() -> None:

@@ -14,7 +14,7 @@ from otolith.discovery.hypotheses import (
     prune,
     without_insignificant,
 )
-from otolith.discovery.sequential_test import FitSummary, SequentialTest, join
+from otolith.discovery.sequential_test import FilterEvidence, FitSummary, SequentialTest, WindowCounts, join
 from otolith.estimation.information import Evidence, Prior
 from otolith.estimation.posterior import PhaseAdvance, Posterior
 from otolith.estimation.problem import Component, Problem, amplitude_indices, augment
@@ -90,9 +90,9 @@ def test_what_opened_a_test_has_ended_where_the_filter_alone_explains_a_window(e
     null, moved = hypothesis(FaultType.NOTHING, BARE), hypothesis(FaultType.PARAMETER, BARE)
     wrong = hypothesis(FaultType.SENSOR, augment(BARE, [PERIODIC]))
     wrong = replace(wrong, cost=5.0)
-    old = SequentialTest(BARE, (wrong, null.worse_by(60.0, 60.0)), 0.0, windows=15, last=FitSummary(9000.0))
+    old = SequentialTest(BARE, (wrong, null.worse_by(60.0, 60.0)), 0.0, FitSummary(9000.0), WindowCounts(tested=15))
     others = (null, moved.worse_by(5.0, 0.0)) if ended else (moved, null.worse_by(15.0, 15.0))
-    fresh = SequentialTest(BARE, others, 30.0, last=FitSummary(400.0))
+    fresh = SequentialTest(BARE, others, 30.0, FitSummary(400.0))
     joined = join(old, fresh)
     assert joined.best.type is (FaultType.NOTHING if ended else FaultType.PARAMETER)
     assert (joined is fresh) == ended
@@ -104,5 +104,42 @@ def test_a_sensor_is_named_only_if_no_structure_is_left(inflation: float, named:
     null = hypothesis(FaultType.NOTHING, BARE).worse_by(60.0, 60.0)
     problem = augment(BARE, [Component("sensor of omega", "linear", "omega", 0.25)])
     sensor = replace(hypothesis(FaultType.SENSOR, problem), cost=1.2, inflation=inflation)
-    test = SequentialTest(BARE, (sensor, null), 0.0, windows=5, leading=5, settled=5)
+    test = SequentialTest(BARE, (sensor, null), 0.0, counts=WindowCounts(5, 5, 5))
     assert decide(test, learned=10).decision is (WindowDecision.SENSOR if named else WindowDecision.SUSPECTED)
+
+
+def evidence_after(*differences: float) -> FilterEvidence:
+    """Evidence about the filter after windows in which its χ² exceeds the best by so many variance factors."""
+    evidence, best = FilterEvidence(), FitSummary(chi_square=400.0, variance_factor=2.0)
+    for difference in differences:
+        evidence = evidence.after(400.0 + 2.0 * difference, best)
+    return evidence
+
+
+@pytest.mark.parametrize(
+    ("differences", "against", "supporting"),
+    [
+        ((1e6,), False, False),  # no window decides alone
+        ((1e6, 1e6), True, False),
+        ((1e6, 1e6, 0.0), False, False),  # windows that say nothing take the evidence against it away
+        ((9.0,) * 30, False, False),  # weak evidence in each of many windows is that of a filter that lags
+        ((-6.0,), False, False),
+        ((-6.0, -6.0), False, True),
+        ((-6.0, -6.0, *(0.0,) * 30), False, True),  # and leave the evidence for it
+    ],
+)
+def test_windows_after_the_first_are_evidence_about_the_filter(
+    differences: tuple[float, ...], against: bool, supporting: bool
+) -> None:
+    evidence = evidence_after(*differences)
+    assert (evidence.is_against, evidence.is_for) == (against, supporting)
+    assert (evidence.probability > 0.5) == (sum(differences) < 0.0)
+
+
+def test_a_component_that_leaves_structure_does_not_lead() -> None:
+    component, other = (hypothesis(kind, BARE) for kind in (FaultType.COMPONENT, FaultType.SENSOR))
+    counts = WindowCounts().after(component, component, is_resolved=True)
+    assert (counts.leading, counts.since_search, counts.resolved) == (2, 2, 3)
+    assert counts.after(component, replace(component, inflation=1.8), is_resolved=True).leading == 0
+    changed = counts.after(component, other, is_resolved=False)
+    assert (changed.leading, changed.since_search, changed.resolved) == (1, 3, 0)

@@ -148,10 +148,10 @@ def test_an_open_event_goes_on_after_a_restart(tmp_path: Path) -> None:
 def test_what_shifted_the_last_windows_survives_a_restart(tmp_path: Path) -> None:
     state = healthy()
     sums = np.tile([[3.0], [0.5]], len(state.problem.free))
-    shifted = replace(state, shifts=ParameterCusum(sums))
-    assert restarted(shifted, tmp_path).shifts.sums == pytest.approx(sums)
+    shifted = replace(state, cusum=ParameterCusum(sums))
+    assert restarted(shifted, tmp_path).cusum.sums == pytest.approx(sums)
     with pytest.raises(OtolithError, match="shifts: not plausible"):
-        store_in(tmp_path).save(replace(state, shifts=ParameterCusum(-sums)))
+        store_in(tmp_path).save(replace(state, cusum=ParameterCusum(-sums)))
 
 
 def test_histories_survive_a_restart_and_forecasts_are_computed_again(tmp_path: Path) -> None:

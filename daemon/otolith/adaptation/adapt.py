@@ -19,7 +19,7 @@ from otolith.adaptation.state import (
     with_posterior,
     with_records,
 )
-from otolith.commissioning.structure import PooledWindows, pooled_with
+from otolith.commissioning.structure import PooledWindows
 from otolith.discovery.decision import (
     MAX_COST,
     UPDATES,
@@ -137,26 +137,29 @@ def _reject(state: AdaptationState, predicted: Posterior, checked: CheckedWindow
 
 
 def _decide(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
-    """Screen the window for what the twin lacks, and return the result of the update that follows.
+    """Return the result of a window whose data are usable. The first of these cases that applies decides.
 
-    A window that is expected and shows nothing that the twin lacks updates the filter. Otherwise, or while a test is
-    open, hypotheses are compared, and the update follows the decision.
+    - No test is open, and the window shows nothing that the twin lacks: the filter is updated. Parameters that this
+      window and those before show to have moved are estimated anew.
+    - The window opens a test although it is expected, and the null hypothesis is possible: the filter is updated.
+    - The window shows nothing of what opened the test: the filter is updated beside it.
+    - Otherwise the decision of the test is applied.
     """
-    screening = _screen(state, tested)
+    screening, cusum = _screen(state, tested), _parameter_cusum(state, tested)
     is_calm = tested.is_expected and not screening.is_positive
-    shifts = _shifts(state, tested)
     test = _continued_test(state, tested, screening)
-    if test is None and is_calm:
-        moved = shifts.moved
-        result = _follow_shifts(state, tested, moved) if moved else _update_filter(state, tested)
-        return _pool(state, tested, replace(result, shifts=shifts))
+    is_new = test is None and not is_calm
+    if is_new:
+        state, test = replace(state, test=None), open_test(tested.predicted, screening)
     if test is None:
-        result = _open_test(state, tested, screening)
-    elif is_calm and not shifts.moved and not test.rejects_filter:
+        result = _reset_moved(state, tested, cusum.moved) if cusum.moved else _update_filter(state, tested)
+    elif is_new and tested.is_expected and test.is_null_possible:
+        result = _update_filter(state, tested)
+    elif not is_new and is_calm and not cusum.moved and not test.filter_evidence.is_against:
         result = _update_filter_beside(state, tested, test)
     else:
-        result = _apply_decision(state, tested, test)
-    return _pool(state, tested, replace(result, searched=True, shifts=shifts))
+        result = _apply_decision(state, tested, test, is_new=is_new)
+    return _with_pooled(state, tested, replace(result, searched=test is not None, cusum=cusum))
 
 
 def _screen(state: AdaptationState, tested: _TestedEstimate) -> ScreeningResult:
@@ -186,42 +189,38 @@ def _continued_test(
     return None if test.best.type is FaultType.NOTHING and not tested.is_expected else test
 
 
-def _open_test(state: AdaptationState, tested: _TestedEstimate, screening: ScreeningResult) -> WindowResult:
-    """Search for hypotheses. If the window is expected and none is decisively better, only the filter is updated."""
-    state, test = replace(state, test=None), open_test(tested.predicted, screening)
-    if tested.is_expected and test.is_null_possible:
-        return _update_filter(state, tested)
-    return _apply_decision(state, tested, test)
-
-
-def _shifts(state: AdaptationState, tested: _TestedEstimate) -> ParameterCusum:
-    """Return the sums of shifts after a window; estimates without trends are biased where a parameter drifts fast."""
+def _parameter_cusum(state: AdaptationState, tested: _TestedEstimate) -> ParameterCusum:
+    """Return the sums after a window; estimates without trends are biased where a parameter drifts fast."""
     estimated = tested.estimated
     if estimated.drifts:
-        return state.shifts
+        return state.cusum
     values = np.array([own.value for own in estimated.parameters])
     sd = np.array([own.sd for own in estimated.parameters])
     length = estimated.fit.window.grid.length
-    return state.shifts.after(tested.predicted.shifts(values, sd, estimated.trend_response, length))
+    return state.cusum.after(tested.predicted.shifts(values, sd, estimated.trend_response, length))
 
 
-def _apply_decision(state: AdaptationState, tested: _TestedEstimate, test: SequentialTest) -> WindowResult:
+def _apply_decision(
+    state: AdaptationState, tested: _TestedEstimate, test: SequentialTest, *, is_new: bool
+) -> WindowResult:
     """Return the result of a window that the filter does not expect, or that shows what the twin lacks.
 
-    ``state`` has no test if this window opened ``test``.
+    ``is_new`` says whether this window opened the test.
     """
-    test = replace(test, quiet=0, has_explained=test.has_explained or test.explains)
-    outcome, estimated = decide(test, state.learned), tested.estimated
-    if outcome.update is PosteriorUpdate.HYPOTHESIS:
-        return _adopt_hypothesis(state, estimated, test, outcome)
-    if outcome.update is PosteriorUpdate.NONE:
-        result = WindowResult.unchanged(state, tested.predicted, outcome.decision, estimate=estimated, test=test)
-        return _with_mixture(result, state.problem) if outcome.decision in OPEN else result
-    if estimated.cost > MAX_COST:  # the null hypothesis leads, but does not explain the whole window
-        return WindowResult.unchanged(state, tested.predicted, WindowDecision.REFUSED, estimate=estimated)
-    if state.test is None:  # no hypothesis is better yet: a change in the last records shows in the next window
-        return WindowResult.unchanged(state, tested.predicted, WindowDecision.SUSPECTED, estimate=estimated)
-    return _update_filter(state, tested)
+    predicted, estimated, test = tested.predicted, tested.estimated, test.after_unexpected()
+    outcome = decide(test, state.learned)
+    match outcome.update:
+        case PosteriorUpdate.HYPOTHESIS:
+            return _adopt_hypothesis(state, estimated, test, outcome)
+        case PosteriorUpdate.NONE:
+            result = WindowResult.unchanged(state, predicted, outcome.decision, estimate=estimated, test=test)
+            return _with_mixture(result, state.problem) if outcome.decision in OPEN else result
+        case PosteriorUpdate.FILTER if estimated.cost > MAX_COST:  # the null hypothesis does not explain all of it
+            return WindowResult.unchanged(state, predicted, WindowDecision.REFUSED, estimate=estimated)
+        case PosteriorUpdate.FILTER if is_new:  # a change in the last records shows in the next window
+            return WindowResult.unchanged(state, predicted, WindowDecision.SUSPECTED, estimate=estimated)
+        case PosteriorUpdate.FILTER:
+            return _update_filter(state, tested)
 
 
 def _update_filter_beside(state: AdaptationState, tested: _TestedEstimate, test: SequentialTest) -> WindowResult:
@@ -232,28 +231,28 @@ def _update_filter_beside(state: AdaptationState, tested: _TestedEstimate, test:
     filter is one of the hypotheses. Hypotheses that explain no window have no evidence to lose.
     """
     result = _update_filter(state, tested)
-    if test.accepts_filter or test.best.type is FaultType.NOTHING or not test.has_explained:
+    if test.filter_evidence.is_for or test.best.type is FaultType.NOTHING or not test.has_explained:
         return result
-    return _with_mixture(replace(result, test=replace(test, quiet=test.quiet + 1)), state.problem)
+    return _with_mixture(replace(result, test=test.after_expected()), state.problem)
 
 
 def _update_filter(state: AdaptationState, tested: _TestedEstimate) -> WindowResult:
     """Return the result of a window that updates the filter; a faded component that it does not need is removed."""
     innovation, estimated = tested.innovation, tested.estimated
-    if state.test is not None and state.test.quiet == 0:  # the filter did not expect the window before: it may be wrong
+    if state.test is not None and not state.test.counts.expected:  # the window before contradicted the filter
         innovation = innovation.inflate_variance(state.test.null_reduced_chi_square)
     posterior, before = tested.predicted.update(innovation, estimated.advance), estimated.fit.prior
     result = WindowResult(WindowDecision.LEARNED, posterior, before, posterior.prior(), (), estimate=estimated)
     return _without_faded(state, result, estimated) if state.adopted else result
 
 
-def _pool(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
-    """Return the result of a window; if the twin explains it alone, it is searched together with those before."""
+def _with_pooled(state: AdaptationState, tested: _TestedEstimate, result: WindowResult) -> WindowResult:
+    """Return the result of a window; if the twin explains it, it is searched together with those before."""
     fitted = tested.estimated.fit
     is_undecided = result.decision is not WindowDecision.LEARNED or result.test is not None
     if is_undecided or fitted.cost > EXPLAINED or tested.estimated.drifts:
         return result
-    pooled = pooled_with(state.pooled, fitted, result.after.mean[: len(fitted.problem.free)])
+    pooled = state.pooled.after(fitted, result.after.mean[: len(fitted.problem.free)])
     if pooled.confirmed is None:
         return replace(result, pooled=pooled)
     record = ComponentRecord.of(pooled.confirmed)
@@ -262,10 +261,10 @@ def _pool(state: AdaptationState, tested: _TestedEstimate, result: WindowResult)
     return replace(discovered, decision=WindowDecision.DISCOVERED, before=discovered.after)
 
 
-def _follow_shifts(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:
+def _reset_moved(state: AdaptationState, tested: _TestedEstimate, moved: list[int]) -> WindowResult:
     """Return the result of a window that, with those before, shows a change of the parameters at ``moved``.
 
-    What was known of them is replaced by the initial prior.
+    What was known of them is replaced by the initial prior, and the window gives their values.
     """
     again = _TestedEstimate.of(tested.predicted.reset_parameters(moved), tested.estimated.fit.window)
     result = _update_filter(state, again)
@@ -320,11 +319,17 @@ def _with_mixture(result: WindowResult, problem: Problem) -> WindowResult:
 def _next_state(
     state: AdaptationState, result: WindowResult, previous: dict[str, PreviousStatus], health: HealthState
 ) -> AdaptationState:
-    """Return the state for the next window."""
+    """Return the state for the next window.
+
+    A posterior that replaces the filter's contains what windows before have shown: their test, sums and pool end.
+    """
+    test, cusum, pooled = result.test, result.cusum or state.cusum, result.pooled or state.pooled
+    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
+        test, cusum, pooled = None, ParameterCusum(), PooledWindows()
+    elif result.decision in DATA_FAULTS:  # the error of a sensor shifts no parameter
+        cusum = state.cusum
     if result.estimate is None:  # data that are not used are evidence neither for a hypothesis nor against one
         test = state.test
-    else:  # the test that led to another posterior is closed
-        test = None if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS else result.test
     return replace(
         state,
         posterior=result.posterior,
@@ -332,30 +337,13 @@ def _next_state(
         learned=state.learned + result.is_accepted,
         contradictions=result.contradictions(state),
         adopted=result.adopted,
-        shifts=_next_shifts(state, result),
-        pooled=_next_pooled(state, result),
+        cusum=cusum,
+        pooled=pooled,
         noisier_since=result.noisier_since(state),
         previous=previous,
         health=health,
         records=_next_records(state, result),
     )
-
-
-def _next_shifts(state: AdaptationState, result: WindowResult) -> ParameterCusum:
-    """Return the cumulative shifts; a posterior that replaces the filter's contains what shifted the windows before.
-
-    The error of a sensor shifts no parameter.
-    """
-    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
-        return ParameterCusum()
-    return state.shifts if result.shifts is None or result.decision in DATA_FAULTS else result.shifts
-
-
-def _next_pooled(state: AdaptationState, result: WindowResult) -> PooledWindows:
-    """Return the windows to be searched together; those before a change are not."""
-    if UPDATES[result.decision] is PosteriorUpdate.HYPOTHESIS:
-        return PooledWindows()
-    return result.pooled or state.pooled
 
 
 def _next_records(state: AdaptationState, result: WindowResult) -> int:

@@ -91,7 +91,7 @@ class WindowResult:
     notes: tuple[str, ...] = ()  # What the data checks left out
     is_mixture: bool = False  # Whether after is the mixture of the hypotheses of an open test
     searched: bool = False  # Whether other hypotheses were compared
-    shifts: ParameterCusum | None = None  # With those of this window; None for a window that was not estimated from
+    cusum: ParameterCusum | None = None  # After this window; None for a window that was not estimated from
     pooled: PooledWindows | None = None  # With this window, if the twin explained it
 
     @classmethod
@@ -433,7 +433,8 @@ def _kind_and_subject(decision: WindowDecision, test: SequentialTest) -> tuple[F
 def _moved_known(test: SequentialTest) -> str:
     """Return the parameter that the machine file gives as known and that has moved for all that the test shows."""
     names = {parameter.name for parameter in test.best.problem.free} & {name for name, _ in test.problem.known}
-    is_sure = test.leading >= COMPONENT_WINDOWS and test.probability(FaultType.PARAMETER) >= COMPONENT_PROBABILITY
+    probable = test.probability(FaultType.PARAMETER) >= COMPONENT_PROBABILITY
+    is_sure = probable and test.counts.leading >= COMPONENT_WINDOWS
     is_alone = test.explains and test.best.type is FaultType.PARAMETER and len(names) == 1
     return names.pop() if is_alone and is_sure else ""
 

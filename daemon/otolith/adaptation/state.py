@@ -39,8 +39,8 @@ class AdaptationState:
     restricted: frozenset[str] = frozenset()  # Keys of components that the machine file excludes
     approved: frozenset[str] = frozenset()  # Keys of components that the operator approved
     adopted: tuple[AdoptedComponent, ...] = ()  # The components in the twin
-    shifts: ParameterCusum = field(default_factory=ParameterCusum)
-    """By how much the estimates of windows differ from their predictions, all the same way."""
+    cusum: ParameterCusum = field(default_factory=ParameterCusum)
+    """By how much the estimates of windows have differed from their predictions, all the same way."""
     pooled: PooledWindows = field(default_factory=PooledWindows)
     """The last windows that the twin explained, which are searched together."""
     noisier_since: float | None = None
@@ -174,7 +174,7 @@ def _reset(state: AdaptationState, name: str) -> AdaptationState:
                 posterior=state.posterior.reset_parameters([index]),
                 previous=previous,
                 test=None,
-                shifts=ParameterCusum(),
+                cusum=ParameterCusum(),
                 health=state.health.without_history(name),
             )
     for component in state.problem.components:

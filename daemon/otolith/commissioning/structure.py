@@ -393,32 +393,31 @@ class PooledWindows:
     shown: Structure | None = None  # By the last search
     confirmed: Structure | None = None  # By the last two: it is to be adopted
 
+    def after(self, fitted: Fit, parameters: Array) -> "PooledWindows":
+        """Return the windows with that of a fit; ``parameters`` (free,) are known after it.
 
-def pooled_with(pooled: PooledWindows, fitted: Fit, parameters: Array) -> PooledWindows:
-    """Return ``pooled`` with the window of a fit; ``parameters`` (free,) are known after it.
-
-    What two searches in a row show is confirmed: the second one contains a window that the first one has not seen.
-    """
-    pause, problem = pooled.pause - 1, fitted.problem
-    if not positions(problem.base_model):
-        return pooled
-    in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
-    if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
-        return replace(pooled, windows=(), pause=pause)  # what is in the twin may have another phase in each window
-    states = fitted.initial[: len(problem.base_model.states)]
-    start = fitted.window, tuple(states.tolist()), tuple(parameters[: len(problem.free)].tolist())
-    windows = (*pooled.windows, start)[-MAX_WINDOWS:]
-    while sum(window.records for window, *_ in windows) > MAX_TOTAL_RECORDS:
-        windows = windows[1:]
-    if pause > 0 or len(windows) < MIN_WINDOWS:
-        return replace(pooled, windows=windows, pause=pause)
-    shown, before = lacking_component(problem, windows), pooled.shown
-    if shown is not None and before is not None and shown.component.key == before.component.key:
-        one, other = shown.component.inner, before.component.inner
-        if abs(one - other) <= SAME_INNER * abs(one):
-            return PooledWindows(confirmed=shown)
-    longer = min(2 * pooled.next_pause, MAX_PAUSE)
-    return PooledWindows(windows, pooled.next_pause if shown is None else 1, longer, shown)
+        What two searches in a row show is confirmed: the second one contains a window that the first one has not seen.
+        """
+        pause, problem = self.pause - 1, fitted.problem
+        if not positions(problem.base_model):
+            return self
+        in_twin = (source_of(problem.base_model, component.source) for component in problem.components)
+        if not problem.discover or pause >= MAX_WINDOWS or any(source.symbol.startswith("_") for source in in_twin):
+            return replace(self, windows=(), pause=pause)  # what is in the twin may have another phase in each window
+        states = fitted.initial[: len(problem.base_model.states)]
+        start = fitted.window, tuple(states.tolist()), tuple(parameters[: len(problem.free)].tolist())
+        windows = (*self.windows, start)[-MAX_WINDOWS:]
+        while sum(window.records for window, *_ in windows) > MAX_TOTAL_RECORDS:
+            windows = windows[1:]
+        if pause > 0 or len(windows) < MIN_WINDOWS:
+            return replace(self, windows=windows, pause=pause)
+        shown, before = lacking_component(problem, windows), self.shown
+        if shown is not None and before is not None and shown.component.key == before.component.key:
+            one, other = shown.component.inner, before.component.inner
+            if abs(one - other) <= SAME_INNER * abs(one):
+                return PooledWindows(confirmed=shown)
+        longer = min(2 * self.next_pause, MAX_PAUSE)
+        return PooledWindows(windows, self.next_pause if shown is None else 1, longer, shown)
 
 
 def lacking_component(problem: Problem, windows: Starts) -> Structure | None:

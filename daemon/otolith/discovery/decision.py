@@ -84,47 +84,52 @@ class WindowOutcome:
 
 
 def decide(test: SequentialTest, learned: int) -> WindowOutcome:
-    """Return the decision that the evidence so far allows, where the filter had ``learned`` windows before the test."""
-    best = test.best
-    if 0 < learned <= YOUNG_WINDOWS and test.windows > learned and (anew := _all_moved(test)) is not None:
+    """Return the decision that the evidence so far allows, where the filter had ``learned`` windows before the test.
+
+    The first rule that applies decides; ``docs/explanation/discovery.md`` has them as a table.
+    """
+    best, is_young = test.best, learned <= YOUNG_WINDOWS
+    if is_young and 0 < learned < test.counts.tested and (anew := _all_moved(test)) is not None:
         return WindowOutcome(WindowDecision.STEPPED, anew)
     if best.type is FaultType.NOTHING:
         return WindowOutcome(WindowDecision.LEARNED, best)
     if best.cost > MAX_COST:
         return WindowOutcome(WindowDecision.REFUSED, best)
     if test.is_ambiguous:
-        several = test.settled >= AMBIGUOUS_WINDOWS
+        several = test.counts.since_search >= AMBIGUOUS_WINDOWS
         return WindowOutcome(WindowDecision.AMBIGUOUS if several else WindowDecision.SUSPECTED, best)
-    agreed = test.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
+    agreed = test.counts.leading >= STEP_WINDOWS and test.probability(best.type) >= STEP_PROBABILITY
     if best.type is FaultType.NOISE and agreed:
         return WindowOutcome(WindowDecision.NOISIER, best)
     own, known = ({parameter.label for parameter in problem.free} for problem in (best.problem, test.problem))
     if best.type is FaultType.PARAMETER and agreed and own <= known:  # fewer if a component became insignificant
         return WindowOutcome(WindowDecision.STEPPED if own == known else WindowDecision.FADED, best)
-    return _data_fault_or_component(test, is_young=learned <= YOUNG_WINDOWS)
+    leaves_structure = best.inflation > EXPLAINED  # then the cause may be none of the hypotheses
+    if not leaves_structure and (fault := _data_fault(test, is_young=is_young)) is not None:
+        return fault
+    if _is_component_accepted(test) and (accepted := _without_undecided_terms(test)).type is FaultType.COMPONENT:
+        return WindowOutcome(WindowDecision.DISCOVERED, accepted)
+    return WindowOutcome(WindowDecision.SUSPECTED, best)
 
 
-def _data_fault_or_component(test: SequentialTest, *, is_young: bool) -> WindowOutcome:
-    """Return the decision where neither parameters nor noise are accepted.
+def _data_fault(test: SequentialTest, *, is_young: bool) -> WindowOutcome | None:
+    """Return the decision for a faulty sensor or a late signal; None if neither is probable enough.
 
     If ``is_young``, few windows have updated the filter, and sensors are as little known as components.
     """
-    best = test.best
     for kind, (decision, windows) in DATA_FAULTS.items():
-        if best.inflation > EXPLAINED:  # it leaves structure: the cause may be none of the hypotheses
-            break
         needed = COMPONENT_WINDOWS if is_young and kind is FaultType.SENSOR else windows
-        if test.probability(kind) >= DATA_FAULT_PROBABILITY and test.leading >= needed:
+        if test.probability(kind) >= DATA_FAULT_PROBABILITY and test.counts.leading >= needed:
             accepted = next(item for item in test.hypotheses if item.type is kind)
             return WindowOutcome(WindowDecision.SUSPECTED if _is_below_noise(accepted) else decision, accepted)
-    leads = best.type is FaultType.COMPONENT and test.leading >= COMPONENT_WINDOWS
+    return None
+
+
+def _is_component_accepted(test: SequentialTest) -> bool:
+    """Whether windows agree on a component, and no other hypothesis explains them as well."""
+    leads = test.best.type is FaultType.COMPONENT and test.counts.leading >= COMPONENT_WINDOWS
     probable = test.probability(FaultType.COMPONENT) >= COMPONENT_PROBABILITY
-    alone = test.windows >= MAX_OPEN_WINDOWS or not test.alternatives(best)
-    if leads and probable and alone:
-        best = _without_undecided_terms(test)
-        if best.type is FaultType.COMPONENT:
-            return WindowOutcome(WindowDecision.DISCOVERED, best)
-    return WindowOutcome(WindowDecision.SUSPECTED, best)
+    return leads and probable and (test.counts.tested >= MAX_OPEN_WINDOWS or not test.alternatives(test.best))
 
 
 def _is_below_noise(hypothesis: TrackedHypothesis) -> bool:

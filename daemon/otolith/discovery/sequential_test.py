@@ -45,84 +45,13 @@ MAX_DEVIANCE = 30.0  # in -2 log evidence behind the best: a worse hypothesis is
 MAX_FIRST_EVIDENCE = 15.0  # in -2 log evidence: of the first window, so that the second one can outweigh it
 MAX_WINDOW_EVIDENCE = 20.0  # in -2 log evidence: of any window, so that none decides alone
 MAX_TOTAL_DEVIANCE = 60.0  # in -2 log evidence: a hypothesis can return when things change
-CLEAR_WINDOWS = 2  # after which one cause must explain the windows best before a class counts as resolved
+RESOLVED_WINDOWS = 2  # after which one cause must explain the windows best before a class counts as resolved
 PRUNED_AFTER = 3  # windows of a test after which a hypothesis must differ from the null hypothesis
 DIVERGED = 1e12  # χ² of a twin that explains nothing
 MAX_OPEN_WINDOWS = 8  # windows after which a test tracks only the best hypothesis of each place
 MIN_WEIGHT = 0.05  # of a hypothesis whose own interval the published one contains
 WRONG_WINDOW = 0.5  # probability that the window that opened a test is itself wrong
 ALWAYS_TRACKED = (FaultType.NOTHING, FaultType.PARAMETER)
-
-
-def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
-    """Return the indices of the hypotheses that explain the windows equally well, grouped by type and place.
-
-    Their misfits are at most ``DECISIVE`` above the least. The best of each group comes first. A component is in a
-    group only if nothing with fewer values explains the windows as well. Otherwise its deviance decides, with the
-    complexity penalty. The null hypothesis is contained in all others, so it is in no group.
-    """
-    others = [at for at, item in enumerate(hypotheses) if item.type is not FaultType.NOTHING]
-    least = min((hypotheses[at].misfit for at in others), default=0.0)
-    equal = [at for at in others if hypotheses[at].misfit <= least + DECISIVE]
-    least_values = min((hypotheses[at].hypothesis.added for at in equal), default=0)
-    moved = [hypotheses[at] for at in equal if hypotheses[at].type is FaultType.PARAMETER]
-    simplest = min(moved, key=lambda item: (item.hypothesis.added, item.deviance), default=None)
-    groups: dict[tuple[FaultType, tuple[str, ...]], list[int]] = {}
-    for at in sorted(equal, key=lambda at: hypotheses[at].deviance):
-        item = hypotheses[at]
-        if item.type is not FaultType.COMPONENT or item.hypothesis.added <= least_values:
-            groups.setdefault((item.type, _place(item, simplest)), []).append(at)
-    return list(groups.values())
-
-
-def _place(item: TrackedHypothesis, simplest: TrackedHypothesis | None) -> tuple[str, ...]:
-    """Return what ``item`` is about: of moved parameters their names.
-
-    More moved parameters than those of the ``simplest`` hypothesis of moved parameters are a variant of it.
-    """
-    if simplest is None or item.type is not FaultType.PARAMETER:
-        return item.places
-    return ((item if item.hypothesis.added <= simplest.hypothesis.added else simplest).hypothesis.name,)
-
-
-def probabilities(hypotheses: Sequence[TrackedHypothesis], groups: Sequence[Sequence[int]]) -> list[float]:
-    """Return the probability of each hypothesis; ``groups`` of interchangeable ones are equally probable."""
-    logs = -0.5 * np.array([item.deviance for item in hypotheses])
-    totals = [float(np.logaddexp.reduce(logs[list(group)])) for group in groups]
-    for group, total in zip(groups, totals, strict=True):
-        logs[list(group)] += max(totals) - total
-    weights = np.exp(logs - logs.max())
-    shares: list[float] = (weights / weights.sum()).tolist()
-    return shares
-
-
-def without_duplicates(
-    hypotheses: tuple[TrackedHypothesis, ...], groups: Sequence[Sequence[int]]
-) -> tuple[TrackedHypothesis, ...]:
-    """Return the hypotheses with only the best of each of the ``groups`` of interchangeable ones."""
-    worse = {at for group in groups for at in group[1:]}
-    return tuple(item for at, item in enumerate(hypotheses) if at not in worse)
-
-
-def mixture(
-    hypotheses: Sequence[TrackedHypothesis], shares: Sequence[float], problem: Problem, before: Prior, wrong: float
-) -> Prior:
-    """Return what is known of the free parameters of ``problem`` under all hypotheses, as one normal distribution.
-
-    ``shares`` are their probabilities if the window that opened the test is right. With probability ``wrong`` it is
-    not, and ``before`` holds, which is known without it.
-    """
-    priors = [*(item.known(problem) for item in hypotheses), before]
-    weights = np.append((1.0 - wrong) * np.array(shares), wrong)
-    means = np.array([prior.mean for prior in priors])
-    mean: Array = weights @ means
-    offsets = means - mean
-    own = np.array([prior.covariance for prior in priors])
-    covariance = np.einsum("h,hij->ij", weights, own + offsets[:, :, None] * offsets[:, None, :])
-    sd = np.sqrt(np.diag(covariance))
-    reach = np.abs(offsets) / QUANTILE + np.sqrt(np.diagonal(own, axis1=1, axis2=2))
-    wider = np.maximum(reach[weights >= MIN_WEIGHT].max(axis=0, initial=0.0) / np.where(sd > 0.0, sd, 1.0), 1.0)
-    return Prior(mean, covariance * np.outer(wider, wider))
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +63,74 @@ class FitSummary:
     variance_factor: float = 1.0  # By what evidence is divided
 
 
+@dataclass(frozen=True, slots=True)
+class FilterEvidence:
+    """Evidence for and against the filter, which has not learned from the window that opened the test.
+
+    That window may itself have been wrong. So only those after it count, each by the difference that it makes between
+    the filter and the best hypothesis, Δ = (χ² of the filter - χ² of the best) / variance factor::
+
+        deviance ← deviance + Δ                  -2 log likelihood of the filter, relative to the best hypothesis
+        cusum    ← cusum + Δ - DECISIVE          cumulative sum: it falls in windows that give less
+
+    (E. S. Page, Biometrika 41, 1954.) ``docs/explanation/discovery.md`` has the bounds.
+    """
+
+    deviance: float = 0.0
+    cusum: float = -MAX_WINDOW_EVIDENCE  # below zero: it must exceed the complexity penalty of a hypothesis as well
+
+    def after(self, chi_square: float, best: FitSummary) -> "FilterEvidence":
+        """Return the evidence after a window, of which the filter leaves ``chi_square``."""
+        more = (chi_square - best.chi_square) / best.variance_factor
+        deviance = self.deviance + np.clip(more, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
+        cusum = self.cusum + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
+        return FilterEvidence(
+            float(np.clip(deviance, -MAX_TOTAL_DEVIANCE, MAX_TOTAL_DEVIANCE)),
+            float(np.clip(cusum, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)),
+        )
+
+    def worse_by(self, deviance: float) -> "FilterEvidence":
+        """Return the evidence with more deviance, as the best hypothesis has become another."""
+        return replace(self, deviance=self.deviance + deviance)
+
+    @property
+    def is_against(self) -> bool:
+        """Whether the windows are decisive evidence against the filter."""
+        return self.cusum > DECISIVE
+
+    @property
+    def is_for(self) -> bool:
+        """Whether the windows are decisive evidence for the filter."""
+        return self.deviance < -DECISIVE
+
+    @property
+    def probability(self) -> float:
+        """Probability of the filter: that the window that opened the test was itself wrong."""
+        return float(WRONG_WINDOW / (WRONG_WINDOW + (1.0 - WRONG_WINDOW) * np.exp(0.5 * self.deviance)))
+
+
+@dataclass(frozen=True, slots=True)
+class WindowCounts:
+    """How many windows, up to the last one, agree with each other. The one that opens a test is the first."""
+
+    tested: int = 1  # Since the test was opened; hypotheses that a later search added are younger
+    leading: int = 1  # In a row with the same best hypothesis; of a component, since it last left structure
+    since_search: int = 1  # Since a hypothesis of a new search took the lead
+    resolved: int = RESOLVED_WINDOWS  # In a row after which one cause explained all windows best
+    expected: int = 0  # In a row that the filter expected, and that did not confirm the test
+
+    def after(self, before: TrackedHypothesis, best: TrackedHypothesis, *, is_resolved: bool) -> "WindowCounts":
+        """Return the counts after a tested window, by the best hypothesis ``before`` it and the ``best`` one now."""
+        is_same = best.hypothesis.name == before.hypothesis.name
+        leaves_structure = best.type is FaultType.COMPONENT and best.inflation > EXPLAINED
+        return replace(
+            self,
+            leading=(0 if leaves_structure else self.leading + 1) if is_same else 1,
+            since_search=self.since_search + 1,
+            resolved=self.resolved + 1 if is_resolved else 0,
+        )
+
+
 @dataclass(frozen=True, eq=False)  # no slots: probabilities are computed once
 class SequentialTest:
     """The competing hypotheses. Plain: it pickles."""
@@ -141,18 +138,9 @@ class SequentialTest:
     problem: Problem  # Of the filter, without what the hypotheses add
     hypotheses: tuple[TrackedHypothesis, ...]  # The best first
     onset: float  # Unix seconds
-    windows: int = 1  # Windows since the test was opened; hypotheses that a later search added are younger
-    leading: int = 1  # Consecutive windows in which the best hypothesis was the best, and a component left no structure
-    settled: int = 1  # Windows since a hypothesis of a new search took the lead
     last: FitSummary = FitSummary()  # Of the last window
-    clear: int = CLEAR_WINDOWS  # Consecutive windows after which one cause explained all windows best
-    quiet: int = 0  # Consecutive windows, up to the last, that the filter expected, and that did not confirm the test
-    cusum_against_filter: float = -MAX_WINDOW_EVIDENCE
-    """Cumulative sum of the evidence against the filter, in -2 log likelihood, of the windows after the one that opened
-    the test. It starts below zero, because it must exceed the complexity penalty of a hypothesis. See
-    :meth:`with_filter`."""
-    filter_deviance: float = 0.0
-    """-2 log likelihood of the same windows under the filter, relative to the best hypothesis: a sum without decay."""
+    counts: WindowCounts = WindowCounts()
+    filter_evidence: FilterEvidence = FilterEvidence()
     null_reduced_chi_square: float = 1.0
     """χ² per measured value of the first window under the null hypothesis; at least one."""
     has_explained: bool = True
@@ -182,7 +170,7 @@ class SequentialTest:
     @property
     def is_ambiguous(self) -> bool:
         """Whether hypotheses of several causes explain the windows equally, or did so one window before."""
-        return self.clear < CLEAR_WINDOWS or self.has_equal_causes
+        return self.counts.resolved < RESOLVED_WINDOWS or self.has_equal_causes
 
     @property
     def explains(self) -> bool:
@@ -200,25 +188,10 @@ class SequentialTest:
         return null <= DECISIVE
 
     @property
-    def filter_probability(self) -> float:
-        """Probability that the window that opened the test was itself wrong, so that the filter's posterior holds."""
-        return float(WRONG_WINDOW / (WRONG_WINDOW + (1.0 - WRONG_WINDOW) * np.exp(0.5 * self.filter_deviance)))
-
-    @property
     def wrong_probability(self) -> float:
         """Probability that none of the hypotheses holds; one window alone is as likely to be wrong itself."""
-        is_sure = self.explains and self.settled > 1
-        return self.filter_probability if is_sure else max(self.filter_probability, WRONG_WINDOW)
-
-    @property
-    def rejects_filter(self) -> bool:
-        """Whether windows after the one that opened the test are decisive evidence against the filter."""
-        return self.cusum_against_filter > DECISIVE
-
-    @property
-    def accepts_filter(self) -> bool:
-        """Whether windows after the one that opened the test are decisive evidence for the filter."""
-        return self.filter_deviance < -DECISIVE
+        is_sure = self.explains and self.counts.since_search > 1
+        return self.filter_evidence.probability if is_sure else max(self.filter_evidence.probability, WRONG_WINDOW)
 
     def with_steps(self, steps: tuple[float, ...]) -> "SequentialTest":
         """Return the test with the steps of converters that windows have shown since."""
@@ -229,20 +202,17 @@ class SequentialTest:
         return replace(self, problem=replace(self.problem, steps=steps), hypotheses=hypotheses)
 
     def with_filter(self, filtered: Fit) -> "SequentialTest":
-        """Return the test after its last window, of which the filter leaves ``filtered``.
+        """Return the test after its last window, of which the filter leaves ``filtered``."""
+        return replace(self, filter_evidence=self.filter_evidence.after(filtered.chi_square, self.last))
 
-        The evidence against the filter is a cumulative sum (E. S. Page, Biometrika 41, 1954) with decisive evidence as
-        its reference value: it falls in windows that give less.
-        """
-        last = self.last
-        more = (filtered.chi_square - last.chi_square) / last.variance_factor
-        total = self.cusum_against_filter + np.clip(more - DECISIVE, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
-        deviance = self.filter_deviance + np.clip(more, -MAX_WINDOW_EVIDENCE, MAX_WINDOW_EVIDENCE)
-        return replace(
-            self,
-            cusum_against_filter=float(np.clip(total, -MAX_WINDOW_EVIDENCE, MAX_TOTAL_DEVIANCE)),
-            filter_deviance=float(np.clip(deviance, -MAX_TOTAL_DEVIANCE, MAX_TOTAL_DEVIANCE)),
-        )
+    def after_expected(self) -> "SequentialTest":
+        """Return the test after a window that the filter expected, and that did not confirm the test."""
+        return replace(self, counts=replace(self.counts, expected=self.counts.expected + 1))
+
+    def after_unexpected(self) -> "SequentialTest":
+        """Return the test after a window that the filter did not expect, or that confirmed the test."""
+        has_explained = self.has_explained or self.explains
+        return replace(self, counts=replace(self.counts, expected=0), has_explained=has_explained)
 
     def alternatives(self, to: TrackedHypothesis) -> list[tuple[TrackedHypothesis, float]]:
         """Return the others that the data do not distinguish decisively from ``to``, with their probabilities."""
@@ -306,7 +276,7 @@ def new_test(fitted: Sequence[FittedHypothesis], predicted: Posterior) -> Sequen
 
 def follow(test: SequentialTest, window: Window) -> SequentialTest:
     """Return the test after one more window: predict, fit and update every hypothesis, then compare them."""
-    test = replace(test, windows=test.windows + 1)
+    test = replace(test, counts=replace(test.counts, tested=test.counts.tested + 1))
     steps = [step for step in _steps(test, window) if step.is_usable]
     if not steps:
         return test
@@ -314,23 +284,15 @@ def follow(test: SequentialTest, window: Window) -> SequentialTest:
     tracked, deviances = _updated(steps)
     if not tracked:
         return test
-    if test.windows >= PRUNED_AFTER:
+    if test.counts.tested >= PRUNED_AFTER:
         tracked = prune(tracked, deviances)
-    filter_deviance = test.filter_deviance - min(item.deviance for item in tracked)
+    evidence = test.filter_evidence.worse_by(-min(item.deviance for item in tracked))
     hypotheses = _sorted([without_insignificant(item) for item in tracked])
-    if test.windows > MAX_OPEN_WINDOWS:
+    if test.counts.tested > MAX_OPEN_WINDOWS:
         hypotheses = without_duplicates(hypotheses, interchangeable(hypotheses))
-    best, name = hypotheses[0], test.best.hypothesis.name
-    leaves_structure = best.type is FaultType.COMPONENT and best.inflation > EXPLAINED
-    followed = replace(
-        test,
-        hypotheses=_screened(hypotheses, steps),
-        leading=(0 if leaves_structure else test.leading + 1) if best.hypothesis.name == name else 1,
-        settled=test.settled + 1,
-        last=last,
-        filter_deviance=filter_deviance,
-    )
-    return replace(followed, clear=0 if followed.has_equal_causes else test.clear + 1)
+    followed = replace(test, hypotheses=_screened(hypotheses, steps), last=last, filter_evidence=evidence)
+    counts = test.counts.after(test.best, followed.best, is_resolved=not followed.has_equal_causes)
+    return replace(followed, counts=counts)
 
 
 def _updated(steps: Sequence[HypothesisStep]) -> tuple[list[TrackedHypothesis], list[float]]:
@@ -419,12 +381,13 @@ def join(test: SequentialTest, fresh: SequentialTest) -> SequentialTest:
         return test
     lead = min(gain, MAX_WINDOW_EVIDENCE)
     together = _best_of_each([*(item.worse_by(lead, lead) for item in test.hypotheses), *fresh.hypotheses])
-    filter_deviance = test.filter_deviance + lead - min(item.deviance for item in together)
     hypotheses = _sorted(together)[: 2 * MAX_HYPOTHESES]
-    joined = replace(test, hypotheses=hypotheses, filter_deviance=filter_deviance)
+    evidence = test.filter_evidence.worse_by(lead).worse_by(-min(item.deviance for item in together))
+    joined = replace(test, hypotheses=hypotheses, filter_evidence=evidence)
     if any(item.posterior is joined.best.posterior for item in fresh.hypotheses):
-        return replace(joined, leading=1, settled=1)
-    return joined if joined.best.hypothesis.name == test.best.hypothesis.name else replace(joined, leading=1)
+        return replace(joined, counts=replace(test.counts, leading=1, since_search=1))
+    is_same = joined.best.hypothesis.name == test.best.hypothesis.name
+    return joined if is_same else replace(joined, counts=replace(test.counts, leading=1))
 
 
 def _best_of_each(tracked: Sequence[TrackedHypothesis]) -> list[TrackedHypothesis]:
@@ -451,3 +414,74 @@ def _sorted(tracked: list[TrackedHypothesis]) -> tuple[TrackedHypothesis, ...]:
         )
         for item in sorted(tracked, key=lambda item: item.deviance)
     )
+
+
+def interchangeable(hypotheses: Sequence[TrackedHypothesis]) -> list[list[int]]:
+    """Return the indices of the hypotheses that explain the windows equally well, grouped by type and place.
+
+    Their misfits are at most ``DECISIVE`` above the least. The best of each group comes first. A component is in a
+    group only if nothing with fewer values explains the windows as well. Otherwise its deviance decides, with the
+    complexity penalty. The null hypothesis is contained in all others, so it is in no group.
+    """
+    others = [at for at, item in enumerate(hypotheses) if item.type is not FaultType.NOTHING]
+    least = min((hypotheses[at].misfit for at in others), default=0.0)
+    equal = [at for at in others if hypotheses[at].misfit <= least + DECISIVE]
+    least_values = min((hypotheses[at].hypothesis.added for at in equal), default=0)
+    moved = [hypotheses[at] for at in equal if hypotheses[at].type is FaultType.PARAMETER]
+    simplest = min(moved, key=lambda item: (item.hypothesis.added, item.deviance), default=None)
+    groups: dict[tuple[FaultType, tuple[str, ...]], list[int]] = {}
+    for at in sorted(equal, key=lambda at: hypotheses[at].deviance):
+        item = hypotheses[at]
+        if item.type is not FaultType.COMPONENT or item.hypothesis.added <= least_values:
+            groups.setdefault((item.type, _place(item, simplest)), []).append(at)
+    return list(groups.values())
+
+
+def _place(item: TrackedHypothesis, simplest: TrackedHypothesis | None) -> tuple[str, ...]:
+    """Return what ``item`` is about: of moved parameters their names.
+
+    More moved parameters than those of the ``simplest`` hypothesis of moved parameters are a variant of it.
+    """
+    if simplest is None or item.type is not FaultType.PARAMETER:
+        return item.places
+    return ((item if item.hypothesis.added <= simplest.hypothesis.added else simplest).hypothesis.name,)
+
+
+def probabilities(hypotheses: Sequence[TrackedHypothesis], groups: Sequence[Sequence[int]]) -> list[float]:
+    """Return the probability of each hypothesis; ``groups`` of interchangeable ones are equally probable."""
+    logs = -0.5 * np.array([item.deviance for item in hypotheses])
+    totals = [float(np.logaddexp.reduce(logs[list(group)])) for group in groups]
+    for group, total in zip(groups, totals, strict=True):
+        logs[list(group)] += max(totals) - total
+    weights = np.exp(logs - logs.max())
+    shares: list[float] = (weights / weights.sum()).tolist()
+    return shares
+
+
+def without_duplicates(
+    hypotheses: tuple[TrackedHypothesis, ...], groups: Sequence[Sequence[int]]
+) -> tuple[TrackedHypothesis, ...]:
+    """Return the hypotheses with only the best of each of the ``groups`` of interchangeable ones."""
+    worse = {at for group in groups for at in group[1:]}
+    return tuple(item for at, item in enumerate(hypotheses) if at not in worse)
+
+
+def mixture(
+    hypotheses: Sequence[TrackedHypothesis], shares: Sequence[float], problem: Problem, before: Prior, wrong: float
+) -> Prior:
+    """Return the moment-matched mixture of what the hypotheses know of the free parameters of ``problem``.
+
+    ``shares`` are their probabilities if the window that opened the test is right. With probability ``wrong`` it is
+    not, and ``before`` holds, which is known without it.
+    """
+    priors = [*(item.known(problem) for item in hypotheses), before]
+    weights = np.append((1.0 - wrong) * np.array(shares), wrong)
+    means = np.array([prior.mean for prior in priors])
+    mean: Array = weights @ means
+    offsets = means - mean
+    own = np.array([prior.covariance for prior in priors])
+    covariance = np.einsum("h,hij->ij", weights, own + offsets[:, :, None] * offsets[:, None, :])
+    sd = np.sqrt(np.diag(covariance))
+    reach = np.abs(offsets) / QUANTILE + np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    wider = np.maximum(reach[weights >= MIN_WEIGHT].max(axis=0, initial=0.0) / np.where(sd > 0.0, sd, 1.0), 1.0)
+    return Prior(mean, covariance * np.outer(wider, wider))

@@ -125,6 +125,7 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
     size = np.linalg.norm(root, axis=0)
     size[size == 0.0] = np.inf  # a direction without information has no bias
     inverse = np.linalg.pinv(root / size, rcond=MIN_SINGULAR)
+    # Sums over the draws: C in all but the last row and column, g in the last column.
     moments, bias = np.zeros((len(size) + 1, len(size) + 1)), np.zeros(len(residual))
     scale, draws = np.append(size, 1.0), 0
     for change in islice(changes, NOISE_DRAWS):
@@ -134,6 +135,7 @@ def without_input_noise(root: Array, residual: Array, changes: Iterable[Array]) 
             return root, residual
     if not np.isfinite(moments).all():
         return root, residual
+    # S by its eigenvalues: the share of the information of each direction that is not by the noise.
     shares, directions = np.linalg.eigh(np.eye(len(bias)) - inverse.T @ moments[:-1, :-1] @ inverse / max(draws, 1))
     kept = directions[:, shares >= MIN_KEPT_INFORMATION]
     shares = np.where(shares >= MIN_KEPT_INFORMATION, np.minimum(shares, 1.0), INFORMATION_OF_NOISE)
@@ -291,21 +293,22 @@ class MapObjective:
     def evidence(self, fit: FitResult, inflation: float, *, has_noisy_inputs: bool = True) -> Evidence:
         """Return the evidence of the window around ``fit``; ``inflation`` multiplies its standard deviations.
 
-        If ``has_noisy_inputs``, it is without the bias that their noise causes.
+        If ``has_noisy_inputs``, it is without the bias that their noise causes. Symbols in the comments are those of
+        ``docs/explanation/filter.md``.
         """
         count = len(self._mean)
         residuals, jacobian = fit.residuals[:-count], fit.jacobian[:-count]
-        constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])
+        constant = np.concatenate([np.arange(count // 2), np.arange(count, len(fit.guess))])  # all but the trends
         curvature = second_order_change(self._objective, fit.guess[constant], fit.jacobian[:, constant])
         of_states = jacobian[:, count:] * (self.high - self.low)[count:]
-        columns = eliminate_states(np.column_stack([jacobian[:, :count], residuals, curvature]), of_states)
-        basis, root = np.linalg.qr(columns[:, :count])
+        columns = eliminate_states(np.column_stack([jacobian[:, :count], residuals, curvature]), of_states)  # J, r, N
+        basis, root = np.linalg.qr(columns[:, :count])  # J = QR
         rotated = basis.T @ columns[:, count:]
-        residual, noise = rotated[:, 0], rotated[:, 1:]
+        residual, noise = rotated[:, 0], rotated[:, 1:]  # b and N, in the directions that R measures
         if has_noisy_inputs:
             moved = self._objective.changes_by_input_noise(fit.guess, residuals, jacobian)
             parts = (eliminate_states(np.delete(rows, np.s_[count:-1], axis=1), of_states) for rows in moved)
-            root, residual = without_input_noise(root, residual, parts)
+            root, residual = without_input_noise(root, residual, parts)  # R' and b'
         root, residual = _with_noise(root / inflation, residual / inflation, noise)
         return Evidence(fit.guess[:count], root, residual)
 

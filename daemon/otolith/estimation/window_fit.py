@@ -276,7 +276,10 @@ def estimate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BothFits:
-    """The fit under the prior, and the fit of the window alone that starts there."""
+    """The fit under the prior, and the fit of the window alone that starts there.
+
+    ``docs/explanation/filter.md`` says what each is used for.
+    """
 
     fit: Fit
     alone: FitResult

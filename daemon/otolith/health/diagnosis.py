@@ -3,7 +3,7 @@
 A row matches a finding if every key that it has agrees; one of a limit that names a parameter also matches a parameter
 that has moved without being estimated. Of the rows that match, those of the machine file come first, then those with
 most keys, which rest on most evidence. If several remain, the data do not distinguish them: they are given together,
-and none is preferred.
+and none is preferred. The plan of a machine has its rows beside the limits of what is monitored.
 """
 
 from collections.abc import Mapping, Sequence

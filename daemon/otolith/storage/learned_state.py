@@ -158,7 +158,7 @@ def _filter_record(state: AdaptationState) -> FilterRecord:
 
 def _sums(state: AdaptationState, free: int) -> tuple[tuple[float, ...], ...]:
     """Return the cumulative shifts; those of other parameters than the present ones count no more."""
-    sums = state.shifts.sums
+    sums = state.cusum.sums
     return () if sums is None or sums.shape[1] != free else tuple(map(tuple, sums.tolist()))
 
 
@@ -200,7 +200,7 @@ def restored(document: LearnedState, state: AdaptationState, now: float) -> Adap
         state,
         **kept,
         posterior=posterior,
-        shifts=_shifts(record),
+        cusum=_shifts(record),
         previous=dict(zip(record.labels, record.previous, strict=True)),
         adopted=adopted,
         resets=document.resets,
