@@ -42,7 +42,7 @@ class MessageOrder:
         self._query, self._on_message, self._pause, self._after = query, on_message, pause, after
         self._topics = topics
         self._last: dict[str, int] = {}
-        self.missed = 0  # Gaps that no query could fill
+        self.missed, self.gap = 0, (0, 0)  # Gaps that no query could fill; numbers before the last one and at its end
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -66,7 +66,7 @@ class MessageOrder:
                 last = self._last.get(key, last)
             if sequence <= last:
                 return
-            self.missed += previous is not None and previous > last
+            self._count_gap(last, previous)
         self._pass_on(key, text, sequence)
 
     def catch_up(self, key: str) -> None:
@@ -77,6 +77,7 @@ class MessageOrder:
             texts = self._query(key, last)
             for number, text in sorted((_numbers(text)[0] or 0, text) for text in texts):
                 if number > last:
+                    self._count_gap(last, _numbers(text)[1])
                     last = number
                     self._pass_on(key, text, number)
             is_full = len(texts) >= MAX_REPLIES
@@ -90,6 +91,11 @@ class MessageOrder:
             self.catch_up(key)
             if self._last.get(key, 0) >= previous or self._pause():
                 return
+
+    def _count_gap(self, last: int, previous: int | None) -> None:
+        """Count a gap if the message before the next one, ``previous``, is later than ``last``, which is 0 at first."""
+        if last and previous is not None and previous > last:
+            self.missed, self.gap = self.missed + 1, (last, previous)
 
     def _pass_on(self, key: str, text: str, sequence: int | None) -> None:
         if sequence is not None:
