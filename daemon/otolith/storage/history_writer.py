@@ -19,7 +19,7 @@ from pathlib import Path
 
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.machine_file import MachineFile
-from otolith.storage.disk import WriterThread, give_to, opened_folder
+from otolith.storage.disk import LEAP_PATIENCE, MAX_AHEAD, MAX_LEAP, WriterThread, give_to, opened_folder
 from otolith.storage.history import (
     BUSY_TIMEOUT,
     CHECKPOINT_BYTES,
@@ -48,9 +48,6 @@ PRUNE_INTERVAL = 60.0  # s between two deletions by age
 MAX_LOG_BYTES = 32 << 20  # of the write-ahead log, which a reader that never ends keeps from being merged
 QUERY_WAIT = 1.0  # s that a query waits for what is not yet written
 AGES = {WINDOW: 1.0 * DAY, MINUTE: 14.0 * DAY, HOUR: 366.0 * DAY}  # s; of days, events and findings the machine file
-MAX_LEAP = 1.0 * DAY  # s by which the clock may pass the time that the daemon ran
-LEAP_PATIENCE = 1.0 * DAY  # s of operation after which a clock that leapt is used
-MAX_AHEAD = 1.0 * DAY  # s after the present from which a time is that of a wrong clock
 HARD_SHARE, PRUNED_SHARE = 0.9, 0.8  # of the size limit: never exceeded, and kept by deleting
 MIN_REPORTS = 1800  # that are kept before coarser values go
 CHUNK = 1000  # rows of a table in one transaction

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from otolith.storage.disk import LEAP_PATIENCE, MAX_AHEAD, MAX_LEAP
 from otolith_drivers.user_dirs import writable
 
 log = logging.getLogger(__name__)
@@ -76,10 +77,13 @@ def expendable(
 
     ``size`` is that of the file that is being written, which is not among ``files``; ``shortage`` is how many bytes
     more must be free on the disk. Marked files have no greatest age, but a share of the budget; they are not deleted
-    for a disk that even so would not have room.
+    for a disk that even so would not have room. Files from after ``now`` are the oldest: the clock was set back since.
     """
-    ordered = sorted(files, key=lambda file: (file.is_marked, file.begin, file.path.name))
-    gone = {file for file in ordered if not file.is_marked and now - file.end > budget.max_age}
+    ordered = sorted(
+        files, key=lambda file: (file.is_marked, file.begin <= now + MAX_AHEAD, file.begin, file.path.name)
+    )
+    clock = _clock(files, now)
+    gone = {file for file in ordered if not file.is_marked and clock - file.end > budget.max_age}
     excess = sum(file.size for file in ordered if file.is_marked) - MAX_EVENT_SHARE * budget.max_bytes
     for file in ordered:
         if file.is_marked and excess > 0:
@@ -93,6 +97,16 @@ def expendable(
         if is_needed and file not in gone:
             yield file
             freed += file.size
+
+
+def _clock(files: Sequence[RecordingFile], now: float) -> float:
+    """Return ``now``, or the end of the last file before a leap of the clock: a wrong clock deletes nothing."""
+    begin = now
+    for file in sorted(files, key=lambda file: file.end, reverse=True):
+        if begin - file.end > MAX_LEAP:
+            return file.end if now - begin < LEAP_PATIENCE else now
+        begin = min(begin, file.begin)
+    return now
 
 
 def shortage_of(folder: Path, share: float = 0.0, factor: float = 1.0) -> int:
