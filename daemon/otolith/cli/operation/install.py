@@ -5,6 +5,7 @@ Each step of the installation is idempotent, and shown by ``--dry-run``.
 
 import contextlib
 import os
+import pwd
 import re
 import shlex
 import shutil
@@ -64,13 +65,15 @@ def install(file: Path, dry_run: bool, root: Path) -> None:
     if is_here and not dry_run and os.geteuid() != 0:
         raise ServiceError("install needs root: use sudo, or --root DIR to look at the files, or --dry-run")
     files = list(_files(file))
+    read = [folder for item in files for folder in item.path.parents if ETC in (folder, *folder.parents)]
+    closed = closed_folders([*read, Path("var/lib/otolith"), Path("var/cache/otolith")], root)
     for item in files:
         others = [other.name for other in _machines_with(root / item.path, root / ETC) if other.name != file.name]
         if _put(item, root, dry_run=dry_run) and others:
             remedy = "if they need another one, give this file another name"
             click.echo(f"warning: {root / item.path} is also a file of {', '.join(others)}: {remedy}", err=True)
     private = [f"/{item.path}" for item in files if item.is_private]
-    for command, user in _commands(file.stem, private):
+    for command, user in _commands(file.stem, private, closed):
         click.echo(f"{'run' if is_here and not dry_run else 'to run'}: {shlex.join(command)}")
         if is_here and not dry_run:
             _run(command, user, file.stem)
@@ -212,12 +215,37 @@ def _put(item: InstalledFile, root: Path, *, dry_run: bool) -> bool:
     return before is not None
 
 
-def _commands(name: str, private: list[str]) -> list[tuple[list[str], str | None]]:
-    """Return the commands of an installation, each with the user who runs it, root if None."""
+def closed_folders(folders: Sequence[Path], root: Path) -> list[str]:
+    """Return the ``folders`` below ``root`` that exist and that the user of the service may not enter.
+
+    Raises ServiceError for one that is open to a group of its own: only its owner can decide who else may enter it.
+    """
+    user = group = -1  # before the first installation
+    with contextlib.suppress(KeyError):
+        user, group = pwd.getpwnam(USER)[2:4]
+    closed = []
+    for folder in (each for each in dict.fromkeys(folders) if (root / each).is_dir()):
+        status = (root / folder).stat()
+        needed = 0o100 if status.st_uid == user else 0o010 if status.st_gid == group else 0o001
+        if status.st_mode & needed:
+            continue
+        if status.st_gid not in (0, group, os.getegid()) and status.st_mode & 0o070:
+            remedy = f"'chmod o+x {root / folder}' lets it, and every other user of this computer"
+            raise ServiceError(f"{root / folder}: user {USER!r} may not enter it: {remedy}")
+        closed.append(f"/{folder}")
+    return closed
+
+
+def _commands(name: str, private: list[str], closed: list[str]) -> list[tuple[list[str], str | None]]:
+    """Return the commands of an installation, each with the user who runs it, root if None.
+
+    The group of the service may enter ``closed`` folders afterwards, and nobody else.
+    """
     cache, program = f"/var/cache/otolith/{name}", str(PROGRAM if PROGRAM.exists() else Path(sys.argv[0]).absolute())
     return [
         (["systemd-sysusers"], None),
-        *([(["chgrp", USER, *private], None)] if private else []),
+        *([(["chgrp", USER, *private, *closed], None)] if private or closed else []),
+        *([(["chmod", "g+x", *closed], None)] if closed else []),
         (["systemctl", "daemon-reload"], None),
         (["install", "-d", "-m", "0700", "-o", USER, "-g", USER, cache], None),
         ([program, "compile", f"/etc/otolith/{name}.toml"], USER),
@@ -227,9 +255,13 @@ def _commands(name: str, private: list[str]) -> list[tuple[list[str], str | None
 def _run(command: list[str], user: str | None, name: str) -> None:
     environment = {"PATH": os.environ.get("PATH", ""), "CACHE_DIRECTORY": f"/var/cache/otolith/{name}"}
     extra_groups = None if user is None else ()
-    done = subprocess.run(  # noqa: S603 - the commands above, without a shell
-        command, env=environment, user=user, group=user, extra_groups=extra_groups, check=False
-    )
+    try:
+        done = subprocess.run(  # noqa: S603 - the commands above, without a shell
+            command, env=environment, user=user, group=user, extra_groups=extra_groups, check=False
+        )
+    except PermissionError as error:
+        remedy = "open it, its environment, and the folders of both and of their Python to all users (chmod go+rX)"
+        raise ServiceError(f"{command[0]}: user {user or 'root'!r} may not run it: {remedy}") from error
     if done.returncode:
         raise ServiceError(f"{shlex.join(command)}: ended with exit code {done.returncode}; repeat the installation")
 
