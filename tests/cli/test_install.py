@@ -170,6 +170,18 @@ def test_readers_whose_network_is_in_a_drop_in_of_ones_own_leave_1_0(file: Path,
     assert exposure(tmp_path, "press-3") <= 1.0
 
 
+def test_the_service_accepts_packets_from_the_networks_of_its_readers_alone(file: Path, tmp_path: Path) -> None:
+    table = '[zenoh]\nlisten = ["tcp/0.0.0.0:7447"]\naccess = { networks = ["192.168.7.0/24", "fd00::/8"] }\n'
+    file.write_text(file.read_text(encoding="utf-8") + table, encoding="utf-8")
+    installed(file, tmp_path)
+    text = (tmp_path / "etc/systemd/system/otolith@press-3.service.d/machine.conf").read_text(encoding="utf-8")
+    assert "IPAddressDeny=any\nIPAddressAllow=localhost\n" in text
+    assert text.endswith("IPAddressAllow=192.168.7.0/24\nIPAddressAllow=fd00::/8\n")
+    assert "# No IPAddressDeny: the addresses that drive " in drop_in(
+        "press-3", [{"type": "modbus", "host": "drive"}], ("tcp/0.0.0.0:7447",), (), networks=("192.168.7.0/24",)
+    )
+
+
 @pytest.mark.parametrize("bus", [True, False], ids=["vcan0", "no vcan0"])
 @pytest.mark.parametrize("name", sorted(path.stem for path in EXAMPLES.glob("*.toml")))
 def test_each_shipped_machine_file_is_exposed_at_most_1_0(

@@ -94,7 +94,8 @@ def _files(file: Path) -> Iterator[InstalledFile]:
     yield InstalledFile(Path("usr/lib/sysusers.d/otolith.conf"), (shipped / SYSUSERS).read_bytes())
     zenoh = machine.file.zenoh
     command = bool(machine.file.machine.on_event)
-    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, command=command)
+    networks = zenoh.access.networks
+    text = drop_in(file.stem, machine.file.drivers, zenoh.listen, zenoh.connect, command=command, networks=networks)
     yield InstalledFile(etc / f"systemd/system/otolith@{file.stem}.service.d/machine.conf", text.encode())
     for name in [Path(file.name), *named_files(file)]:
         source = file.parent / name
@@ -125,11 +126,13 @@ def _strings(value: Any) -> Iterator[str]:
 
 
 def drop_in(
-    name: str, drivers: Sequence[Table], listen: Endpoints, connect: Endpoints, *, command: bool = False
-) -> str:
+    name: str, drivers: Sequence[Table], listen: Endpoints, connect: Endpoints, *,
+    command: bool = False, networks: Sequence[str] | None = None,
+) -> str:  # fmt: skip
     """Return the drop-in of the unit: devices, addresses and kinds of sockets that the machine file needs, no others.
 
-    ``command``: the daemon runs one for each event, which may use the network of this computer.
+    ``command``: the daemon runs one for each event, which may use the network of this computer. ``networks`` are those
+    of the readers, None if they are not known.
     """
     from otolith.machine_file import address_of, host_of
 
@@ -152,14 +155,15 @@ def drop_in(
         lines += [] if sockets else ["PrivateNetwork=yes"]
     local = {host: (address := address_of(host)) and address.is_loopback for host in hosts + published}
     local["localhost"] = True
-    unknown = [host for host in hosts if local[host] is None] + [host for host in published if not local[host]]
+    unknown = [host for host in hosts if local[host] is None]
+    unknown += [host for host in published if networks is None and not local[host]]
     if unknown or foreign:
         names = ", ".join(dict.fromkeys([*unknown, *foreign]))
         lines += [f"# No IPAddressDeny: the addresses that {names} stands for are not known."]
         lines += ["# Its devices are hidden: 'Run Otolith as a service' shows how to allow them."] if foreign else []
         return "\n".join([*lines, ""])
     multicast = ["multicast"] if "udp_multicast" in buses else []
-    allowed = dict.fromkeys(["localhost", *multicast, *hosts])
+    allowed = dict.fromkeys(["localhost", *multicast, *hosts, *(networks or ())])
     return "\n".join([*lines, "IPAddressDeny=any", *(f"IPAddressAllow={host}" for host in allowed), ""])
 
 
