@@ -460,6 +460,22 @@ def test_a_clock_that_leaps_ahead_deletes_nothing_for_a_day(opened: Callable[...
     assert len(history.writer.reader.samples(WINDOW, 0.0)) == 100  # a day after the leap, the clock is used
 
 
+@pytest.mark.parametrize("wrong", [0.0, START - 2 * DAY, START + 20 * DAY])
+def test_a_clock_that_was_wrong_for_a_while_deletes_no_reports(opened: Callable[..., Simulated], wrong: float) -> None:
+    """Without a battery it begins anywhere, until the network sets it right; reports of before the boot are there."""
+    history = opened(Bounds(20 * MEGABYTE, 3650, 24))
+    history.write(*documents(100))
+    history.write(*documents(100, start=wrong))
+    history.write(*documents(100, start=START + HOUR))
+    for hours in range(1, 23):
+        history.prune(START + hours * HOUR, HOUR)
+        assert len(numbers_of(history.writer.reader)) == 300, hours
+    history.write(*documents(100, start=START + 30 * HOUR))
+    for hours in range(24, 32):
+        history.prune(START + hours * HOUR, HOUR)
+    assert len(numbers_of(history.writer.reader)) == 100
+
+
 WRITES_FOR_EVER = """
 import sys
 from pathlib import Path

@@ -20,11 +20,7 @@ from otolith_drivers.user_dirs import writable
 
 log = logging.getLogger(__name__)
 
-# Thresholds: docs/reference/thresholds-storage.md has the origin of each.
-WRITE_RETRY = 30.0  # s from an error to the next try
-MAX_LEAP = 86_400.0  # s by which the clock may pass the time of operation
-LEAP_PATIENCE = 86_400.0  # s of operation after which a clock that leapt is used
-MAX_AHEAD = 86_400.0  # s after the present from which a time is that of a wrong clock
+WRITE_RETRY = 30.0  # s from an error to the next try; docs/reference/thresholds-storage.md has its origin
 
 
 class WriterThread(ABC):

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from otolith.health.schema import EventDocument, ReportDocument
 from otolith.machine_file import MachineFile
-from otolith.storage.disk import LEAP_PATIENCE, MAX_AHEAD, MAX_LEAP, WriterThread, give_to, opened_folder
+from otolith.storage.disk import WriterThread, give_to, opened_folder
 from otolith.storage.history import (
     BUSY_TIMEOUT,
     CHECKPOINT_BYTES,
@@ -33,6 +33,7 @@ from otolith.storage.history import (
     create,
     history_path,
 )
+from otolith.storage.recording_files import LEAP_PATIENCE, MAX_AHEAD, MAX_LEAP
 from otolith_drivers.errors import OtolithError, ServiceError
 
 log = logging.getLogger(__name__)
@@ -78,11 +79,11 @@ class Retention:
             oldest = clock - min(AGES.get(resolution, longest), longest)
             while self._delete_samples(resolution, oldest):
                 pass
-        # By sequence: a report from a time when the clock was ahead goes with those that were published after it.
-        oldest_rows = f"(SELECT sequence, time FROM report ORDER BY sequence LIMIT {CHUNK})"  # noqa: S608 - our own names
-        latest = f"(SELECT max(sequence) FROM {oldest_rows} WHERE time < ?)"  # noqa: S608 - our own names
+        # By sequence: reports with the time of a wrong clock, ahead or behind, go with those around them.
         resend = clock - min(self._bounds.resend_hours * HOUR, longest)
-        while self._delete_reports(f"sequence <= {latest}", resend):
+        recent = "coalesce((SELECT min(sequence) FROM report WHERE time BETWEEN ?1 AND ?2), 9e18)"
+        latest = f"(SELECT max(sequence) FROM report WHERE time < ?1 AND sequence < {recent})"  # noqa: S608 - our own names
+        while self._delete_reports(f"sequence <= {latest}", resend, clock + MAX_AHEAD):
             pass
         for table, column in (("event", "time"), ("finding", "last"), ("counters", "hour"), ("state", "since")):
             self._delete(f"DELETE FROM {table} WHERE {column} < ?", clock - longest)  # noqa: S608 - our own names

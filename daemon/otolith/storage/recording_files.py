@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from otolith.storage.disk import LEAP_PATIENCE, MAX_AHEAD, MAX_LEAP
 from otolith_drivers.user_dirs import writable
 
 log = logging.getLogger(__name__)
@@ -24,6 +23,9 @@ MIN_FREE_BYTES = 100 << 20  # kept free on any disk
 MIN_FREE_SHARE = 0.05  # of the disk, kept free from recordings that the daemon makes by itself
 RESUME_FACTOR = 1.1  # times what is kept free, for recording to go on
 EVENT_MARGIN = 300.0  # s before and after a change of an event whose files are marked
+MAX_LEAP = 86_400.0  # s by which the clock may pass the time of operation
+LEAP_PATIENCE = 86_400.0  # s of operation after which a clock that leapt is used
+MAX_AHEAD = 86_400.0  # s after the present from which a time is that of a wrong clock
 MAX_EVENT_SHARE = 0.5  # of the budget, for marked files
 DAY, MEGABYTE, GIGABYTE = 86_400.0, 1e6, 1e9  # s, bytes
 
