@@ -353,16 +353,16 @@ class HistoryWriter(WriterThread):
             with contextlib.suppress(FileNotFoundError):
                 self._path.with_name(f"{self._path.name}{suffix}").rename(kept.with_name(f"{kept.name}{suffix}"))
         self._path.with_name(f"{self._path.name}-shm").unlink(missing_ok=True)
-        self._limit_kept()
+        self._limit_kept(kept)
         self._connect()
         return f"{self._path}: begun anew: {reason}; the file is kept as {kept.name}"
 
-    def _limit_kept(self) -> None:
-        """Delete the oldest kept databases beyond the size of a history; the newest stays."""
+    def _limit_kept(self, latest: Path) -> None:
+        """Delete the oldest kept databases beyond the size of a history; the ``latest`` stays, with any clock."""
         total, names = 0, self._path.parent.glob(f"{self.reader.site}.{self.reader.machine}.*{KEPT}")
-        for index, path in enumerate(sorted(names, reverse=True)):
+        for path in sorted(names, key=lambda path: (path == latest, path.name), reverse=True):
             total += path.stat().st_size
-            if index and total > self._bounds.max_bytes:
+            if path != latest and total > self._bounds.max_bytes:
                 path.unlink()
                 path.with_name(f"{path.name}-wal").unlink(missing_ok=True)
 
