@@ -227,17 +227,16 @@ def closed_folders(folders: Sequence[Path], root: Path) -> list[str]:
     user = group = -1  # before the first installation
     with contextlib.suppress(KeyError):
         user, group = pwd.getpwnam(USER)[2:4]
-    closed = []
-    for folder in (each for each in dict.fromkeys(folders) if (root / each).is_dir()):
+    closed: dict[str, None] = {}
+    for folder in filter(lambda each: (root / each).is_dir(), folders):
         status = (root / folder).stat()
         needed = 0o100 if status.st_uid == user else 0o010 if status.st_gid == group else 0o001
-        if status.st_mode & needed:
-            continue
-        if status.st_gid not in (0, group, os.getegid()) and status.st_mode & 0o070:
-            remedy = f"'chmod o+x {root / folder}' lets it, and every other user of this computer"
-            raise ServiceError(f"{root / folder}: user {USER!r} may not enter it: {remedy}")
-        closed.append(f"/{folder}")
-    return closed
+        if not status.st_mode & needed:
+            if status.st_gid not in (0, group, os.getegid()) and status.st_mode & 0o070:
+                remedy = f"'chmod o+x {root / folder}' lets it, and every other user of this computer"
+                raise ServiceError(f"{root / folder}: user {USER!r} may not enter it: {remedy}")
+            closed[f"/{folder}"] = None
+    return list(closed)
 
 
 def _commands(name: str, private: list[str], closed: list[str]) -> list[tuple[list[str], str | None]]:
