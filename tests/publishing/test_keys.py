@@ -1,6 +1,7 @@
 """``otolith keys``, the checks of the files that a session uses, and how readers find sockets."""
 
 import re
+import resource
 import socket
 from datetime import timedelta
 from pathlib import Path
@@ -53,6 +54,18 @@ def settings(site: Path, endpoint: str = ENDPOINT, access: AccessTable | None = 
     tls = TlsTable(ca=Path("ca.crt"), certificate=Path("press.crt"), key=Path("press.key"))
     table = ZenohTable(tls=tls, access=access or AccessTable())
     return Access(table, site / "machine.toml").settings("otolith/here/motor", [endpoint])[1]
+
+
+def test_a_certificate_that_the_disk_has_no_room_for_leaves_no_key(tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, limits[1]))  # bytes: a key is shorter, a certificate longer
+    try:
+        with pytest.raises(ConfigurationError, match=r"ca.crt: cannot be written: File too large"):
+            make_authority(tmp_path, utc_now())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
+    make_authority(tmp_path, utc_now())
 
 
 def test_keys_are_private_and_never_replaced(tmp_path: Path) -> None:

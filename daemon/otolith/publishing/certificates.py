@@ -215,6 +215,8 @@ def _write(stem: Path, private: ec.EllipticCurvePrivateKey, certificate: x509.Ce
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
                 file.write(data)
         except OSError as error:
+            for made in () if isinstance(error, FileExistsError) else paths:  # a half would prevent the next try
+                made.unlink(missing_ok=True)
             raise ConfigurationError(f"{path}: cannot be written: {error.strerror}") from error
 
 
